@@ -1,4 +1,5 @@
-"""Animations: `render` for each frame, with a single framing for all of them."""
+"""Films: each picture is drawn by `render`, and the camera is chosen such that all pictures fit
+together."""
 
 from __future__ import annotations
 
@@ -47,17 +48,17 @@ Pixels = npt.NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class Animation:
-    """A written animation file.
+    """A film that was written to a file; notebooks show it.
 
     path: of the file.
-    size: (width, height) of its pictures.
+    size: (width, height) of its pictures in pixels.
     """
 
     path: Path
     size: tuple[int, int]
 
     def _repr_html_(self) -> str:
-        """For notebooks: the film itself, in the page."""
+        """HTML that shows the film in a notebook; it contains the film itself."""
         data = base64.b64encode(self.path.read_bytes()).decode()
         width, height = self.size
         size = f'width="{width}" height="{height}"'
@@ -143,14 +144,15 @@ def animate(
 
 @dataclass(frozen=True)
 class _FilmJob:
-    """The arguments of `render` that all pictures of a film have in common, and Mitsuba's
-    variant."""
+    """The arguments of `render` that all pictures of a film have in common, and the Mitsuba
+    variant. It can be sent to other processes, which draw single pictures."""
 
     arguments: dict[str, Any]
     variant: str
 
     def frame(self, changes: dict[str, Any]) -> TaskResult:
-        """The pixels of one picture. changes: its arguments that differ from the film's."""
+        """The pixels of one picture, as an array by name. changes: the arguments that differ
+        between pictures."""
         set_variant(self.variant)
         arguments = {**self.arguments, **changes}
         return {"shown": render(arguments.pop("surfaces"), **arguments).srgb}
@@ -159,7 +161,8 @@ class _FilmJob:
 def _job(
     frames: list[dict[str, Any]], same: dict[str, Any]
 ) -> tuple[_FilmJob, list[tuple[dict[str, Any]]]]:
-    """The job of a film, and the arguments that differ from picture to picture."""
+    """The job with the arguments that all pictures of a film share, and for each picture a tuple
+    with its other arguments. same: further shared arguments."""
     first = frames[0]
     varying = [name for name in first if any(frame[name] is not first[name] for frame in frames)]
     same = {**same, **{name: first[name] for name in first if name not in varying}}
@@ -169,7 +172,7 @@ def _job(
 
 
 def check_film_path(path: str | os.PathLike[str]) -> Path:
-    """The path of a film to write.
+    """The path of a film to write, checked.
 
     Raises:
         ValueError: its extension is neither .gif nor .mp4.
@@ -183,13 +186,14 @@ def check_film_path(path: str | os.PathLike[str]) -> Path:
 
 
 def _value_at(value: Any, s: float) -> Any:
-    """A setting at the time s: functions of s are called, all else is constant."""
+    """The value of an option in the picture at the time s. Functions of s are called; all other
+    values are constant."""
     return value(s) if _is_function_of_s(value) else value
 
 
 def _is_function_of_s(value: Any) -> bool:
-    """Whether an option is a function of one number. A function of three coordinates, by which a
-    surface is colored, is no function of s."""
+    """Whether an option is a function of s, the time in a film: whether it can be called with one
+    number. A function of three coordinates, by which a surface is colored, cannot."""
     if not callable(value) or isinstance(value, type):
         return False
     try:
@@ -203,8 +207,13 @@ def _is_function_of_s(value: Any) -> bool:
 def _cameras(
     moments: list[dict[str, Any]], steps: FloatArray, orbit: float, size: tuple[int, int]
 ) -> list[Camera]:
-    """The camera of each picture. All cameras have the same box, target, distance and angle of
-    view, except where they set their own."""
+    """The camera of each picture, such that the surfaces of all pictures are always in view. All
+    cameras have the same box, target, distance and angle of view, unless an option sets them.
+
+    moments: the arguments of each picture. steps: (n,) the time s of each. orbit: degrees from s =
+        0 to 1.
+    size: (width, height) in pixels.
+    """
     given = [moment.get("camera") for moment in moments]
     cameras = [Camera() if camera is None else check_camera(camera) for camera in given]
     ups = [moment.get("up") for moment in moments]
@@ -242,7 +251,8 @@ def _cameras(
 
 
 def _orbited(camera: Camera, orbit: float, upright: FloatArray) -> Camera:
-    """The camera after it has gone around its target. upright: (3, 3) rotation of up to z."""
+    """The camera after it has gone around its target by `orbit` degrees. upright: (3, 3) the
+    rotation that turns the direction up to z."""
     if camera.position is None:
         return replace(camera, azimuth=camera.azimuth_elevation[0] + orbit)
     c, s = math.cos(math.radians(orbit)), math.sin(math.radians(orbit))
@@ -253,7 +263,8 @@ def _orbited(camera: Camera, orbit: float, upright: FloatArray) -> Camera:
 
 
 def _points(moments: list[dict[str, Any]], steps: FloatArray) -> FloatArray:
-    """Points (n, 3) of all surfaces that are seen in a film."""
+    """Points (n, 3) of the visible parts of all surfaces in a film. moments: the arguments of each
+    picture. steps: (n,) the time s of each."""
     backend = mitsuba_backend(register())
     points: list[FloatArray] = []
     last: Any = None
@@ -270,13 +281,15 @@ def _points(moments: list[dict[str, Any]], steps: FloatArray) -> FloatArray:
 
 
 def _as_point(point: FloatArray) -> tuple[float, float, float]:
+    """A point (3,) as a tuple of floats."""
     x, y, z = (float(c) for c in point)
     return x, y, z
 
 
 @contextmanager
 def _encoder(path: Path, size: tuple[int, int], fps: float) -> Generator[Callable[[Pixels], None]]:
-    """Yields a function that takes pictures; the film is in `path` when the block ends."""
+    """A context whose value is a function that adds a picture (h, w, 3 or 4) to the film. The film
+    is in the file when the block ends."""
     if path.suffix.lower() == ".gif":
         with _gif(path, fps) as add:
             yield add
@@ -287,6 +300,7 @@ def _encoder(path: Path, size: tuple[int, int], fps: float) -> Generator[Callabl
 
 @contextmanager
 def _gif(path: Path, fps: float) -> Generator[Callable[[Pixels], None]]:
+    """A context whose value is a function that adds a picture (h, w, 3 or 4) to a GIF file."""
     try:
         from PIL import Image
     except ModuleNotFoundError:
@@ -296,6 +310,7 @@ def _gif(path: Path, fps: float) -> Generator[Callable[[Pixels], None]]:
     pictures: list[Any] = []
 
     def add(pixels: Pixels) -> None:
+        """Add a picture (h, w, 3 or 4) to the film."""
         opaque = Image.fromarray(np.ascontiguousarray(pixels[..., :3]))
         indexed = opaque.quantize(_CLEAR, method=Image.Quantize.MEDIANCUT)
         if pixels.shape[-1] == 4:  # a GIF has no partly transparent pixels
@@ -313,6 +328,7 @@ def _gif(path: Path, fps: float) -> Generator[Callable[[Pixels], None]]:
 
 @contextmanager
 def _mp4(path: Path, size: tuple[int, int], fps: float) -> Generator[Callable[[Pixels], None]]:
+    """A context whose value is a function that adds a picture (h, w, 3) to an MP4 file."""
     try:
         import av
     except ModuleNotFoundError:
@@ -329,6 +345,7 @@ def _mp4(path: Path, size: tuple[int, int], fps: float) -> Generator[Callable[[P
         stream.options = {"crf": "16"}
 
         def add(pixels: Pixels) -> None:
+            """Add a picture (h, w, 3) to the film."""
             if pixels.shape[-1] == 4:
                 raise ValueError("films in .mp4 have no alpha: choose another backdrop, or a .gif")
             height, width = (side - side % 2 for side in pixels.shape[:2])

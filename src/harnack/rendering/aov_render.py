@@ -1,8 +1,9 @@
-"""Renders arbitrary output variables (AOVs): normals, evaluations, status, depth, and values of
-another function on the surface.
+"""Renders arbitrary output variables (AOVs): normals, numbers of evaluations, status of rays,
+depth, and values of another function on the surface.
 
-The numbers are exact, not averaged: those of a single ray through the middle of each pixel. So are
-the pictures, except those of values: at edges, the colors of several rays are averaged.
+The numbers of a pixel are those of the single ray through its middle; nothing is averaged. The
+pixels of pictures show these numbers, too, except for pictures of values: at edges, the colors of
+several rays are averaged.
 """
 
 from __future__ import annotations
@@ -51,18 +52,22 @@ _STATUS_COLORS = {
 
 @dataclass(frozen=True)
 class AovBuffers:
-    """First hits of the rays through the middles of all pixels.
+    """Numbers of the first hits of the rays through the middles of all pixels: arrays of shape (h,
+    w) unless another shape is stated.
 
-    depth: (h, w) distance from the camera in the unit of the viewer's placement, inf without a hit;
-        for a ray out of steps, the distance up to which it is proved free.
-    normal: (h, w, 3) unit, zero without a hit; of a level set it points to larger values.
-    evaluations: (h, w) of all the scene's fields.
-    status: (h, w) a `RayStatus`; shapes of Mitsuba count as hits.
-    isoline_color: (h, w, 3) color in sRGB of the isoline that is hit; NaN where no isoline is hit.
-    is_near_isoline: (h, w) whether the edge of an isoline may pass through the pixel.
-    value: (h, w) of a function at hits, NaN elsewhere; None without a function.
-    period: of that function, if it is angle-valued.
-    background: sRGB in [0, 1], of pictures without a hit.
+    depth: the distance from the camera in the coordinates of the surfaces; inf without a hit; for a
+        ray that ran out of steps, the distance up to which no surface lies.
+    normal: (h, w, 3) unit normals, 0 without a hit. The normal of a level set points to larger
+        values.
+    evaluations: the number of evaluations of fields along the ray, summed over all fields of the
+        scene.
+    status: a `RayStatus`; hits of Mitsuba's own shapes count as hits.
+    isoline_color: (h, w, 3) sRGB color of the isoline that is hit; NaN if no isoline is hit.
+    is_near_isoline: whether the edge of an isoline may pass through the pixel.
+    value: the function that colors the surface, at hits; NaN without a hit; None if there is no
+        such function.
+    period: the period of this function if it is angle-valued, else None.
+    background: the sRGB color, in [0, 1], of pixels without a hit.
     """
 
     depth: FloatArray
@@ -78,10 +83,13 @@ class AovBuffers:
 
 @dataclass(frozen=True)
 class AovTask:
-    """The rendering of AOVs for a sensor in a scene, by ranges of pixels.
+    """The rendering of the arrays of `AovBuffers` for a sensor in a scene, by ranges of pixels.
 
-    placement: of the surfaces, in whose coordinates depths are given.
-    function: of the same coordinates, to be evaluated at hits; None for no function.
+    world: the Mitsuba scene with the level sets in it.
+    placement: the map from the coordinates of the surfaces to the world. Depths are in the former.
+    function: the function, in the coordinates of the surfaces, that is evaluated at hits; None for
+        none.
+    background: the sRGB color, in [0, 1], of pixels without a hit.
     """
 
     mi: Any
@@ -101,7 +109,7 @@ class AovTask:
         function: Field | None = None,
         background: Color = _BACKGROUND,
     ) -> AovTask:
-        """The task for a loaded Mitsuba scene."""
+        """The task for a loaded Mitsuba scene. The parameters are the attributes of the class."""
         return cls(mi, HybridScene.of(mi, scene), sensor, placement, function, background)
 
     @property
@@ -112,11 +120,12 @@ class AovTask:
 
     @functools.cached_property
     def order(self) -> IntArray:
-        """All pixels, as `tiled_pixel_order` visits them."""
+        """The indices (n,) of all pixels, counted by rows, in the order in which they are traced:
+        squares of 4 x 4 pixels, one after the other."""
         return tiled_pixel_order(self.size)
 
     def render_range(self, start: int, stop: int) -> AovBuffers:
-        """The first hits (n,) of the rays through the middles of a range of pixels, counted as in
+        """The `AovBuffers`, with arrays (n,), of the pixels from `start` to `stop` in the order of
         `order`."""
         return self._trace_pixels(
             upload_indices(self.mi, self.order[start:stop]), self.mi.Vector2f(0.5)
@@ -125,10 +134,11 @@ class AovTask:
     def look(
         self, executor: RenderExecutor | None = None, advance: Callable[[float], None] | None = None
     ) -> AovBuffers:
-        """The first hits of the rays through the middles of all pixels.
+        """The `AovBuffers` of all pixels.
 
-        executor: executes the methods of a task like this one in place of this task.
-        advance: called with the fraction that has been finished since the last call.
+        executor: calls `render_range` of a copy of this task, for example on a cluster; None to
+            call it in this process.
+        advance: called with the fraction of the pixels that has been finished since the last call.
         """
         executor = LocalRenderExecutor(self) if executor is None else executor
         width, height = self.size
@@ -142,6 +152,8 @@ class AovTask:
                 advance((stop - start) / (width * height))
 
         def by_rows(*column: Any) -> Any:
+            """The image (h, w, ...) of arrays (n, ...) of ranges of pixels in the order of
+            `order`."""
             image = np.empty((height, width, *column[0].shape[1:]), column[0].dtype)
             image.reshape(height * width, *column[0].shape[1:])[order] = np.concatenate(column)
             return image
@@ -149,8 +161,11 @@ class AovTask:
         return _map_arrays(by_rows, *buffers)
 
     def render_samples(self, pixels: IntArray, offsets: FloatArray) -> AovBuffers:
-        """The first hits of rays through points (m, 2) in each of n pixels, which are counted by
-        rows: arrays (n, m)."""
+        """The `AovBuffers`, with arrays (n, m), of rays through m points in each of n pixels.
+
+        pixels: (n,) indices of the pixels, counted by rows.
+        offsets: (m, 2) coordinates in [0, 1) of the points in each pixel.
+        """
         mi, count = self.mi, len(offsets)
         pixel = upload_indices(mi, np.repeat(pixels, count))
         table = np.tile(offsets, (len(pixels), 1)).T
@@ -162,7 +177,11 @@ class AovTask:
         return _map_arrays(by_pixels, self._trace_pixels(pixel, positions))
 
     def _trace_pixels(self, pixel: Any, offset: Any) -> AovBuffers:
-        """The first hits of rays through places in pixels, counted by rows: arrays (n,)."""
+        """The `AovBuffers`, with arrays (n,), of rays through one point in each of n pixels.
+
+        pixel: (n,) indices of the pixels, counted by rows.
+        offset: the coordinates in [0, 1) of the point in its pixel.
+        """
         mi, count = self.mi, dr.width(pixel)
         position = film_positions(mi, pixel, offset, self.size)
         ray, _ = self.sensor.sample_ray_differential(
@@ -177,6 +196,7 @@ class AovTask:
         dr.eval(first, near, color)
 
         def numbers(values: Any) -> Any:
+            """A Dr.Jit array as a NumPy array with one row for each ray."""
             flat = to_numpy(values)
             return np.broadcast_to(flat, (count, *flat.shape[1:]))
 
@@ -201,7 +221,8 @@ class AovTask:
         return replace(view, value=value, period=self.function.period)
 
     def _line_color(self, si: Any, first: Any) -> Any:
-        """The color in sRGB of the isoline that is hit; NaN where no isoline is hit."""
+        """The sRGB color of the isoline that each ray hits; NaN if it hits no isoline. si, first:
+        the hit, as an interaction and as a `SurfaceHit`."""
         mi = self.mi
         line_color = mi.Vector3f(dr.nan)
         for proxy in self.world.proxies:
@@ -216,8 +237,8 @@ class AovTask:
 
 
 def _map_arrays(change: Callable[..., Any], *views: AovBuffers) -> AovBuffers:
-    """AOV buffers whose arrays are the results of `change` for the arrays of that name in all
-    views."""
+    """The `AovBuffers` in which each array is `change(...)` of the arrays of the same name in all
+    `views`. Other entries are those of the first view."""
     arrays = {
         name: change(*(getattr(view, name) for view in views))
         for name, value in vars(views[0]).items()
@@ -227,19 +248,21 @@ def _map_arrays(change: Callable[..., Any], *views: AovBuffers) -> AovBuffers:
 
 
 def _values(function: Field, points: FloatArray) -> FloatArray:
-    """Values at points (n, 3), NaN where the function is not defined."""
+    """The function at points (n, 3); NaN outside the volume in which the function is defined."""
     values: FloatArray = function.value(points)
     volume = padded_domain(function, float(np.ptp(points, axis=0).max()))
     return values if volume is None else np.where(volume.contains_points(points), values, np.nan)
 
 
 def normal_picture(view: AovBuffers) -> npt.NDArray[np.uint8]:
-    """x, y, z from [-1, 1] as red, green, blue."""
+    """The picture (h, w, 3) whose red, green and blue are the x, y and z of the normals, from [-1,
+    1]."""
     return _of_surfaces(view, 0.5 + 0.5 * view.normal)
 
 
 def status_picture(view: AovBuffers) -> npt.NDArray[np.uint8]:
-    """Misses dark, hits white, out of steps magenta."""
+    """The picture (h, w, 3) in which misses are dark, hits are white, and rays out of steps are
+    magenta."""
     picture = np.zeros((*view.status.shape, 3))
     for status, color in {RayStatus.MISS: view.background, **_STATUS_COLORS}.items():
         picture[view.status == int(status)] = color
@@ -247,35 +270,40 @@ def status_picture(view: AovBuffers) -> npt.NDArray[np.uint8]:
 
 
 def depth_picture(view: AovBuffers, scale: ColorScale) -> npt.NDArray[np.uint8]:
-    """Depths of hits as the colors of a scale."""
+    """The picture (h, w, 3) of the depths of hits in the colors of a scale."""
     return _of_surfaces(view, scale.colors(view.depth))
 
 
 def value_picture(view: AovBuffers, scale: ColorScale) -> npt.NDArray[np.uint8]:
-    """Values at hits as the colors of a scale, gray where there is no value; with isolines."""
+    """The picture (h, w, 3) of the values at hits in the colors of a scale; gray where a hit has no
+    value. Isolines have their own colors."""
     value = value_of(view)
     picture = np.where(np.isnan(value)[..., None], _UNKNOWN, scale.colors(value))
     return _of_surfaces(view, np.where(np.isnan(view.isoline_color), picture, view.isoline_color))
 
 
 def evaluations_picture(view: AovBuffers, scale: ColorScale) -> npt.NDArray[np.uint8]:
-    """Evaluations as the colors of a scale, of rays that miss as well."""
+    """The picture (h, w, 3) of the numbers of evaluations in the colors of a scale; rays that miss
+    are colored, too."""
     return _with_lost(view, scale.colors(view.evaluations.astype(np.float64)))
 
 
 def depth_scale(view: AovBuffers) -> ColorScale:
-    """Near is bright, far is dark."""
+    """The gray scale from the smallest depth that is seen, which is bright, to the largest, which
+    is dark."""
     return ColorScale(*_range(view, view.depth), "depth", gray_colormap)
 
 
 def evaluations_scale(view: AovBuffers) -> ColorScale:
-    """Zero is dark blue; the 99.5th percentile, and all above it, is yellow."""
+    """The color scale from zero, which is dark blue, to the 99.5th percentile, which is yellow as
+    are all larger numbers."""
     top = max(float(np.percentile(view.evaluations, 99.5)), 1.0)
     return ColorScale(0.0, top, "evaluations")
 
 
 def value_scale(view: AovBuffers) -> ColorScale:
-    """From the least value that is seen, dark blue, to the greatest, yellow; angles as hues."""
+    """The color scale from the smallest value that is seen, dark blue, to the largest, yellow.
+    Values of an angle-valued function have a circle of hues instead."""
     if view.period is not None:
         return ColorScale.cyclic(view.period, "value")
     return ColorScale(*_range(view, value_of(view)), "value")
@@ -295,23 +323,26 @@ def _range(view: AovBuffers, numbers: FloatArray) -> tuple[float, float]:
 
 
 def _of_surfaces(view: AovBuffers, picture: FloatArray) -> npt.NDArray[np.uint8]:
-    """Colors where something is hit, over the background."""
+    """The picture (h, w, 3) with the colors of `picture` at hits, magenta for rays out of steps,
+    and the background elsewhere."""
     is_hit = (view.status == int(RayStatus.HIT))[..., None]
     return _with_lost(view, np.where(is_hit, picture, view.background))
 
 
 def _with_lost(view: AovBuffers, picture: FloatArray) -> npt.NDArray[np.uint8]:
+    """The picture (h, w, 3) with magenta for rays out of steps."""
     is_lost = (view.status == int(RayStatus.OUT_OF_STEPS))[..., None]
     return to_uint8(np.where(is_lost, OUT_OF_STEPS_COLOR, picture))
 
 
 @dataclass(frozen=True)
 class AovMode:
-    """How an AOV is read from the buffers as numbers, and drawn.
+    """How one kind of picture is made from `AovBuffers`.
 
-    scale: the color scale of the numbers, by which `picture` draws them; None for AOVs without a
-        scale.
-    is_averaged: whether the picture, not the numbers, averages several rays at edges.
+    numbers: gives the array that `render` returns.
+    picture: gives the pixels (h, w, 3), from the buffers and the color scale.
+    scale: gives the color scale of the numbers; None for a kind of picture without a scale.
+    is_averaged: whether the colors, not the numbers, of several rays are averaged at edges.
     """
 
     numbers: Callable[[AovBuffers], Any]
@@ -349,12 +380,16 @@ def aov_picture(
     spp: int,
     executor: RenderExecutor | None = None,
 ) -> npt.NDArray[np.uint8]:
-    """The picture (h, w, 3) of AOV buffers.
+    """The pixels (h, w, 3) of a picture of normals, depths, values or other numbers, with a color
+    bar if requested.
 
-    value_range: of the scale, in place of the range of the numbers that are seen.
-    bar: whether to put a color bar beside the picture, or its title.
-    spp: rays of a pixel at an edge, for pictures that are averaged.
-    executor: as for `AovTask.look`.
+    show: the kind of picture, a key of `AOV_MODES`.
+    viewer, view: the task, and its result for all pixels.
+    value_range: (low, high) of the color scale, in place of the range of the numbers that are seen.
+    bar: whether to put a color bar beside the picture, or the title of this bar.
+    spp: the number of rays of a pixel at an edge, for pictures in which edges are averaged.
+    executor: calls methods of `viewer`, for example on a cluster; None to call them in this
+        process.
     """
     mode = AOV_MODES[show]
     scale = None if mode.scale is None else mode.scale(view)
@@ -387,8 +422,12 @@ def _antialias(
     spp: int,
     executor: RenderExecutor | None,
 ) -> None:
-    """Make pixels that differ visibly from a neighbor, or that the edge of an isoline may pass
-    through, the mean light of a grid of rays."""
+    """Change `picture` (h, w, 3) in place: pixels that differ visibly from a neighbor, or through
+    which the edge of an isoline may pass, get the mean light of a grid of `spp` rays.
+
+    colors: gives the pixels of an `AovBuffers`.
+    executor: calls methods of `viewer`; None to call them in this process.
+    """
     order = tiled_pixel_order(viewer.size)
     edges = order[(edge_pixels(picture) | view.is_near_isoline).ravel()[order]]
     offsets = multijitter_offsets(spp)

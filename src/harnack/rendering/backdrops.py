@@ -1,10 +1,11 @@
-"""The surroundings of a picture in the studio: ground and lights, or colors and images.
+"""The surroundings of a picture in the studio: the ground and the lights, or a color or an image
+behind the surfaces.
 
-Ground and lights are placed around the camera's view of the stage. A color or an image takes the
-place of the studio's wall behind the surfaces.
+Ground and lights are placed relative to the camera. A color or an image takes the place of the
+studio's wall behind the surfaces.
 
-The camera does not see the environment of the studio but a backdrop: alpha comes with it, and no
-horizon.
+The camera does not see the environment that lights the studio but a backdrop, which is added to the
+picture afterwards. So pictures can have alpha, and there is no horizon.
 """
 
 from __future__ import annotations
@@ -41,12 +42,13 @@ _ENVIRONMENT_SIZE = (64, 128)
 
 
 def reflectance_of(backdrop: str) -> FloatArray:
-    """Reflectance (3,) of the ground."""
+    """Reflectance (3,) of the ground, in linear sRGB. backdrop: "light" or "dark"."""
     return np.array(GROUNDS[backdrop])
 
 
 def distant_ground_radiance(backdrop: str, azimuth: float) -> FloatArray:
-    """Radiance (3,) of the ground far from the stage, which the environment alone lights."""
+    """Radiance (3,) of the ground far from the stage, which only the environment lights. backdrop:
+    "light" or "dark". azimuth: of the camera, in degrees."""
     image = environment(azimuth)
     z = np.cos(math.pi * (np.arange(len(image)) + 0.5) / len(image))
     weight = np.clip(z, 0, None) * np.sqrt(1 - z * z)  # of rows, by the cosine
@@ -55,7 +57,7 @@ def distant_ground_radiance(backdrop: str, azimuth: float) -> FloatArray:
 
 
 def ground(mi: Any, backdrop: str) -> dict[str, Any]:
-    """A wide floor."""
+    """A wide floor as an entry of a Mitsuba scene dictionary. backdrop: "light" or "dark"."""
     floor = mi.ScalarTransform4f().translate([0, 0, FLOOR_HEIGHT]).scale(100)
     color = {"type": "rgb", "value": list(GROUNDS[backdrop])}
     return {
@@ -68,12 +70,13 @@ def ground(mi: Any, backdrop: str) -> dict[str, Any]:
 
 
 def lights(mi: Any, azimuth: float) -> dict[str, Any]:
-    """A large key light to the left of the camera and above, and an environment as fill light.
+    """The lights of the studio as entries of a Mitsuba scene dictionary: a large key light to the
+    left of the camera and above it, and an environment as fill light.
 
     azimuth: of the camera, in degrees.
 
-    The environment is smooth: paths that reach it by sampling BSDFs are less noisy than samples of
-    it, so it is not sampled itself.
+    The environment is smooth: light paths that reach it by sampling BSDFs are less noisy than paths
+        that sample the environment. So it is not sampled as a light.
     """
     key = 4.9 * _direction(azimuth - 52, 55)
     look = mi.ScalarTransform4f().look_at(origin=key.tolist(), target=[0, 0, 0.3], up=[0, 0, 1])
@@ -94,7 +97,8 @@ def lights(mi: Any, azimuth: float) -> dict[str, Any]:
 
 
 def environment(azimuth: float) -> Any:
-    """Radiance of the environment as an equirectangular image (h, w, 3) of float32, z up."""
+    """Radiance of the environment as an equirectangular image (h, w, 3) of float32 with z up.
+    azimuth: of the camera, in degrees."""
     height, width = _ENVIRONMENT_SIZE
     theta = math.pi * (np.arange(height) + 0.5) / height
     phi = 2 * math.pi * (np.arange(width) + 0.5) / width
@@ -110,6 +114,7 @@ def environment(azimuth: float) -> Any:
 
 
 def _direction(azimuth: float, elevation: float) -> FloatArray:
+    """The unit vector (3,) of an azimuth, from the x axis, and an elevation, both in degrees."""
     a, e = math.radians(azimuth), math.radians(elevation)
     return np.array([math.cos(e) * math.cos(a), math.cos(e) * math.sin(a), math.sin(e)])
 
@@ -126,14 +131,15 @@ IMAGE_FILES = (".png", ".jpg", ".jpeg", ".exr")
 
 @dataclass(frozen=True)
 class GroundBackdrop:
-    """The studio's floor, which turns into a wall far away. name: in GROUNDS."""
+    """The studio's floor, which turns into a wall far away. name: "light" or "dark"."""
 
     name: str
 
 
 @dataclass(frozen=True)
 class GradientBackdrop:
-    """From a color at the bottom of a picture to one at its top, both in sRGB."""
+    """A color at the bottom of a picture that changes gradually to another one at its top, both in
+    sRGB. They may be the same."""
 
     bottom: Color
     top: Color
@@ -141,7 +147,8 @@ class GradientBackdrop:
 
 @dataclass(frozen=True, eq=False)
 class ImageBackdrop:
-    """An image, pixels (h, w, 3) of linear sRGB, first row at the top, that fills a picture."""
+    """An image behind the surfaces, scaled to fill the picture. pixels: (h, w, 3) linear sRGB,
+    first row at the top."""
 
     pixels: FloatImage
 
@@ -151,7 +158,8 @@ Backdrop = GroundBackdrop | GradientBackdrop | ImageBackdrop | None
 
 
 def parse_backdrop(backdrop: Any) -> Backdrop:
-    """The backdrop that an option describes.
+    """The backdrop that the value of an option describes: a name, a color, two colors, an image, or
+    its file.
 
     Raises:
         TypeError, ValueError: it is no backdrop; the message lists the backdrops.
@@ -179,6 +187,8 @@ _BACKDROP_HELP = (
 
 
 def _backdrop_from_text(name: str) -> Backdrop:
+    """The backdrop of a text: its name, the name of an image file, or a color. Raises ValueError
+    for other texts."""
     if name in GROUNDS:
         return GroundBackdrop(name)
     if name == TRANSPARENT:
@@ -196,7 +206,8 @@ def _backdrop_from_text(name: str) -> Backdrop:
 
 
 def _pixels(image: npt.NDArray[Any]) -> FloatImage:
-    """An array as an image: bytes are sRGB, other numbers linear."""
+    """An array (h, w, 3) as an image in linear sRGB. Bytes are sRGB and are converted; other
+    numbers are linear."""
     wrong = f"a backdrop's image must have the shape (h, w, 3), not {image.shape}"
     if image.ndim != 3 or image.shape[-1] != 3 or not image.size:
         raise ValueError(wrong)
@@ -213,7 +224,7 @@ def _pixels(image: npt.NDArray[Any]) -> FloatImage:
 
 
 def _read(path: Path) -> FloatImage:
-    """The image in a file, over white where it is transparent."""
+    """The image (h, w, 3) in a file, in linear sRGB, laid over white if it is transparent."""
     if path.suffix.lower() not in IMAGE_FILES:
         raise FileLocation(path).error(f"a backdrop is an image: {', '.join(IMAGE_FILES)}")
     data = read_bytes(path)
@@ -226,6 +237,7 @@ def _read(path: Path) -> FloatImage:
 
 
 def _read_bitmap(data: bytes) -> FloatImage:
+    """The image (h, w, 3) of the bytes of a PNG or JPEG file, in linear sRGB."""
     mi = load_mitsuba()
     stream = mi.MemoryStream()
     stream.write(data)
@@ -234,7 +246,8 @@ def _read_bitmap(data: bytes) -> FloatImage:
 
 
 def _decoded(bitmap: Any) -> FloatImage:
-    """The pixels of one of Mitsuba's bitmaps."""
+    """The pixels (h, w, 3) of one of Mitsuba's bitmaps, in linear sRGB, laid over white if it is
+    transparent."""
     mi = load_mitsuba()
     has_alpha = bitmap.has_alpha()
     kind = mi.Bitmap.PixelFormat.RGBA if has_alpha else mi.Bitmap.PixelFormat.RGB
@@ -245,7 +258,8 @@ def _decoded(bitmap: Any) -> FloatImage:
 
 
 def _read_exr(data: bytes) -> FloatImage:
-    """Read by OpenEXR: Mitsuba never returns where Dr.Jit has one thread."""
+    """The image (h, w, 3) of the bytes of an EXR file, laid over white if it is transparent. It is
+    read by the package OpenEXR: Mitsuba's reader never returns if Dr.Jit has one thread."""
     import OpenEXR  # here, since most pictures do without
 
     library = cast("Any", OpenEXR)

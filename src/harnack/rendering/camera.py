@@ -1,4 +1,4 @@
-"""A camera that frames the surfaces on the stage."""
+"""`Camera`, which chooses from where a picture is seen such that the surfaces fill it."""
 
 from __future__ import annotations
 
@@ -27,22 +27,24 @@ Point = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Camera:
-    """A view of the stage.
+    """From where a picture is seen. What is not set is chosen such that the surfaces fill the
+    picture.
 
-    azimuth, elevation: of the direction the camera looks from, in degrees; azimuth 0 is +x and
-        90 is +y, elevation 90 is straight from above. By default -50 and 28.
-    fov: the larger of the horizontal and vertical angle of view, in degrees. By default 26, or, of
-        a camera with a position or a distance, the angle that frames the surface from there.
-    zoom: 1 frames the surface tightly with a margin; more comes closer or, of a camera with a
-        position or a distance, makes the angle of view smaller.
-    box: a box to frame in place of the visible surfaces, in their coordinates; it stands on the
-        ground. The pictures of a film, in which surfaces change, then fit each other, and nothing
-        has to be traced to find the frame.
+    azimuth, elevation: the direction from the surfaces to the camera, in degrees; azimuth 0 is +x
+        and 90 is +y, elevation 90 is straight above. By default -50 and 28.
+    fov: the larger of the horizontal and vertical angle of view, in degrees. By default 26; for a
+        camera with a position or a distance, the angle at which the surfaces fill the picture.
+    zoom: with 1, the surfaces fill the picture up to a margin. With a larger number the camera
+        comes closer; if it has a position or a distance, the angle of view becomes smaller instead.
+    box: a box, in the coordinates of the surfaces, that fills the picture in place of the visible
+        surfaces; it stands on the ground. With the same box, pictures of surfaces that change fit
+        each other, and no rays are traced to find the frame.
     position: (x, y, z), where the camera stands, in the coordinates of the surfaces, in place of
         azimuth and elevation.
     target: (x, y, z), the point in the middle of the picture, in the same coordinates; by default
-        the middle of the framed box.
-    distance: from the target, in the same unit; by default the one that frames the surface.
+        the middle of what fills the picture.
+    distance: of the camera from the target, in the same unit; by default such that the surfaces
+        fill the picture.
     """
 
     azimuth: float | None = None
@@ -95,7 +97,8 @@ class Camera:
         )
 
     def axes(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Unit vectors of the world: to the right, up, and back to the camera."""
+        """Unit vectors (3,) in the world that point to the right, up, and back to the camera, for a
+        camera with azimuth and elevation."""
         a, e = map(math.radians, self.azimuth_elevation)
         back = np.array([math.cos(e) * math.cos(a), math.cos(e) * math.sin(a), math.sin(e)])
         right = np.array([-math.sin(a), math.cos(a), 0.0])
@@ -104,10 +107,14 @@ class Camera:
     def frame_points(
         self, points: FloatArray, size: tuple[int, int]
     ) -> tuple[FloatArray, FloatArray]:
-        """Origin and target such that all points (n, 3) are in the picture of (width, height).
+        """Origin (3,) and target (3,) of the camera that keeps all points (n, 3) within a picture
+        of `size` (width, height), as close as its angle of view allows.
 
-        Along each image axis the picture's edges are planes through the origin; the points'
-        supports in the directions of these planes' normals give origin and distance.
+        Let x, y, z be the coordinates of a point to the right, up, and back to the camera. A point
+        is in the picture if |x - cx| <= slope (h - z), and likewise for y; (cx, cy, h) are the
+        coordinates of the camera. So the largest x + slope z and the smallest x - slope z over all
+        points give cx and the least h. The larger of the two h, of x and of y, is taken. zoom then
+        divides the distance from the middle of the points.
         """
         right, up, back = self.axes()
         x, y, z = points @ right, points @ up, points @ back
@@ -128,9 +135,12 @@ class Camera:
         size: tuple[int, int],
         to_world: Callable[[FloatArray], FloatArray],
     ) -> CameraPose:
-        """The camera in the world, placed to see points (n, 3) of the world.
+        """The camera as a `CameraPose` in the world, placed such that it sees points (n, 3) of the
+        world.
 
-        to_world: from the coordinates of the surfaces, a map of one scale for all axes.
+        size: (width, height) of the picture in pixels.
+        to_world: maps points (n, 3) from the coordinates of the surfaces to the world, with one
+            scale for all axes.
         """
         if self.position is None and self.target is None and self.distance is None:
             origin, target = self.frame_points(points, size)
@@ -171,8 +181,12 @@ class Camera:
         return CameraPose(target + length * back, target, up, fov, oriented.azimuth_elevation[0])
 
     def _fov_to_frame(self, across: FloatArray, depth: FloatArray, size: tuple[int, int]) -> float:
-        """The angle of view, in degrees, that frames points as far as `across` (2, n) from the
-        middle, to the right and upwards, and `depth` (n,) in front of the camera."""
+        """The angle of view, in degrees, of a camera at a given position that sees n points; at
+        most 120, and 60 if a point lies beside or behind the camera.
+
+        across: (2, n) horizontal and vertical distances of the points from the axis of the view.
+        depth: (n,) their distances from the camera along this axis.
+        """
         if depth.min() <= 0:
             return _FOV_INSIDE
         shape = max(size) / np.array(size)
@@ -184,16 +198,19 @@ class Camera:
 
     @property
     def fov_or_default(self) -> float:
-        """The angle of view of a camera that chooses its distance, in degrees."""
+        """The angle of view that was set, in degrees, or else 26, that of a camera that chooses its
+        distance."""
         return _DEFAULT_FOV if self.fov is None else self.fov
 
     def _slopes(self, size: tuple[int, int]) -> tuple[float, float]:
-        """Slopes of the edges of the part of the picture to fill, to the right and upwards."""
+        """Tangents of half the angle of view, to the right and upwards, of the part of the picture
+        that surfaces are to fill (86 percent)."""
         slope = math.tan(math.radians(self.fov_or_default) / 2) * _FILL_FRACTION / max(size)
         return slope * size[0], slope * size[1]
 
 
 def _is_number(value: Any) -> bool:
+    """Whether `float` accepts a value."""
     try:
         float(value)
     except (TypeError, ValueError):
@@ -203,9 +220,13 @@ def _is_number(value: Any) -> bool:
 
 @dataclass(frozen=True)
 class CameraPose:
-    """A camera in the world.
+    """Position, orientation and angle of view of a camera, in world coordinates (z is up).
 
-    origin, target, up: (3,). fov: degrees. azimuth: of the direction it looks from, in degrees.
+    origin, target, up: (3,) where the camera stands, the point in the middle of the picture, and
+        the unit vector that is up in the picture.
+    fov: the larger of the horizontal and vertical angle of view, in degrees.
+    azimuth: the angle from the x axis to the horizontal part of the vector from target to origin,
+        in degrees.
     """
 
     origin: FloatArray

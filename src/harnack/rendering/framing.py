@@ -1,8 +1,9 @@
-"""Computes the framing of a picture: which way is up, the box that holds a surface, and where in it
-the surface is visible.
+"""Computes the framing of a picture: which way is up, the box that contains a surface, and the part
+of this box in which the surface is visible.
 
-The box that a surface is proved to lie in can be many times larger than the surface. A picture
-should be filled by the visible part, so the surface is located by tracing it from all sides.
+The box in which a surface is proved to lie can be many times larger than the surface. The visible
+part should fill the picture, so the surface is located by tracing rays from all six sides of the
+box.
 """
 
 from __future__ import annotations
@@ -38,10 +39,11 @@ UP_AXES: tuple[str, ...] = (*_UPRIGHT, *("-" + axis for axis in _UPRIGHT))
 
 
 def rotation_to_z_up(up: Any) -> FloatArray:
-    """The rotation (3, 3) that turns an axis ("x", "-y", ...) or a vector to z.
+    """The rotation matrix (3, 3) that turns an axis ("x", "-y", ...) or a vector to z. For y it
+    turns z, the front of a glTF model, to -y, where the studio's camera stands.
 
     Raises:
-        TypeError, ValueError: neither.
+        TypeError, ValueError: `up` is neither an axis nor a vector that is not zero.
     """
     if isinstance(up, str):
         if up not in UP_AXES:
@@ -70,7 +72,7 @@ def rotation_to_z_up(up: Any) -> FloatArray:
 
 
 class UnboundedSurfaceError(ValueError):
-    """A surface without a box around it cannot be drawn.
+    """The error for a surface that cannot be drawn, as no box around it is known.
 
     reason: the text of the error.
     bounded_level: a level of the same field whose surface has a box; None if no such level is
@@ -87,7 +89,7 @@ class UnboundedSurfaceError(ValueError):
 
 
 class NothingVisibleError(ValueError):
-    """A surface that no ray hits: there is nothing to frame."""
+    """The error for a surface that no ray hits, so that there is nothing to frame."""
 
 
 def bounding_box(surface: TracedSurface) -> FloatArray:
@@ -104,6 +106,7 @@ def bounding_box(surface: TracedSurface) -> FloatArray:
 
 
 def _unbounded(surface: TracedSurface) -> UnboundedSurfaceError:
+    """The error for a surface without a box, with a hint on the reason and on another level."""
     field = surface.field
     levels = surface.level_values
     shown = ", ".join(f"{level:g}" for level in levels)
@@ -137,20 +140,21 @@ _VISIBLE_POINTS_CACHE: FieldCache[FloatArray] = FieldCache()
 
 
 def visible_points(surface: TracedSurface, backend: Backend) -> FloatArray:
-    """Points (n, 3) of the surface, as seen from the six sides of the box it lies in.
+    """Points (n, 3) of the surface that are seen from the six sides of the box in which it lies.
 
-    They are cached for a field that is uploaded once, as long as the settings are the same: when
-    only the camera moves, nothing is traced for it.
+    They are cached for a field that is prepared once for all calls, as long as the other settings
+    are the same. So if only the camera moves, no ray is traced for the framing.
 
     Raises:
-        ValueError: it has no bounds, or a size that single precision cannot draw; a
-            NothingVisibleError where no ray hits it.
+        ValueError: the surface has no bounds, or a size that single precision cannot draw; a
+            NothingVisibleError if no ray hits it.
     """
     ends = bounding_box(surface)
     check_drawable_size(ends)
     prepared = surface.evaluator(backend)
 
     def find() -> FloatArray:
+        """The points, found anew."""
         return _find_visible_points(surface, backend, ends)
 
     if prepared is surface.field:  # it may have changed in place
@@ -168,7 +172,8 @@ def visible_points(surface: TracedSurface, backend: Backend) -> FloatArray:
 
 
 def check_drawable_size(ends: FloatArray) -> None:
-    """Raise ValueError for a box (2, 3) that single precision cannot draw."""
+    """Raise ValueError for a box with corners `ends` (2, 3) that is too small, or has too large
+    coordinates, for pictures in single precision."""
     if 0.0 < (ends[1] - ends[0]).max() < _SMALLEST or np.abs(ends).max() > _LARGEST:
         raise ValueError(
             f"the surface lies in a box from {_point(ends[0])} to {_point(ends[1])}: pictures are "
@@ -178,8 +183,9 @@ def check_drawable_size(ends: FloatArray) -> None:
 
 
 def check_offset(points: FloatArray) -> None:
-    """Warn of surfaces, represented by points (n, 3), that are blurred by the rounding of
-    coordinates far from the origin, as those of maps; raise ValueError if they are lost in it."""
+    """Warn if surfaces are so far from the origin for their size that rounding of coordinates blurs
+    them, as surfaces of maps are; raise ValueError if rounding loses them. points: (n, 3) points of
+    the surfaces."""
     size, distance = float(np.ptp(points, axis=0).max()), float(np.abs(points).max())
     if distance <= _MAX_SHARP_OFFSET * size or size == 0:
         return
@@ -194,7 +200,9 @@ def check_offset(points: FloatArray) -> None:
 
 
 def _find_visible_points(surface: TracedSurface, backend: Backend, ends: FloatArray) -> FloatArray:
-    """The hits of rays of a coarse grid, and of a finer grid around these hits."""
+    """Points (n, 3) at which rays hit the surface: rays of a coarse grid on the box with corners
+    `ends` (2, 3), and of a finer grid on the box of these hits. Raises NothingVisibleError if there
+    is none."""
     lower, upper = ends
     points = _probe(surface, backend, lower, upper, _GRID)
     if len(points) == 0:
@@ -217,13 +225,15 @@ def _find_visible_points(surface: TracedSurface, backend: Backend, ends: FloatAr
 
 
 def _point(corner: FloatArray) -> str:
+    """A point (3,) as text, for messages."""
     return "(" + ", ".join(f"{c:.4g}" for c in corner) + ")"
 
 
 def _probe(
     surface: TracedSurface, backend: Backend, lower: FloatArray, upper: FloatArray, grid: int
 ) -> FloatArray:
-    """First hits of parallel rays, grid x grid from each of the six sides of a box."""
+    """The first hits (n, 3) of parallel rays with a surface: grid x grid rays from each of the six
+    sides of the box from `lower` to `upper`."""
     size = float(np.linalg.norm(upper - lower))
     # A twentieth of the distance between rays; smaller tolerances are slow for sums over trees.
     coarse = replace(surface, tolerance=HitTolerance(1e-3 * size))
@@ -243,8 +253,13 @@ def _probe(
 def _rays(
     lower: FloatArray, upper: FloatArray, gap: float, grid: int
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Origins, directions and lengths of a grid of rays through the box along each axis, tile by
-    tile."""
+    """Origins (n, 3), directions (n, 3) and lengths (n,) of parallel rays through a box, from each
+    of its six sides. Rays that follow each other are close together.
+
+    lower, upper: (3,) corners of the box.
+    gap: the distance from the box at which rays begin and end.
+    grid: the number of rays along a side of the grid, a multiple of 8.
+    """
     rows = grid // _TILE
     # Axes: tiles down and across, and rays down and across a tile.
     index = np.indices((rows, rows, _TILE, _TILE), dtype=np.float64)

@@ -1,9 +1,9 @@
-"""Mitsuba scenes with level sets in them: rays are traced through both, and hits become surface
-interactions.
+"""Mitsuba scenes with level sets in them. Rays are traced through both, and hits with level sets
+become surface interactions of Mitsuba's.
 
-Mitsuba's integrators cannot see level sets. Where a scene's integrator asks for light that
-harnack's path tracer computes, that path tracer is used; scenes without level sets are left to
-Mitsuba; all else is refused by name.
+Mitsuba's integrators cannot see level sets. If a scene's integrator asks for light that harnack's
+path tracer computes, that path tracer is used. Scenes without level sets are left to Mitsuba. All
+other scenes are refused with an error that names the integrator.
 """
 
 from __future__ import annotations
@@ -24,12 +24,15 @@ if TYPE_CHECKING:
 
 
 def surface_interaction(mi: Any, met: SurfaceHit, ray: Any, shape: Any) -> Any:
-    """The SurfaceInteraction3f of a ray with a level set, valid where `met.is_hit`.
+    """The SurfaceInteraction3f of rays with a level set, valid where `met.is_hit`.
 
-    shape: ShapePtr of the proxy, whose BSDF is evaluated. Texture coordinates are x and y of the
-        position in the world: a level set has no parametrization of its own. The index of the
-        primitive is the number of the isoline that is drawn there, by which a BSDF chooses
-        (`mitsuba_proxy.isoline_bsdf`).
+    met: the hits, in the world.
+    shape: ShapePtr of the proxy (the Mitsuba mesh that stands for the level set), whose BSDF is
+        evaluated.
+
+    Texture coordinates are x and y of the position in the world, as a level set has no
+    parametrization. The primitive index is the number of the isoline at the hit, by which the BSDF
+    chooses a color (`mitsuba_proxy.isoline_bsdf`).
     """
     si = dr.zeros(mi.SurfaceInteraction3f)
     si.t = dr.select(met.is_hit, met.t, dr.inf)
@@ -47,25 +50,31 @@ def surface_interaction(mi: Any, met: SurfaceHit, ray: Any, shape: Any) -> Any:
 
 
 def offset_origin(mi: Any, si: Any, clearance: Real, d: Vec3) -> Any:
-    """The origin of a ray in direction d that does not hit the surface of `si` again.
+    """The origin (3,) of a ray that leaves the surface at `si` in direction d and does not hit it
+    again there.
 
-    It is off the surface along the normal, on the side to which the ray leaves, as far as for
-    Mitsuba's own rays, (1 + |p|_max) RayEpsilon, but no less than `clearance`: within its tolerance
-    of a level set every point is a hit.
+    clearance: the least distance of the origin from the surface; within its tolerance of a level
+        set every point is a hit.
+
+    The origin is moved along the normal to the side to which the ray leaves: as far as for
+        Mitsuba's own rays, (1 + |p|_max) RayEpsilon with p the position, but at least by
+        `clearance`.
     """
     distance = dr.maximum((1 + dr.max(dr.abs(si.p))) * mi.math.RayEpsilon, clearance)
     return dr.fma(dr.mulsign(distance, dr.dot(si.n, d)), mi.Vector3f(si.n), si.p)
 
 
 def spawn_ray(mi: Any, si: Any, clearance: Real, d: Vec3) -> Any:
-    """The ray from `si` in direction d."""
+    """The ray from a surface interaction in direction d. clearance: the least distance of its
+    origin from the surface."""
     return mi.Ray3f(
         offset_origin(mi, si, clearance, d), d, dr.largest(mi.Float), si.time, si.wavelengths
     )
 
 
 def spawn_ray_to(mi: Any, si: Any, clearance: Real, target: Vec3) -> Any:
-    """The ray from `si` to a target point, ending just before it."""
+    """The ray from a surface interaction to a target point (3,), ending just before it. clearance:
+    the least distance of its origin from the surface."""
     o = offset_origin(mi, si, clearance, target - si.p)
     vector = target - o
     length = dr.norm(vector)
@@ -76,8 +85,12 @@ def spawn_ray_to(mi: Any, si: Any, clearance: Real, target: Vec3) -> Any:
 
 @dataclass(frozen=True)
 class HybridScene:
-    """The scene that rays are traced in: all of its shapes, Mitsuba's and the level sets of
-    harnack."""
+    """A Mitsuba scene in which rays meet all shapes, Mitsuba's own and the level sets of harnack.
+
+    proxies: the Mitsuba meshes that stand for level sets. No ray of Mitsuba's hits them.
+    queued: whether rays are traced at once when a method is called, by few lanes that share a queue
+        of rays.
+    """
 
     mi: Any
     scene: Any
@@ -87,25 +100,27 @@ class HybridScene:
 
     @classmethod
     def of(cls, mi: Any, scene: Any, *, queued: bool = False) -> HybridScene:
-        """Find the proxies of level sets in a scene.
+        """The scene with the proxies that are found in it: the Mitsuba meshes that stand for level
+        sets.
 
-        queued: whether rays are traced without delay, from a queue, which is faster where they
-            differ in length, and cannot be done while a kernel is being recorded.
+        queued: whether rays are traced at once when a method is called, by few lanes that share a
+            queue of rays. That is faster for rays of different lengths, and impossible while a
+            kernel is being recorded.
         """
         return cls(mi, scene, tuple(s for s in scene.shapes() if is_proxy(s)), queued)
 
     def _placed(self, carrier: Any) -> PlacedSurface:
+        """The level set of a proxy in the world, traced with a queue if the scene is."""
         return carrier.placed.queued() if self.queued else carrier.placed
 
     def intersect(
         self, ray: Any, start: Any, active: Mask, hidden: Mask | None = None
     ) -> tuple[Any, SurfaceHit]:
-        """The first hit of rays, as a surface interaction and as a `SurfaceHit`.
+        """The first hit of rays, as a surface interaction of Mitsuba's and as a `SurfaceHit`. For a
+        ray out of steps the interaction is not valid.
 
-        start: the interaction that rays leave, not valid for rays that come from a camera.
-        hidden: mask of rays that do not see shapes that emit light; None for no such rays.
-
-        For a ray out of steps the interaction is not valid.
+        start: the interaction that rays leave; not valid for rays that come from a camera.
+        hidden: mask of rays that do not see shapes that emit light; None if there are no such rays.
         """
         mi = self.mi
         preliminary = self.scene.ray_intersect_preliminary(ray, active=active)
@@ -140,13 +155,17 @@ class HybridScene:
         return si, dr.select(ended, hit, scene_hit)
 
     def _skip_emitters(self, ray: Any, first: Any, active: Mask) -> Any:
-        """The first hits of rays with the scene behind the shapes that emit light."""
+        """The first hits of rays with Mitsuba's shapes that do not emit light. first: the first
+        hits with all of these shapes. active: rays that pass through shapes that emit light."""
         mi = self.mi
 
         def is_emitter(hit: Any, active: Mask) -> Mask:
+            """Mask of hits with a shape that emits light."""
             return active & hit.is_valid() & hit.shape.is_emitter()
 
         def skip(hit: Any, active: Mask) -> tuple[Any, Mask]:
+            """The next hit behind each shape that emits light, and the mask of those that are again
+            with such a shape."""
             distance = hit.t * (1 + mi.math.RayEpsilon) + mi.math.RayEpsilon
             rest_ray = mi.Ray3f(ray)
             rest_ray.o = dr.fma(mi.Vector3f(distance), ray.d, ray.o)
@@ -164,10 +183,12 @@ class HybridScene:
         return hit
 
     def no_hit(self, si: Any) -> SurfaceHit:
-        """The `SurfaceHit` of rays that hit nothing. si: invalid interactions, one for each ray."""
+        """The `SurfaceHit` of rays that hit nothing. si: interactions that are not valid, one for
+        each ray."""
         return self._of_scene(si, self.mi.Bool(False))
 
     def _of_scene(self, si: Any, active: Mask) -> SurfaceHit:
+        """The `SurfaceHit` of surface interactions with Mitsuba's own shapes."""
         mi, vector = self.mi, mitsuba_backend(self.mi).Array3f
         return SurfaceHit(
             t=si.t,
@@ -184,18 +205,24 @@ class HybridScene:
         )
 
     def has_line_near(self, si: Any, ray: Any, d: Any, t: Any) -> Mask:
-        """Whether the edge of an isoline may pass through the pixel of a ray with differentials.
+        """Mask of rays for which the edge of an isoline may pass through the pixel.
 
-        d: the direction in which the ray arrives.
-        t: the length of its path.
+        si: the first hit of each ray. ray: rays with differentials, that is with the rays of two
+            neighboring pixels.
+        d: the direction in which the ray arrives at the hit; behind glass it is not that of the
+            ray.
+        t: the length of the path of the ray.
 
-        The points at which neighboring rays hit the tangent plane are computed along d.
+        The rays of neighboring pixels are assumed to arrive along d, too; so they hit the tangent
+        plane at points that are computed from there.
         """
         mi, near = self.mi, self.mi.Bool(False)
         normal = mi.Vector3f(si.n)
         facing = dr.dot(normal, d)
 
         def to_neighbor(o: Any, along: Any) -> Any:
+            """The vector from the hit to the point at which a neighboring ray o + t along hits the
+            tangent plane."""
             offset = o + t * along - ray.o - t * ray.d
             return offset - d * (dr.dot(offset, normal) / facing)
 
@@ -207,7 +234,8 @@ class HybridScene:
         return near
 
     def occluded(self, ray: Any, active: Mask) -> Mask:
-        """Whether rays hit anything; rays that are not proved to hit nothing count as hitting."""
+        """Mask of rays that hit a shape or a level set. Rays that are not proved to miss count as
+        hits."""
         blocked = self.scene.ray_test(ray, active)
         for proxy in self.proxies:
             blocked |= self._placed(proxy).occludes(ray.o, ray.d, ray.maxt, active & ~blocked)

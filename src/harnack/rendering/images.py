@@ -1,4 +1,5 @@
-"""Pictures as arrays and as files: the array that `render` returns, tone mapping, PNG and EXR."""
+"""Pictures as arrays and as files: the array that `render` returns, tone mapping, and PNG and EXR
+files."""
 
 from __future__ import annotations
 
@@ -23,12 +24,12 @@ _ROWS_AT_ONCE = 64
 
 
 def check_picture_path(path: Any) -> Path:
-    """The path of a picture to write.
+    """The path of a picture to write, checked.
 
     Raises:
         TypeError: it is no path.
         ValueError: its extension is neither .png nor .exr.
-        OSError: no file can be created there, as `write_atomically` says.
+        OSError: no file can be created there.
     """
     if not isinstance(path, str | os.PathLike):
         raise TypeError(f"path must name a picture to write, such as 'a.png', not {path!r}")
@@ -42,11 +43,13 @@ def check_picture_path(path: Any) -> Path:
 
 
 def tone_map(image: FloatImage, behind: FloatImage | None = None) -> npt.NDArray[np.uint8]:
-    """Linear sRGB radiance as 8-bit sRGB: a smooth shoulder, then the transfer function.
+    """The 8-bit sRGB of an image of linear sRGB radiance: bright light is compressed smoothly, then
+    the transfer function of sRGB is applied.
 
-    The last channel of an image (h, w, 4) is alpha, by which the others are multiplied. It stays,
-    and the others are divided by it, as PNG wants it. Or the image is laid over `behind`, linear
-    sRGB (h, w, 3) without a shoulder, and three channels are left.
+    image: (h, w) or (h, w, 3); or (h, w, 4) with alpha, by which the other channels are multiplied.
+        In the result they are divided by alpha, as PNG files need it.
+    behind: (h, w, 3) linear sRGB to lay the image over, which is not compressed; then the result
+        has three channels.
     """
     shape = image.shape if behind is None else behind.shape
     shown = np.empty(shape, dtype=np.uint8)
@@ -59,6 +62,7 @@ def tone_map(image: FloatImage, behind: FloatImage | None = None) -> npt.NDArray
 
 
 def _tone_mapped(image: FloatArray, behind: FloatImage | None) -> npt.NDArray[np.uint8]:
+    """`tone_map` of some rows of an image."""
     if image.ndim < 3 or image.shape[-1] < 4:
         return to_uint8(linear_to_srgb(_apply_shoulder(image)))
     alpha = np.clip(image[..., 3:], 0.0, 1.0)
@@ -69,13 +73,14 @@ def _tone_mapped(image: FloatArray, behind: FloatImage | None) -> npt.NDArray[np
 
 
 def _apply_shoulder(radiance: FloatArray) -> FloatArray:
+    """Radiance with values above 0.8 compressed smoothly to at most 1."""
     x = np.clip(np.nan_to_num(radiance, nan=0.0, posinf=1e6), 0.0, None)
     room = 1.0 - SHOULDER_START
     return np.where(x <= SHOULDER_START, x, 1.0 - room * np.exp(-(x - SHOULDER_START) / room))
 
 
 def linear_to_srgb(x: FloatArray) -> FloatArray:
-    """Linear sRGB in [0, 1] as sRGB."""
+    """Linear sRGB in [0, 1] as sRGB, by its transfer function."""
     return np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
 
 
@@ -92,9 +97,11 @@ def to_uint8(image: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.uint8]:
 def write_image(
     mi: Any, path: Path, image: npt.NDArray[Any], names: Sequence[str] | None = None
 ) -> None:
-    """Write (h, w), (h, w, 3) or (h, w, 4) floats as EXR or bytes as PNG, all or nothing.
+    """Write an image to a file. The file is replaced only if all of it was written.
 
-    names: of the channels of an EXR file, if they are others than Y, RGB or RGBA."""
+    path: .exr or .png. image: (h, w), (h, w, 3) or (h, w, 4), floats for EXR and bytes for PNG.
+    names: of the channels of an EXR file, if they are other than Y, RGB or RGBA.
+    """
     with write_atomically(path) as partial:
         if path.suffix.lower() == ".exr":
             partial.write_bytes(exr_bytes(image, names))
@@ -111,8 +118,9 @@ def png_bytes(mi: Any, image: npt.NDArray[np.uint8]) -> bytes:
 
 
 def exr_bytes(image: npt.NDArray[np.floating[Any]], names: Sequence[str] | None = None) -> bytes:
-    """An OpenEXR file of an image (h, w) with channel Y, (h, w, 3) with R, G and B, or (h, w, 4)
-    with A as well, by which these are multiplied; or with channels of these names."""
+    """The bytes of an OpenEXR file of an image: (h, w) with channel Y, (h, w, 3) with R, G and B,
+    (h, w, 4) with A as well, by which the others are multiplied; or with channels of the given
+    names."""
     # Mitsuba writes them too, but waits for ever where Dr.Jit has one thread (OpenEXR 2.5 hands
     # its work to a pool without threads).
     import OpenEXR  # here, since most pictures do without
@@ -132,16 +140,17 @@ def exr_bytes(image: npt.NDArray[np.floating[Any]], names: Sequence[str] | None 
 
 
 class Picture(np.ndarray[Any, np.dtype[Any]]):
-    """The numbers of a picture, an array like any other, which notebooks show as an image.
+    """The array of numbers that `render` returns. Notebooks show it as an image.
 
-    Arrays that are computed from it are ordinary ones and have no image.
+    Arrays that are computed from it are ordinary arrays, which notebooks do not show as images.
     """
 
     _srgb: npt.NDArray[np.uint8] | None = None
 
     @classmethod
     def of(cls, numbers: npt.NDArray[Any], pixels: npt.NDArray[np.uint8]) -> Picture:
-        """Numbers, and the pixels (h, w), (h, w, 3) or (h, w, 4) that they are shown as."""
+        """A picture with these numbers, which notebooks show by the pixels (h, w), (h, w, 3) or (h,
+        w, 4)."""
         picture = numbers.view(cls)
         picture._srgb = pixels
         return picture
@@ -164,10 +173,10 @@ class Picture(np.ndarray[Any, np.dtype[Any]]):
 
     @property
     def srgb(self) -> npt.NDArray[np.uint8]:
-        """The pixels that are shown: sRGB in bytes, (h, w, 3), or (h, w, 4) with alpha.
+        """The pixels that are shown: 8-bit sRGB, (h, w, 3), or (h, w, 4) with alpha.
 
         Raises:
-            AttributeError: this array was computed from that of a picture.
+            AttributeError: this array was computed from a picture and has no pixels.
         """
         if self._srgb is None:
             raise AttributeError(
@@ -176,7 +185,7 @@ class Picture(np.ndarray[Any, np.dtype[Any]]):
         return self._srgb
 
     def to_pil(self) -> Any:
-        """As an image of Pillow's.
+        """The picture as an image of the package Pillow.
 
         Raises:
             ModuleNotFoundError: Pillow is not installed.
@@ -190,9 +199,11 @@ class Picture(np.ndarray[Any, np.dtype[Any]]):
         return Image.fromarray(self.srgb)
 
     def _repr_png_(self) -> bytes | None:
-        """For notebooks."""
+        """The bytes of a PNG file, which notebooks show; None for an array that was computed from a
+        picture."""
         return None if self._srgb is None else png_bytes(load_mitsuba(), self._srgb)
 
 
 def _restored(numbers: npt.NDArray[Any], shown: npt.NDArray[np.uint8] | None) -> Picture:
+    """A picture from its pickled numbers and pixels."""
     return numbers.view(Picture) if shown is None else Picture.of(numbers, shown)

@@ -1,15 +1,15 @@
 """A path tracer that sees both Mitsuba's shapes and level sets, and the sampler of its light paths.
 
-Light paths are traced in waves (vertex by vertex), and their rays from a queue. In a recorded loop
-over whole paths, each packet of lanes would wait for its slowest ray at each vertex: three quarters
-of the lanes were idle. Paths that have ended are left out between vertices, and a lane that has
-finished a ray fetches the next. Any ray march can be queued (`surface_tracer`), as its state is a
-record; `trace` does so with many rays whose neighbors differ. No rays are queued for fields whose
-samples take less time than fetching a ray (`Field.is_cheap`). Only the order of lanes changes.
-Intermediate results lie in memory of their own, so that kernels do not depend on how many paths are
-left.
+All light paths advance together, one vertex at a time, and the rays of a vertex are traced from a
+    queue: a lane that has finished a ray takes the next one. In a recorded loop over whole paths,
+    each packet of lanes would wait for its slowest ray at each vertex, and three quarters of the
+    lanes were idle. Paths that have ended are left out after each vertex. Fields whose samples take
+    less time than taking a ray from the queue are traced without it (`Field.is_cheap`). The queue
+    only changes the order of lanes, not the results. Intermediate results are written to memory, so
+    that kernels do not depend on the number of paths that are left.
 
-Samples are computed from their index, since paths change lanes.
+Paths change lanes. So the random numbers of a path are computed from its pixel and index, and not
+from a state of its lane.
 """
 
 from __future__ import annotations
@@ -40,18 +40,20 @@ _HASH = (0x21F0AAAD, 0xD35A2D97)
 
 @dataclass
 class SobolSampler:
-    """Sobol' points for light paths, scrambled after Owen, computed from their index alone.
+    """Points of Sobol' for light paths, scrambled after Owen, computed from their index alone.
 
-    A sampler with a state must be carried along with each path; this one needs the path's pixel,
-    the index of the sample and the dimension, so that paths can be moved to other lanes, and the
-    same path has the same numbers whatever else is drawn. Each pair of dimensions is the first two
-    of Sobol' in an order of its own (Burley 2020, Practical Hash-based Owen Scrambling), which
-    stratifies samples of a pixel as well as multi-jittering does, for any number of them.
+    A sampler with a state would have to be carried along with each path. This one needs only the
+    path's pixel, the index of its sample and the dimension. So paths can be moved to other lanes,
+    and a path has the same numbers whatever else is drawn. Each pair of dimensions consists of the
+    first two dimensions of Sobol' in an order of its own (Burley 2020, Practical Hash-based Owen
+    Scrambling). This stratifies the samples of a pixel as well as multi-jittering does, for any
+    number of samples.
 
-    Methods are called as Mitsuba's. Each call takes the next dimension.
+    Methods are called as those of Mitsuba's samplers. Each call takes the next dimension.
 
-    pixel, index: (UInt32) for each path its pixel, and the index of its sample in the pixel.
-    seed: UInt32. dimension: UInt32, of the next call.
+    pixel, index: UInt32, for each path its pixel, and the index of its sample in the pixel.
+    seed: UInt32; another seed gives other points.
+    dimension: UInt32, the dimension that the next call takes.
     """
 
     mi: Any
@@ -61,15 +63,14 @@ class SobolSampler:
     dimension: Any
 
     def at_vertex(self, depth: Any, rows: Any) -> SobolSampler:
-        """The sampler for a subset of the paths, at vertex `depth`, counted from 0.
-
-        rows: indices of the paths."""
+        """The sampler of a subset of the paths at the vertex `depth`, counted from 0. rows: the
+        indices of these paths."""
         uint = self.mi.UInt32
         pixel, index = dr.gather(uint, self.pixel, rows), dr.gather(uint, self.index, rows)
         return SobolSampler(self.mi, pixel, index, self.seed, _CAMERA + _VERTEX * uint(depth))
 
     def next_2d(self, active: Any = True) -> Any:
-        """Points in [0, 1)^2."""
+        """The next random point in [0, 1)^2 of each path."""
         del active
         uint, mi = self.mi.UInt32, self.mi
         key = _hashed(uint, self.pixel + _hashed(uint, self.dimension + _hashed(uint, self.seed)))
@@ -86,11 +87,12 @@ class SobolSampler:
         return mi.Point2f(*(dr.minimum(mi.Float(bits) * 2.0**-32, largest) for bits in pair))
 
     def next_1d(self, active: Any = True) -> Any:
-        """Numbers in [0, 1)."""
+        """The next random number in [0, 1) of each path."""
         return self.next_2d(active).x
 
 
 def _hashed(uint: Any, x: Any) -> Any:
+    """A hash of 32-bit integers (Wellons 2018). uint: the array type."""
     x = uint(x)
     for multiplier, shift in zip(_HASH, (16, 15), strict=True):
         x = (x ^ (x >> shift)) * uint(multiplier)
@@ -98,7 +100,8 @@ def _hashed(uint: Any, x: Any) -> Any:
 
 
 def _owen(uint: Any, x: Any, seed: Any) -> Any:
-    """Owen's scrambling: whether a bit is flipped depends on the bits above it."""
+    """Owen's scrambling of 32-bit integers: whether a bit is flipped depends on the bits above it
+    and on the seed. uint: the array type."""
     x = dr.brev(x) + seed
     for multiplier in _OWEN:
         x ^= x * uint(multiplier)
@@ -115,8 +118,8 @@ _UNLIMITED = 2**32 - 1
 
 @dataclass(frozen=True)
 class _Vertex:
-    """The last vertex of a path: its position and normal, and the shape it lies on. Not valid
-    before the first."""
+    """The last vertex of each path: its position (3,) and normal (3,), the shape on which it lies,
+    and whether there is one (before the first vertex there is none)."""
 
     position: Any
     normal: Any
@@ -125,17 +128,18 @@ class _Vertex:
 
     @classmethod
     def none(cls, mi: Any) -> _Vertex:
-        """No vertex: the path comes from the camera."""
+        """The vertex of paths that have none yet, as they come from the camera; it is not valid."""
         zero = dr.zeros(mi.SurfaceInteraction3f)
         return cls(zero.p, zero.n, zero.shape, mi.Bool(False))
 
     @classmethod
     def of(cls, si: Any) -> _Vertex:
-        """From an interaction."""
+        """The vertex at a surface interaction of Mitsuba's."""
         return cls(si.p, si.n, si.shape, si.is_valid())
 
     def interaction(self, mi: Any) -> Any:
-        """As an interaction with nothing else in it."""
+        """The vertex as a surface interaction of Mitsuba's, which has only position, normal and
+        shape."""
         si = dr.zeros(mi.SurfaceInteraction3f)
         si.p, si.n, si.shape = self.position, self.normal, self.shape
         si.t = dr.select(self.is_valid, mi.Float(0), dr.inf)
@@ -144,14 +148,18 @@ class _Vertex:
 
 @dataclass(frozen=True)
 class _PathState:
-    """The state of paths.
+    """The state of light paths between two vertices.
 
-    number: of the path among all.
-    previous, pdf, delta: the last vertex and how it sampled the ray, for the weights of lights that
-        the ray finds.
-    eta: product of relative refractive indices; keeps Russian roulette from ending paths in glass.
+    number: the index of the path among all paths.
+    ray: from the last vertex to the next one.
+    throughput: the fraction of the light along the ray that reaches the camera.
+    eta: the product of the relative refractive indices so far. It keeps Russian roulette from
+        ending paths in glass.
+    previous: the last vertex.
+    pdf, delta: the probability density with which the last vertex sampled the ray, and whether it
+        could sample no other direction. They give the weight of a light that the ray finds.
     is_diffused, was_diffused: whether a rough surface has scattered the path up to the last vertex,
-        and up to the one before that.
+        and up to the vertex before that.
     """
 
     number: Any
@@ -167,7 +175,11 @@ class _PathState:
 
 @dataclass(frozen=True)
 class _LightConnection:
-    """Light that a vertex scatters along the path, if nothing lies on the ray to its emitter."""
+    """The light that comes from an emitter to a vertex and is scattered there along the path, if
+    nothing lies on the ray to the emitter.
+
+    ray: from the vertex to a point of the emitter. active: whether there is such light.
+    """
 
     ray: Any
     light: Any
@@ -176,14 +188,15 @@ class _LightConnection:
 
 @dataclass
 class DenoisingFeatures:
-    """Features of the first hits of paths, for denoising: albedo, in (0, 1), and unit normal. Both
-    are 0 where paths hit nothing."""
+    """What the denoiser needs of the first hits of paths: albedo, in (0, 1), and unit normal. Both
+    are 0 for paths that hit nothing."""
 
     albedo: Any
     normal: Any
 
     def record(self, mi: Any, si: Any, numbers: Any, active: Mask) -> None:
-        """Store the features of interactions, at the numbers of their paths."""
+        """Store the albedo and normal at surface interactions `si`, at the indices `numbers` of
+        their paths."""
         bsdf, straight = si.bsdf(), mi.SurfaceInteraction3f(si)
         straight.wi = mi.Vector3f(0, 0, dr.mulsign(mi.Float(1), si.wi.z))
         albedo = bsdf.eval_diffuse_reflectance(straight, active)
@@ -196,12 +209,12 @@ class DenoisingFeatures:
 
 @dataclass
 class PathResults:
-    """Results of light paths.
+    """The results of light paths, with one entry for each path.
 
-    light: radiance.
-    valid: whether they hit a surface.
-    lost: whether a ray ran out of steps.
-    features: of the first hits, if requested.
+    light: the radiance that reaches the camera.
+    valid: whether the path hits a surface.
+    lost: whether one of its rays ran out of steps.
+    features: albedo and normal at the first hit, if requested; else None.
     """
 
     light: Any
@@ -213,10 +226,11 @@ class PathResults:
 class PathTracer:
     """Path tracing with multiple importance sampling of lights and BSDFs (Veach 1997).
 
-    max_depth: longest path in edges, -1 for no limit. rr_depth: where Russian roulette begins.
+    max_depth: the length of the longest path in edges, -1 for no limit.
+    rr_depth: the vertex, counted from 1, at which Russian roulette begins.
     hide_emitters: whether lights and environment are invisible to the camera.
     clamp: an upper limit of the contribution of a path whose light was scattered by a rough surface
-        before its last scattering. A finite limit removes light, and with it the white specks
+        before its last scattering. A finite limit removes some light, and with it the white specks
         ("fireflies") of sharp reflections and caustics that paths sample too rarely.
     """
 
@@ -247,16 +261,20 @@ class PathTracer:
         )
 
     def with_depth(self, max_depth: int) -> PathTracer:
-        """The same path tracer with another maximum depth."""
+        """The same path tracer with another length of the longest path in edges, -1 for no
+        limit."""
         return PathTracer(self.mi, max_depth, self.rr_depth, self.hide_emitters, self.clamp)
 
     def trace(
         self, scene: Any, sampler: SobolSampler, ray: Any, active: Mask, features: bool = False
     ) -> PathResults:
-        """Trace the paths that begin with these camera rays, one for each of the sampler's lanes.
+        """Trace the light paths that begin with the given camera rays, one for each lane of the
+        sampler, and return their `PathResults`.
 
-        All paths advance together, vertex by vertex, without the paths that have ended; each part
-        of a vertex is evaluated only for the paths that need it (`backend.loops`).
+        features: whether albedo and normal at first hits are stored, too.
+
+        All paths advance together, vertex by vertex. Paths that have ended are left out, and each
+        part of the work at a vertex is done only for the paths that need it (`backend.loops`).
         """
         mi, world = self.mi, HybridScene.of(self.mi, scene, queued=True)
         width = dr.width(sampler.index)
@@ -287,6 +305,7 @@ class PathTracer:
             if not count:
                 return results
             paths = gather_record(paths, rows)
+            # `rows` lists a single path twice; the second entry is not active.
             active = dr.arange(mi.UInt32, len(rows)) < dr.opaque(mi.UInt32, count)
             # No number is a literal, so that all vertices run the same kernels.
             dr.make_opaque(active, *array_leaves(paths))
@@ -297,8 +316,12 @@ class PathTracer:
         self, world: HybridScene, paths: _PathState, exist: Mask, sampler: SobolSampler, depth: int,
         results: PathResults,
     ) -> tuple[_PathState, Mask]:  # fmt: skip
-        """Find the next vertex of paths, collect its light, and sample the next direction. Returns
-        the paths behind the vertex, and the mask of those that go on."""
+        """Find the next vertex of paths, add its light to `results`, and sample the next direction.
+        Returns the state of the paths behind the vertex, and the mask of paths that go on.
+
+        exist: mask of lanes that hold a path.
+        depth: the number of the vertex, counted from 0.
+        """
         mi, vertex = self.mi, dr.opaque(self.mi.UInt32, depth)
         previous = paths.previous.interaction(mi)
         hidden = (vertex == 0) if self.hide_emitters else None
@@ -355,7 +378,11 @@ class PathTracer:
         return next_paths, active
 
     def _emitted(self, scene: Any, paths: _PathState, si: Any, active: Mask) -> Any:
-        """Light that a vertex, or the environment behind no vertex, sends along the ray."""
+        """The light that the surface at a vertex emits along the path. If a ray has hit nothing, it
+        is the light of the environment.
+
+        si: the interaction at the vertex.
+        """
         mi, previous = self.mi, paths.previous.interaction(self.mi)
         direction = mi.DirectionSample3f(scene, si, previous)
         emitter_pdf = scene.pdf_emitter_direction(previous, direction, active & ~paths.delta)
@@ -364,7 +391,7 @@ class PathTracer:
         return dr.select(active, self._clamped(light, paths.was_diffused), 0)
 
     def _clamped(self, light: Any, indirect: Mask) -> Any:
-        """Light, dimmed to at most `clamp` in every channel where it is indirect."""
+        """The light; on lanes of `indirect` it is dimmed such that no channel exceeds `clamp`."""
         if self.clamp == math.inf:
             return light
         excess = dr.max(light) / self._brightest
@@ -379,7 +406,13 @@ class PathTracer:
         numbers: SobolSampler,
         active: Mask,
     ) -> _LightConnection:
-        """To a sampled point of an emitter, with the light scattered if nothing is between."""
+        """The light from a sampled point of an emitter that each vertex scatters along its path,
+        and the ray to that point, which has to be free.
+
+        si: the interaction at the vertex.
+        clearance: the distance from the surface at which a ray has to start.
+        numbers: the sampler.
+        """
         mi, bsdf = self.mi, si.bsdf()
         active = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
         light, weight = world.scene.sample_emitter_direction(si, numbers.next_2d(), False, active)
@@ -392,14 +425,16 @@ class PathTracer:
 
 
 def _power_heuristic(a: Real, b: Real) -> Real:
-    """Veach's power heuristic with exponent 2."""
+    """The weight a^2/(a^2 + b^2) of a sample with probability density a, if another technique gives
+    it with density b: Veach's power heuristic. It is 0 if it is not finite."""
     a, b = a * a, b * b
     weight = a / (a + b)
     return dr.select(dr.isfinite(weight), weight, 0)
 
 
 def _sobol_from(mi: Any, sampler: Any) -> SobolSampler:
-    """Our sampler, seeded by one of Mitsuba's, whose lanes are the samples of pixel after pixel."""
+    """A `SobolSampler` with a seed from one of Mitsuba's samplers, whose lanes are the samples of
+    pixel after pixel."""
     width, spp = sampler.wavefront_size(), max(int(sampler.sample_count()), 1)
     lane = dr.arange(mi.UInt32, width)
     seed = mi.UInt32(dr.gather(mi.Float, sampler.next_1d(), mi.UInt32(0)) * 2.0**24)
@@ -409,13 +444,14 @@ def _sobol_from(mi: Any, sampler: Any) -> SobolSampler:
 
 @functools.cache
 def integrator_class(variant: str) -> Any:
-    """The plugin's class; Mitsuba's classes differ from variant to variant."""
+    """The class of the plug-in `harnack_path` for a Mitsuba variant, as Mitsuba's base classes
+    differ from variant to variant."""
     mi = load_mitsuba()
     if mi.variant() != variant:
         raise RuntimeError(f"the variant changed from {variant} to {mi.variant()}")
 
     class HarnackPath(mi.SamplingIntegrator):
-        """Mitsuba's interface to `PathTracer`, whose arguments are the plug-in's properties."""
+        """Mitsuba's interface to `PathTracer`. Its properties are the arguments of `PathTracer`."""
 
         def __init__(self, props: Any) -> None:
             mi.SamplingIntegrator.__init__(self, props)
@@ -431,13 +467,15 @@ def integrator_class(variant: str) -> Any:
         def sample(
             self, scene: Any, sampler: Any, ray: Any, medium: Any = None, active: Mask = True
         ) -> tuple[Any, Mask, list[Any]]:
+            """The light of camera rays, whether they hit a surface, and no further channels, as
+            Mitsuba asks for them."""
             del medium
             results = self.tracer.trace(scene, _sobol_from(mi, sampler), ray, active)
             self.lost = self.lost + dr.count(results.lost)
             return results.light, results.valid, []
 
         def take_lost(self) -> int:
-            """The number of paths that ran out of steps since the last call."""
+            """The number of paths that ran out of steps since the last call of this method."""
             count = int(self.lost[0])
             self.lost = mi.UInt32(0)
             return count

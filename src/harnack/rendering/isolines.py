@@ -1,26 +1,25 @@
-"""Isolines: lines on a surface where another function takes given values.
+"""Isolines: lines of constant width on a surface, where another function g takes given values.
 
-A line is the set of points within half its width of the curve {g = level} on the surface. Its
-distance from a point is |g - level| / |grad_T g| to first order, with the part grad_T g of the
-gradient along the surface: lines are as wide where g rises gently as where it is steep. They are
-compared without the quotient, |g - level| < width/2 |grad_T g|, so that nothing is drawn where g is
-constant along the surface, whatever its value there.
+A point of the surface belongs to a line if its distance from the curve {g = level} on the surface
+is less than width/2. To first order this distance is |g - level| / |grad_T g|, where grad_T g is
+the part of the gradient of g tangent to the surface. So a line is equally wide where g is steep and
+where it is not. The test is made without division, |g - level| < width/2 |grad_T g|, so that
+nothing is drawn where g is constant along the surface, even if g equals the level there.
 
-Where g has a critical point on the surface, lines cannot widen without limit. Let its difference
-from the level be q(x) of degree n there, to leading order (2 at maxima, minima and saddles, where
-no more vanishes). Along a ray from the point q = c r^n, and |grad_T g| <= n |q|_max / r, where
-|q|_max is the largest |q| at the distance r (Kellogg 1928): in directions in which |q| is within a
-factor k of that, the line ends before r = k n/2 width. So a maximum at a level is a dot, as wide as
-two lines, and lines that cross at a saddle are joined by a fillet of that size. Around a maximum
-that is a little higher, with g - level = (R^2 - r^2)/2 at the distance r, the line is where
-|r^2 - R^2| < width r, which is r < width/2 + sqrt(width^2/4 + R^2) <= R + width: at most half a
-width too far.
+Width near a critical point of g on the surface. To leading order let g - level be a homogeneous
+polynomial q of degree n in the position on the surface (n = 2 at nondegenerate maxima, minima and
+saddles). At the distance r from the point, |grad_T g| <= n Q/r, where Q is the largest |q| at this
+distance (Kellogg 1928). So in directions with |q| >= Q/k the line ends before r = k n/2 width. A
+maximum at the level is therefore a dot twice as wide as a line, and lines that cross at a saddle
+are joined by a fillet of that size. If a maximum is a little higher than the level, g - level =
+(R^2 - r^2)/2 at the distance r, and the line is {|r^2 - R^2| < width r}, which is r < width/2 +
+sqrt(width^2/4 + R^2) <= R + width. So the line ends at most width/2 too far out.
 
-`as_field` and `padded_domain` serve pictures of values as well.
+Isolines are found once for each hit. The number of the isoline then travels as the primitive index
+of Mitsuba's surface interaction, by which the BSDF chooses a color (`mitsuba_proxy`). So g is not
+evaluated again at each call of the BSDF.
 
-Lines are found with the hit, once, and their number travels in the interaction's index of the
-primitive, by which the BSDF chooses (`mitsuba_proxy`): the other function is not evaluated again by
-every question that a BSDF is asked.
+Pictures of values of a function use `as_field` and `padded_domain` of this module, too.
 """
 
 from __future__ import annotations
@@ -49,8 +48,9 @@ _PADDING = 1e-5
 
 
 def as_field(function: Any, name: str = "color_by") -> Field:
-    """A function on space as a field. It is a field; or an argument of `harnack.expression`: a
-    function of three coordinates, or a text such as "z".
+    """A function on space as a `Field`. function: a field, which is returned; or what
+    `harnack.expression` takes, a Python function of three coordinates or a text such as "z". name:
+    of the argument, for messages.
 
     Raises:
         TypeError, ValueError: another argument, or a field with patches.
@@ -76,9 +76,10 @@ def as_field(function: Any, name: str = "color_by") -> Field:
 
 
 def padded_domain(function: Field, size: float) -> Volume | None:
-    """The volume in which a function is defined, with a margin for rounding; None for all of space.
+    """The volume in which a function is defined, with a margin for rounding; None if that is all of
+    space.
 
-    size: the size of the surface on which the function is evaluated.
+    size: the length of the surface on which the function is evaluated; the margin is 1e-5 of it.
     """
     if function.domain is None or function.is_global:
         return None
@@ -105,12 +106,14 @@ class Isolines:
         hk.render(field, "b.png", isolines=[hk.Isolines(other, [0, 1], color="white"), ...])
 
     function: the function: "x", "y" or "z", which gives contour lines of height; a `Field`; or a
-        Python function of x, y and z as `harnack.expression` takes it. All are in the coordinates
-        of the surface, wherever it stands. There are no lines where the field is not defined:
-        outside of its `domain`, unless it `is_global`.
-    levels: the values, or one; those of angle-valued fields count up to their period.
-    interval: in place of levels, lines at all whole multiples of it. It must divide the period of
-        an angle-valued field, which has 12 lines if neither is given.
+        Python function of x, y and z as `harnack.expression` takes it. Its coordinates are those of
+        the surface, wherever that is placed. There are no lines outside the `domain` of a field,
+        unless the field is defined everywhere (`is_global`).
+    levels: the value, or several, at which there are lines. For an angle-valued field they are
+        taken modulo its period.
+    interval: in place of levels: there are lines at all whole multiples of this number. It must
+        divide the period of an angle-valued field. Such a field has 12 lines if neither levels nor
+        interval is given.
     width: of the lines, along the surface, in the unit of its coordinates; by default 0.4 percent
         of the diagonal of the surface's box.
     color: a name of CSS, "#rrggbb", or three numbers of sRGB.
@@ -145,8 +148,9 @@ class Isolines:
         self._exact_interval()
 
     def _exact_interval(self) -> float | None:
-        """The interval; exactly a fraction of the period, if there is a period. None for lines at
-        levels."""
+        """The difference of neighboring levels; None if the levels are listed. For a periodic
+        function it is exactly a fraction of the period. Raises ValueError if the interval does not
+        divide the period."""
         period = self.function_field.period
         if self.levels is not None or period is None:
             return self.interval
@@ -160,7 +164,8 @@ class Isolines:
         return period / count
 
     def prepare(self, backend: Backend, size: float) -> PreparedIsolines:
-        """The isolines on a backend. size: diagonal of the surface's box, for the default width."""
+        """The isolines on a backend. size: the diagonal of the surface's box, 0.4 percent of which
+        is the default width of a line."""
         width = _DEFAULT_WIDTH * size if self.width is None else self.width
         step, period = self._exact_interval(), self.function_field.period
         volume = padded_domain(self.function_field, size)
@@ -175,10 +180,12 @@ class Isolines:
 
 
 def _table(levels: tuple[float, ...], period: float | None) -> FloatArray:
-    """Levels in ascending order, in which the nearest level is next to the place of a value.
+    """A table of 2^k - 1 numbers in ascending order: the levels, then inf as filler. The level
+    nearest to a value is next to the place of the value in this order.
 
-    The levels of an angle-valued function lie in [0, period); a copy of the last precedes them and
-    a copy of the first follows them. The rest of the table, of 2^k - 1 entries, is infinite.
+    period: of an angle-valued function, whose levels are reduced to [0, period). A copy of the last
+        level minus the period precedes them, and a copy of the first level plus the period follows
+        them. None for other functions.
     """
     ordered = np.unique(np.array(levels) if period is None else np.mod(levels, period))
     if period is not None:
@@ -188,6 +195,8 @@ def _table(levels: tuple[float, ...], period: float | None) -> FloatArray:
 
 
 def _numbers(levels: Any) -> tuple[float, ...]:
+    """Levels, one number or several, as a tuple of finite floats; TypeError or ValueError for
+    anything else."""
     try:
         numbers = np.atleast_1d(np.asarray("none" if isinstance(levels, str) else levels, float))
     except (TypeError, ValueError):
@@ -198,7 +207,8 @@ def _numbers(levels: Any) -> tuple[float, ...]:
 
 
 def parse_isolines(isolines: Any) -> tuple[Isolines, ...]:
-    """`Isolines`, or a list of them, as a tuple; empty for None.
+    """The value of the option `isolines`, None or an `Isolines` or a list of them, as a tuple of
+    `Isolines`.
 
     Raises:
         TypeError: anything else.
@@ -218,11 +228,15 @@ def parse_isolines(isolines: Any) -> tuple[Isolines, ...]:
 
 @dataclass(frozen=True)
 class PreparedIsolines:
-    """Isolines on a backend; all of their numbers are data, which kernels do not depend on.
+    """Isolines on a backend. All of their numbers are kernel parameters, so other numbers compile
+    no other kernel.
 
-    volume: where the function is defined; None for all of space.
-    spacing: of lines at whole multiples of it.
-    levels: a table, for lines at single levels.
+    function: the function g.
+    volume: the volume in which g is defined; None for all of space.
+    half_width: half the width of a line, a length.
+    spacing: if the lines are at all whole multiples of a number, this number; else None.
+    levels: if the lines are at listed levels, the table of `_table`; else None.
+    period: of an angle-valued g, else None.
     """
 
     function: Field
@@ -233,21 +247,28 @@ class PreparedIsolines:
     period: Real | None
 
     def contains(self, p: Vec3, normal: Vec3) -> Mask:
-        """Whether points of a surface, with unit normals, are on a line."""
+        """Mask of points p (3,) of a surface that are on a line. normal: (3,) the surface's unit
+        normals."""
         gap, along = self._gap_and_gradient(p, normal)
         return gap < self.half_width * norm(along)
 
     def edge_is_near(self, p: Vec3, normal: Vec3, across: Vec3, down: Vec3) -> Mask:
-        """Whether the edge of a line passes through a pixel, to first order, or near it.
+        """Mask of pixels through which the edge of a line passes, to first order, or near which it
+        passes.
 
-        across, down: from a pixel's middle on the surface to those of its neighbors.
+        p, normal: (3,) the point of the surface in the middle of the pixel, and the unit normal
+            there.
+        across, down: (3,) vectors from p to the points of the tangent plane in the middles of the
+            neighboring pixels.
         """
         gap, along = self._gap_and_gradient(p, normal)
         reach = dr.abs(dr.dot(along, across)) + dr.abs(dr.dot(along, down))
         return dr.abs(gap - self.half_width * norm(along)) < reach
 
     def _gap_and_gradient(self, p: Vec3, normal: Vec3) -> tuple[Real, Vec3]:
-        """The gap from g to the nearest level, and the gradient of g along the surface."""
+        """|g - nearest level| at points p, and the part (3,) of the gradient of g along the
+        surface. The latter is 0 outside the domain of g, and if it is so small that it is due to
+        rounding."""
         sample = self.function.evaluate(p)
         gradient = sample.gradient
         along = gradient - dr.dot(gradient, normal) * normal
@@ -257,6 +278,8 @@ class PreparedIsolines:
         return self._gap(sample.value), dr.select(counts, along, 0)
 
     def _gap(self, g: Real) -> Real:
+        """The difference between values g and the nearest level, for g modulo the period if there
+        is one."""
         if self.spacing is not None:
             return dr.abs(g - self.spacing * dr.round(g / self.spacing))
         if self.period is not None:
@@ -276,10 +299,11 @@ class PreparedIsolines:
 def isoline_index_at(
     lines: tuple[PreparedIsolines, ...], p: Vec3, normal: Vec3, index: Any
 ) -> Index:
-    """The number of the isoline that points are on, counted from 1; the last isoline where they
-    overlap; 0 for no isoline.
+    """The number of the isoline on which each point lies, counted from 1; 0 if it lies on none, and
+    the last one if several overlap.
 
-    index: the type of the numbers.
+    p, normal: (3,) points of the surface and unit normals.
+    index: the array type of the result.
     """
     line_index = index(0)
     for number, isoline in enumerate(lines, start=1):

@@ -1,8 +1,9 @@
-"""Renders path-traced pixels, and traces rays through transparent solids.
+"""Renders pictures by light paths, and traces rays of shaded pictures through transparent solids.
 
-The time that a picture will take is estimated before it is begun; noise can be removed from it.
+The time that a picture will take is estimated before it is begun, and noise can be removed from it.
 
-Entering and leaving a solid alternate, so that absorption in glass depends on the last hit only.
+A ray that enters a solid leaves it before it enters anything else. So whether a segment of a ray
+lies in glass, which absorbs light, depends only on the hit at which the segment begins.
 """
 
 from __future__ import annotations
@@ -40,9 +41,9 @@ _FILTER_REACH = 2.0
 
 @dataclass(frozen=True)
 class PathRender:
-    """Radiance of all pixels of a sensor.
+    """The light of all pixels of a sensor.
 
-    image: (h, w, 4) linear sRGB and, last, the fraction of the pixel that is covered.
+    image: (h, w, 4) linear sRGB radiance and, last, the fraction of the pixel that is covered.
     lost: the number of paths that ran out of steps.
     albedo, normal: (h, w, 3) means of albedos and normals at first hits; None unless requested.
     """
@@ -55,9 +56,11 @@ class PathRender:
 
 @dataclass(frozen=True)
 class PathRenderTask:
-    """The path tracing of a picture for a sensor, by ranges of pixels.
+    """The rendering of a picture by light paths for a sensor, by ranges of pixels.
 
-    features: whether to compute albedos and normals too.
+    spp: the number of paths of a pixel.
+    seed: another seed gives other noise.
+    features: whether to compute albedos and normals at first hits too, for denoising.
     paths_a_band: the largest number of paths traced at once.
     """
 
@@ -77,12 +80,13 @@ class PathRenderTask:
         return width, height
 
     def render_range(self, start: int, stop: int) -> tuple[npt.NDArray[np.float32], int]:
-        """Means (n, 4) of the paths of pixels from `start` to `stop`, counted by rows, as in an
-        `PathRender`, with features (n, 10); and how many paths ran out of steps.
+        """The means of the paths of each pixel from `start` to `stop`, counted by rows, as an array
+        (n, 4), or (n, 10) with features; and the number of paths that ran out of steps. The columns
+        are radiance, covered fraction, albedo and normal.
 
-        Each band of pixels gets all its samples at once, so that samplers can stratify them, and
-        every pixel averages its own samples only. So there are no sums whose order threads could
-        change: the same seed gives the same picture, in whatever parts it is drawn.
+        All samples of a pixel are traced at once, so that samplers can stratify them. Every pixel
+        averages only its own samples. So there are no sums whose order threads could change: the
+        same seed gives the same picture, in whatever parts it is drawn.
         """
         mi, spp = self.mi, self.spp
         rows: list[npt.NDArray[np.float32]] = []
@@ -108,10 +112,11 @@ class PathRenderTask:
 def render_paths(
     task: PathRenderTask, advance: Callable[[float], None], executor: RenderExecutor | None = None
 ) -> PathRender:
-    """Radiance of all pixels.
+    """The light of all pixels, as a `PathRender`.
 
     advance: called with the fraction of the picture that has been finished since the last call.
-    executor: executes the method `render_range`, in place of `task` itself.
+    executor: calls `render_range` of a copy of the task, for example on a cluster; None to call it
+        in this process.
     """
     executor = LocalRenderExecutor(task) if executor is None else executor
     width, height = task.size
@@ -135,8 +140,13 @@ def trace_samples(
     mi: Any, scene: Any, sensor: Any, tracer: PathTracer, pixel: Any, sample: Any, seed: int,
     features: bool,
 ) -> tuple[PathResults, Any]:  # fmt: skip
-    """Trace paths through samples of pixels. Returns their results, weighted by the sensor, and
-    their wavelengths."""
+    """Trace light paths through samples of pixels. Returns their `PathResults`, with light weighted
+    by the sensor, and their wavelengths.
+
+    pixel, sample: (n,) for each path, the index of its pixel, counted by rows, and of its sample in
+        the pixel.
+    features: whether to store albedo and normal at first hits, too.
+    """
     width, height = (int(n) for n in sensor.film().crop_size())
     zero, hashed = dr.opaque(mi.UInt32, 0), dr.opaque(mi.UInt32, _mixed(seed))
     sampler = SobolSampler(mi, pixel, sample, hashed, zero)
@@ -148,18 +158,22 @@ def trace_samples(
 
 
 def _mixed(seed: int) -> int:
-    """32 bits of any whole number: neighboring seeds have nothing in common."""
+    """A hash of 32 bits of an integer, so that pictures with neighboring seeds have independent
+    noise."""
     return int(np.random.SeedSequence(seed % 2**63).generate_state(1)[0])
 
 
 def _in_pixel(mi: Any, sample: Any) -> Any:
-    """A place in the pixel or near it, distributed as the filter."""
+    """Offsets (2,) of a point in a pixel or near it, distributed as the pixel's filter, from
+    uniform numbers in [0, 1)^2."""
     edge = float(dr.erf(_FILTER_REACH / _FILTER_DEVIATION / np.sqrt(2)))
     gauss = dr.erfinv(edge * (2 * sample - 1)) * (np.sqrt(2) * _FILTER_DEVIATION)
     return mi.Vector2f(gauss) + 0.5
 
 
 def _camera_ray(mi: Any, sensor: Any, sampler: Any, position: Any) -> tuple[Any, Any]:
+    """The ray of a sensor through a point of the film in [0, 1]^2, and the weight of its light.
+    Time, wavelength and lens are sampled if the sensor has them."""
     time = sensor.shutter_open()
     if sensor.shutter_open_time() > 0:
         time = time + sampler.next_1d() * sensor.shutter_open_time()
@@ -169,7 +183,7 @@ def _camera_ray(mi: Any, sensor: Any, sampler: Any, position: Any) -> tuple[Any,
 
 
 def as_rgb(mi: Any, radiance: Any, wavelengths: Any) -> Any:
-    """A spectrum of the variant in linear sRGB."""
+    """The radiance of a Mitsuba variant, which may be spectral or monochromatic, in linear sRGB."""
     if mi.is_spectral:
         matching = [mi.cie1931_xyz(wavelength) for wavelength in wavelengths]
         xyz = sum(value * weights for value, weights in zip(radiance, matching, strict=True))
@@ -178,7 +192,8 @@ def as_rgb(mi: Any, radiance: Any, wavelengths: Any) -> Any:
 
 
 def mean_of_blocks(color: Any, spp: int) -> Any:
-    """The means over blocks of `spp` successive lanes."""
+    """The means of colors over blocks of `spp` successive lanes, which are the samples of one
+    pixel."""
     return type(color)(*(dr.block_sum(channel, spp) / spp for channel in color))
 
 
@@ -197,14 +212,15 @@ _SECONDS_PER_BAND, _MIN_BAND_PATHS = 4.0, 2**14
 
 @dataclass(frozen=True)
 class TimeEstimate:
-    """Seconds for one path, and for all of a picture."""
+    """Seconds for one light path, and for all paths of a picture."""
 
     path: float
     picture: float
 
     @property
     def paths_a_band(self) -> int:
-        """The number of paths that take as long as a progress bar may stand still."""
+        """The number of paths to trace at once such that a progress bar moves about every four
+        seconds."""
         return round(
             min(max(_SECONDS_PER_BAND / max(self.path, 1e-9), _MIN_BAND_PATHS), MAX_PATHS_PER_BATCH)
         )
@@ -225,15 +241,18 @@ def estimate_time(
 ) -> TimeEstimate:
     """The time for a picture, measured on a few paths all over it.
 
-    The start of a run takes the same time for any number of paths, so the estimate is from the
-    additional time of four times as many paths. A picture of few paths is not measured, and its
-    estimate is 0.
+    spp: the number of paths of a pixel. features: whether albedo and normal are stored, too.
+
+    A run takes some time to start, whatever the number of its paths. So the time of a path is
+    computed from the additional time that four times as many paths take. A picture of few paths is
+    not measured, and its estimate is 0.
     """
     width, height = (int(n) for n in sensor.film().crop_size())
     pixels = width * height
     path_count = pixels * spp
 
     def seconds(count: int) -> float:
+        """The time of a run of `count` paths."""
         # The golden ratio spreads any number of pixels evenly.
         indices = (np.arange(count) * 0.6180339887498949 % 1 * pixels).astype(np.int64)
         pixel = upload_indices(mi, np.minimum(indices, pixels - 1))
@@ -259,7 +278,7 @@ def estimate_time(
 
 
 def load_denoiser() -> Any:
-    """The package `pyoidn`.
+    """The package `pyoidn`, which holds Open Image Denoise.
 
     Raises:
         ModuleNotFoundError: it is not installed, or its library cannot be loaded.
@@ -275,11 +294,14 @@ def load_denoiser() -> Any:
 
 
 def denoise_image(render: PathRender) -> npt.NDArray[np.float32]:
-    """The image of an exposure with features, (h, w, 4), without noise.
+    """The image (h, w, 4) of a render with features (albedo and normal), without noise.
 
     Open Image Denoise, a neural network that runs on CPUs, removes the noise. It guesses: the
-    result looks clean and is close to a picture with more samples, but none of its numbers is a
-    mean of samples any more. The covered fraction of each pixel is not changed.
+    result looks clean and is close to a picture with more samples, but its numbers are no means of
+    samples. The covered fraction of each pixel is not changed.
+
+    Raises:
+        ValueError: the render has no features.
     """
     if render.albedo is None or render.normal is None:
         raise ValueError("an exposure without features cannot be denoised")
@@ -300,14 +322,14 @@ _DEFAULT_REFLECTANCE = 0.04
 
 @dataclass
 class RefractedHits:
-    """The first opaque hits of rays through transparent solids.
+    """The first opaque hits of rays through transparent solids, with one entry for each ray.
 
-    ray: the last segment of the path.
-    si, first: its hit, as an interaction and as a `SurfaceHit`.
+    ray: the last segment of the ray's path.
+    si, first: the hit of this segment, as an interaction and as a `SurfaceHit`.
     throughput: the fraction of the light from there that reaches the eye.
-    reflected_light: the light that interfaces on the path reflect to the eye.
+    reflected_light: the light that the crossed boundaries of transparent solids reflect to the eye.
     path_length: the length of the path before the last segment.
-    interface_count: how many interfaces the path has crossed.
+    interface_count: the number of boundaries that the path has crossed, and the last hit.
     active: rays that are still being traced.
     """
 
@@ -322,13 +344,14 @@ class RefractedHits:
 
 
 class RefractionTracer:
-    """Traces refracted rays through transparent solids for shaded pictures.
+    """Traces rays through transparent solids for shaded pictures, with refraction.
 
-    At an interface only the transmitted ray is followed (the reflected one for total reflection);
-    the other contributes sky light and a highlight. So there is no noise, and there are no
-    caustics.
+    Only one ray is followed behind a boundary: the transmitted ray, or the reflected one for total
+        reflection. Reflection of other light is approximated: sky light and a highlight. So there
+        is no noise, and there are no caustics.
 
-    indices: of refraction, of each proxy shape that is transparent.
+    indices: pairs of a proxy, the mesh that stands for a transparent solid, and its index of
+        refraction.
     hides_lights: whether shapes that emit light are not seen.
     """
 
@@ -342,7 +365,7 @@ class RefractionTracer:
         self.indices = tuple((carrier, index) for carrier, index in pairs if index is not None)
 
     def trace(self, ray: Any) -> RefractedHits:
-        """The first opaque hits of camera rays, behind transparent solids."""
+        """The first opaque hits of camera rays, behind transparent solids, as `RefractedHits`."""
         mi, world = self.world.mi, self.world
         nothing = dr.zeros(mi.SurfaceInteraction3f, dr.width(ray.d))
         hits = RefractedHits(
@@ -364,13 +387,15 @@ class RefractionTracer:
         return hits
 
     def _is_clear(self, si: Any) -> Mask:
+        """Mask of interactions with the boundary of a transparent solid."""
         clear = self.world.mi.Bool(False)
         for proxy, _ in self.indices:
             clear |= si.shape == self.world.mi.ShapePtr(proxy)
         return clear
 
     def _through_boundary(self, hits: RefractedHits) -> RefractedHits:
-        """The rays at their next hit and, if it is on a transparent solid, refracted there."""
+        """The state of rays at their next hit. A ray that hits a transparent solid is refracted
+        there and goes on; another ray ends."""
         mi, world, d = self.world.mi, self.world, hits.ray.d
         si, first = world.intersect(hits.ray, hits.si, hits.active, self.hidden)
         throughput = hits.throughput * transmittance(mi, world.proxies, hits.si, si, d)
@@ -402,9 +427,13 @@ class RefractionTracer:
         )
 
     def _reflected(self, si: Any, d: Any, index: Any, fraction: Real) -> Any:
-        """The light of the sky, and of the key light in a highlight, that interfaces reflect.
+        """The light of the sky, and of the key light in a highlight, that a boundary of a
+        transparent solid reflects towards the eye.
 
-        fraction: the reflected fraction of the sky's light."""
+        si, d: the interaction at the boundary, and the unit direction of the ray.
+        index: of refraction, of the inside relative to the outside.
+        fraction: the reflected fraction of the sky's light.
+        """
         mi = self.world.mi
         normal = mi.Vector3f(si.n)
         mirrored = d - 2 * dr.dot(normal, d) * normal

@@ -1,7 +1,8 @@
-"""Imports Mitsuba with a usable variant, loads its scene files, and computes refraction and
-absorption in transparent solids.
+"""Imports Mitsuba with a variant that can draw surfaces, loads scene files, and computes refraction
+and absorption in transparent solids.
 
-Scene files in XML are checked before Mitsuba reads them, and its errors are reworded.
+Scene files in XML are checked before Mitsuba reads them, and Mitsuba's error messages are
+shortened.
 """
 
 from __future__ import annotations
@@ -26,16 +27,16 @@ _USABLE = re.compile(r"(llvm|cuda|metal)_ad_(mono|rgb|spectral)(_double)?")
 
 
 def load_mitsuba() -> Any:
-    """The `mitsuba` module, imported when it is first needed, with a variant that can draw
-    surfaces.
+    """The `mitsuba` module, imported when it is first needed, with a variant in which surfaces can
+    be drawn.
 
-    A variant that was set before stays. If none was, it becomes cuda_ad_rgb, metal_ad_rgb or
-    llvm_ad_rgb, as `harnack.backend.choose_backend` finds a device.
+    A variant that was set before stays. If none was set, it becomes cuda_ad_rgb, metal_ad_rgb or
+    llvm_ad_rgb, after the device that `harnack.backend.choose_backend` finds.
 
     Raises:
-        RuntimeError: Mitsuba lacks the device's variant, or the one that is set has no vectorized
-            arrays, or tracks polarization.
-        LLVMNotFoundError: LLVM is wanted and there is none that Dr.Jit can work with.
+        RuntimeError: Mitsuba lacks the variant of the device, or the variant that is set has no
+            vectorized arrays, or tracks polarization.
+        LLVMNotFoundError: LLVM is needed, and there is none that Dr.Jit can work with.
     """
     mi = importlib.import_module("mitsuba")
     if mi.variant() is None:
@@ -56,11 +57,11 @@ def load_mitsuba() -> Any:
 
 
 def set_variant(variant: str) -> None:
-    """Set a Mitsuba variant, if another or none is set: that of the process for which this one
-    works.
+    """Set a Mitsuba variant, if another or none is set. A worker calls it with the variant of the
+    process for which it works.
 
     Raises:
-        ImportError: this Mitsuba does not have it, or cannot use it here.
+        ImportError: this Mitsuba does not have the variant, or cannot use it here.
     """
     mi = importlib.import_module("mitsuba")
     if mi.variant() != variant:
@@ -68,7 +69,7 @@ def set_variant(variant: str) -> None:
 
 
 def mitsuba_backend(mi: Any) -> Backend:
-    """The backend whose arrays are those of the variant that is set."""
+    """The backend with the array types of the Mitsuba variant that is set."""
     return backend_of(mi.Float(0))
 
 
@@ -89,11 +90,11 @@ _REPEATED = re.compile(r"(?m)^(.*\n)(?:\1)+")
 
 
 def load_scene_file(mi: Any, path: str | os.PathLike[str]) -> Any:
-    """The scene in an XML file.
+    """The scene in an XML file, loaded by Mitsuba.
 
     Raises:
-        FileFormatError: missing, no ordinary file, unreadable, empty, above 256 MiB, no XML; or
-            the same of a file that it includes.
+        FileFormatError: the file, or one that it includes, is missing, no ordinary file,
+            unreadable, empty, above 256 MiB, or no XML.
         RuntimeError: Mitsuba cannot read it; the message says where.
     """
     path = Path(path)
@@ -105,7 +106,7 @@ def load_scene_file(mi: Any, path: str | os.PathLike[str]) -> Any:
 
 
 def load_dict(mi: Any, description: Mapping[str, Any]) -> Any:
-    """The scene, or another object of Mitsuba's, that a dictionary describes.
+    """The scene, or another object of Mitsuba's, that a dictionary describes, loaded by Mitsuba.
 
     Raises:
         RuntimeError: Mitsuba cannot make it; the message says which entry is wrong.
@@ -117,9 +118,10 @@ def load_dict(mi: Any, description: Mapping[str, Any]) -> Any:
 
 
 def check_scene_file(path: Path) -> None:
-    """Check a scene file and the files that it names before Mitsuba reads them.
+    """Check a scene file and the files that it names before Mitsuba reads them. Raises
+    FileFormatError.
 
-    Mitsuba's parser looks at neither kind nor size of a file: it waits forever at a pipe, and takes
+    Mitsuba's parser checks neither kind nor size of a file: it waits forever at a pipe, and takes
     all memory for a file of many gigabytes.
     """
     if path.suffix.lower() in GEOMETRY_SUFFIXES:
@@ -159,7 +161,7 @@ def check_scene_file(path: Path) -> None:
 
 
 def _scene_text(path: Path) -> str:
-    """The text of a file that may be XML."""
+    """The text of a file, which may be XML. Raises FileFormatError if it is not."""
     data = read_bytes(path)
     mark = next((mark for mark in _BYTE_ORDER_MARKS if data.startswith(mark)), b"")
     text = data.decode(_BYTE_ORDER_MARKS.get(mark, "latin-1"), "replace")
@@ -173,7 +175,8 @@ def _scene_text(path: Path) -> str:
 
 
 def _files_named(text: str) -> list[tuple[str, str]]:
-    """(element, name) of the files that a scene may name."""
+    """The files that the text of a scene may name, as pairs (element, name), such as ("include",
+    "lights.xml")."""
     return [
         (element[1], attribute[2] or attribute[3])
         for element in _NAMES_A_FILE.finditer(text)
@@ -183,6 +186,7 @@ def _files_named(text: str) -> list[tuple[str, str]]:
 
 
 def _exists(path: Path) -> bool:
+    """Whether a path exists; False for a path that the system cannot handle."""
     try:
         return path.exists()
     except (OSError, ValueError):
@@ -202,7 +206,8 @@ _MIN_INDEX_DIFFERENCE = 1e-6
 
 
 def transmittance_texture(mi: Any, tint: Any) -> Any:
-    """A texture of the transmittance per unit of length; None where no light is absorbed.
+    """A Mitsuba texture of the fraction of light that is left after one unit of length in a solid;
+    None if no light is absorbed. tint: these fractions of red, green and blue, or None.
 
     Raises:
         TypeError, ValueError: not three numbers in (0, 1].
@@ -223,7 +228,8 @@ def transmittance_texture(mi: Any, tint: Any) -> Any:
 
 def refractive_index(mi: Any, carrier: Any) -> Any:
     """The index of refraction of a transparent solid, relative to its surroundings, as a kernel
-    parameter; None for opaque shapes, and for shapes that are no solids."""
+    parameter; None for opaque shapes and for surfaces that bound no solid. carrier: the proxy, the
+    mesh that stands for the solid in Mitsuba."""
     bsdf = carrier.bsdf()
     flags = (mi.BSDFFlags.DeltaTransmission, mi.BSDFFlags.GlossyTransmission)
     if carrier.surface.solid_range is None or not any(
@@ -238,18 +244,21 @@ def refractive_index(mi: Any, carrier: Any) -> Any:
 
 
 def is_inside(mi: Any, carrier: Any, start: Any, d: Any) -> Any:
-    """Whether rays that leave interactions in directions d run inside a carrier's solid."""
+    """Mask of rays that leave interactions `start` in directions d and run inside a solid. carrier:
+    the proxy, the mesh that stands for the solid in Mitsuba."""
     leaves = start.is_valid() & (start.shape == mi.ShapePtr(carrier))
     return leaves & (dr.dot(start.n, d) < 0)
 
 
 def transmittance(mi: Any, carriers: Any, start: Any, si: Any, d: Any) -> Any:
-    """The transmittance between interactions, along rays from `start` in directions d.
+    """The fraction of light that transparent solids let through on the way from interactions
+    `start`, in directions d, to interactions `si`.
 
-    By Beer and Lambert's law the fraction tint^t is left of light that travels a length t in a
-    solid.
-    As going in and out of a solid alternate (`CappedSolid.intersect`), a ray that leaves a point of
-    its boundary against the outward normal is inside up to the next thing that it hits.
+    carriers: the proxies, meshes that stand for surfaces of harnack in Mitsuba.
+
+    By Beer and Lambert's law the fraction tint^t of the light is left after a length t in a solid.
+    Going in and out of a solid alternate (`CappedSolid.intersect`). So a ray that leaves a point of
+    a solid's boundary against the outward normal is inside up to the next hit.
     """
     remaining = mi.Spectrum(1)
     for carrier in carriers:
@@ -263,9 +272,9 @@ def transmittance(mi: Any, carriers: Any, start: Any, si: Any, d: Any) -> Any:
 
 
 def refract(normal: Any, d: Any, index: Any) -> tuple[Any, Any]:
-    """Refract rays in unit directions d at an interface with an outward unit normal. Returns the
-    directions behind it, and the fraction of unpolarized light that is reflected (Fresnel). Where
-    that is 1 (total reflection), the direction is that of the mirror.
+    """Refract rays in unit directions d at a boundary with outward unit normals. Returns the unit
+    directions behind it, and the fraction of unpolarized light that is reflected (Fresnel). If this
+    fraction is 1 (total reflection), the direction is that of the mirrored ray.
 
     index: of refraction, of the inside relative to the outside.
     """

@@ -17,14 +17,15 @@ scenes that are put together in Python.
 </shape>
 <integrator type="harnack_path"/>                  max_depth, rr_depth, hide_emitters, clamp
 
-Mitsuba's own integrators ask Mitsuba's shapes alone, for which a proxy is two points: they would
-draw nothing, and say nothing. No method of a shape is called while they render, so `mitsuba.render`
-looks first and warns. `harnack.render` follows paths itself where the integrator asks for the same
-light, leaves scenes without our surfaces to Mitsuba, and refuses the rest.
+Mitsuba's own integrators trace rays to Mitsuba's shapes only. A level set is represented by a proxy
+mesh of two triangles, each of which is a single point, so they would draw nothing of it and say
+nothing. Mitsuba calls no method of a shape while it renders, so `mitsuba.render` is replaced by a
+function that checks the scene first and warns. `harnack.render` uses its own path tracer if the
+integrator asks for the same light, leaves scenes without level sets to Mitsuba, and raises an error
+for all other scenes.
 
-Mitsuba surfaces are zero-area proxy meshes with a path integrator that meets both worlds; finding
-a hit and describing it (`SurfaceInteraction`) are separate, since Mitsuba's next release lets
-Python define shapes.
+Finding a hit and describing it to Mitsuba (`SurfaceInteraction`) are separate, since Mitsuba's next
+release lets Python define shapes.
 """
 
 from __future__ import annotations
@@ -65,13 +66,15 @@ _DIRECT, _CHANNELS = "DirectIntegrator", "AOVIntegrator"
 
 
 def patch_mitsuba_render(mi: Any) -> None:
-    """Have `mitsuba.render` warn of surfaces that it will not draw; it renders as before."""
+    """Replace `mitsuba.render` by a function that warns of level sets of harnack that will not be
+    drawn, and then renders as before."""
     original = mi.render
     if _MARK in vars(original):
         return
 
     @functools.wraps(original)
     def render(scene: Any, *args: Any, **settings: Any) -> Any:
+        """`mitsuba.render`, with a warning of level sets of harnack that it will not draw."""
         chosen = settings.get("integrator") or (args[2] if len(args) > 2 else None)
         if isinstance(scene, mi.Scene):
             warn_unsupported_integrator(scene, chosen or scene.integrator())
@@ -82,7 +85,8 @@ def patch_mitsuba_render(mi: Any) -> None:
 
 
 def warn_unsupported_integrator(scene: Any, integrator: Any) -> None:
-    """Warn if the integrator is Mitsuba's own, and the scene holds surfaces of ours."""
+    """Warn if the integrator is one of Mitsuba's own and the scene holds level sets of harnack,
+    which it cannot see."""
     if not type(integrator).__module__.startswith("mitsuba") or _sees_ours(integrator):
         return
     unseen = sum(is_proxy(shape) for shape in scene.shapes())
@@ -99,13 +103,14 @@ def warn_unsupported_integrator(scene: Any, integrator: Any) -> None:
 
 
 def equivalent_path_tracer(mi: Any, scene: Any) -> PathTracer | None:
-    """Return a path tracer equivalent to the scene's integrator; None where Mitsuba has to draw the
-    scene itself: its integrator follows no paths, and the scene has no surfaces of harnack, or the
-    integrator sees them.
+    """A path tracer of harnack that computes the same light as the scene's integrator. None if
+    Mitsuba has to draw the scene: its integrator follows no paths, and the scene has no level sets
+    of harnack or the integrator sees them.
 
     Raises:
-        ValueError: the scene has surfaces of harnack, and its integrator asks for something that no
-            path tracer without media computes, such as light in a medium or channels of its own.
+        ValueError: the scene has level sets of harnack, and its integrator asks for something that
+            a path tracer without media does not compute, such as light in a medium or channels of
+            its own.
     """
     integrator = scene.integrator()
     if integrator is None:
@@ -136,7 +141,8 @@ def equivalent_path_tracer(mi: Any, scene: Any) -> PathTracer | None:
 
 
 def _with_settings(mi: Any, integrator: Any) -> PathTracer:
-    """A path tracer with the settings of one of Mitsuba's, which shows them in its text alone."""
+    """A path tracer of harnack with the path lengths and other settings of one of Mitsuba's
+    integrators. They can only be read from the integrator's text."""
     words = str(integrator)
     depths = {name: int(n) for name, n in re.findall(r"(max_depth|rr_depth) = (\d+)", words)}
     depth = depths.get("max_depth", 2**32 - 1)
@@ -146,14 +152,14 @@ def _with_settings(mi: Any, integrator: Any) -> PathTracer:
 
 
 def _sees_ours(integrator: Any) -> bool:
-    """Whether all light of an integrator comes from our integrator inside it, as for moments of its
-    light, but not for the channels of `aov`."""
+    """Whether all light of an integrator comes from harnack's integrator inside it. That holds for
+    an integrator of moments, but not for `aov`, which adds channels of its own."""
     words = str(integrator)
     return INTEGRATOR in words and _CHANNELS not in words
 
 
 def _kind(integrator: Any) -> str:
-    """The name of an integrator's class in Mitsuba."""
+    """The name of the C++ class of a Mitsuba integrator."""
     moments = "MomentIntegrator"  # says that it is a Scene
     kind = str(integrator).partition("[")[0]
     return moments if kind == "Scene" else kind
@@ -163,11 +169,12 @@ _PERIODIC = {"gyroid": Gyroid, "schwarz_p": SchwarzP, "schwarz_d": SchwarzD}
 
 
 def register() -> Any:
-    """Make `harnack` (shape) and `harnack_path` (integrator) known, and return `mitsuba`.
+    """Register the shape `harnack` and the integrator `harnack_path` with Mitsuba, and return the
+    module `mitsuba`.
 
-    Needed once in each variant, before a scene that names them is loaded with Mitsuba's own
-    functions; `render` and `mitsuba_shape` do it by themselves. From then on `mitsuba.render` warns
-    of surfaces that another integrator would leave out.
+    It is needed once in each variant before Mitsuba's own functions load a scene that names them;
+    `render` and `mitsuba_shape` call it themselves. From then on `mitsuba.render` warns of level
+    sets that another integrator would leave out.
     """
     mi = register_surfaces(mitsuba_proxy.PLUGIN, surface_from_properties)
     mi.register_integrator(integrator.PLUGIN, integrator.integrator_class(mi.variant()))
@@ -176,13 +183,17 @@ def register() -> Any:
 
 
 def register_surfaces(plugin: str, surface: Callable[[Any], TracedSurface]) -> Any:
-    """Register a shape whose surfaces come from a function of `mitsuba.Properties`.
+    """Register a Mitsuba shape whose surfaces a function makes from `mitsuba.Properties`, and
+    return the module `mitsuba`.
 
-    The function reads the properties that it knows; `to_world` and BSDF are read elsewhere.
+    plugin: the name of the shape.
+    surface: the function. It reads the properties that it knows; `to_world` and the BSDF are read
+        elsewhere.
     """
     mi = load_mitsuba()
 
     def make_shape(props: Any) -> Any:
+        """The shape for the properties in a scene."""
         return mitsuba_proxy.from_properties(mi, props, surface(props).with_call_cache())
 
     mi.register_shape(plugin, make_shape)
@@ -190,11 +201,11 @@ def register_surfaces(plugin: str, surface: Callable[[Any], TracedSurface]) -> A
 
 
 def surface_from_properties(props: Any) -> TracedSurface:
-    """The surface that the properties of a `harnack` shape describe. "low" and "high" are the ends
-    of the values on a closed solid, one of which may be missing.
+    """The surface that the properties of a `harnack` shape describe. The properties "low" and
+    "high" are the ends of the values of the field on a closed solid; one of them may be missing.
 
     Raises:
-        ValueError: they describe none, or contradict each other.
+        ValueError: the properties describe no surface, or contradict each other.
     """
     keywords: dict[str, Any] = {"clip": _clip(props)}
     ends = [props[name] for name in ("low", "high") if name in props]
@@ -212,6 +223,8 @@ def surface_from_properties(props: Any) -> TracedSurface:
 
 
 def _field(props: Any) -> Field:
+    """The field that the properties of a `harnack` shape name: of a file of curves, or one of a few
+    formulas. Raises ValueError for unknown names."""
     if ("file" in props) == ("field" in props):
         raise ValueError("a harnack shape needs either a file of curves or a field")
     if "file" in props:
@@ -230,6 +243,8 @@ def _field(props: Any) -> Field:
 
 
 def _clip(props: Any) -> Volume | None:
+    """The volume that the clip properties of a `harnack` shape describe, a ball, a box or their
+    intersection; None without such properties."""
     volumes: list[Volume] = []
     if "clip_radius" in props:
         center = props.get("clip_center", [0.0, 0.0, 0.0])
@@ -244,6 +259,7 @@ def _clip(props: Any) -> Volume | None:
 
 
 def _point(value: Any) -> tuple[float, float, float]:
+    """A vector of Mitsuba's as three floats."""
     x, y, z = (float(component) for component in value)
     return x, y, z
 
@@ -268,18 +284,22 @@ def mitsuba_shape(
             ...
         })
 
-    bsdf: dictionary or BSDF object; gray diffuse, seen from both sides, if left out. Open
-        surfaces have two sides: wrap one-sided BSDFs as {"type": "twosided", ...}.
-    to_world: matrix (4, 4) or Mitsuba transform of moves, turns and one scale for all axes.
-    tint: of a solid of glass, the fractions of red, green and blue light that are left after one
+    bsdf: a dictionary or a BSDF object; by default gray diffuse, seen from both sides. An open
+        surface has two sides: wrap a one-sided BSDF as {"type": "twosided", ...}.
+    to_world: a matrix (4, 4) or a Mitsuba transform of translations, rotations, mirrors and one
+        scale for all axes.
+    tint: for a solid of glass, the fractions of red, green and blue light that are left after one
         unit of length in it, in the world: (1, 1, 1) for clear glass (Beer and Lambert).
-    section_bsdf: of the faces at which `section` cuts an opaque solid; by default that of the rest.
-    isolines: `harnack.Isolines` to draw on it, or a list of them; later ones cover earlier ones.
-    options, keywords: as `render` takes them: level, clip, tolerance, side, ... Glass needs a
-        `side`.
+    section_bsdf: the BSDF of the faces at which `section` cuts an opaque solid; by default that of
+        the rest.
+    isolines: `harnack.Isolines` to draw on the surface, or a list of them; later ones cover earlier
+        ones.
+    options, keywords: a `TraceOptions`, and the options level, clip, section, side, tolerance, ...
+        as `render` takes them. Glass needs a `side`.
 
     Raises:
-        ValueError: the surface has no bounds and no `clip`, or `to_world` is no similarity.
+        ValueError: the surface has no bounds and no `clip`, or `to_world` does not scale all
+            lengths alike.
     """
     mi = register()
     if isinstance(surface, Surface | Field):
@@ -299,7 +319,8 @@ def mitsuba_shape(
 
 
 def _section_bsdf(mi: Any, surface: TracedSurface, bsdf: Any, section_bsdf: Any) -> Any:
-    """The BSDF of the faces at which a section cuts a solid; None for that of the rest."""
+    """The BSDF of the faces at which a section cuts a solid; None if they have the BSDF of the
+    rest. Raises ValueError if there are no such faces, or light passes through them."""
     if section_bsdf is None:
         return None
     if surface.solid_range is None or surface.section is None:
@@ -317,7 +338,8 @@ def _section_bsdf(mi: Any, surface: TracedSurface, bsdf: Any, section_bsdf: Any)
 
 
 def as_bsdf(mi: Any, bsdf: Any) -> Any:
-    """A BSDF object, from one, its dictionary, or None."""
+    """A BSDF object of Mitsuba's. bsdf: such an object, its dictionary, or None for gray diffuse on
+    both sides."""
     if bsdf is None:
         bsdf = {"type": "twosided", "nested": {"type": "diffuse"}}
     loaded: Any = bsdf

@@ -1,11 +1,13 @@
-"""Represents level sets in Mitsuba scenes: proxy meshes that hold them, and BSDFs with isolines.
+"""Represents level sets in Mitsuba scenes: proxy meshes that stand for them, and BSDFs with
+isolines.
 
-Mitsuba 3.9 has no shapes written in Python, except meshes. So a level set is held by a *proxy*, a
-mesh of two triangles that are each a point, at opposite corners of its bounding box: no ray hits
-them, but the scene's bounding box is right, and the mesh holds the BSDF. `hybrid_scene.HybridScene`
-finds the proxies in a scene and traces their level sets.
+Mitsuba 3.9 has no shapes written in Python, except meshes. So a level set is represented by a
+*proxy*: a mesh of two triangles, each of which is a single point, at opposite corners of the level
+set's bounding box. No ray hits such triangles, but the bounding box of the scene is right, and the
+mesh holds the BSDF. `hybrid_scene.HybridScene` finds the proxies in a scene and traces their level
+sets.
 
-On isolines the BSDF is another one, chosen by the number of the isoline (`isoline_bsdf`).
+On an isoline another BSDF is used, chosen by the number of the isoline (`isoline_bsdf`).
 """
 
 from __future__ import annotations
@@ -35,28 +37,32 @@ if TYPE_CHECKING:
 
 
 def isoline_bsdf(mi: Any, bsdf: Any, colors: Sequence[Color]) -> Any:
-    """A BSDF that is the given one off the isolines, and diffuse on both sides on them.
+    """A BSDF that has the color of the isoline on isolines, diffuse on both sides, and is `bsdf`
+    elsewhere.
 
-    colors: of the isolines, in sRGB.
+    colors: of the isolines, in sRGB, in the order of their numbers.
     """
     paints = [load_dict(mi, _matte_bsdf(color)) for color in colors]
     return _lined_class(mi.variant())(bsdf, paints)
 
 
 def _matte_bsdf(color: Color) -> dict[str, Any]:
+    """The dictionary of a BSDF that is diffuse on both sides. color: sRGB."""
     reflectance = {"type": "rgb", "value": list(linear_from_srgb(color))}
     return {"type": "twosided", "nested": {"type": "diffuse", "reflectance": reflectance}}
 
 
 @functools.cache
 def _lined_class(variant: str) -> Any:
-    """The class of such BSDFs; Mitsuba's classes differ from variant to variant."""
+    """The class of BSDFs that `isoline_bsdf` returns, for a Mitsuba variant, as Mitsuba's base
+    classes differ from variant to variant."""
     mi = load_mitsuba()
     assert mi.variant() == variant
 
     class Lined(mi.BSDF):
-        """`hybrid_scene.surface_interaction` gives the isoline's number as the index of the
-        primitive."""
+        """A BSDF that is `base` off the isolines, and on isoline k the k-th of `paints`.
+        `hybrid_scene.surface_interaction` gives the number of the isoline as the primitive index,
+        counted from 1."""
 
         def __init__(self, base: Any, paints: Sequence[Any]) -> None:
             mi.BSDF.__init__(self, mi.Properties())
@@ -71,7 +77,8 @@ def _lined_class(variant: str) -> Any:
             self.m_flags = flags
 
         def _select_bsdf(self, call: Callable[[Any, Mask], Any], si: Any, active: Mask) -> Any:
-            """The result of `call(bsdf, mask)` for the BSDF that is seen in each lane."""
+            """The result of `call(bsdf, mask)` on each lane, where bsdf is `base` or, on an
+            isoline, the BSDF of the isoline, and the mask holds the lanes of this BSDF."""
             line = si.prim_index
             result = call(self.base, active & (line == 0))
             for number, paint in enumerate(self.paints, start=1):
@@ -129,15 +136,17 @@ def from_properties(
     section_bsdf: Any = None,
     isolines: Sequence[Isolines] = (),
 ) -> Any:
-    """The shape of a surface with the `to_world` and the BSDF that a plug-in's properties hold.
+    """The proxy shape of a surface, with the `to_world` and the BSDF that a plug-in's properties
+    hold.
 
-    tint: of a solid, the fraction of light that is left after one unit of length in it, in the
-        world.
+    tint: of a transparent solid, the fractions of red, green and blue light that are left after one
+        unit of length in it, in the world; None for all of the light.
     section_bsdf: of the faces at which a section cuts a solid; None for the BSDF of the rest.
     isolines: to be drawn on the surface.
 
     Raises:
-        ValueError: as `mitsuba_shape`; or the properties hold an emitter or a medium.
+        ValueError: the surface has no bounds, `to_world` does not scale all lengths alike, an
+            option does not suit the surface, or the properties hold an emitter or a medium.
     """
     if tint is not None and surface.solid_range is None:
         raise ValueError(
@@ -168,7 +177,7 @@ def from_properties(
 
 
 def _bsdf_text(bsdf: Any) -> str:
-    """The text of a BSDF; empty if it was written in Python without `to_string`."""
+    """The text of a BSDF; empty for a BSDF that was written in Python without `to_string`."""
     try:
         return str(bsdf)
     except RuntimeError:
@@ -183,12 +192,14 @@ def as_matrix(transform: Any) -> FloatArray:
 
 @functools.cache
 def _carrier_class(variant: str) -> Any:
-    """The class of carriers; Mitsuba's classes differ from variant to variant."""
+    """The class of proxies for a Mitsuba variant, as Mitsuba's base classes differ from variant to
+    variant."""
     mi = load_mitsuba()
     assert mi.variant() == variant
 
     class Carrier(mi.Mesh):
-        """A mesh that no ray hits, with the surface that it stands for."""
+        """A proxy: a mesh that no ray hits, which holds the BSDF and the surface for which it
+        stands."""
 
         def __init__(
             self, props: Any, surface: TracedSurface, placement: Placement, tint: Any,
@@ -217,12 +228,12 @@ def _carrier_class(variant: str) -> Any:
 
 
 def _bsdf_holder(mi: Any, bsdf: Any) -> Any:
-    """A mesh in no scene, which only holds a BSDF."""
+    """A mesh that belongs to no scene and only holds a BSDF."""
     props = mi.Properties()
     props["bsdf"] = bsdf
     return mi.Mesh(PLUGIN, 1, 1, props=props)
 
 
 def is_proxy(shape: Any) -> bool:
-    """Whether a Mitsuba shape is the proxy of a harnack surface."""
+    """Whether a Mitsuba shape is a proxy, a mesh that stands for a level set of harnack."""
     return isinstance(getattr(shape, "placed", None), PlacedSurface)

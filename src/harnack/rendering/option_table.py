@@ -1,8 +1,8 @@
-"""The table of all options of all verbs: `OPTIONS`.
+"""The table `OPTIONS` of all options of all verbs (the functions `trace`, `render`, `mesh`, ...).
 
-From it come the checks of calls in Python and their signatures, the options of the command line,
-what scene files hold, what films and sliders may change, and the table of the documentation. An
-option is a row here, a check in `render_options`, and what uses it.
+The table determines the checks and signatures of calls in Python, the options of the command line,
+which options scene files hold and films and sliders may change, and a table of the documentation.
+To add an option, add a row here, a check in `render_options`, and the code that uses it.
 """
 
 from __future__ import annotations
@@ -54,20 +54,23 @@ Parse = Callable[[str], Any]
 
 @dataclass(frozen=True)
 class Option:
-    """An option of verbs.
+    """An option of some verbs (the functions `trace`, `render`, `mesh`, ...).
 
     name: the keyword in Python and the name in scene files; on the command line "--name", with
         hyphens.
-    group: the kind of thing that it says: surface, trace, image, style, color, quality, run, film,
-        live, server, mesh or repair.
-    verbs: those that honor it; all others refuse it by name.
+    group: what it is about: surface, trace, image, style, color, quality, run, film, live, server,
+        mesh or repair.
+    verbs: the names of the verbs that honor it; all other verbs refuse it with an error that names
+        it.
     help: what it is, in a sentence without a period, and its default in brackets.
-    value: what a value is on the command line, such as "LENGTH" or "WxH"; "" for an option that
-        takes none.
-    parse: the value of a text of the command line; None for a switch (by default False), and for an
-        option that it does not have, or makes of several others.
-    check: of a value and of `show`, for a picture; it returns the value in its final form.
-    default: the value if it is not set; default_of: other defaults, by verb.
+    value: what stands for its value in the help of the command line, such as "LENGTH" or "WxH"; ""
+        for an option without a value.
+    parse: turns the text on a command line into the value. None for a switch (an option that is
+        False by default), and for an option that the command line does not have or makes of several
+        others.
+    check: a function of the value and of the option `show`, for pictures; it returns the value in
+        its final form.
+    default, default_of: the value if it is not set, and other defaults by verb.
     varies: whether films and sliders may change it.
     in_files: whether scene files hold it.
     """
@@ -86,30 +89,32 @@ class Option:
 
     @property
     def flag(self) -> str:
-        """Its name on the command line."""
+        """The name of the option on the command line."""
         return f"--{self.name.replace('_', '-')}"
 
     @property
     def is_switch(self) -> bool:
-        """Whether it takes no value on the command line, and is on if it is there."""
+        """Whether the option has no value on the command line, and is True if it is given."""
         return self.parse is None and self.default is False
 
     @property
     def is_on_command_line(self) -> bool:
-        """Whether commands have it."""
+        """Whether commands of the command line have this option."""
         return bool(self.verbs & COMMANDS) and (self.parse is not None or self.is_switch)
 
     def default_in(self, verb: str) -> Any:
-        """The value that a verb has if it is not set."""
+        """The value of the option in calls of a verb that do not set it."""
         return self.default_of.get(verb, self.default)
 
 
 def _checked(parse: Parse, check: Callable[[Any], Any]) -> Parse:
-    """A parser of texts whose values are checked before a source is read."""
+    """A parser of texts that also checks the value, so that mistakes are found before any file is
+    read."""
     return lambda text: check(parse(text))
 
 
 def _of_trace(name: str) -> Any:
+    """The default of an option of `TraceOptions`."""
     return TraceOptions.__dataclass_fields__[name].default
 
 
@@ -254,7 +259,7 @@ _OTHER_PROGRAMS_NAMES = {
 
 
 class RenderKeywords(TraceKeywords, total=False):
-    """The keywords of `render`, for type checkers: the rows of `OPTIONS` for pictures."""
+    """The keywords of `render` with their types, for type checkers: all options of pictures."""
 
     show: ShowMode | str
     camera: Camera | tuple[float, float, float] | None
@@ -285,18 +290,18 @@ ShowMode = Literal["path", "shaded", "normal", "evaluations", "status", "depth",
 
 
 def options_of(verb: str) -> tuple[Option, ...]:
-    """The options that a verb honors."""
+    """The options (rows of `OPTIONS`) that a verb honors."""
     return tuple(option for option in OPTIONS if verb in option.verbs)
 
 
 def names_of(verb: str, *groups: str) -> tuple[str, ...]:
-    """The names of the options that a verb honors, of these groups."""
+    """The names of the options that a verb honors and that belong to one of the given groups."""
     return tuple(option.name for option in options_of(verb) if option.group in groups)
 
 
 def complete_options(verb: str, keywords: Mapping[str, Any]) -> dict[str, Any]:
-    """All options of a verb but those of surfaces and traces, set or by default; and of these only
-    those that are set.
+    """The options of a call of a verb, by name. Options that are not set have their defaults; but
+    options of surfaces and traces are left out if they are not set.
 
     Raises:
         TypeError: there is no such option, or the verb does not honor it.
@@ -311,7 +316,7 @@ def complete_options(verb: str, keywords: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def refuse_unknown(verb: str, keywords: Mapping[str, Any]) -> None:
-    """Raise TypeError for a keyword that is no option of a verb."""
+    """Raise TypeError for keywords that are not options of a verb. The message suggests a name."""
     refuse_others(verb, keywords)
     for name in keywords:
         if name not in BY_NAME:
@@ -324,7 +329,8 @@ def refuse_unknown(verb: str, keywords: Mapping[str, Any]) -> None:
 
 
 def refuse_others(verb: str, keywords: Mapping[str, Any]) -> None:
-    """Raise TypeError for a keyword that is an option of other verbs alone."""
+    """Raise TypeError for keywords that are options only of other verbs. The message names
+    these."""
     for name in keywords:
         option = BY_NAME.get(name)
         if option is not None and verb not in option.verbs:
@@ -333,8 +339,9 @@ def refuse_others(verb: str, keywords: Mapping[str, Any]) -> None:
 
 
 def shows_options(verb: str) -> Callable[[_Function], _Function]:
-    """Return a decorator of a verb that takes keywords: its signature shows its options by name,
-    with their defaults. Films and live views may have others, which their functions take."""
+    """Return a decorator of a verb that takes `**keywords`. The signature of the decorated verb
+    shows its options by name, with their defaults. That of a live view still shows `**keywords`, as
+    it may take others."""
     shorthand, annotations = shorthand_parameters(), RenderKeywords.__annotations__
     kind = inspect.Parameter.KEYWORD_ONLY
     parameters = [
@@ -358,14 +365,15 @@ SHORTHAND = frozenset((*SURFACE_OPTIONS, *TRACE_OPTIONS))
 
 
 def shorthand_among(options: Mapping[str, Any]) -> dict[str, Any]:
-    """The options of `Surface` and `TraceOptions` among these."""
+    """Those of the given options that belong to `Surface` and `TraceOptions`, by name."""
     return {name: value for name, value in options.items() if name in SHORTHAND}
 
 
 @dataclass(frozen=True)
 class RenderOptions:
-    """The options of a picture in their final form, but for those of surfaces, traces and of who
-    does the work: sizes and counts are integers, None is not set."""
+    """The checked options of a picture, as `render` describes them: sizes and counts are integers,
+    and an option that is not set is None. Options of surfaces and traces, and of where the work is
+    done, are not among them."""
 
     show: str
     size: tuple[int, int] | None
@@ -396,10 +404,11 @@ class RenderOptions:
 
     @classmethod
     def of(cls, options: Mapping[str, Any]) -> RenderOptions:
-        """The options, from values by name.
+        """The checked options, from values by name.
 
         Raises:
-            TypeError, ValueError: naming the option that is wrong, and what it should be.
+            TypeError, ValueError: a value is wrong; the message names the option and says what it
+                should be.
         """
         show: str = options["show"]
         names = [column.name for column in fields(cls)]

@@ -1,6 +1,6 @@
-"""Values of options as people write them on a command line: text to values.
+"""Parsers of the values of options as people write them on a command line.
 
-Each function raises ValueError with a sentence that says how to write it.
+Each function raises ValueError, with a sentence that says how the value is written.
 """
 
 from __future__ import annotations
@@ -25,14 +25,15 @@ _AXES = ("x", "y", "z", "-x", "-y", "-z")
 
 
 def quoted(text: str) -> str:
-    """The beginning of an argument, in quotes."""
+    """The text in quotes, for messages; only its beginning if it is long."""
     return repr(text if len(text) <= _SHOWN else text[:_SHOWN] + "...")
 
 
 def parse_choice(*names: str) -> Callable[[str], str]:
-    """A parser of one of several names."""
+    """A parser that accepts one of several names and returns it."""
 
     def choice(text: str) -> str:
+        """The text, if it is one of the names."""
         if text not in names:
             raise ValueError(
                 f"{quoted(text)} is none of {', '.join(names)}{did_you_mean(text, names)}"
@@ -47,7 +48,7 @@ parse_axis = parse_choice(*_AXES)
 
 
 def parse_number(text: str) -> float:
-    """A finite number."""
+    """The finite number that a text holds, as a float."""
     try:
         number = float(text)
     except ValueError:
@@ -58,7 +59,7 @@ def parse_number(text: str) -> float:
 
 
 def parse_positive(text: str) -> float:
-    """A positive number."""
+    """The positive number that a text holds, as a float."""
     try:
         number = float(text)
     except ValueError:
@@ -69,7 +70,7 @@ def parse_positive(text: str) -> float:
 
 
 def parse_count(text: str) -> int:
-    """A number of things, at least 1."""
+    """The whole number from 1 to 999999999 that a text holds."""
     number = int(text) if re.fullmatch(r"[0-9]{1,9}", text) else 0
     if number < 1:
         raise ValueError(f"{quoted(text)} must be a whole number from 1 to 999999999")
@@ -77,21 +78,22 @@ def parse_count(text: str) -> int:
 
 
 def parse_integer(text: str) -> int:
-    """An integer."""
+    """The integer of at most 18 digits that a text holds."""
     if not re.fullmatch(r"[+-]?[0-9]{1,18}", text):
         raise ValueError(f"{quoted(text)} must be an integer of at most 18 digits")
     return int(text)
 
 
 def parse_port(text: str) -> int:
-    """A port of this machine."""
+    """The number of a network port, from 0 to 65535, that a text holds."""
     if not re.fullmatch(r"[0-9]{1,5}", text) or int(text) > 65535:
         raise ValueError(f"{quoted(text)} must be a number from 0 to 65535")
     return int(text)
 
 
 def parse_level(text: str) -> float:
-    """A finite number, or a multiple of pi such as "2pi", "1.5*pi", "-pi/2"."""
+    """The level that a text holds: a finite number, or a multiple of pi such as "2pi", "1.5*pi" or
+    "-pi/2"."""
     match = re.fullmatch(
         r"([+-]?[\d.]*(?:e[+-]?\d+)?)\s*\*?\s*(pi)?\s*(?:/\s*([\d.]+))?", text.strip()
     )
@@ -112,13 +114,13 @@ def parse_level(text: str) -> float:
 
 
 def parse_levels(text: str) -> float | list[float]:
-    """A level, or several with commas."""
+    """The level that a text holds, or a list of several levels separated by commas."""
     levels = [parse_level(part) for part in text.split(",")]
     return levels if len(levels) > 1 else levels[0]
 
 
 def parse_range(text: str) -> tuple[float, float]:
-    """ "-0.3:0.3" as (-0.3, 0.3)."""
+    """The ends of a range, such as (-0.3, 0.3) for "-0.3:0.3"."""
     low, colon, high = text.partition(":")
     if not colon:
         raise ValueError(f"{quoted(text)}: write two values as -0.3:0.3")
@@ -129,7 +131,7 @@ def parse_range(text: str) -> tuple[float, float]:
 
 
 def parse_size(text: str) -> tuple[int, int]:
-    """ "800x600" as (800, 600)."""
+    """The width and height in pixels, such as (800, 600) for "800x600"."""
     match = re.fullmatch(r"([0-9]{1,9})[xX]([0-9]{1,9})", text)
     if not match:
         raise ValueError(f"{quoted(text)} is no size; write it as 800x600")
@@ -137,7 +139,7 @@ def parse_size(text: str) -> tuple[int, int]:
 
 
 def parse_numbers(text: str, count: int) -> tuple[float, ...]:
-    """Finite numbers with commas."""
+    """A tuple of `count` finite numbers, which the text separates by commas."""
     try:
         numbers = tuple(float(part) for part in text.split(","))
     except ValueError:
@@ -148,12 +150,12 @@ def parse_numbers(text: str, count: int) -> tuple[float, ...]:
 
 
 def parse_point(text: str) -> tuple[float, ...]:
-    """ "1,0,2" as (1, 0, 2)."""
+    """The coordinates of a point, such as (1.0, 0.0, 2.0) for "1,0,2"."""
     return parse_numbers(text, 3)
 
 
 def parse_clip(text: str) -> Volume:
-    """ "ball:0,0,0,1" or "box:-1,-1,-1,1,1,1" as a volume."""
+    """The volume that a text such as "ball:0,0,0,1" or "box:-1,-1,-1,1,1,1" describes."""
     kind, colon, rest = text.partition(":")
     if not colon or kind not in ("ball", "box"):
         raise ValueError(
@@ -168,7 +170,9 @@ def parse_clip(text: str) -> Volume:
 
 
 def parse_section(text: str) -> HalfSpace:
-    """ "0,0,1" or "0,0,1,0.2" as the half-space behind a plane, at a distance from the origin."""
+    """The half-space that a text such as "0,0,1" or "0,0,1,0.2" describes: the side of a plane away
+    from the vector of the first three numbers. The fourth number is the distance of the plane from
+    the origin, by default 0."""
     plane = parse_numbers(text, 4 if text.count(",") == 3 else 3)
     x, y, z = plane[:3]
     if not any((x, y, z)):
@@ -177,13 +181,13 @@ def parse_section(text: str) -> HalfSpace:
 
 
 def parse_formula(text: str) -> str:
-    """A formula of x, y and z, as it is written."""
+    """The text itself, if it is a formula of x, y and z."""
     TextFormula.parse(text)
     return text
 
 
 def parse_isolines_text(text: str) -> Isolines:
-    """ "z:0.1" as isolines of z at multiples of 0.1."""
+    """The `Isolines` that a text such as "z:0.1" describes: those of z at all multiples of 0.1."""
     formula, colon, interval = text.rpartition(":")
     if not colon:
         raise ValueError(
@@ -193,19 +197,20 @@ def parse_isolines_text(text: str) -> Isolines:
 
 
 def parse_material_name(text: str) -> str:
-    """The name of a material, or a color."""
+    """The text itself, if it is the name of a material, or a color."""
     parse_material(text)
     return text
 
 
 def parse_color_name(text: str) -> str:
-    """A color by its name or as #rrggbb."""
+    """The text itself, if it is the name of a color or "#rrggbb"."""
     parse_color(text, "a color")
     return text
 
 
 def parse_backdrop_text(text: str) -> Any:
-    """A name, colors with a comma, or an image's file, as `render` takes it."""
+    """The value of the option `backdrop` of `render` that a text describes: a name, a color, two
+    colors separated by a comma, or the file of an image."""
     parts = [part.strip() for part in text.split(",")]
     is_file = text.lower().endswith(IMAGE_FILES)
     backdrop: Any = text if is_file or len(parts) != 2 else tuple(parts)

@@ -71,43 +71,44 @@ def render(
     surfaces: a field, a `Surface` or a list of them, drawn in the studio; or a Mitsuba scene, its
         dictionary, or the path of its XML file.
     path: .png (8-bit sRGB, tone mapped) or .exr (the numbers).
-    options: a `TraceOptions` for all surfaces, of which pictures do not have `precision` and
-        `backend`. Beside bare fields the keywords of `Surface` may be given (level, clip, section,
-        side, largest), and those of `TraceOptions` in place of `options`. A `Solid` with a section,
-        or of glass, is drawn with its inside. Without a tolerance, it is 1e-4 of half the diagonal
-        of what is drawn.
+    options: a `TraceOptions` for all surfaces; `precision` and `backend` must not be set. Beside
+        bare fields the keywords of `Surface` may be given (level, clip, section, side, largest),
+        and those of `TraceOptions` in place of `options`. A `Solid` with a section, or of glass, is
+        drawn with its inside. The default tolerance is 1e-4 of half the diagonal of the box of what
+        is drawn.
     show: "path" follows light paths; "shaded" lights first hits by a formula, in seconds and
         without noise; or what one ray a pixel found: "normal", "evaluations" (of the fields),
         "status" and "depth", or "value", which colors the surface by the function `color_by`.
         Edges of pictures of values are antialiased, the numbers that are returned are not.
     size: (width, height) in pixels, by default (800, 600) or the scene's own.
-    spp: samples a pixel of a color picture, by default 64 or the scene's own, and of the edges
-        of one that is shaded or shows values, by default 9. Others have one ray a pixel.
-    antialias: of shaded pictures, which pixels get all their samples: "edges", the default, those
+    spp: samples per pixel. With show="path" of each pixel, by default 64 or the number of the
+        scene. With "shaded" and "value" of pixels at edges, by default 9. Other pictures have one
+        ray per pixel.
+    antialias: which pixels of a shaded picture get all their samples: "edges", the default, those
         that differ from a neighbor; "cones" also those that a surface covers in part, found by
-        a cone around each pixel. Wires thinner than a pixel then stay lines. It evaluates fields
-        about twice as often, goes by |f - level| / |grad f|, and takes no fields that jump,
-        such as winding numbers of meshes.
-    color_by: the function of which show="value" shows values on the surface: a field, "x", "y",
-        "z", or a function of three coordinates. All are those of the surface or, of a scene, of
-        the world.
+        a cone around each pixel. With cones, wires thinner than a pixel stay lines. Cones take
+        about twice as many evaluations of fields, estimate distances by |f - level| / |grad f|,
+        and raise an error for fields that jump, such as winding numbers of meshes.
+    color_by: the function whose values show="value" shows on the surface: a field, "x", "y", "z",
+        or a function of three coordinates. Coordinates are those of the surface; for a Mitsuba
+        scene, those of the world.
     color_range: (low, high) of the colors of values, depths or evaluations, by default what is
         seen; the same for all pictures of a series.
     color_bar: True, or the title, for a bar with numbers to the right of these pictures. It widens
         the picture that is written and displayed, not the array that is returned. Needs Pillow,
         which `pip install harnack[film]` brings.
     max_depth: longest light path in edges, -1 for no limit; by default 12 or the scene's own.
-    seed: another seed, other noise; the same seed, the same picture. Only color pictures have
-        noise.
+    seed: pictures with another seed have other noise; the same seed gives the same picture. Only
+        pictures with show="path" have noise.
     denoise: whether a neural network (Open Image Denoise; `pip install harnack[denoise]`) takes the
         noise out of a color picture. It guesses: do not read numbers off such a picture.
-    progress: whether a bar on stderr shows how far the picture is, and a line before it how long a
-        long one will take; or a function that is told each part, of 1, that is done, in its place.
-        What it raises ends the picture.
+    progress: whether a bar on stderr shows how much of the picture is done, and a line before it
+        how long a long picture will take. Or a function in place of the bar, which is called with
+        the fraction that was done since its last call; an error that it raises ends the picture.
     client: a `dask.distributed.Client`, or the address of a scheduler, whose workers draw parts of
         the picture: the same picture bit for bit, whatever the parts and however many the workers.
-        What is made of the whole picture (outlines, hidden sky, noise taken out) is made here.
-        Needs `pip install harnack[cluster]`, here and there.
+        Steps that need the whole picture (edges, hidden sky, removal of noise) are done in this
+        process. Needs `pip install harnack[cluster]`, in this process and on the workers.
     checkpoint: a folder, in which parts that are done are kept, so that a picture that was stopped
         goes on from there. It is not emptied when the picture is done.
     chunks: how many parts a picture is divided into, with a client or a checkpoint; by default as
@@ -139,10 +140,10 @@ def render(
     tinted glass takes some of it away by the law of Beer and Lambert. Shaded pictures look straight
     through it and leave out caustics, blur, and reflections of anything but the sky.
 
-    Returns the numbers: (h, w, 3) linear sRGB radiance, or (h, w, 4) with alpha where the backdrop
-    is transparent or the film of a scene has it; (h, w, 3) normals; or (h, w), of which depths are
-    in units of the (first) surface's coordinates, and values NaN where nothing is met. Notebooks
-    show them as the picture they make.
+    Returns an array, which notebooks show as the picture. With show="path" and "shaded" it is
+    linear sRGB radiance, (h, w, 3), or (h, w, 4) with alpha if the backdrop is transparent or the
+    film of the scene has alpha. Normals are (h, w, 3); all else is (h, w). Depths are in units of
+    the (first) surface's coordinates; values are NaN without a hit.
 
     A ray that runs out of steps is drawn magenta, and a warning says how many there were.
 
@@ -161,13 +162,13 @@ def render(
     if target is not None and picture_options.color_bar and target.suffix.lower() == ".exr":
         raise ValueError(f"{target}: EXR files hold the numbers; a color bar is drawn in .png")
     shorthand = shorthand_among(arguments)
-    if not _is_of_studio(surfaces):
+    if not _is_for_studio(surfaces):
         of_studio = {name: arguments[name] for name in STUDIO_OPTIONS}
         refuse_studio_options({**of_studio, **shorthand, "options": options})
     job = RenderJob(surfaces, picture_options, options, shorthand, register().variant())
     task = job.task
     if is_divided:
-        _check_can_be_sent(surfaces, task)
+        _check_can_be_divided(surfaces, task)
     with open_executor(client, checkpoint, chunks) as workers:
         is_local = workers.client is None and workers.checkpoint is None
         executor = LocalRenderExecutor(task) if is_local else ClusterRenderExecutor(workers, job)
@@ -187,10 +188,12 @@ def _render_job(
     *,
     alone: bool,
 ) -> tuple[Image, npt.NDArray[np.uint8], list[str] | None]:
-    """The numbers of a picture, its pixels, and the names of its channels if it has its own.
+    """The numbers of a picture (h, w) or (h, w, n), its pixels in 8-bit sRGB, and the names of its
+    channels, or None for the usual names.
 
-    color_by: the option as it was set, the title of a color bar.
-    alone: whether this process draws everything.
+    executor: calls the methods of the job's task.
+    color_by: the option as it was set; if it is a text, it is the title of the color bar.
+    alone: whether this process draws everything. Only then is the time estimated before.
     """
     mi, options, task, sensor = job.mi, job.options, job.task, job.scene.sensors()[0]
     if task is None:
@@ -226,8 +229,8 @@ def _render_job(
 def _with_time_estimate(
     job: RenderJob, task: PathRenderTask, progress: bool | Advance
 ) -> PathRenderTask:
-    """The task in bands after which a progress bar can move; prints the estimated time of a long
-    picture."""
+    """The task with as many light paths at a time as let a progress bar move every few seconds. If
+    the picture will take long, a line with the estimated time is printed to stderr."""
     estimate = estimate_time(
         job.mi, job.scene, task.sensor, task.tracer, spp=task.spp,
         features=task.features,
@@ -239,16 +242,25 @@ def _with_time_estimate(
     return replace(task, paths_a_band=estimate.paths_a_band)
 
 
-def _is_of_studio(surfaces: Any) -> bool:
+def _is_for_studio(surfaces: Any) -> bool:
+    """Whether the first argument of `render` is drawn in the studio: a field, a surface, or a list
+    of them. Otherwise it is a Mitsuba scene."""
     return isinstance(surfaces, Field | Surface | TracedSurface | list | tuple)
 
 
-def _check_can_be_sent(surfaces: Any, task: Any) -> None:
+def _check_can_be_divided(surfaces: Any, task: Any) -> None:
+    """Raise an error if a picture cannot be divided into parts that are drawn on a cluster or kept
+    in a checkpoint. ValueError: Mitsuba's own integrator draws the scene, in one piece. TypeError:
+    the scene is given as a loaded scene or a file, and only a dictionary can be sent.
+
+    surfaces: the first argument of `render`.
+    task: the task that draws the picture part by part; None if Mitsuba draws it.
+    """
     if task is None:
         raise ValueError(
             "client, checkpoint: Mitsuba draws this scene, by an integrator of its own"
         )
-    if not _is_of_studio(surfaces) and not isinstance(surfaces, Mapping):
+    if not _is_for_studio(surfaces) and not isinstance(surfaces, Mapping):
         raise TypeError(
             "client, checkpoint: a loaded scene cannot be sent, and the files of one may change or "
             "be elsewhere: give the scene as a dictionary"
@@ -258,8 +270,8 @@ def _check_can_be_sent(surfaces: Any, task: Any) -> None:
 def _render_by_mitsuba(
     mi: Any, scene: Any, options: RenderOptions
 ) -> tuple[Image, npt.NDArray[np.uint8], list[str]]:
-    """The numbers (h, w, n) of a scene without our surfaces, with all channels of its own
-    integrator, the pixels of the first of them, and the names of all."""
+    """The picture of a scene without our surfaces, drawn by the scene's own integrator: the numbers
+    (h, w, n) of all n channels, the pixels of the color channels, and the names of all channels."""
     for name, used in (("max_depth", options.max_depth is not None), ("denoise", options.denoise)):
         if used:
             raise ValueError(f"{name}: Mitsuba draws this scene, by an integrator of its own")
@@ -272,6 +284,8 @@ def _render_by_mitsuba(
 
 
 def _warn_of(lost: int, kind: str) -> None:
+    """Warn that rays ran out of steps, if there are any. lost: their number. kind: what to call
+    them."""
     if lost:
         warnings.warn(
             f"{lost} {kind} ran out of steps and are drawn magenta; raise max_steps", stacklevel=3
@@ -281,7 +295,12 @@ def _warn_of(lost: int, kind: str) -> None:
 def _composite_over_backdrop(
     mi: Any, sensor: Any, image: Image, stage: StudioScene | None, show: str
 ) -> tuple[Image, npt.NDArray[np.uint8]]:
-    """The numbers of a picture and its pixels. image: its light and the covered fraction."""
+    """The numbers of a picture and its pixels, with the backdrop behind the surfaces.
+
+    image: (h, w, 4) linear sRGB light and the covered fraction of each pixel.
+    stage: the studio; None for a Mitsuba scene, which is left as it is.
+    show: "path" or "shaded".
+    """
     if stage is None:
         has_alpha = mi.has_flag(sensor.film().flags(), mi.FilmFlags.Alpha)
         image = image if has_alpha else np.ascontiguousarray(image[..., :3])

@@ -1,4 +1,4 @@
-"""The job of a picture, which can be sent to other processes to have parts of it drawn there."""
+"""The job of a picture. It can be sent to other processes, which draw parts of the picture."""
 
 from __future__ import annotations
 
@@ -39,13 +39,14 @@ _RAYS_A_PATH = 3
 class RenderJob:
     """Everything that determines a picture.
 
-    surfaces: fields or surfaces, or a Mitsuba scene, as `render` takes them.
-    options: of the picture. trace_options: of all surfaces.
-    shorthand: options of surfaces and traces that were set by keywords.
-    variant: of Mitsuba.
+    surfaces: the first argument of `render`: fields or surfaces, or a Mitsuba scene.
+    options: the options of the picture.
+    trace_options: the `TraceOptions` of all surfaces, or None.
+    shorthand: options of surfaces and traces that were set by keywords, by name.
+    variant: the Mitsuba variant.
 
-    Methods named like those of a task (`AovTask`, `PathRenderTask`, `ShadedTask`) draw a part of
-    the picture and return plain arrays.
+    A picture is drawn by a task: an `AovTask`, a `PathRenderTask` or a `ShadedTask`. The methods
+        here that are named like methods of a task call these, and return plain arrays.
     """
 
     surfaces: Any
@@ -56,7 +57,7 @@ class RenderJob:
 
     @property
     def mi(self) -> Any:
-        """Mitsuba, in the variant and with our plug-ins."""
+        """The module `mitsuba`, in the variant of this job and with the plug-ins of harnack."""
         set_variant(self.variant)
         return register()
 
@@ -96,7 +97,8 @@ class RenderJob:
 
     @functools.cached_property
     def task(self) -> AovTask | PathRenderTask | ShadedTask | None:
-        """The task that draws the picture pixel by pixel; None for a scene that Mitsuba draws."""
+        """The task that draws the picture, and can draw it part by part; None for a scene that
+        Mitsuba's own integrator draws."""
         mi, options, stage = self.mi, self.options, self.stage
         scene = self.scene
         sensor = scene.sensors()[0]
@@ -122,12 +124,14 @@ class RenderJob:
         return PathRenderTask(mi, scene, sensor, tracer, spp, options.seed, options.denoise)
 
     def _task_in_variant(self) -> Any:
-        """The task, after a worker may have worked in another variant."""
+        """The task, after the Mitsuba variant was set again: a worker may have worked in another
+        one."""
         set_variant(self.variant)
         return self.task
 
     def render_range(self, start: int, stop: int) -> TaskResult:
-        """The result of the method of the task, an `AovTask` or a `PathRenderTask`."""
+        """The result of `render_range` of the task, an `AovTask` or a `PathRenderTask`, for pixels
+        from `start` to `stop`, as arrays by name."""
         task = self._task_in_variant()
         if isinstance(task, AovTask):
             return _arrays_of(task.render_range(start, stop))
@@ -135,32 +139,36 @@ class RenderJob:
         return _with_lost(task.render_range(start, stop))
 
     def render_samples(self, *part: Any) -> TaskResult:
-        """The result of the method of the `AovTask`."""
+        """The result of `AovTask.render_samples` as arrays by name. part: its arguments."""
         return _arrays_of(cast("AovTask", self._task_in_variant()).render_samples(*part))
 
     def render_gbuffer(self, start: int, stop: int) -> TaskResult:
-        """As of `ShadedTask`."""
+        """The result of `ShadedTask.render_gbuffer`, the first hits of a range of pixels, as arrays
+        by name."""
         return cast("ShadedTask", self._task_in_variant()).render_gbuffer(start, stop).to_numpy()
 
     def refine_pixels(self, *part: Any) -> TaskResult:
-        """As of `ShadedTask`."""
+        """The result of `ShadedTask.refine_pixels`, the means of samples in pixels, as arrays by
+        name. part: its arguments."""
         return _with_lost(cast("ShadedTask", self._task_in_variant()).refine_pixels(*part))
 
 
 @dataclass(frozen=True)
 class ClusterRenderExecutor:
-    """Executes tasks on a cluster: its workers call the methods of a `RenderJob`, with the results
-    that the task itself would return."""
+    """Runs the tasks of a picture on a cluster, whose workers call the methods of a `RenderJob`.
+    The results are those that the task itself would return."""
 
     executor: Executor
     job: RenderJob
 
     def split_range(self, count: int, max_size: int) -> list[tuple[int, int]]:
-        """Ranges (start, stop) of a number that suits the workers."""
+        """Ranges (start, stop) of at most `max_size` elements that cover range(count), as many as
+        suit the workers."""
         return self.executor.split_range(count, max_size)
 
     def run_tasks(self, step: str, parts: Sequence[tuple[Any, ...]]) -> Iterator[Any]:
-        """Results of the tasks, in order; several run at the same time."""
+        """The results, in order, of calls of the method named `step`; several calls run at the same
+        time. Each entry of `parts` holds the arguments of one call."""
         task = self.job.task
         for arrays in self.executor.run_tasks(self.job, step, parts):
             if isinstance(task, AovTask):
@@ -173,14 +181,19 @@ class ClusterRenderExecutor:
 
 
 def _with_lost(result: tuple[Any, int]) -> TaskResult:
+    """A mean color and a number of rays out of steps, as arrays by name."""
     return {"means": result[0], "lost": np.array(result[1])}
 
 
 def _arrays_of(view: AovBuffers) -> TaskResult:
+    """The arrays of an `AovBuffers`, by name."""
     return {name: array for name, array in vars(view).items() if isinstance(array, np.ndarray)}
 
 
 def _loaded(mi: Any, source: Any, size: tuple[int, int] | None) -> Any:
+    """The Mitsuba scene of a loaded scene, a dictionary, or the path of an XML file, with a film of
+    `size` (width, height) pixels unless that is None. Raises TypeError or ValueError for anything
+    else."""
     if isinstance(source, mi.Scene):
         if size is not None:
             raise ValueError("size: a loaded scene has its own; set film.size of its sensor")

@@ -1,4 +1,5 @@
-"""Checks of the options of pictures, before anything is drawn."""
+"""Checks of the options of pictures, made before anything is drawn. `show` is the kind of the
+picture."""
 
 from __future__ import annotations
 
@@ -34,7 +35,8 @@ _AOV_BYTES = 130
 
 
 def check_max_depth(max_depth: Any, show: str) -> int | None:
-    """The longest light path, or None; ValueError for pictures without light paths."""
+    """The length of the longest light path in edges, or None. Raises ValueError for pictures
+    without light paths."""
     if max_depth is None:
         return None
     _check_has_paths("max_depth", show)
@@ -42,7 +44,8 @@ def check_max_depth(max_depth: Any, show: str) -> int | None:
 
 
 def check_denoise(denoise: Any, show: str) -> bool:
-    """Whether to denoise; ValueError for pictures without noise."""
+    """Whether to take the noise out of a picture. Raises ValueError if that is requested for a
+    picture without noise."""
     if not isinstance(denoise, bool):
         raise TypeError(f"denoise must be True or False, not {denoise!r}")
     if denoise:
@@ -51,12 +54,14 @@ def check_denoise(denoise: Any, show: str) -> bool:
 
 
 def _check_has_paths(setting: str, show: str) -> None:
+    """Raise ValueError for pictures without light paths. setting: the option that needs them."""
     if show != "path":
         raise ValueError(f'{setting} needs a picture with show="path", not show="{show}"')
 
 
 def check_isolines(isolines: Any, show: str) -> tuple[Isolines, ...]:
-    """Isolines as a tuple; ValueError for pictures that cannot have any."""
+    """The value of the option `isolines` as a tuple of `Isolines`. Raises ValueError for pictures
+    that cannot show isolines."""
     lines = parse_isolines(isolines)
     if lines and show not in MODES_WITH_ISOLINES:
         raise ValueError(
@@ -66,8 +71,8 @@ def check_isolines(isolines: Any, show: str) -> tuple[Isolines, ...]:
 
 
 def check_color_by(color_by: Any, show: str) -> Field | None:
-    """The function whose values are shown; ValueError if it is missing, or given for another kind
-    of picture."""
+    """The function whose values a picture shows, as a field; None for other pictures. Raises
+    ValueError if it is missing, or given for another kind of picture."""
     if show != "value":
         if color_by is not None:
             raise ValueError(f'color_by needs a picture with show="value", not show="{show}"')
@@ -81,7 +86,8 @@ def check_color_by(color_by: Any, show: str) -> Field | None:
 
 
 def check_color_range(color_range: Any, show: str) -> tuple[float, float] | None:
-    """The ends of the color scale, or None; ValueError for pictures without such a scale."""
+    """The ends (low, high) of the color scale, or None. Raises ValueError for pictures without a
+    color scale."""
     if color_range is None:
         return None
     _check_scaled("color_range", show)
@@ -96,7 +102,8 @@ def check_color_range(color_range: Any, show: str) -> tuple[float, float] | None
 
 
 def check_color_bar(color_bar: Any, show: str) -> bool | str:
-    """Whether to draw a color bar, or its title; ValueError for pictures without a color scale."""
+    """Whether to draw a color bar, or the title of the bar. Raises ValueError for pictures without
+    a color scale."""
     if not isinstance(color_bar, bool | str):
         raise TypeError(f"color_bar must be True, False or the bar's title, not {color_bar!r}")
     if color_bar:
@@ -110,8 +117,8 @@ def check_color_bar(color_bar: Any, show: str) -> bool | str:
 
 
 def check_backdrop(backdrop: Any, show: str) -> Backdrop:
-    """What is behind the surfaces: any backdrop, or one color for pictures of numbers
-    (`AOV_MODES`).
+    """The backdrop of a picture, by default the studio's light floor. Pictures of numbers
+    (`AOV_MODES`) have one color behind the surfaces.
 
     Raises:
         TypeError, ValueError: it is no backdrop, or not one color where that is required.
@@ -132,6 +139,7 @@ def check_backdrop(backdrop: Any, show: str) -> Backdrop:
 
 
 def _check_scaled(setting: str, show: str) -> None:
+    """Raise ValueError for pictures without a color scale. setting: the option that needs one."""
     if show not in MODES_WITH_SCALE:
         raise ValueError(
             f'{setting} needs a picture with show={_join_or(MODES_WITH_SCALE)}, not "{show}"'
@@ -139,11 +147,12 @@ def _check_scaled(setting: str, show: str) -> None:
 
 
 def _join_or(names: Sequence[str]) -> str:
+    """Names in quotes, joined by "or"."""
     return " or ".join(f'"{name}"' for name in names)
 
 
 def check_show(show: Any) -> str:
-    """The mode; ValueError if it is unknown."""
+    """The kind of the picture, a name. Raises ValueError if it is unknown."""
     if not isinstance(show, str) or show not in SHOW_MODES:
         raise ValueError(
             f"show must be one of {', '.join(SHOW_MODES)}, not {show!r}"
@@ -153,8 +162,8 @@ def check_show(show: Any) -> str:
 
 
 def check_antialias(antialias: Any, show: str) -> str | None:
-    """The way to choose pixels for more samples, or None; ValueError if it is unknown, or the
-    picture is not shaded."""
+    """How pixels of a shaded picture are chosen that get more samples: "edges", "cones", or None
+    for the default. Raises ValueError for other values, and for other pictures."""
     if antialias is None:
         return None
     if not isinstance(antialias, str) or antialias not in ANTIALIASING:
@@ -168,11 +177,11 @@ def check_antialias(antialias: Any, show: str) -> str | None:
 
 
 def check_image_size(size: Any) -> tuple[int, int]:
-    """A size in pixels.
+    """The size of a picture in pixels, (width, height).
 
     Raises:
         TypeError: not two integers.
-        ValueError: a side of no pixel, or of more than MAX_SIDE.
+        ValueError: a side of no pixels, or of more than MAX_SIDE.
     """
     wrong = f"size must be (width, height) in pixels, such as (800, 600), not {size!r}"
     try:
@@ -185,7 +194,8 @@ def check_image_size(size: Any) -> tuple[int, int]:
 
 
 def check_spp(spp: Any, *, source: str = "") -> int:
-    """Samples per pixel. source: where the number is from, for messages, if not from the call."""
+    """The number of samples per pixel, from 1 to MAX_SPP. source: where the number is from, for
+    messages, if it is not from the call."""
     number = check_integer("spp", spp)
     if not 1 <= number <= MAX_SPP:
         raise ValueError(f"spp must be at least 1 and at most {MAX_SPP}, not {number}{source}")
@@ -193,11 +203,11 @@ def check_spp(spp: Any, *, source: str = "") -> int:
 
 
 def check_integer(name: str, number: Any) -> int:
-    """An integer of any sign.
+    """An option's value as an int. name: of the option.
 
     Raises:
         TypeError: it is no integer.
-        ValueError: a max_depth too large for the path tracer's counters.
+        ValueError: a max_depth that is too large for the path tracer's counters.
     """
     try:
         integer = _index(number)
@@ -209,24 +219,23 @@ def check_integer(name: str, number: Any) -> int:
 
 
 def check_chunks(chunks: Any, *, is_divided: bool) -> int | None:
-    """The number of parts that a task is divided into, or None.
-
-    is_divided: whether it is divided at all.
-    """
+    """The number of parts into which a task is divided, or None. is_divided: whether it is divided
+    at all; ValueError if it is not, and chunks is set."""
     if chunks is not None and not is_divided:
         raise ValueError("chunks: parts are drawn one by one with a client or a checkpoint only")
     return None if chunks is None else as_integer_in_range(chunks, "chunks", 1, _MAX_CHUNKS)
 
 
 def _index(number: Any) -> int:
-    """An integer; True and False are none."""
+    """A number as an int; TypeError if it is no integer. True and False are no integers here."""
     if isinstance(number, bool | np.bool_):
         raise TypeError
     return operator.index(number)
 
 
 def check_camera(camera: Any) -> Camera:
-    """A `Camera`: the given one, one at a position (x, y, z), or the default for None."""
+    """The value of the option `camera` as a `Camera`: such an object, the (x, y, z) where a camera
+    stands, or None for the default camera."""
     if camera is None:
         return Camera()
     if isinstance(camera, Camera):
@@ -245,28 +254,29 @@ Check = Callable[[Any, str], Any]
 
 
 def ignoring_mode(check: Callable[[Any], Any]) -> Check:
-    """A check that does not depend on the mode of the picture."""
+    """A check of an option's value that does not depend on the kind of the picture."""
     return lambda value, show: check(value)
 
 
 def if_set(check: Callable[[Any], Any]) -> Check:
-    """A check, of an option that may be None."""
+    """A check of an option's value that leaves None unchanged."""
     return lambda value, show: None if value is None else check(value)
 
 
 def unchecked(value: Any, show: str) -> Any:
-    """No check: the code that uses the option checks it."""
+    """The value unchanged: the code that uses the option checks it."""
     del show
     return value
 
 
 def as_integer(name: str) -> Check:
-    """The check of an integer."""
+    """A check that the value of the option with this name is an integer."""
     return lambda value, show: check_integer(name, value)
 
 
 def refuse_studio_options(options: Mapping[str, Any]) -> None:
-    """Raise ValueError for options of the studio, which a Mitsuba scene does not take."""
+    """Raise ValueError if options of the studio are set, which a Mitsuba scene does not take.
+    options: by name, None if not set."""
     wrong = [name for name, value in options.items() if value is not None]
     if wrong:
         raise ValueError(f"{', '.join(wrong)}: a Mitsuba scene is drawn as it is")

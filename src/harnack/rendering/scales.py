@@ -1,4 +1,5 @@
-"""Colors and numbers as colors: names of colors, color maps, scales with ticks, and color bars."""
+"""Names of colors, color maps that turn numbers into colors, color scales with ticks, and color
+bars."""
 
 from __future__ import annotations
 
@@ -61,8 +62,9 @@ _COLOR_HELP = 'a name of CSS such as "steelblue", "#4682b4", or three numbers fr
 
 
 def parse_color(color: Any, name: str) -> Color:
-    """A color in sRGB, three numbers in [0, 1], as screens show them.
+    """A color in sRGB, as three numbers in [0, 1].
 
+    color: a name of CSS, "#rrggbb", or three numbers in [0, 1].
     name: of the colored thing, for messages.
 
     Raises:
@@ -83,6 +85,8 @@ def parse_color(color: Any, name: str) -> Color:
 
 
 def _from_text(text: str, name: str) -> Color:
+    """The sRGB color of a text, the name of a CSS color or "#rrggbb". name: of the colored thing,
+    for messages."""
     digits = NAMED_COLORS.get(text.strip().lower())
     if digits is None:
         match = re.fullmatch(r"#([0-9a-fA-F]{3}|[0-9a-fA-F]{6})", text.strip())
@@ -96,12 +100,13 @@ def _from_text(text: str, name: str) -> Color:
 
 
 def linear_from_srgb(color: Color) -> Color:
-    """A color in sRGB as linear sRGB, which light adds up in (IEC 61966-2-1)."""
+    """A color in sRGB as linear sRGB, in which amounts of light can be added (IEC 61966-2-1)."""
     red, green, blue = (_linear(channel) for channel in color)
     return red, green, blue
 
 
 def _linear(channel: float) -> float:
+    """A channel of sRGB, in [0, 1], as linear sRGB."""
     return channel / 12.92 if channel <= 0.04045 else math.pow((channel + 0.055) / 1.055, 2.4)
 
 
@@ -123,9 +128,9 @@ _VIRIDIS = np.array(
 
 
 def viridis(x: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.float64]:
-    """Colors (..., 3) in sRGB, in [0, 1], of numbers (...) in [0, 1]: dark blue to yellow.
+    """Colors (..., 3) in sRGB, in [0, 1], of numbers (...) in [0, 1], from dark blue to yellow.
 
-    Equal differences look equally large, and it reads well in gray and for the color-blind.
+    Equal differences of numbers look equally large, also in gray and for the color-blind.
     """
     x = np.clip(np.nan_to_num(x), 0.0, 1.0).astype(np.float64)
     colors = np.zeros((*x.shape, 3))
@@ -154,8 +159,8 @@ _LIGHTNESS, _CHROMA = 0.72, 0.11
 
 
 def cyclic_colormap(x: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.float64]:
-    """Colors (..., 3) in sRGB of numbers (...) of which 0 and 1 are the same: all hues, equally
-    light and equally far from gray."""
+    """Colors (..., 3) in sRGB of numbers (...) that count modulo 1, so that 0 and 1 have the same
+    color. They go through all hues, equally light and equally far from gray."""
     angle = 2 * np.pi * np.nan_to_num(x).astype(np.float64)
     lab = np.stack(
         [np.full_like(angle, _LIGHTNESS), _CHROMA * np.cos(angle), _CHROMA * np.sin(angle)], axis=-1
@@ -165,7 +170,7 @@ def cyclic_colormap(x: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.float64]
 
 
 def gray_colormap(x: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.float64]:
-    """Grays (..., 3) of numbers (...) in [0, 1]: 0 is white, 1 is dark."""
+    """Grays (..., 3) in sRGB of numbers (...) in [0, 1]: 0 is white and 1 is dark."""
     gray = 0.25 + 0.75 * (1 - np.clip(np.nan_to_num(x), 0.0, 1.0).astype(np.float64))
     return np.repeat(gray[..., None], 3, axis=-1)
 
@@ -184,11 +189,13 @@ _MAX_PI_MULTIPLE = 16
 
 @dataclass(frozen=True)
 class ColorScale:
-    """Colors of numbers from `low` to `high`; numbers beyond an end have its color.
+    """A map from numbers to colors. Numbers outside of [low, high] have the color of the nearer
+    end.
 
-    name: the name of the numbers, on color bars.
-    period: of numbers that count modulo `high` - `low` = period; None for other numbers.
-    exceeded: whether numbers that are shown lie below `low`, and above `high`.
+    name: what the numbers are, for color bars.
+    colors_of: gives the colors (..., 3) in sRGB of numbers (...) in [0, 1].
+    period: high - low for numbers that count modulo this period; None for other numbers.
+    exceeded: whether a picture shows numbers below `low`, and above `high`.
     """
 
     low: float
@@ -200,11 +207,12 @@ class ColorScale:
 
     @classmethod
     def cyclic(cls, period: float, name: str) -> ColorScale:
-        """Of numbers that count modulo a period: its ends have one color."""
+        """The scale of numbers that count modulo a period, from 0 to the period. Its two ends have
+        the same color."""
         return cls(0.0, period, name, cyclic_colormap, period)
 
     def with_exceeded(self, numbers: Numbers) -> ColorScale:
-        """This scale, for the bar of a picture that shows these numbers."""
+        """This scale with `exceeded` set for a picture that shows the given numbers."""
         if self.period is not None or not numbers.size:
             return self
         slack = 1e-6 * max(abs(self.low), abs(self.high))
@@ -212,7 +220,7 @@ class ColorScale:
         return replace(self, exceeded=(bool(below), bool(above)))
 
     def colors(self, numbers: Numbers) -> npt.NDArray[np.float64]:
-        """Colors (..., 3) in sRGB, in [0, 1]."""
+        """The colors (..., 3) in sRGB, in [0, 1], of numbers (...)."""
         if self.period is not None:
             return self.colors_of(np.mod(numbers, self.period) / self.period)
         # The range of equal numbers is their rounding.
@@ -220,7 +228,8 @@ class ColorScale:
         return self.colors_of((numbers - self.low) / span)
 
     def ticks(self, max_count: int) -> list[tuple[float, str]]:
-        """At most `max_count` ticks, but at least two: numbers, and how they are written."""
+        """The ticks of a color bar as pairs (number, text): at most `max_count`, but at least two
+        unless all numbers of the scale are equal."""
         period = 0.0 if self.period is None else self.period
         multiple = round(period / math.pi)
         if 0 < multiple <= _MAX_PI_MULTIPLE and math.isclose(
@@ -242,21 +251,20 @@ class ColorScale:
         return [(k * step, _format_number(k * step, step, largest)) for k in range(first, last + 1)]
 
     def _multiples(self, step: float) -> tuple[int, int]:
-        """The first and the last multiple of a step in the range."""
+        """The integers k of the first and the last multiple k * step in [low, high]."""
         return math.ceil(self.low / step - 1e-9), math.floor(self.high / step + 1e-9)
 
 
 def _step(bound: float) -> float:
-    """The smallest nice number that is at least the bound, a positive number."""
+    """The smallest number that is at least `bound` > 0 and 1, 2 or 5 times a power of ten."""
     power = 10.0 ** math.floor(math.log10(bound))
     return next(multiple * power for multiple in _NICE if multiple * power >= bound * (1 - 1e-9))
 
 
 def _format_number(number: float, step: float, largest: float) -> str:
-    """A multiple of a nice step, with the digits that it needs.
-
-    largest: the largest of all numbers that are written.
-    """
+    """The text of a multiple of a step, with as many digits as it needs. step: 1, 2 or 5 times a
+    power of ten. largest: the largest of all numbers of the scale's ticks, which decides whether
+    exponents are written."""
     if number == 0:
         return "0"
     last_place = math.floor(math.log10(step) + 1e-9)  # the place of the last digit
@@ -268,7 +276,8 @@ def _format_number(number: float, step: float, largest: float) -> str:
 
 
 def _ticks_at_parts_of_pi(multiple: int, max_count: int) -> list[tuple[float, str]]:
-    """Ticks from 0 to `multiple` pi: at halves of pi, or at 1, 2, ... times pi."""
+    """Ticks (number, text) from 0 to `multiple` pi: at multiples of pi/2, pi, 2 pi, ... such that
+    there are at most `max_count`, but at least two."""
     halves = next(
         step for step in (1, 2, 4, 8, 16, 32)
         if (2 * multiple) // step + 1 <= max(max_count, 2) or step >= 2 * multiple
@@ -277,7 +286,7 @@ def _ticks_at_parts_of_pi(multiple: int, max_count: int) -> list[tuple[float, st
 
 
 def _as_pi(halves: int) -> str:
-    """The text of a number of halves of pi."""
+    """The text of halves * pi/2, such as "3 pi/2" for 3."""
     if halves == 0:
         return "0"
     factor, divisor = (halves // 2, "") if halves % 2 == 0 else (halves, "/2")
@@ -301,10 +310,10 @@ _ON_DARK, _ON_LIGHT = (226, 226, 226), (26, 26, 28)
 
 
 def require_pillow() -> tuple[Any, Any, Any]:
-    """Pillow's images, drawings and typefaces.
+    """The modules Image, ImageDraw and ImageFont of the package Pillow.
 
     Raises:
-        ModuleNotFoundError: it is not installed.
+        ModuleNotFoundError: Pillow is not installed.
     """
     try:
         from PIL import Image, ImageDraw, ImageFont
@@ -316,8 +325,8 @@ def require_pillow() -> tuple[Any, Any, Any]:
 
 
 def typeface_for(text: str, size: int) -> Any:
-    """A typeface with all letters of a text: Pillow's own, which has plain ASCII letters, or the
-    first of a list that is installed on this machine.
+    """A typeface of Pillow with all letters of a text. It is Pillow's own for plain ASCII letters;
+    otherwise the first one of a list that is installed on this machine and has the letters.
 
     Raises:
         ValueError: no typeface has all letters.
@@ -341,10 +350,11 @@ def typeface_for(text: str, size: int) -> Any:
 
 
 def add_color_bar(pixels: Pixels, scale: ColorScale, background: Color) -> Pixels:
-    """A picture (h, w, 3) with the bar of its scale to the right: (h, w + more, 3).
+    """A picture (h, w, 3) with the color bar of a scale to its right, (h, w + more, 3).
 
-    An end of the bar is pointed where the picture has numbers beyond it.
-    background: behind the bar, sRGB in [0, 1].
+    background: the sRGB color, in [0, 1], behind the bar.
+
+    An end of the bar is pointed if the picture has numbers beyond it.
     """
     behind = tuple(round(255 * fraction) for fraction in background)
     ink = _ON_LIGHT if sum(background) > 1.5 else _ON_DARK

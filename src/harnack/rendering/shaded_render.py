@@ -1,10 +1,11 @@
-"""Shaded pictures: one ray a pixel, more where the picture has edges, and no noise.
+"""Shaded pictures: one ray a pixel, more rays at edges, and no noise.
 
-The rays through the middles of all pixels are traced first. Pixels that differ visibly from a
-neighbor are then drawn again as the mean of a fixed grid of samples, and so are those that the edge
-of an isoline may pass through: outlines are smooth, lines thinner than a pixel have no gaps, and
-the inside of a surface costs one ray a pixel. Cones find more pixels to draw again, if asked for:
-those that a surface covers in part, though no ray through a middle tells.
+The rays through the middles of all pixels are traced first. Two kinds of pixels are then drawn
+again, as the mean of a fixed grid of samples: pixels that differ visibly from a neighbor, and
+pixels through which the edge of an isoline may pass. So outlines are smooth, lines thinner than a
+pixel have no gaps, and the inside of a surface costs one ray a pixel. If requested, cones around
+the rays find more pixels to draw again: those that a surface covers in part although no ray through
+a middle hits it.
 """
 
 from __future__ import annotations
@@ -45,14 +46,15 @@ if TYPE_CHECKING:
 
 
 class ConeCoverage:
-    """Finds pixels that surfaces may cover in part, by cones, so that no thin part is overlooked.
+    """Finds pixels that surfaces may cover in part, by a cone around the ray through each pixel's
+    middle.
 
-    The ray through the middle of a pixel mostly misses parts that are thinner than the pixel, and
-    so do the rays of its neighbors. The cone that holds the pixel does not miss them.
+    The ray mostly misses parts of a surface that are thinner than the pixel, and so do the rays of
+    the neighbors. The cone contains the whole pixel, so it does not miss them.
 
     Raises:
-        ValueError: a field that jumps, such as the winding number of a mesh: it is constant on both
-            sides of the surface, so that its values tell no distance.
+        ValueError: the field of a surface jumps, such as the winding number of a mesh. It is nearly
+            constant on both sides of the surface, so its values tell no distance.
     """
 
     def __init__(self, mi: Any, world: HybridScene) -> None:
@@ -60,10 +62,10 @@ class ConeCoverage:
         self.placed = tuple(_prepared(mi, carrier) for carrier in world.proxies)
 
     def partly_covered(self, ray: Any, position: Any) -> Any:
-        """Whether the cones of pixels are covered in part before the points that rays see.
+        """Mask of pixels whose cones are covered in part, before the points that their rays hit.
 
         ray: the rays through the middles, with differentials.
-        position: the points that they hit; NaN for no hit.
+        position: (3,) the points that they hit; NaN for no hit.
         """
         mi = self.mi
         distance = dr.norm(position - ray.o)
@@ -77,8 +79,8 @@ class ConeCoverage:
 
 
 def _prepared(mi: Any, carrier: Any) -> tuple[PlacedSurface, Any]:
-    """A surface that cones can be tested against outside its extent, and balls in and around the
-    extent."""
+    """The surface of a proxy (the mesh that stands for it in Mitsuba), prepared for cones; and a
+    ball inside its extent and a ball around its extent, as `inner_and_outer_ball` returns them."""
     surface, backend = carrier.surface, mitsuba_backend(mi)
     if surface.field.has_patches:
         raise ValueError(
@@ -95,8 +97,9 @@ def _prepared(mi: Any, carrier: Any) -> tuple[PlacedSurface, Any]:
 
 
 def inner_and_outer_ball(volume: Volume | None, backend: Backend) -> tuple[Vec3, Real, Real] | None:
-    """The middle of a volume, the radius about it of a ball inside the volume, and the radius of a
-    ball around the volume; None if the volume is unbounded or no such ball was found."""
+    """The middle (3,) of a volume's box, the radius of a ball about it that lies inside the volume,
+    and the radius of a ball about it that contains the volume. None if the volume is unbounded or
+    no inner ball was found."""
     if volume is None:
         return None
     lower, upper = (np.asarray(end, dtype=np.float64) for end in volume.bounds())
@@ -123,15 +126,17 @@ _REACH = 0.16
 def ambient_visibility(
     mi: Any, position: Any, normal: Any, width: Any, size: tuple[int, int]
 ) -> Any:
-    """The part of the hemisphere over each pixel's point that nothing near it hides, in [0, 1].
+    """The fraction of the hemisphere over each pixel's point that nothing near it hides, in [0, 1].
 
-    position: points seen by the pixels, counted by rows; NaN where nothing is seen. normal: unit,
-    towards the eye. width: of a pixel, there. size: (width, height) in pixels.
+    position: (3,) points seen by the pixels, counted by rows; NaN where nothing is seen.
+    normal: (3,) unit normals there, towards the eye.
+    width: the width of a pixel there.
+    size: (width, height) of the picture in pixels.
 
-    Along each direction across the picture the highest point over the tangent plane, at elevation
-    h, hides sin^2 h of the light with a cosine (Bavoil and Sainz 2008), less so the farther away it
-    is. Only what the picture shows can hide light. The directions are the same everywhere: no
-    noise.
+    Along each of 16 directions across the picture, the points seen by a few pixels are examined.
+    The one with the highest elevation h over the tangent plane hides sin^2 h of the light, weighted
+    by the cosine (Bavoil and Sainz 2008); it counts less the farther away it is. Only what the
+    picture shows can hide light. The directions are the same at all pixels, so there is no noise.
     """
     columns, rows = size
     count = columns * rows
@@ -141,7 +146,8 @@ def ambient_visibility(
     radius = reach * width
 
     def tap(k: int, direction: Any) -> Any:
-        """The sine of the elevation of a tap, faded with its distance; 0 if nothing is there."""
+        """The sine of the elevation of the k-th point along a direction, multiplied by a factor
+        that falls with its distance; 0 if nothing is seen there."""
         distance = 1.0 + reach * ((k + 0.5) / _TAPS) ** 2
         u, v = x + distance * direction.x, y + distance * direction.y
         inside = (u >= 0) & (v >= 0) & (u <= columns - 1) & (v <= rows - 1)
@@ -153,6 +159,8 @@ def ambient_visibility(
         return dr.select(inside & (height > 0), height * fade, 0)
 
     def add_direction(turn: Any, hidden: Any) -> tuple[Any, Any]:
+        """The index of the next direction, and the sum of hidden fractions with this direction
+        added."""
         s, c = dr.sincos((mi.Float(turn) + 0.5) * (dr.two_pi / _DIRECTIONS))
         highest = mi.Float(0)
         for k in range(_TAPS):
@@ -178,19 +186,20 @@ _FIRST_PASS_FRACTION = 0.6
 
 @dataclass
 class GBuffer:
-    """G-buffer: per pixel, the first opaque hit, seen through transparent solids.
+    """The first opaque hit of the ray of each pixel, seen through transparent solids.
 
-    position, normal, eye: the point, its unit normal toward the eye, and the direction to the eye.
-    width: pixel size there.
-    color: reflectance.
-    light: emitted, from the environment, or reflected by transparent solids; magenta for rays out
-        of steps.
-    transmittance: of the transparent solids in front.
+    position, normal, eye: (3,) the point, its unit normal toward the eye, and the unit direction to
+        the eye.
+    width: the width of a pixel at the point.
+    color: (3,) reflectance.
+    light: (3,) the light that does not come from shading the point: emitted there, from the
+        environment, or reflected by transparent solids; magenta for rays out of steps.
+    transmittance: (3,) of the transparent solids in front.
     glossy: whether the material is glossy.
-    met, lost: whether there is a hit; whether the ray ran out of steps.
+    met, lost: whether there is a hit, and whether the ray ran out of steps.
     covered: whether anything but the environment is visible.
-    needs_refinement: whether the pixel is to be drawn again, as an isoline's edge may cross it, or
-        a cone found it partly covered.
+    needs_refinement: whether the pixel is to be drawn again, since the edge of an isoline may cross
+        it or a cone found it partly covered.
     """
 
     position: Any
@@ -208,18 +217,18 @@ class GBuffer:
 
     @classmethod
     def nothing(cls, mi: Any, count: int) -> GBuffer:
-        """Empty arrays for `count` pixels, to scatter to."""
+        """Arrays of zeros for `count` pixels, which parts are scattered to."""
         vectors, colors, masks = (mi.Vector3f,) * 3, (mi.Color3f,) * 3, (mi.Bool,) * 5
         kinds = (*vectors, mi.Float, *colors, *masks)
         return cls(*(dr.zeros(kind, count) for kind in kinds))
 
     def to_numpy(self) -> dict[str, npt.NDArray[Any]]:
-        """The arrays as NumPy arrays, by name."""
+        """The arrays of this buffer as NumPy arrays, by name."""
         return {name: to_numpy(value) for name, value in vars(self).items()}
 
     @classmethod
     def from_numbers(cls, mi: Any, numbers: Mapping[str, npt.NDArray[Any]]) -> GBuffer:
-        """The G-buffer from the result of `to_numpy`, of this process or another."""
+        """The buffer whose arrays `to_numpy` returned, in this process or another."""
         empty = vars(cls.nothing(mi, 0))
         return cls(
             **{name: _of_numbers(mi, type(kind), numbers[name]) for name, kind in empty.items()}
@@ -227,7 +236,8 @@ class GBuffer:
 
 
 def _of_numbers(mi: Any, kind: Any, numbers: npt.NDArray[Any]) -> Any:
-    """A Dr.Jit array of a type, from numbers (n,) or (n, 3). Kernels depend on the alignment."""
+    """A Dr.Jit array of type `kind`, from numbers (n,) or (n, 3). It is uploaded such that kernels
+    do not depend on its alignment in memory."""
     if dr.is_mask_v(kind):
         return kind(np.ascontiguousarray(numbers))
     columns = numbers.reshape(len(numbers), -1).T
@@ -235,16 +245,17 @@ def _of_numbers(mi: Any, kind: Any, numbers: npt.NDArray[Any]) -> Any:
 
 
 class ShadedTask:
-    """The rendering of a shaded picture for a sensor and a light, by ranges of pixels.
+    """The rendering of a shaded picture for a sensor, by ranges of pixels.
 
-    spp: rays of a pixel at an edge, at least; 1 for a single ray in every pixel.
+    spp: at least this many rays are averaged for a pixel at an edge; with 1, every pixel has a
+        single ray.
     on_floor: whether the scene is a studio's, whose floor shows shadows.
     cut_out: whether to leave out the light of the backdrop behind all objects.
-    cones: whether cones find pixels to draw again, besides the edges in the picture.
+    cones: whether cones find pixels to draw again, besides edges in the picture.
 
     Raises:
-        ValueError: the Mitsuba variant is spectral, whose four wavelengths a ray are no color; or
-            cones are requested for a field that jumps.
+        ValueError: the Mitsuba variant is spectral, whose four wavelengths a ray do not give a
+            color; or cones are requested for a field that jumps.
     """
 
     def __init__(
@@ -272,8 +283,8 @@ class ShadedTask:
         self.floor = FloorShadow.of(world, self.light) if on_floor else None
 
     def render_gbuffer(self, start: int, stop: int) -> GBuffer:
-        """The first hits of the rays through the middles of a range of pixels; `order` counts
-        pixels."""
+        """The `GBuffer` of the pixels from `start` to `stop` in the order of the attribute `order`,
+        by rays through their middles."""
         mi = self.mi
         pixel = upload_indices(mi, self.order[start:stop])
         gbuffer = self._trace_pixels(pixel, mi.Vector2f(_MIDDLE))
@@ -285,7 +296,11 @@ class ShadedTask:
         return gbuffer
 
     def _trace_pixels(self, pixel: Any, offset: Any) -> GBuffer:
-        """The first hits of rays through points in pixels."""
+        """The `GBuffer` of rays through one point in each of n pixels.
+
+        pixel: (n,) indices of the pixels, counted by rows.
+        offset: the coordinates in [0, 1) of the point in its pixel.
+        """
         mi, scene = self.mi, self.world.scene
         ray, weight = self.ray(pixel, offset)
         hits = self.evaluate_with.trace(mi.Ray3f(ray))
@@ -334,7 +349,8 @@ class ShadedTask:
         )
 
     def ray(self, pixel: Any, offset: Any) -> tuple[Any, Any]:
-        """Rays with differentials through points in pixels, and the weights of their light."""
+        """Rays with differentials through one point in each pixel, and the weights of their light.
+        pixel: indices, counted by rows. offset: coordinates in [0, 1) of the point in its pixel."""
         mi = self.mi
         position = film_positions(mi, pixel, offset, self.size)
         return self.sensor.sample_ray_differential(
@@ -342,14 +358,16 @@ class ShadedTask:
         )
 
     def _reflectance(self, si: Any, side: int) -> Any:
-        """The reflectance at normal incidence of the visible side (1) or the other side (-1)."""
+        """The reflectance at normal incidence of the visible side (1) or the other side (-1) of the
+        surface at interactions `si`."""
         mi = self.mi
         straight = mi.SurfaceInteraction3f(si)
         straight.wi = mi.Vector3f(0, 0, dr.mulsign(mi.Float(side), si.wi.z))
         return si.bsdf().eval_diffuse_reflectance(straight, si.is_valid())
 
     def _is_open(self, si: Any) -> Any:
-        """Whether interactions are on open surfaces of harnack, of which both sides can be seen."""
+        """Mask of interactions with a level set of harnack that bounds no solid, so that both of
+        its sides can be seen."""
         is_open = self.mi.Bool(False)
         for carrier in self.world.proxies:
             surface = carrier.surface
@@ -358,8 +376,11 @@ class ShadedTask:
         return is_open
 
     def shade(self, buffer: GBuffer, sky: Any) -> Any:
-        """The radiance towards the eye, and 1 where anything but the environment is visible, else
-        0."""
+        """The radiance of each pixel towards the eye, and as fourth number 1 if anything but the
+        environment is visible, else 0.
+
+        sky: the fraction of the hemisphere over the pixel's point that nothing near it hides.
+        """
         key = 1.0
         if self.floor is not None:
             key, above = self.floor.at(buffer.position)
@@ -371,11 +392,12 @@ class ShadedTask:
     def refine_pixels(
         self, indices: IntArray, position: FloatArray, sky: FloatArray
     ) -> tuple[npt.NDArray[np.float32], int]:
-        """The means (n, 4) of samples in pixels, and the number of samples out of steps.
+        """The mean colors (n, 4) of a grid of samples in each of n pixels, and the number of
+        samples that ran out of steps.
 
-        indices: (n,) of the pixels, counted by rows.
-        position, sky: seen by the pixels and their neighbors, (n, 5, 3) and (n, 5)
-            (`neighborhood`).
+        indices: (n,) the pixels, counted by rows.
+        position, sky: (n, 5, 3) and (n, 5), the points seen by each pixel and its four neighbors,
+            and the fractions of the hemisphere there that nothing hides (`neighborhood`).
         """
         mi, spp = self.mi, len(self.offsets)
         lane = dr.arange(mi.UInt32, len(indices) * spp)
@@ -388,8 +410,12 @@ class ShadedTask:
         return to_numpy(mean_of_blocks(color, spp)), int(dr.count(gbuffer.lost)[0])
 
     def neighborhood(self, indices: IntArray, *arrays: Any) -> tuple[npt.NDArray[Any], ...]:
-        """Entries (n, 5, ...) of arrays of all pixels, counted by rows, at chosen pixels and their
-        four neighbors; at the picture's border a pixel is its own neighbor."""
+        """The entries (n, 5, ...) of arrays at n pixels and their four neighbors. At the picture's
+        border, a pixel takes the place of a missing neighbor.
+
+        indices: (n,) the pixels. The arrays have an entry for each pixel of the picture. Both are
+            counted by rows.
+        """
         columns, rows = self.size
         x, y = indices % columns, indices // columns
         u = np.clip(x[:, None] + np.array([0, 1, -1, 0, 0]), 0, columns - 1)
@@ -400,10 +426,13 @@ class ShadedTask:
 
 
 def _nearest_sky(mi: Any, samples: GBuffer, row: Any, position: FloatArray, sky: FloatArray) -> Any:
-    """The visible sky of that pixel of a neighborhood whose point lies nearest to the sample.
+    """For each sample, the fraction of the hemisphere that nothing hides. It is taken from that
+    pixel, of the sample's pixel and its neighbors, whose point lies nearest to the sample's point.
 
-    row: the index of the sample's pixel among the chosen pixels.
-    position, sky: as for `ShadedTask.refine_pixels`."""
+    row: the index of the sample's pixel among the n chosen pixels.
+    position, sky: (n, 5, 3) and (n, 5), the points of the chosen pixels and their neighbors, and
+        the fractions there.
+    """
     nearest, value = mi.Float(dr.inf), mi.Float(1)
     for k in range(position.shape[1]):
         point = dr.gather(mi.Vector3f, _of_numbers(mi, mi.Vector3f, position[:, k]), row)
@@ -419,10 +448,10 @@ def _nearest_sky(mi: Any, samples: GBuffer, row: Any, position: FloatArray, sky:
 def render_shaded(
     shading: ShadedTask, executor: RenderExecutor, advance: Callable[[float], None]
 ) -> tuple[npt.NDArray[np.float32], int]:
-    """The image (h, w, 4): linear sRGB radiance and, last, the covered fraction; and the number of
+    """The image (h, w, 4), linear sRGB radiance and last the covered fraction, and the number of
     rays that ran out of steps.
 
-    executor: calls the methods of `shading`.
+    shading: the task. executor: calls its methods, here or on a cluster.
     advance: called with the fraction of the picture that has been finished since the last call.
     """
     mi, order, size = shading.mi, shading.order, shading.size

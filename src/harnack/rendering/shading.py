@@ -1,4 +1,5 @@
-"""Parts of shaded pictures: the order of pixels, light, the floor's shadow, the studio's wall."""
+"""Parts of shaded pictures: the order in which pixels are traced, the light, the shadow on the
+floor, and the studio's wall."""
 
 from __future__ import annotations
 
@@ -32,47 +33,50 @@ _EDGE = 16
 
 
 def pixel_ranges(pixels: int, step: int) -> Iterator[tuple[int, int]]:
-    """Ranges (start, stop) of at most `step` pixels that cover range(pixels).
-
-    Ctrl-C works between the ranges.
-    """
+    """Ranges (start, stop) of at most `step` pixels that cover range(pixels). Ctrl-C works between
+    the ranges."""
     for start in range(0, pixels, step):
         yield start, min(start + step, pixels)
 
 
 class RenderExecutor(Protocol):
-    """Interface to an executor of the tasks of a render: this process, or a Dask cluster."""
+    """Interface to what runs the tasks of a render: this process, or a Dask cluster. A task is a
+    call of a method of a fixed object."""
 
     def split_range(self, count: int, max_size: int) -> list[tuple[int, int]]:
         """Ranges (start, stop) that cover range(count), each of at most `max_size` elements."""
         ...
 
     def run_tasks(self, step: str, parts: Sequence[tuple[Any, ...]]) -> Iterator[Any]:
-        """Results of the method named `step`, called with the arguments of each of `parts`, in
-        order."""
+        """The results, in order, of calls of the method named `step`. Each entry of `parts` holds
+        the arguments of one call."""
         ...
 
 
 @dataclass(frozen=True)
 class LocalRenderExecutor:
-    """Executes tasks in this process: calls the methods of the object `drawing`."""
+    """Runs tasks in this process. drawing: the object whose methods are called."""
 
     drawing: Any
 
     def split_range(self, count: int, max_size: int) -> list[tuple[int, int]]:
-        """The fewest ranges possible."""
+        """Ranges (start, stop) of at most `max_size` elements that cover range(count), as few as
+        possible."""
         return list(pixel_ranges(count, max_size))
 
     def run_tasks(self, step: str, parts: Sequence[tuple[Any, ...]]) -> Iterator[Any]:
-        """Results of the tasks, which are run one after the other."""
+        """The results of calls of the method named `step`, one after another. Each entry of `parts`
+        holds the arguments of one call."""
         method = getattr(self.drawing, step)
         return (method(*part) for part in parts)
 
 
 def tiled_pixel_order(size: tuple[int, int]) -> IntArray:
-    """All pixels of a picture, counted by rows, one square of 4 x 4 after the other.
+    """The indices (n,) of all pixels of a picture of `size` (width, height), counted by rows,
+    ordered by squares of 4 x 4 pixels.
 
-    Rays that a processor follows together then have about the same length, whatever the size.
+    Rays that a processor follows together are then close to each other and have about the same
+    length.
     """
     width, height = size
     rows, columns = -(-height // _TILE), -(-width // _TILE)
@@ -84,27 +88,29 @@ def tiled_pixel_order(size: tuple[int, int]) -> IntArray:
 
 
 def upload_indices(mi: Any, pixels: IntArray) -> Any:
-    """Pixels as one of Mitsuba's arrays."""
+    """Indices of pixels as an array of the Mitsuba variant."""
     return upload_integers(mitsuba_backend(mi), pixels)
 
 
 def film_positions(mi: Any, pixel: Any, offset: Any, size: tuple[int, int]) -> Any:
-    """Places on the film, in [0, 1]^2, of offsets in [0, 1]^2 within pixels counted by rows."""
+    """Points on the film, in [0, 1]^2. pixel: indices, counted by rows. offset: in [0, 1]^2 within
+    the pixel. size: (width, height) in pixels."""
     position = mi.Vector2f(pixel % size[0], pixel // size[0]) + offset
     return mi.Point2f(position / mi.ScalarVector2f(*size))
 
 
 def grid_sample_count(spp: int) -> int:
-    """The samples a pixel, at least `spp`, that can be arranged in a nearly square grid."""
+    """The smallest number of samples, at least `spp`, that fills a nearly square grid."""
     rows = max(1, math.isqrt(spp))
     return rows * -(-spp // rows)
 
 
 def multijitter_offsets(count: int) -> FloatArray:
-    """At least `count` places (n, 2) in the unit square, always the same.
+    """At least `count` points (n, 2) in the unit square, always the same for a count.
 
-    The canonical arrangement of multi-jittering (Kensler 2013): one in each cell of a grid, and
-    no two in the same row or column of the n x n grid, so that edges of any slope look smooth.
+    It is the canonical arrangement of multi-jittering (Kensler 2013): one point in each cell of a
+    nearly square grid, and no two in the same row or column of a grid of n x n cells. So edges of
+    any slope look smooth.
     """
     total = grid_sample_count(count)
     rows = max(r for r in range(1, total + 1) if total % r == 0 and r * r <= total)
@@ -116,7 +122,8 @@ def multijitter_offsets(count: int) -> FloatArray:
 
 
 def edge_pixels(picture: npt.NDArray[np.uint8]) -> BoolArray:
-    """Pixels (h, w) of a picture (h, w, 3) that differ visibly from one of four neighbors."""
+    """Mask (h, w) of the pixels of a picture (h, w, 3) that differ from one of their four neighbors
+    by more than 16 of 255 in a channel."""
     shown = picture.astype(np.int64)
     edge = np.zeros(shown.shape[:2], dtype=np.bool_)
     across = (np.abs(np.diff(shown, axis=1)) > _EDGE).any(axis=-1)
@@ -158,15 +165,15 @@ _TEAL: Color = (0.05, 0.40, 0.46)
 
 @dataclass(frozen=True)
 class StudioLight:
-    """The light of shaded pictures: a formula, so that one ray a sample is all they need.
+    """The light of shaded pictures. It is a formula, so one ray a sample suffices.
 
-    A soft key light from the upper left of the camera, a hemisphere of light that is cooler above
-    than below, and highlights on glossy materials. `shaded_render.ambient_visibility` computes how
-    much of the hemisphere is hidden by nearby surfaces, `FloorShadow` where the studio's floor
-    lies in shadow.
+    It consists of a soft key light from the upper left of the camera, a hemisphere of light that is
+    cooler above than below, and highlights on glossy materials. `shaded_render.ambient_visibility`
+    computes how much of the hemisphere nearby surfaces hide, and `FloorShadow` where the studio's
+    floor lies in shadow.
 
-    key, up: unit vectors, as lists of three numbers, to the key light and to the brighter
-    hemisphere.
+    key, up: unit vectors, as lists of three numbers, to the key light and to the middle of the
+        brighter half of the hemisphere.
     """
 
     key: Sequence[float]
@@ -174,7 +181,8 @@ class StudioLight:
 
     @classmethod
     def of(cls, world_from_camera: FloatArray) -> StudioLight:
-        """The light that goes with a camera, from its matrix (4, 4): x left, y up, z forward."""
+        """The light for a camera. world_from_camera: its matrix (4, 4), whose axes point left, up
+        and forward."""
         left, up, forward = (axis / np.linalg.norm(axis) for axis in world_from_camera[:3, :3].T)
         key = np.stack([-left, up, -forward], axis=1) @ _TO_KEY
         return cls(key.tolist(), up.tolist())
@@ -182,11 +190,14 @@ class StudioLight:
     def shade(
         self, color: Any, normal: Any, eye: Any, glossy: Any, visible: Any, reached: Any = 1.0
     ) -> Any:
-        """Radiance towards the eye; all are Dr.Jit arrays.
+        """Radiance (3,) towards the eye; all parameters are Dr.Jit arrays.
 
-        color: reflectance. normal, eye: unit, on the same side. glossy: mask. visible: the part
-        of the hemisphere over the normal that nothing near hides, and reached: the part of the
-        key light that is not in shadow, in [0, 1].
+        color: (3,) reflectance.
+        normal, eye: (3,) the surface's unit normal and the unit direction to the eye, on the same
+            side of the surface.
+        glossy: mask of glossy materials.
+        visible: the fraction of the hemisphere over the normal that nothing near hides.
+        reached: the fraction of the key light that is not in shadow.
         """
         key, up = _parameter(normal, self.key), _parameter(normal, self.up)
         wrapped = dr.clip((dr.dot(normal, key) + _WRAP) / (1 + _WRAP), 0, 1)
@@ -203,9 +214,11 @@ class StudioLight:
 
 
 def reflectance(color: Any, painted: Any) -> Any:
-    """The color in which a surface is drawn, from the reflectance of its BSDF at normal incidence.
+    """The color (3,) in which a surface is drawn, from the reflectance `color` of its BSDF at
+    normal incidence. Metal is darkened, and matter without diffuse reflectance gets the color of
+    glass.
 
-    painted: mask of isolines, which have this reflectance, and are black if it is 0.
+    painted: mask of points on isolines, which keep their reflectance, even if it is 0.
     """
     painted_color = color
     top = dr.max(color)
@@ -215,8 +228,10 @@ def reflectance(color: Any, painted: Any) -> Any:
 
 
 def two_sided_color(color: Any, other: Any, inside: Any) -> Any:
-    """The color of a side: the side of larger values is darker and cooler if both have one color.
+    """The color (3,) of the visible side of an open surface. If both sides have one color, the side
+    of larger values is drawn darker and cooler.
 
+    color, other: the colors of the visible and of the hidden side.
     inside: mask of points that are seen from the side of larger values.
     """
     same = dr.max(dr.abs(color - other)) < 1e-4
@@ -224,21 +239,22 @@ def two_sided_color(color: Any, other: Any, inside: Any) -> Any:
 
 
 def hole_filling_tint(color: Any, is_filling: Any) -> Any:
-    """The color, tinted where a level set closes a hole of a mesh."""
+    """The color (3,), tinted amber, or teal if it is warm, on lanes of `is_filling`: points at
+    which a level set closes a hole of a mesh."""
     tint = dr.select(color[0] > 1.6 * color[2], _like(color, _TEAL), _like(color, _AMBER))
     return dr.select(is_filling, dr.lerp(color, tint, _FILLING_TINT), color)
 
 
 def _parameter(array: Any, numbers: Sequence[float]) -> Any:
-    """Numbers as an array of the type of another array, as kernel parameters: other numbers compile
-    no other kernel."""
+    """Numbers as an array of the type of `array`, as kernel parameters: other numbers compile no
+    other kernel."""
     vector = _like(array, numbers)
     dr.make_opaque(vector)
     return vector
 
 
 def _like(array: Any, numbers: Sequence[float]) -> Any:
-    """Numbers as an array of the type of another array."""
+    """Numbers as an array of the type of `array`."""
     return type(array)(*numbers)
 
 
@@ -266,21 +282,24 @@ class ShadowCaster(Protocol):
     def mi(self) -> Any: ...
 
     def occluded(self, ray: Any, active: Any) -> Any:
-        """Whether rays of Mitsuba's meet anything."""
+        """Mask of rays of Mitsuba's that hit an object."""
         ...
 
 
 @dataclass(frozen=True)
 class FloorShadow:
-    """The soft shadow on the studio's floor, traced on a coarse grid and blurred: a texture of two
-    channels, the fractions of the key light and of the sky's light that reach the floor."""
+    """The soft shadow on the studio's floor, traced on a coarse grid and blurred.
+
+    texture: has two channels, the fractions of the key light and of the sky's light that reach a
+        point of the floor.
+    """
 
     mi: Any
     texture: Any
 
     @classmethod
     def of(cls, world: ShadowCaster, light: StudioLight) -> FloorShadow:
-        """The shadow of a studio scene, by tracing rays."""
+        """The shadow of the objects of a scene, by tracing rays from the floor."""
         mi = world.mi
         cell = (np.arange(_CELLS) + 0.5) / _CELLS * 2 * _REACH - _REACH
         y, x = np.meshgrid(cell, cell, indexing="ij")
@@ -291,7 +310,8 @@ class FloorShadow:
         return cls(mi, mi.Texture2f(tensor, wrap_mode=dr.WrapMode.Clamp))
 
     def at(self, position: Any) -> tuple[Any, Any]:
-        """The fractions of key light and sky that reach points of the floor; 1 for other points."""
+        """The fractions of the key light and of the sky's light that reach points (3,) of the
+        floor; 1 for points that are not on the floor."""
         mi = self.mi
         on_floor = position.z < 0.5 * FLOOR_HEIGHT
         place = mi.Point2f(position.x, position.y) / (2 * _REACH) + 0.5
@@ -302,8 +322,13 @@ class FloorShadow:
 def _visible_fractions(
     world: ShadowCaster, x: FloatArray, y: FloatArray, towards: FloatArray
 ) -> FloatArray:
-    """The fractions (k, n, n) of directions (k, 16, rays, 3) that are free, from points (n, n) of
-    the floor."""
+    """The fractions (k, n, n) of rays from n x n points of the floor that hit nothing, for k sets
+    of directions.
+
+    x, y: (n, n) coordinates of the points.
+    towards: (k, 16, rays, 3) unit directions. Each point of a block of 4 x 4 points takes one of
+        the 16 groups of rays.
+    """
     mi = world.mi
     j, i = np.indices(x.shape)
     d = towards[:, (j % _BLOCK) * _BLOCK + i % _BLOCK]
@@ -317,11 +342,13 @@ def _visible_fractions(
 
 
 def _vectors(kind: Any, rows: FloatArray) -> Any:
+    """Rows (..., 3) as a Dr.Jit array of vectors, of the type `kind`."""
     return kind(np.ascontiguousarray(rows.reshape(-1, 3).T, dtype=np.float32))
 
 
 def _square() -> FloatArray:
-    """Places (16, rays, 2) in the unit square, spread evenly (Roberts 2018)."""
+    """16 groups of points in the unit square, (16, rays, 2); all of them together are spread evenly
+    (Roberts 2018)."""
     k = np.arange(_BLOCK * _BLOCK * _RAYS)
     plastic = 1.32471795724474602596  # the real root of x^3 = x + 1
     points = np.mod(0.5 + np.outer(k, [1 / plastic, 1 / plastic**2]), 1.0)
@@ -329,7 +356,8 @@ def _square() -> FloatArray:
 
 
 def _to_key(key: Any) -> FloatArray:
-    """Directions (16, rays, 3) to places on the round key light."""
+    """16 groups of unit directions, (16, rays, 3), to points of the round key light. key: the
+    direction to its middle."""
     axis = np.asarray(key, dtype=np.float64)
     u = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
     u /= np.linalg.norm(u)
@@ -340,7 +368,8 @@ def _to_key(key: Any) -> FloatArray:
 
 
 def _to_sky() -> FloatArray:
-    """Directions (16, rays, 3) to the sky, distributed with the cosine."""
+    """16 groups of unit directions, (16, rays, 3), to the sky, distributed with the cosine of their
+    angle to the vertical."""
     s, angle = np.moveaxis(_square(), -1, 0)
     across = np.sqrt(s)
     return np.stack([across * np.cos(2 * math.pi * angle), across * np.sin(2 * math.pi * angle),
@@ -348,7 +377,8 @@ def _to_sky() -> FloatArray:
 
 
 def _blurred(image: FloatArray) -> FloatArray:
-    """The image (n, n), blurred along both axes; outside of it everything is free (1)."""
+    """The image (n, n), blurred along both axes. Outside of the image its values are taken as 1:
+    nothing is hidden."""
     kernel = np.convolve(_BLUR, [0.5, 0.5])  # of odd length: it stays in place
     for _ in range(2):
         rows = [np.convolve(row, kernel, mode="valid") for row in _framed(image, len(kernel) // 2)]
@@ -357,6 +387,7 @@ def _blurred(image: FloatArray) -> FloatArray:
 
 
 def _framed(image: FloatArray, width: int) -> FloatArray:
+    """The image with `width` columns of ones on the left and on the right."""
     return np.pad(image, ((0, 0), (width, width)), constant_values=1.0)
 
 
@@ -370,13 +401,14 @@ FloatImage = npt.NDArray[np.float32]
 def studio_wall(
     mi: Any, sensor: Any, ground: GroundBackdrop, azimuth: float, show: str
 ) -> FloatImage:
-    """Radiance (h, w, 3) of a ground and the wall behind it, in the middle of each pixel.
-
-    The camera does not see the environment that lights the stage, but the ground going on to the
-    horizon, and above it a wall of the same color that is darker higher up. So there is no edge at
-    the horizon, however low the camera stands.
+    """Radiance (h, w, 3) of the studio's ground and of the wall behind it, at the middle of each
+    pixel.
 
     azimuth: of the camera, in degrees. show: "path" or "shaded".
+
+    The camera does not see the environment that lights the stage. It sees the ground as far as the
+    horizon, and above it a wall of the same color that is darker higher up. So the horizon is no
+    edge, however low the camera stands.
     """
     width, height = (int(n) for n in sensor.film().crop_size())
     pixel = dr.arange(mi.UInt32, width * height)
@@ -391,7 +423,7 @@ def studio_wall(
 
 
 def _far_shaded(mi: Any, sensor: Any, ground: GroundBackdrop) -> FloatArray:
-    """Radiance (3,) of the ground far away, in the light of shaded pictures."""
+    """Radiance (3,) of the ground far from the stage, in the light of shaded pictures."""
     matrix = np.array(sensor.world_transform().matrix, dtype=np.float64).reshape(4, 4)
     color = mi.Color3f(*reflectance_of(ground.name).tolist())
     up, one = mi.Vector3f(0, 0, 1), mi.Float(1)
@@ -402,8 +434,8 @@ def _far_shaded(mi: Any, sensor: Any, ground: GroundBackdrop) -> FloatArray:
 def backdrop_image(
     mi: Any, backdrop: GradientBackdrop | ImageBackdrop, size: tuple[int, int]
 ) -> FloatImage:
-    """Linear sRGB (h, w, 3) of colors or an image, as they are, in a picture of (width, height)
-    pixels."""
+    """The linear sRGB (h, w, 3) of a color gradient or an image behind a picture of `size` (width,
+    height) pixels."""
     if isinstance(backdrop, ImageBackdrop):
         return _covering(mi, backdrop.pixels, size)
     width, height = size
@@ -419,8 +451,8 @@ def backdrop_image(
 
 
 def _covering(mi: Any, image: FloatImage, size: tuple[int, int]) -> FloatImage:
-    """The largest part of an image, around its middle, that has the shape of a picture of
-    (width, height) pixels, scaled to this size."""
+    """The image, cropped around its middle to the shape of a picture of `size` (width, height)
+    pixels and scaled to this size."""
     height, width = image.shape[:2]
     scale = max(size[0] / width, size[1] / height)
     extent = [

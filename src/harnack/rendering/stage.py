@@ -1,7 +1,7 @@
-"""A small photo studio: ground, lights and a camera that frames the surfaces; its materials.
+"""A small photo studio: ground, lights, materials, and a camera that frames the surfaces.
 
-Surfaces are scaled to a stage of radius about 1 that stands on the ground z = 0, so that lights,
-shadows and tolerances of Mitsuba's rays suit every size.
+Surfaces are scaled to a radius of about 1 and stand on the ground z = 0, so that lights, shadows
+and the tolerances of Mitsuba's rays suit surfaces of every size.
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ _PAINT, _BLACK, _WHITE = 0.2, 0.005, 0.9
 
 
 def _rgb(color: Color) -> Dictionary:
-    """A color as linear sRGB reflectance."""
+    """The dictionary of a linear sRGB color in Mitsuba."""
     return {"type": "rgb", "value": list(color)}
 
 
 def _coated(color: Color, roughness: float) -> Dictionary:
-    """A colored base under a clear coat."""
+    """The BSDF dictionary of a colored base under a clear coat. color: linear sRGB reflectance."""
     return {
         "type": "roughplastic",
         "diffuse_reflectance": _rgb(color),
@@ -53,6 +53,7 @@ def _coated(color: Color, roughness: float) -> Dictionary:
 
 
 def _metal(name: str, roughness: float) -> Dictionary:
+    """The BSDF dictionary of a rough metal. name: its symbol in Mitsuba, such as "Au"."""
     return {"type": "roughconductor", "material": name, "alpha": roughness, "distribution": "ggx"}
 
 
@@ -60,13 +61,14 @@ def _metal(name: str, roughness: float) -> Dictionary:
 class Material:
     """The material of a surface.
 
-    front: BSDF of the side of larger values (the normal's side); of a solid, its outside.
-    back: of the other side of an open surface; None for the same as the front.
-    two_sided: whether open surfaces are to be seen from both sides. A BSDF that takes care of that
-        itself does not need it.
-    transparent: light passes through it, so that only a solid can have it.
-    tint: the fraction of red, green and blue light that is left after one unit of length on the
-        stage, where half the diagonal of the box of all objects is 1; None for all of the light.
+    front: the BSDF dictionary of the side of larger values, to which the normal points; of a solid,
+        its outside.
+    back: the BSDF dictionary of the other side of an open surface; None for the same as the front.
+    two_sided: whether open surfaces are to be wrapped such that they are seen from both sides. A
+        BSDF that takes care of that itself does not need it.
+    transparent: whether light passes through it, so that only a solid can have it.
+    tint: the fractions of red, green and blue light that are left after one unit of length on the
+        stage, on which half the diagonal of the box of all objects is 1; None for all of the light.
     """
 
     front: Dictionary
@@ -82,10 +84,11 @@ class Material:
             )
 
     def bsdf(self, *, solid: bool, traced_light: bool = True) -> Dictionary:
-        """The BSDF's dictionary for a solid or an open surface.
+        """The BSDF dictionary for the boundary of a solid, or for an open surface.
 
-        traced_light: whether light is to be traced at it; otherwise only its diffuse reflectance
-        and its kind are needed, and the dictionary may be of a BSDF that is made faster.
+        traced_light: whether light paths are to be traced at it. Otherwise only its diffuse
+            reflectance and its kind are needed, and the dictionary may describe a similar BSDF that
+            is made faster.
 
         Raises:
             ValueError: the material is transparent, and the surface is open.
@@ -110,20 +113,22 @@ MaterialLike = str | Color | Material | Mapping[str, Any]
 
 
 def _without_table(bsdf: Dictionary) -> Dictionary:
-    """A BSDF with the same diffuse reflectance, which is made without the table of a rough coat's
-    transmittance (0.07 s)."""
+    """A BSDF dictionary with the same diffuse reflectance. A rough coat is replaced by a smooth
+    one, for which Mitsuba need not compute a table of transmittances (0.07 s)."""
     if bsdf.keys() != _coated((0, 0, 0), 0).keys() or bsdf["type"] != "roughplastic":
         return bsdf
     return {**{key: bsdf[key] for key in bsdf if key != "alpha"}, "type": "plastic"}
 
 
 def _tinted(tint: Color, index: float = 1.5) -> Material:
-    """Glass that takes some of the light away."""
+    """Glass that absorbs some of the light. tint: the fractions that are left after one unit of
+    length. index: of refraction."""
     glass: Dictionary = {"type": "dielectric", "int_ior": index, "ext_ior": 1.0}
     return Material(glass, transparent=True, tint=tint)
 
 
 def _painted(color: Color) -> Material:
+    """The material for a color in linear sRGB: paint under a clear coat."""
     red, green, blue = (max(_WHITE * channel, _BLACK) for channel in color)
     return Material(_coated((red, green, blue), _PAINT))
 
@@ -149,7 +154,8 @@ MATERIALS: Mapping[str, Material] = {
 
 
 def parse_material(material: Any, option: str = "material") -> Material:
-    """A material from its name, from a color, or from a BSDF dictionary used as it stands.
+    """The `Material` that the value of an option describes: None for the default, a name, a color,
+    a `Material`, or a BSDF dictionary, which is used unchanged.
 
     option: the name of the option, for messages.
 
@@ -198,12 +204,12 @@ _LIGHT = GroundBackdrop("light")
 
 @dataclass(frozen=True)
 class StudioObject:
-    """A surface on the stage, with its material.
+    """A surface in the studio, with its material.
 
     surface: if it has no tolerance, it gets one that suits the size of the drawn surfaces.
     section_material: the material of the faces at which a section cuts a solid; None for that of
         the rest.
-    isolines: drawn on it.
+    isolines: lines to draw on it.
     """
 
     surface: TracedSurface
@@ -214,12 +220,12 @@ class StudioObject:
 
 @dataclass(frozen=True)
 class StudioScene:
-    """A studio scene.
+    """A scene of the studio.
 
-    scene: the dictionary for Mitsuba.
-    placement: of the surfaces in it.
-    backdrop: as passed to `build_studio`.
-    azimuth: of the camera.
+    scene: its dictionary for Mitsuba.
+    placement: the map from the coordinates of the surfaces to the world.
+    backdrop: the backdrop that was passed to `build_studio`.
+    azimuth: of the camera, in degrees.
     has_ground: whether the surfaces stand on a floor.
     """
 
@@ -241,12 +247,15 @@ def build_studio(
     surfaces_only: bool = False,
     traced_light: bool = True,
 ) -> StudioScene:
-    """Surfaces on the stage, seen in a picture of (width, height) pixels.
+    """The studio with surfaces, ground, lights and a camera, for a picture of `size` (width,
+    height) pixels.
 
-    up: the direction of the surfaces' coordinates that is up on the stage, as `rotation_to_z_up`
-        takes it.
-    surfaces_only: only surfaces and camera, without ground and lights.
-    traced_light: whether the picture follows light paths, and so needs whole materials.
+    camera: from where the surfaces are seen; what it leaves open is chosen such that they fill the
+        picture.
+    up: the direction, in the coordinates of the surfaces, that is up in the studio, as
+        `rotation_to_z_up` takes it.
+    surfaces_only: whether to leave out ground and lights.
+    traced_light: whether the picture follows light paths, and so needs complete materials.
     """
     backend = mitsuba_backend(mi)
     if camera.box is None:
@@ -293,13 +302,18 @@ def build_studio(
 
 
 def corners_of(ends: FloatArray) -> FloatArray:
-    """Corners (8, 3) of a box (2, 3) of a size that can be drawn."""
+    """The corners (8, 3) of a box with opposite corners `ends` (2, 3). Raises ValueError for a box
+    of a size that pictures cannot show."""
     check_drawable_size(ends)
     return np.array(list(itertools.product(*ends.T)))
 
 
 def stage_placement(points: FloatArray, turned: FloatArray | None = None) -> Placement:
-    """Turns points (n, 3), scales them to half a diagonal of 1 and puts them on the ground.
+    """The placement of surfaces in the studio: they are rotated, scaled until half the diagonal of
+    their box is 1, and put on the ground.
+
+    points: (n, 3) points of the surfaces, whose box counts.
+    turned: the rotation (3, 3); None for no rotation.
 
     Raises:
         ValueError: they are too far from the origin for their size (`check_offset`).
@@ -314,6 +328,8 @@ def stage_placement(points: FloatArray, turned: FloatArray | None = None) -> Pla
 
 
 def _sensor(mi: Any, pose: CameraPose, size: tuple[int, int]) -> dict[str, Any]:
+    """The dictionary of the camera for Mitsuba. Raises ValueError if it is too far away for single
+    precision. size: (width, height) in pixels."""
     # Rays begin near the stage, however far the camera is: their origins are rounded.
     distance = float(np.linalg.norm(pose.origin))
     if distance > _MAX_CAMERA_DISTANCE:

@@ -1,4 +1,4 @@
-"""Turns the arguments of `render` into surfaces on the stage of the studio."""
+"""Turns the arguments of `render` into the objects that its studio shows."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _TUBE_MATERIAL = "gold"
 
 
 def _is_color(materials: Any) -> bool:
-    """Whether a list holds numbers, and not materials."""
+    """Whether a list holds three numbers, a color, and not materials."""
     return len(materials) == 3 and all(isinstance(number, Real) for number in materials)
 
 
@@ -40,7 +40,8 @@ def drawn_surfaces(
     thickness: float | None = None,
     **shorthand: Any,
 ) -> list[TracedSurface]:
-    """The surfaces that `render` draws of its argument, with the options that change them."""
+    """The surfaces that `render` draws for its first argument. The other parameters are the options
+    of `render` that change the surfaces."""
     drawn = studio_objects(
         surfaces, None, options, shorthand, boundary_radius=boundary_radius, thickness=thickness
     )
@@ -59,13 +60,16 @@ def studio_objects(
     isolines: tuple[Isolines, ...] = (),
     thickness: float | None = None,
 ) -> list[StudioObject]:
-    """Fields and surfaces as objects of the studio, with lines on them, and tubes around the curves
-    at which they end.
+    """The objects that the studio shows: fields and surfaces with materials and isolines, and tubes
+    around the curves at which surfaces end.
 
-    options, shorthand: of all surfaces (`surface_and_options`).
-    boundary_radius: the radius of these tubes; None for no tubes. boundary_material: gold if None.
-    section_material: of the faces at which sections cut solids; None for that of the rest.
-    thickness: of closed walls to draw in place of surfaces; None for the surfaces.
+    surfaces: the first argument of `render`. materials: its option `material`.
+    options, shorthand: the `TraceOptions` of all surfaces, and options given as keywords, by name.
+    boundary_radius: the radius of the tubes; None for no tubes. boundary_material: their material,
+        gold if None.
+    section_material: the material of the faces at which sections cut solids; None for that of the
+        rest.
+    thickness: if not None, closed walls of this thickness are drawn in place of the surfaces.
 
     Raises:
         TypeError, ValueError: there is nothing to draw, or an option is wrong.
@@ -124,7 +128,8 @@ def studio_objects(
 
 
 def _thickened(surface: TracedSurface, thickness: float) -> TracedSurface:
-    """The closed mesh that `mesh` makes of a surface with a thickness, as a surface."""
+    """The surface of the closed mesh that `harnack.mesh` makes of a surface with a thickness.
+    Raises ValueError if there is no such mesh."""
     if surface.solid_range is not None or len(surface.levels) != 1:
         raise ValueError("thickness needs a surface of one level; a solid has an inside already")
     if surface.largest:
@@ -149,9 +154,11 @@ def _thickened(surface: TracedSurface, thickness: float) -> TracedSurface:
 
 
 def _with_section_material(objects: list[StudioObject], material: Material) -> list[StudioObject]:
-    """The objects, with a material for the faces at which sections cut solids."""
+    """The objects; those that are solids cut by a section get this material on the faces of the
+    cut. Raises ValueError if there are none."""
 
     def has_faces(element: StudioObject) -> bool:
+        """Whether the object is a solid with a section."""
         return element.surface.section is not None and element.surface.solid_range is not None
 
     if not any(map(has_faces, objects)):
@@ -167,8 +174,8 @@ def _with_section_material(objects: list[StudioObject], material: Material) -> l
 
 
 def _check_no_duplicates(surfaces: list[TracedSurface]) -> None:
-    """Raise ValueError if a surface is there twice: which of the two is seen would be an
-    accident."""
+    """Raise ValueError if a surface is in the list twice: chance would decide which of the two is
+    seen."""
     for k, surface in enumerate(surfaces):
         for earlier in surfaces[:k]:
             same = _is_cut_alike(surface, earlier) and surface.solid_range == earlier.solid_range
@@ -181,7 +188,8 @@ def _check_no_duplicates(surfaces: list[TracedSurface]) -> None:
 
 
 def _shared_levels(first: TracedSurface, second: TracedSurface) -> bool:
-    """Whether two level sets of a field share a level, modulo its period."""
+    """Whether two level sets of one field have a level in common, modulo the period of the
+    field."""
     period = first.field.period
     gaps = np.subtract.outer(first.level_values, second.level_values)
     if period is not None:
@@ -191,7 +199,7 @@ def _shared_levels(first: TracedSurface, second: TracedSurface) -> bool:
 
 
 def _is_cut_alike(first: TracedSurface, second: TracedSurface) -> bool:
-    """Whether two surfaces are of the same field, in the same volume."""
+    """Whether two surfaces have the same field and the same clip and section."""
     same = first.field is second.field
     return same and first.clip == second.clip and first.section == second.section
 
@@ -199,7 +207,7 @@ def _is_cut_alike(first: TracedSurface, second: TracedSurface) -> bool:
 def _boundary_tubes(
     objects: list[StudioObject], radius: Any, material: Material
 ) -> list[StudioObject]:
-    """Tubes around the curves at which surfaces end."""
+    """Tubes of a radius around the curves at which the surfaces of the objects end."""
     if isinstance(radius, bool) or not isinstance(radius, Real) or not 0 < float(radius) < math.inf:
         raise ValueError(f"boundary_radius is a length, such as 0.03, not {radius!r}")
     tubes: list[StudioObject] = []
@@ -224,8 +232,8 @@ def _surface(
     shorthand: Mapping[str, Any],
     is_clear: bool,
 ) -> TracedSurface:
-    """A surface with its options. A `Solid` is drawn as a solid where its inside can be seen: where
-    a section opens it, or it is clear."""
+    """A surface with the options of the call. A `Solid` is drawn as a solid if its inside can be
+    seen: if a section opens it, or its material is transparent."""
     if isinstance(element, TracedSurface):
         return element.with_call_cache(begins=True)
     honored = names_of("render", "surface", "trace")
@@ -235,10 +243,12 @@ def _surface(
 
 
 def with_visible_inside(surface: TracedSurface, *, is_clear: bool = False) -> TracedSurface:
-    """The surface, for a `Solid` whose inside can be seen as the boundary of the solid.
+    """The surface; a `Solid` whose inside can be seen becomes the boundary of the solid, with faces
+    where volumes cut it.
 
     Raises:
-        ValueError: a closed solid of a field that has none (`check_has_inside`).
+        ValueError: the boundary of a solid is requested for a field that has no closed solids
+            (`check_has_inside`).
     """
     is_seen = is_clear or surface.section is not None
     is_solid = isinstance(surface.field, Solid) and len(surface.levels) == 1

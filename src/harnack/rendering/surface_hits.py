@@ -1,7 +1,8 @@
-"""First hits of rays with level sets and closed solids: refined positions, oriented normals.
+"""First hits of rays with level sets and with boundaries of solids: their positions, moved onto the
+surface, and normals that point to a known side.
 
-Everything here is in the surface's own coordinates and knows no Mitsuba;
-`hybrid_scene.surface_interaction` turns a hit into what a BSDF takes.
+All coordinates are those of the surface, and nothing here depends on Mitsuba.
+`hybrid_scene.surface_interaction` turns a hit into the interaction that a BSDF takes.
 """
 
 from __future__ import annotations
@@ -32,20 +33,24 @@ _GRAZING = 1e-3
 
 @dataclass
 class SurfaceHit:
-    """First hits of rays. Rays without a hit have is_hit = is_out_of_steps = False and t = inf.
+    """How each ray ended at a surface, with one entry for each ray.
 
-    t: ray parameter of the hit; of a ray out of steps, up to where it is proved free.
-    is_hit: there is a surface at t.
-    is_out_of_steps: the ray ran out of steps behind t.
-    position, normal: of the surface. The normal is unit and points toward larger values or, of a
-        solid, outward.
-    ray_offset: how far off the surface the next ray must start.
-    value: of the field, close to the surface or just before a jump; undefined without a hit.
-    evaluations: number of evaluations of the field.
-    is_hole_filling: the field has jumps but the hit is on none; the surface closes a hole between
-        jump surfaces there.
-    is_on_section: the hit is on a face where the section cuts a solid.
-    isoline_index: of the isoline drawn there, from 1; 0 for none.
+    A ray ends in one of three ways. Hit: is_hit is True, and t is the ray parameter of the hit.
+    Miss: is_hit and is_out_of_steps are False, and t = inf. Undecided: is_out_of_steps is True; the
+    ray used up its evaluations, no surface lies before t, and nothing is known behind t.
+
+    position, normal: (3,) the point of the surface, and its unit normal. The normal points toward
+        larger values of the field f or, for a solid, outward.
+    ray_offset: the distance from the surface at which a ray that leaves it must start.
+    value: f close to the hit, or just before the jump if the hit is on a jump of f; undefined
+        without a hit.
+    evaluations: the number of evaluations of f along the ray.
+    is_hole_filling: whether f has jumps (such as the winding number of a mesh at its triangles) and
+        the hit is on none of them: it is on a smooth part of the level set, which closes a hole
+        between them.
+    is_on_section: whether the hit is on a flat face where the section, a volume that cuts a solid
+        open, cuts it.
+    isoline_index: the number of the isoline at the hit, counted from 1; 0 if no isoline is there.
     """
 
     t: Real
@@ -64,16 +69,16 @@ class SurfaceHit:
 def intersect_surface(
     prepared: SurfaceTracer, o: Vec3, d: Vec3, t_max: Real, active: Mask
 ) -> SurfaceHit:
-    """The first hits of rays o + t d, |d| = 1, 0 <= t <= t_max, with the level set.
+    """The first hits of rays o + t d, |d| = 1, 0 <= t <= t_max, with the level set, as a
+    `SurfaceHit`.
 
-    One Newton step along the ray, one evaluation there, and one projection along its gradient take
-    a hit from within tolerance to the surface. The proof tells which side of the surface the ray
-    comes from; a normal that says otherwise (the step went past the point where a grazing ray is
-    nearest) is turned to that side.
+    The march ends within the tolerance of the surface. One Newton step along the ray, one
+    evaluation of f there, and one step along the gradient then lead to the surface itself. The last
+    value of the march tells from which side of the level the ray comes. If the normal contradicts
+    that, because the Newton step along a grazing ray went too far, the normal is tilted to agree.
 
-    A hit that requires a crossing is at a root already, and its side is known.
-
-    A hit on a jump surface is not moved; the normal points to the side of larger values.
+    If hits require a crossing, the march itself gives the root and the side, and no Newton step is
+    made. A hit on a jump of f is not moved; its normal points to the side of larger values.
     """
     trace = prepared.first_hit(o, d, 0, t_max, active)
     if not prepared.uses_ray_queue:
@@ -88,7 +93,7 @@ def intersect_surface(
 
 @dataclass(frozen=True)
 class _MarchedRays:
-    """Rays, and the ends of their marches."""
+    """Origins and unit directions of rays, and the `MarchResult` of each."""
 
     o: Vec3
     d: Vec3
@@ -96,7 +101,8 @@ class _MarchedRays:
 
 
 def _no_hit(prepared: SurfaceTracer, trace: MarchResult) -> SurfaceHit:
-    """The `SurfaceHit` of rays that hit nothing."""
+    """The `SurfaceHit` of rays without a hit: misses, and rays that are out of steps. trace: how
+    the rays ended."""
     backend = prepared.backend
     zero, vector, none = backend.Float(0), backend.Array3f(0), backend.Bool(False)
     return SurfaceHit(
@@ -115,7 +121,8 @@ def _no_hit(prepared: SurfaceTracer, trace: MarchResult) -> SurfaceHit:
 
 
 def _refine_hits(prepared: SurfaceTracer, rays: _MarchedRays) -> SurfaceHit:
-    """The `SurfaceHit` of rays, with hits refined."""
+    """The `SurfaceHit` of marched rays, with hits moved onto the surface as `intersect_surface`
+    describes."""
     vector, o, d, trace = prepared.backend.Array3f, rays.o, rays.d, rays.trace
     prepared = prepared.hit_surface(trace)
     is_hit = trace.status == int(RayStatus.HIT)
@@ -161,16 +168,19 @@ def _refine_hits(prepared: SurfaceTracer, rays: _MarchedRays) -> SurfaceHit:
 
 
 def _sample_where(prepared: SurfaceTracer, p: Vec3, value: Real, d: Vec3, active: Mask) -> Sample:
-    """Value, error, gradient and normal at p where active, zeros elsewhere, and no promises.
+    """The `Sample` of f at points p on active lanes: value, error, gradient and shading normal. It
+    is zero on other lanes and holds no promises (proved bounds of f near a point).
 
-    value: f near p. d: of the ray; a point with a zero gradient has the normal -d.
+    value: f near p, which selects the branch of a multivalued f.
+    d: the direction of the ray; a point with a zero gradient has the normal -d.
 
-    Skipped where no lane is active: a sample of a broken mesh costs more than a ray that hits a
-    triangle or nothing, and most rays do.
+    The evaluation is skipped if no lane is active. Evaluating a mesh with holes costs more than
+    tracing a ray, and most rays hit a triangle or nothing.
     """
     real, vector = prepared.backend.Float, prepared.backend.Array3f
 
-    def sampled(_: tuple[Any, ...]) -> tuple[Any, ...]:
+    def sample_all(_: tuple[Any, ...]) -> tuple[Any, ...]:
+        """Value, error, gradient and shading normal at all points p."""
         sample = prepared.sample_with_branch(p, value)
         length = norm(sample.gradient)
         normal = dr.select(length > 0, sample.gradient / length, -d)
@@ -178,17 +188,22 @@ def _sample_where(prepared: SurfaceTracer, p: Vec3, value: Real, d: Vec3, active
         return real(sample.value), real(sample.value_error), vector(sample.gradient), shading
 
     start = real(0), real(0), vector(0), vector(0)
-    value, error, gradient, normal = update_where_active(active, sampled, start, "at hits")
+    value, error, gradient, normal = update_where_active(active, sample_all, start, "at hits")
     return Sample(value, gradient, (), error, shading_normal=normal)
 
 
 def _hit_on_facet(
     prepared: SurfaceTracer, o: Vec3, d: Vec3, trace: MarchResult, hit: SurfaceHit
 ) -> SurfaceHit:
-    """Hits on facets: t is exact up to rounding, and so is the plane of the normal.
+    """The `SurfaceHit` of rays that hit a facet (a flat piece of the surface at which f jumps). The
+    intersection with the facet's plane is exact up to rounding, so neither t nor the normal is
+    refined.
 
-    The ray comes from the side of smaller values if it runs along the normal. The next ray keeps as
-    far away as from a level set, and no less than several roundings of the position.
+    hit: the result for smooth hits, whose other entries stay.
+
+    f is larger on the side to which the normal points. So a ray that runs along the normal comes
+    from the side of smaller values. The next ray starts as far off as from a level set, and at
+    least several roundings of the position.
     """
     t = dr.select(trace.at_jump, trace.t, 0)
     p = dr.fma(prepared.backend.Array3f(t), d, o)
@@ -209,11 +224,15 @@ def _hit_on_facet(
 def _uncertainty(
     prepared: SurfaceTracer, gradient: Vec3, t: Real, f: Real, error: Real = 0.0
 ) -> Real:
-    """The largest distance from the level, to first order, at which a point may be a hit.
+    """The largest distance from the level, to first order, at which the march may accept a point as
+    a hit.
 
-    It is the tolerance, or the distance that rounding of f (`Sample.value_error`) amounts to if
-    that is larger; the rounding of positions is far below the distance that Mitsuba's rays keep
-    from surfaces anyway.
+    gradient, t, f, error: at the point, its gradient (3,), ray parameter, value, and the bound of
+        its rounding error.
+
+    It is the tolerance, or the distance 2 error/|gradient| that corresponds to the rounding of f if
+    that is larger. Rounding of positions is left out: Mitsuba's rays start much farther off
+    surfaces anyway.
     """
     gradient_norm = norm(gradient)
     t = dr.select(dr.isfinite(t), t, 0)
@@ -225,7 +244,8 @@ def _uncertainty(
 
 
 def orient_normal(normal: Vec3, d: Vec3, side: Real) -> Vec3:
-    """The normal, turned if need be such that side * (normal . d) > 0."""
+    """The unit normal if side * (normal . d) > 0 by some margin; else the normal tilted in its
+    plane with d until that holds. d: (3,) unit direction of the ray. side: 1 or -1."""
     cosine = dr.dot(normal, d)
     tilted = dr.normalize(normal + (side * _GRAZING - cosine) * d)
     return dr.select(side * cosine >= _GRAZING, normal, tilted)
@@ -233,14 +253,16 @@ def orient_normal(normal: Vec3, d: Vec3, side: Real) -> Vec3:
 
 @dataclass(frozen=True)
 class CappedSolid:
-    """A closed solid: the points of a volume where low <= f <= high, with caps where it is cut.
+    """A closed solid: the points of a volume at which low <= f <= high.
 
-    Its boundary consists of level sets inside the volume and of caps on the volume's own boundary.
-    A ray hits a cap where it enters the volume at a point of the solid, or leaves it at one without
-    having hit a level before. Volumes are convex, so a ray enters and leaves at most once. A cap
-    lies on the section if it is the section that ends the ray's part in the volume there.
+    Its boundary consists of level sets inside the volume and of caps, which are parts of the
+    volume's own boundary. A ray hits a cap where it enters the volume at a point of the solid, or
+    where it leaves the volume from inside the solid without having hit a level before. Volumes are
+    convex, so a ray enters and leaves a volume at most once. The volume may be an intersection that
+    includes the section (a volume that cuts the solid open). A cap lies on the section if the ray
+    enters or leaves the section there.
 
-    prepared: a level set whose levels are the finite ones of `low` and `high`.
+    prepared: the level set of the finite ones of `low` and `high`.
     """
 
     prepared: SurfaceTracer
@@ -249,7 +271,8 @@ class CappedSolid:
 
     @classmethod
     def of(cls, surface: TracedSurface, prepared: SurfaceTracer) -> CappedSolid:
-        """The solid that `surface.side` describes."""
+        """The solid of a surface whose `side` describes one. prepared: the tracer of the surface.
+        Raises ValueError if the surface is a level set."""
         if surface.solid_range is None:
             raise ValueError("this surface is not the boundary of a solid: give it a side")
         finite = iter(prepared.levels.values)
@@ -257,20 +280,23 @@ class CappedSolid:
         return cls(prepared, low, high)
 
     def _contains(self, p: Vec3) -> Mask:
-        """Whether points of the volume belong to the solid."""
+        """Mask of points (3,) of the volume that belong to the solid."""
         f = self.prepared.sample(p).value
         return (f >= self.low) & (f <= self.high) & self.prepared.level_counts(p)
 
     def intersect(
         self, o: Vec3, d: Vec3, t_max: Real, active: Mask, side: Real = 0.0
     ) -> SurfaceHit:
-        """The first crossings of rays o + t d, |d| = 1, 0 <= t <= t_max, with the boundary.
+        """The first crossings of rays o + t d, |d| = 1, 0 <= t <= t_max, with the boundary, as a
+        `SurfaceHit`.
 
-        side: of a ray that starts at the boundary, 1 if it goes out of the solid there, -1 if it
-            goes in; else 0. Such a ray starts off the boundary by a clearance. Where the solid or a
-            gap in it is thinner than that, it starts on the wrong side: then it crosses back at
-            once, straight on. So going in and going out always alternate, and no light is lost at
-            the sharp edges of caps.
+        side: for a ray that starts at the boundary, 1 if it goes out of the solid there and -1 if
+            it goes in; 0 for other rays.
+
+        A ray that starts at the boundary begins a little off it. If the solid, or a gap in it, is
+        thinner than this distance, the ray begins on the wrong side. It then gets an immediate hit
+        at t = 0 with the normal along the ray, which takes it to the right side without bending it.
+        So going in and going out always alternate, and no light is lost at the sharp edges of caps.
         """
         zero = self.prepared.backend.Float(0)
         start, end = self.prepared.clip(o, d, zero, t_max)
@@ -292,8 +318,8 @@ class CappedSolid:
         outwards = dr.select(leaving | (side < 0), zero + 1, -1)
         normal = outwards * d
         if self.prepared.volume is not None:
-            cap = orient_normal(self.prepared.volume.outward_normal(position), d, outwards)
-            normal = dr.select(slipped, normal, cap)
+            cap_normal = orient_normal(self.prepared.volume.outward_normal(position), d, outwards)
+            normal = dr.select(slipped, normal, cap_normal)
         clearance = zero + RAY_OFFSET * self.prepared.tolerance.distance
         on_section = hit.is_on_section
         if self.prepared.section is not None:
@@ -311,7 +337,8 @@ class CappedSolid:
         return dr.select(capped, cap_hit, hit)
 
     def occludes(self, o: Vec3, d: Vec3, t_max: Real, active: Mask) -> Mask:
-        """Whether rays hit the boundary; rays that are not proved to miss it count as hits."""
+        """Mask of rays o + t d, 0 <= t <= t_max, that hit the boundary of the solid. Rays that are
+        not proved to miss it count as hits."""
         start, end = self.prepared.clip(o, d, self.prepared.backend.Float(0), t_max)
         enters = active & (start < end)
         start = dr.select(enters, start, 0)
@@ -321,12 +348,14 @@ class CappedSolid:
         return capped | self.prepared.occluded(o, d, 0, t_max, active & ~capped)
 
     def _meet_levels(self, o: Vec3, d: Vec3, t_max: Real, active: Mask) -> SurfaceHit:
-        """The first level set inside the volume, its normal turned out of the solid."""
+        """The first hits of rays with the level sets inside the volume, as a `SurfaceHit` whose
+        normals point out of the solid."""
         hit = intersect_surface(self.prepared, o, d, t_max, active)
         at_low = dr.abs(hit.value - self.low) < dr.abs(hit.value - self.high)
         normal = dr.select(at_low, -hit.normal, hit.normal)
         return replace(hit, normal=normal)
 
     def _at(self, o: Vec3, d: Vec3, t: Real) -> Vec3:
+        """The points (3,) at parameters t of rays; the origin where t is not finite."""
         t = dr.select(dr.isfinite(t), t, 0)
         return dr.fma(self.prepared.backend.Array3f(t), d, o)

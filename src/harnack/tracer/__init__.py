@@ -1,4 +1,4 @@
-"""First hits and crossings of rays with level sets, every step proved."""
+"""Finds first hits and crossings of rays with level sets; every step along a ray is proved."""
 
 from __future__ import annotations
 

@@ -1,9 +1,11 @@
-"""Determines the branch of f along rays whose samples give f only modulo 1.
+"""Determines the branch of f along rays if samples give f only modulo 1. The branch is the integer
+that has to be added to a sample.
 
-Such samples (`Sample.branch_unknown`) come from FMM cells of the boundary of a mesh, whose winding
-number is f. The periodic levels are the levels repeated with period 1. Steps that are proved free
-of the periodic levels keep f between the same two of them, and a jump adds an integer. The last
-accepted value therefore determines the branch at the next point.
+Samples without a branch (`Sample.branch_unknown`) come from octree cells that expand the solid
+angle of the boundary of a mesh; f is the winding number of the mesh. The periodic levels are all
+numbers that differ from a level by an integer. On a step that is proved free of the periodic
+levels, f stays between the same two of them. At a triangle of the mesh f jumps by a known integer.
+So the last accepted value determines the branch at the next point.
 """
 
 from __future__ import annotations
@@ -29,67 +31,80 @@ _MAX_CHANGE, _MAX_ERROR = 0.25, 0.125
 
 @dataclass(frozen=True)
 class BranchTracker:
-    """Adds the branch to samples of f that are known only modulo 1.
+    """Finds the branch of samples of f that are known only modulo 1: the integer that has to be
+    added.
 
-    levels: the true levels, at which rays hit.
+    levels: the true levels, at which rays hit. The periodic levels are all numbers that differ from
+        a true level by an integer.
     """
 
     levels: Levels
 
     @property
     def _periodic_levels(self) -> Levels:
+        """All numbers that differ from a true level by an integer."""
         return Levels(self.levels.values, 1.0)
 
     def resolve(
-        self, look: RaySample, before: Real, step: Real, total_error: Real
+        self, ray_sample: RaySample, before: Real, step: Real, total_error: Real
     ) -> tuple[RaySample, Mask]:
-        """Add the branch to samples that lack it.
+        """Add the branch, an integer, to the samples that lack it.
 
-        Also returns the lanes on which the branch is certain even if f is within its error of a
-        periodic level.
+        Returns the samples, and a mask of lanes on which the branch is certain even if f is within
+        its error of a periodic level (a number that differs from a level by an integer).
 
-        before: f at the last accepted point, behind the facet if that point lies on a facet. 0 if
-            there is no such point: then it only tells between which periodic levels f lies.
-        step: the distance back to that point.
-        total_error: a bound of the error of the value.
+        look: the samples at the trial points, with their enclosures (intervals that provably
+            contain the change of f along the ray).
+        before: f at the last accepted point, behind the facet (a triangle at which f jumps) if the
+            point lies on one. On rays without an accepted point it is 0 and only tells between
+            which periodic levels f lies.
+        step: the distance from the trial point back to that point.
+        total_error: a bound of the error of the sampled f.
 
-        Proof. (1) Let the sample prove that f changes by less than a quarter on the way back. Then
-        f is the candidate nearest to the value before, as the errors of both are below an eighth:
-        samples with larger errors are not accepted (`gaps`). (2) Else, if the trial point is
-        proved, the way to it is free of periodic levels, and f lies between the same two of them as
-        before. A point that is not proved is not accepted, whatever its value. A point at which f
-        is within its error of a periodic level is accepted only by (1).
+        Proof. (1) Suppose the sample proves that f changes by less than a quarter on the way back
+        to the accepted point. Both values have errors below an eighth, since samples with larger
+        errors are not accepted (`gaps`). So the true value is the one nearest to `before` among
+        those that differ from the sample by an integer. (2) Otherwise the way to an accepted trial
+        point is free of periodic levels. So f lies between the same two of them as `before`, and
+        the fractional part of the sample determines it. If the way is not proved free, the point is
+        not accepted, whatever its value. If f is within its error of a periodic level, the point is
+        accepted only by (1).
         """
-        sample, level = look.sample, self.levels.values[0]
+        sample, level = ray_sample.sample, self.levels.values[0]
         value, branch = sample.value - level, dr.floor(before - level)
         in_branch = level + (branch + (value - dr.floor(value)))
         nearest = sample.value + dr.round(before - sample.value)
         change = 0 * step + _MAX_CHANGE
-        is_near = any_is_free(look.backward, LevelGaps(change, change), step) & (
+        is_near = any_is_free(ray_sample.backward, LevelGaps(change, change), step) & (
             total_error < _MAX_ERROR
         )
         is_near &= before != 0
         value = dr.select(is_near, nearest, in_branch)
         shift = dr.select(sample.branch_unknown, value - sample.value, 0)
-        return replace(look, sample=sample.shifted(shift)), is_near
+        return replace(ray_sample, sample=sample.shifted(shift)), is_near
 
     def gaps(
         self, sample: Sample, is_modulo: Mask, is_sure: Mask, total_error: Real
     ) -> tuple[LevelGaps, Mask, Mask]:
-        """The level gaps for which steps are solved, and two masks.
+        """The differences between f and the levels below and above it for which the next step is
+        solved, and two masks.
 
-        The gaps are to the neighboring periodic levels. On lanes of `passes`, where a periodic
-        level that is no true level is near or the error of f is large, they are to the neighboring
-        true levels.
-        The first mask has the lanes of `passes` whose sample knows its branch; the second has the
-        lanes to be sampled again with known branch.
+        By default these are the differences to the neighboring periodic levels (numbers that differ
+        from a level by an integer). On lanes of the mask `passes` they are those to the neighboring
+        true levels. These are lanes on which a periodic level that is no true level is near, or the
+        error of f is large.
 
+        The first mask returned holds the lanes of `passes` whose sample was given with its branch.
+        The second holds the lanes whose point has to be sampled again with the branch.
+
+        sample: the samples, with the branch added.
         is_modulo: lanes whose sample gave f only modulo 1.
         is_sure: lanes on which the branch is certain even if f is within its error of a periodic
             level.
+        total_error: a bound of the error of the sampled f.
 
-        A ray passes a periodic level that is no true level by samples that know their branch: a
-        step from such a sample may cross that level, and the next sample must know its branch, too.
+        A ray passes a periodic level that is no true level by samples with known branch. A step
+        from such a sample may cross that level, so the next sample needs a known branch, too.
         """
         periodic, true = self._periodic_levels.gaps(sample.value), self.levels.gaps(sample.value)
         near = fmax(2 * total_error, _NEAR_LEVEL)

@@ -1,18 +1,20 @@
 """Derivatives of hits, by implicit differentiation at the hit.
 
-A marching loop is not differentiable in any useful sense: its derivative depends on where it
-stopped. The hit, f(o + t d; theta) = level, defines t(theta), and
+The marching loop itself is not differentiated: such a derivative would depend on where the loop
+    stopped. The equation of the hit, f(o + t d; theta) = level, determines t as a function of the
+    parameters theta:
 
-    dt = (dlevel - df|_t) / (grad f . d),
+    dt = (dlevel - df|_t) / (grad f . d).
 
-which these functions attach to a detached t. A hit on a facet of a field with jumps lies on a
-plane, n . (o + t d) = const, whatever the level: dt = -(n . (do + t dd))/(n . d).
+Here df|_t is the change of f at a fixed t, by changes of o, d and theta. The trace runs without
+derivatives, and this derivative is attached to its t, by the gradient of a sample at the hit. A hit
+on a facet of a field with jumps lies on a plane n . (o + t d) = const, whatever the level: dt = -(n
+. (do + t dd))/(n . d).
 
-Derivatives are implicit: the trace runs without them, and the derivative of t is attached at the
-hit, by the gradient of the sample there. So no derivative passes through `evaluate`, which may run
-a recorded loop. Derivatives that would be lost are refused, both for arguments (`validation`,
-`Field.__new__`) and for results. At ties of formulas, where the gradient is a range, dual numbers a
-few roundings away choose a one-sided gradient (`Formula.evaluate`).
+So no derivative passes through `evaluate`, which may run a recorded loop. If a derivative would be
+lost, an error is raised: for arguments by `validation` and `Field.__new__`, for results by
+`refuse_derivative`. At points at which a formula has several one-sided gradients, dual numbers a
+few roundings away choose one of them (`Formula.evaluate`).
 """
 
 from __future__ import annotations
@@ -45,9 +47,12 @@ _PARAMETER_FREE: FieldCache[bool] = FieldCache()
 def needs_derivatives(prepared: SurfaceTracer, o: Vec3, d: Vec3) -> bool:
     """Whether rays, levels or the field's parameters have derivatives enabled.
 
+    o, d: (3,) origins and directions of the rays.
+
     Raises:
         NotImplementedError: parameters of a field with jumps have derivatives enabled. They move
-            the facets, and the derivative of that is not known here; zero would be wrong.
+            the facets at which the field jumps, and the derivative of that is not known here; zero
+            would be wrong.
     """
     field = prepared.field
     if not _PARAMETER_FREE.get(field, None, lambda: is_plain_data(vars(field))):
@@ -65,8 +70,9 @@ def needs_derivatives(prepared: SurfaceTracer, o: Vec3, d: Vec3) -> bool:
 
 
 class _NoDerivative(dr.CustomOp):
-    """The identity, whose derivative is not known: reverse mode raises. Forward mode, which goes
-    from parameters to all that depends on them, wanted or not, gives NaN."""
+    """The identity, for a result whose derivative is not known. In reverse mode it raises an error.
+    Forward mode goes from parameters to all that depends on them, needed or not, so the derivative
+    is NaN there."""
 
     def eval(self, value: Any, what: str, sources: list[Any]) -> Any:
         del sources
@@ -85,9 +91,10 @@ class _NoDerivative(dr.CustomOp):
 
 
 def refuse_derivative(prepared: SurfaceTracer, o: Vec3, d: Vec3, what: str, value: Any) -> Any:
-    """The result of a trace, with an error (`_NoDerivative`) if its derivative is requested.
+    """The array `value`, with an error if its derivative is requested: its derivative is not known,
+    and zero would be wrong. In forward mode the derivative is NaN.
 
-    Its derivative is not known, and zero would be wrong.
+    o, d: (3,) origins and directions of the rays. what: the name of the result, for the message.
     """
     sources = [o, d, *prepared.levels.values, *prepared.field.parameters()]
     return dr.custom(_NoDerivative, value, what, sources)
@@ -96,11 +103,15 @@ def refuse_derivative(prepared: SurfaceTracer, o: Vec3, d: Vec3, what: str, valu
 def attach_derivatives(
     prepared: SurfaceTracer, o: Vec3, d: Vec3, end: MarchResult, normal: Vec3
 ) -> tuple[Real, Vec3]:
-    """t, refined up to rounding, with its derivative attached, and the normal at that point.
+    """The ray parameters t of hits, refined up to rounding, with derivatives attached; and the
+    normals (3,) at these points.
 
-    normal: the unit normal of the trace. Normals carry no derivative (it would need the Hessian).
+    o, d: (3,) origins and directions of the rays, possibly with derivatives. end: how the rays
+        ended.
+    normal: (3,) the unit normals of the trace, which are kept if there is no hit.
 
-    At hits on facets t is already exact, and does not depend on the level.
+    Normals carry no derivative, which would need the Hessian. At hits on facets, t is exact already
+    and does not depend on the level.
     """
     t, hit, prepared = end.t, end.status == int(RayStatus.HIT), prepared.hit_surface(end)
     if prepared.field.has_jumps:
@@ -141,7 +152,8 @@ def attach_derivatives(
 
 
 def _on_plane(prepared: SurfaceTracer, o: Vec3, d: Vec3, end: MarchResult) -> Real:
-    """t with the derivative of the intersection with a plane, at hits on facets."""
+    """The ray parameters t; at hits on facets with the derivative of the intersection with the
+    facet's plane."""
     with dr.suspend_grad():
         t_hit = dr.select(end.at_jump, end.t, 0)
         slope = dr.dot(end.gradient, dr.detach(d))
@@ -150,14 +162,15 @@ def _on_plane(prepared: SurfaceTracer, o: Vec3, d: Vec3, end: MarchResult) -> Re
     return _with_derivative(end.t, change, slope, end.at_jump)
 
 
-def _with_derivative(t: Real, change: Real, slope: Real, where: Mask) -> Real:
-    """t with the derivative of -change/slope, infinite or NaN where the slope is 0."""
-    return dr.replace_grad(t, -change * dr.select(where, 1 / slope, 0))
+def _with_derivative(t: Real, change: Real, slope: Real, is_attached: Mask) -> Real:
+    """t with the derivative of -change/slope on lanes of `is_attached`, infinite or NaN if the
+    slope is 0 there. change: a zero with a derivative. slope: the derivative of f along the ray."""
+    return dr.replace_grad(t, -change * dr.select(is_attached, 1 / slope, 0))
 
 
 def _change_of_nearest(prepared: SurfaceTracer, f: Real) -> Real:
-    """The number level - detach(level), a zero with a derivative, of the level nearest to f in each
-    lane."""
+    """level - detach(level) for the level nearest to f on each lane: a zero that carries the
+    derivative of this level."""
     nearest, change = dr.inf, prepared.backend.Float(0)
     for level in prepared.levels.values:
         with dr.suspend_grad():

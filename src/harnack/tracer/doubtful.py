@@ -1,9 +1,10 @@
 """Distances of the surface from hits that may be due to rounding alone.
 
-Where grad f is 0 on the surface, as where two sheets of it meet, f - level behaves as a power c u^m
-of the distance u. Rounding hides the surface there from afar: f equals the level, up to its error
-e, as far as (e/c)^(1/m). The estimate e/|grad f| of the distance is then only of first order, and m
-times too short. So the surface is searched for around such hits.
+Suppose that grad f is 0 on the surface, for example where two sheets of it meet. Then f - level
+behaves as c u^m, with u the distance from the surface and m > 1. Rounding hides the surface there
+from afar: at all distances up to (e/c)^(1/m), f equals the level up to its error e. The usual
+estimate e/|grad f| of the distance is only of first order, and m times too short there. So the
+surface is searched for around such hits.
 """
 
 from __future__ import annotations
@@ -33,10 +34,10 @@ _DIRECTION_COUNT = 6
 
 @dataclass(frozen=True)
 class Doubtful:
-    """Hits around which the surface is searched for.
+    """Hits around which the surface is searched for, with one entry for each hit.
 
-    position: (3,) of the hits.
-    normal: (3,) unit vector along the gradient.
+    position: (3,) the hit.
+    normal: (3,) unit vector along the gradient of f.
     size: a bound of the coordinates along the ray up to the hit.
     distance: the distance from the hit at which the search begins.
     """
@@ -49,17 +50,18 @@ class Doubtful:
 
 @dataclass(frozen=True)
 class _SearchState:
-    """The state of the search around a hit.
+    """The state of the search around each hit.
 
-    distance: the distance of the next sample.
-    way: index of its direction.
-    above, below: whether f was surely seen on these sides of the level.
-    low, high, low_slope, high_slope: lengths along the gradient between which f turns back from the
-        level, and the slopes there.
+    distance: the distance of the next sample from the hit.
+    way: the index of the direction of the next sample, 0 to 5.
+    above, below: whether a sample was surely above, and surely below the level.
+    low, high, low_slope, high_slope: two lengths along the gradient between which f turns back from
+        the level, and the slopes of f there.
     searches: whether the point at which f turns back is being searched for.
     may_turn: whether such a point may still be found.
     looks: the number of samples so far.
-    seen: whether the surface was seen.
+    seen: whether the surface was found.
+    active: whether the search goes on.
     """
 
     distance: Real
@@ -72,22 +74,21 @@ class _SearchState:
     high_slope: Real
     searches: Mask
     may_turn: Mask
-    looks: Any
+    sample_count: Any
     seen: Mask
     active: Mask
 
 
 def seen_distance(backend: Backend, field: Field, levels: Levels, hits: Doubtful) -> Real:
-    """A distance from each hit within which the surface was seen, at least `hits.distance`;
-    infinite if it was not seen within a sixteenth of the size of coordinates.
+    """A distance from each hit within which the surface was found, at least `hits.distance`; inf if
+    it was not found within a sixteenth of the size of coordinates.
 
-    Proof. At one sampled point f is certainly on one side of the level, and at another sampled
-    point certainly on the other side: by more than the bound of its error at each. All points lie
-    within this distance of the hit, so f takes the level between them, or jumps past it at a facet.
-    If f only touches the level, it stays on one side, and no sign tells. Then it turns back: its
-    slope along the gradient of the hit changes sign, and at the point of this change, which secants
-    and bisection give, f equals the level up to its error. No sample in this precision can tell
-    such a point from the surface.
+    Proof. Two cases count as found. (1) At one sampled point f is certainly above the level, and at
+    another one certainly below: the differences exceed the bounds of its error. All points lie
+    within this distance of the hit. So f takes the level between them, or jumps past it. (2) f only
+    touches the level and stays on one side. Then it turns back: its slope along the gradient at the
+    hit changes sign. Secants and bisection find the point of this change, and f equals the level
+    there up to its error. No sample in this precision can tell such a point from the surface.
     """
     at_hit = field.evaluate(hits.position)
     level = at_hit.value + levels.offset_to_nearest(at_hit.value)
@@ -96,7 +97,8 @@ def seen_distance(backend: Backend, field: Field, levels: Levels, hits: Doubtful
     smallest = 4 * backend.machine_epsilon * hits.size
 
     def offset_of(sample: Any) -> tuple[Real, Real, Mask]:
-        """f less the level, the bound of its error, and whether its side is sure."""
+        """f minus the level, the bound of its error, and whether it is certain on which side of the
+        level f is."""
         x, error = (
             sample.value - level,
             value_error_bound(sample, safe_norm(sample.gradient), hits.size),
@@ -113,7 +115,9 @@ def seen_distance(backend: Backend, field: Field, levels: Levels, hits: Doubtful
     x, _, is_sure = offset_of(at_hit)
     side = dr.select(x > 0, backend.Float(1), -1)
 
-    def body(now: _SearchState) -> _SearchState:
+    def sample_once(now: _SearchState) -> _SearchState:
+        """The state after one more sample: in the next of six directions, or at the point at which
+        f may turn back."""
         direction = dr.select(now.way < 2, hits.normal, dr.select(now.way < 4, across, second))
         direction = dr.select((now.way & 1) == 0, direction, -direction)
         length = dr.select(now.searches, _turning_point(now), now.distance)
@@ -146,7 +150,7 @@ def seen_distance(backend: Backend, field: Field, levels: Levels, hits: Doubtful
             high_slope=dr.select(is_high, slope, now.high_slope),
             searches=stays,
             may_turn=now.may_turn & ~(now.searches & ~goes_on),
-            looks=now.looks + 1,
+            sample_count=now.sample_count + 1,
             seen=is_seen,
             active=now.active & ~is_seen & (distance <= farthest),
         )
@@ -156,13 +160,13 @@ def seen_distance(backend: Backend, field: Field, levels: Levels, hits: Doubtful
         hits.distance, backend.UInt32(0), is_sure & (x > 0), is_sure & (x < 0), zero, zero, zero,
         zero, no, yes, backend.UInt32(0), no, yes,
     )  # fmt: skip
-    end = loop_while_active(begin, body, "harnack doubtful hits")
+    end = loop_while_active(begin, sample_once, "harnack doubtful hits")
     return dr.select(end.seen, end.distance, dr.inf)
 
 
 def _turning_point(now: _SearchState) -> Real:
-    """The length at which f may turn back: by the secant through the slopes and by bisection, in
-    turns."""
+    """The length along the gradient at which f may turn back from the level: by the secant through
+    the slopes at `low` and `high`, and by bisection, in turns."""
     fraction = now.low_slope / (now.low_slope - now.high_slope)
-    by_secant = ((now.looks & 1) == 0) & (fraction > 0) & (fraction < 1)
+    by_secant = ((now.sample_count & 1) == 0) & (fraction > 0) & (fraction < 1)
     return dr.fma(dr.select(by_secant, fraction, 0.5), now.high - now.low, now.low)

@@ -54,40 +54,45 @@ _DOUBT_FRACTION, _DOUBT_ROUNDINGS, _SHEET_COUNT, _SEARCH_TOLERANCES = 0.5, 64, 3
 
 @dataclass(frozen=True)
 class Hits:
-    """The ends of n rays, as NumPy arrays or, if the rays were Dr.Jit arrays or tensors, as these.
+    """How n rays ended, as NumPy arrays or, if the rays were Dr.Jit arrays or tensors, as these.
 
-    is_hit: (n,) mask of rays that hit. Rays that ran out of steps have a finite t as well, so that
+    is_hit: (n,) mask of rays that hit. Rays that ran out of steps have a finite t as well, so
         `isfinite(t)` is no such mask.
-    t: (n,) ray parameter of the hit, a length; inf for a miss; for a ray that ran out of steps, the
-        parameter up to which it is proved free. A hit is within the tolerance of the first root,
-        mostly before it. A hit that requires a crossing is at a root, between two samples with f on
-        different sides of the level: at the root of the cubic through their values and slopes, or
-        of a bisection if there is a crease between them.
-    position: (n, 3) point at t, NaN for a miss.
-    normal: (n, 3) unit normal grad f/|grad f|, or of the facet that was hit, to the side of larger
-        f; zero for rays without a hit.
+    t: (n,) the ray parameter of the hit, a length; inf for a miss; for a ray that ran out of steps,
+        the parameter up to which no surface lies. A hit is within the tolerance of the first root,
+        mostly before it. With `require_crossing` a hit is at a root. It lies between two samples
+        with f on different sides of the level: at the root of the cubic through their values and
+        slopes, or found by bisection if there is a crease between them.
+    position: (n, 3) the point at t, NaN for a miss.
+    normal: (n, 3) the unit normal grad f/|grad f|, or that of the facet that was hit; it points to
+        the side of larger f. Zero for rays without a hit. (A facet is a flat piece of surface at
+        which f jumps, such as a triangle of a mesh.)
     value: (n,) f at the last accepted point; for an angle-valued field up to a multiple of its
         period. For hits on facets, f just before the facet.
-    evaluations: (n,) number of evaluations of the field.
+    evaluations: (n,) the number of evaluations of the field.
     status: (n,) a `RayStatus`.
-    primitive_index: (n,) index of the facet (such as a triangle) or of the patch (such as a face of
-        a `PolygonMesh`) that was hit; -1 for misses, for hits of a smooth level set, and for all
-        rays of fields that have neither facets nor patches.
-    uncertainty: (n,) a length: at a hit of a smooth level set, |f - level| is proved to be at most
+    primitive_index: (n,) the index of the facet (such as a triangle) or of the patch (such as a
+        face of a `PolygonMesh`) that was hit; -1 for misses, for hits of a smooth level set, and
+        for all rays of fields that have neither facets nor patches.
+    uncertainty: (n,) a length. At a hit of a smooth level set, |f - level| is proved to be at most
         (tolerance + uncertainty) |grad f|. It is 0 if the error of f is within the tolerance, and
-        for all other rays. Where |grad f| may be unbounded, the surface is proved to be within the
-        tolerance, or within the rounding of the point (see `HitTolerance`). Elsewhere, tolerance +
-        uncertainty bounds the distance to first order: along lines and at points where grad f is 0
-        and f - level behaves as a power u^m of the distance, as where m sheets of the surface meet,
-        the surface may be m times as far (beside the edge of a cusp, as of y^2 = x^3, farther:
-        0.002 for a tolerance of 1e-4, and 0.02 with x^5). Rounding hides the surface there from
-        afar. If rounding adds more than half the tolerance, the uncertainty is that of three
-        sheets. If it adds seven tolerances or more, the surface was seen within tolerance +
-        uncertainty: f is certainly on different sides of the level there, or touches it up to its
-        error. It is infinite if the surface was not seen within a sixteenth of the size of
-        coordinates. (The evaluations of this search are not in `evaluations`.) Along a ray that
-        grazes such a point, t may be too small by more than the uncertainty: the ray is not proved
-        free any farther. Use `precision="double"`, or `require_crossing`.
+        for all other rays.
+
+    Tolerance + uncertainty bounds the distance of the surface from a hit to first order. If |grad
+    f| may be unbounded, the surface is proved to be within the tolerance, or within the rounding of
+    the point (see `HitTolerance`). An exception are lines and points at which grad f is 0 and f -
+    level behaves as a power u^m of the distance u, for example where m sheets of the surface meet.
+    There the surface may be m times as far. Beside the edge of a cusp, such as y^2 = x^3, it may be
+    still farther: 0.002 for a tolerance of 1e-4, and 0.02 for y^2 = x^5.
+
+    Rounding hides the surface near such lines and points. If rounding adds more than half the
+    tolerance, the uncertainty is computed as for three sheets. If it adds seven tolerances or more,
+    the surface is searched for: at points within tolerance + uncertainty of the hit, f is certainly
+    on different sides of the level, or touches it up to its error. The uncertainty is infinite if
+    that fails within a sixteenth of the size of coordinates. (The evaluations of this search are
+    not in `evaluations`.) If a ray grazes such a point, t may be too small by more than the
+    uncertainty, since the ray is not proved free any farther. Use `precision="double"` or
+    `require_crossing` there.
     """
 
     t: Any
@@ -119,35 +124,38 @@ def trace(
 ) -> Hits:
     """First hits of rays with a level set of a field. No hit is missed: every step is proved.
 
-    surface: a field, or a `Surface`: its levels, clip, section and largest component. `side` is
-        refused: the faces of a solid on its clip are no level set.
+    surface: a field; or a `Surface`, with its levels, clip, section and largest component. A
+        `Surface` with a `side` raises an error: the faces of a solid where its clip cuts it are no
+        level set.
     origins, directions: (n, 3) array-likes or Dr.Jit tensors (one of them may be (1, 3)), or Dr.Jit
         3-vectors. Directions need not have length 1; t counts multiples of the *unit* direction, so
         it is a length.
     t_min, t_max: (n,) or a number. With an infinite t_max, a ray that leaves the proved extent of
         the surface is a proved miss.
     options: a `TraceOptions`.
-    keywords: those of `Surface` beside a bare field, and of `TraceOptions` in place of `options`:
-        `trace(field, o, d, level=2.0, tolerance=1e-6)`.
+    keywords: the options of `Surface` beside a bare field, and the options of `TraceOptions` in
+        place of `options`: `trace(field, o, d, level=2.0, tolerance=1e-6)`.
 
-    Arrays of float64 are traced in double precision and give such arrays, others in single
-    precision, unless `precision` says otherwise. Crossing rays behind their first hit are for
-    `crossings`.
+    Arrays of float64 are traced in double precision and give such arrays, other arrays in single
+    precision, unless `precision` says otherwise. To find further crossings behind the first hit,
+    use `crossings`.
 
     With Dr.Jit rays, t and position carry derivatives with respect to rays, level, and vertices of
     a `SolidAngle`, if these have derivatives enabled (implicit differentiation at the hit). The
-    other results have no derivatives: in reverse mode, using theirs raises NotImplementedError; in
-    forward mode they are NaN. Fields of other numbers with derivatives enabled are refused.
+    other results have no derivatives: in reverse mode, using their derivatives raises
+    NotImplementedError; in forward mode they are NaN. Fields raise an error if other numbers of
+    theirs have derivatives enabled.
 
-    With `backend="webgpu"`, NumPy rays are traced in single precision by the package `wgpu`
-    (`pip install harnack[webgpu]`) with a translation of the kernel that Dr.Jit records. Rounding
-    is proved for Dr.Jit's own backends only; so at each call up to 4,096 of the rays are traced
-    there, too, and the device must agree.
+    With `backend="webgpu"`, NumPy rays are traced in single precision by the package `wgpu` (`pip
+    install harnack[webgpu]`) with a translation of the kernel that Dr.Jit records. Rounding is
+    proved for Dr.Jit's own backends only. So at each call up to 4,096 of the rays are traced by
+    Dr.Jit, too, and the results of the device must agree.
 
-    On processors, if there are at least 4,096 rays and neighbors have little to do with each other,
-    rays are traced by few lanes that share a queue, unless samples are cheap (`Field.is_cheap`).
-    This gives the same hits, bit by bit, in about half the time. Rays that start so far from a
-    `largest` component that rounding is more than a part of a cell are out of steps.
+    On processors, if there are at least 4,096 rays and successive rays differ much, rays are traced
+    by few lanes that share a queue, unless samples are cheap (`Field.is_cheap`). This gives the
+    same hits, bit by bit, in about half the time. If only the `largest` component is traced, a ray
+    is out of steps if it starts so far away that its coordinates are rounded by more than a small
+    part of a cell.
 
     Raises:
         TypeError, ValueError: shapes that do not match, NaN, directions of length zero, an empty or
@@ -173,12 +181,14 @@ def trace(
 
 
 def _as_tensors(hits: Hits) -> Hits:
+    """The hits with all arrays as tensors."""
     n = dr.width(hits.status)
     return Hits(*(array_to_tensor(array, (n,)) for array in vars(hits).values()))
 
 
 def _trace(surface: TracedSurface, rays: RayBatch) -> Hits:
-    """The hits, as Dr.Jit arrays; with derivatives if the rays came as such."""
+    """The hits as Dr.Jit arrays. They carry derivatives if the rays are Dr.Jit arrays and rays,
+    levels or field have derivatives enabled."""
     backend, o, d, count = rays.backend, rays.origin, rays.direction, rays.count
     prepared = surface.for_rays(count).prepare(backend, many_rays=count >= _MIN_RAYS_FOR_CELLS)
     if not prepared.field.is_cheap and _are_scattered(backend, dr.detach(o), dr.detach(d)):
@@ -204,11 +214,15 @@ def _trace(surface: TracedSurface, rays: RayBatch) -> Hits:
 
 
 def _are_scattered(backend: Backend, o: Vec3, d: Vec3) -> bool:
-    """Whether there are many rays and successive rays differ much, unlike the rays of a camera.
+    """Whether there are many rays on a processor, and successive rays differ much, unlike the rays
+    of a camera.
 
-    In a packet of a processor, most of such rays would wait for the longest. Measured: bounces, and
-    chords through curves, clouds and unions of shapes, take half the time with a queue; a camera's
-    rays take a fifth more."""
+    o, d: (3,) origins and unit directions of the rays.
+
+    In a packet of a processor, most of such rays would wait for the longest one. Measured:
+    reflected rays, and chords through curves, clouds and unions of shapes, take half the time with
+    a queue; a camera's rays take a fifth more.
+    """
     count = dr.width(o, d)
     if count < _MIN_RAYS_FOR_CELLS or dr.backend_v(d) != dr.JitBackend.LLVM:
         return False
@@ -216,6 +230,7 @@ def _are_scattered(backend: Backend, o: Vec3, d: Vec3) -> bool:
     first = dr.arange(backend.UInt32, (count - 1) // step) * dr.opaque(backend.UInt32, step)
 
     def gather(rays: Vec3, rows: Any) -> FloatArray:
+        """Rows (n, 3) of some of the rays."""
         index = rows if dr.width(rays) > 1 else 0 * rows
         return to_numpy(dr.gather(backend.Array3f, rays, index)).astype(np.float64)
 
@@ -230,8 +245,9 @@ def _are_scattered(backend: Backend, o: Vec3, d: Vec3) -> bool:
 def _first_hits(
     prepared: SurfaceTracer, o: Vec3, d: Vec3, near: Real, far: Real
 ) -> tuple[MarchResult, Hits, _DistanceDoubt | None]:
-    """Ends of rays, the same as `Hits`, without derivatives, and the doubt about the hits; None if
-    no hit can be doubtful."""
+    """Trace rays o + t d from t = near to t = far. Returns the ends of rays, the same data as
+    `Hits` without derivatives, and the doubt about the hits. The doubt is None if no hit can be
+    doubtful."""
     backend = prepared.backend
     end = prepared.first_hit(o, d, near, far)
     hit = end.status == int(RayStatus.HIT)
@@ -262,9 +278,9 @@ def _first_hits(
 
 @dataclass(frozen=True)
 class _DistanceDoubt:
-    """How far the surface may be from hits because of rounding.
+    """How far the surface may be from hits because of rounding, with one entry for each hit.
 
-    size: a bound of the coordinates up to the hit.
+    size: a bound of the coordinates on the ray up to the hit.
     tolerance: the tolerance as a length.
     distance: the distance of the surface to first order, including rounding.
     is_doubtful: whether this distance may be much too short.
@@ -279,7 +295,11 @@ class _DistanceDoubt:
     def of(
         cls, prepared: SurfaceTracer, o: Vec3, t: Real, steepness: Real, uncertainty: Real
     ) -> _DistanceDoubt:
-        """The doubt about hits. steepness: |grad f| there. uncertainty: to first order."""
+        """The doubt about hits.
+
+        o, t: origins (3,) and ray parameters. steepness: |grad f| at the hits.
+        uncertainty: the length that rounding adds to the tolerance, to first order.
+        """
         t = dr.select(dr.isfinite(t), t, 0)
         size = max_norm(o) + t
         tolerance = prepared.tolerance.value_tolerance(steepness, t) / steepness
@@ -291,7 +311,8 @@ class _DistanceDoubt:
 
 @dataclass(frozen=True)
 class _SearchedHits:
-    """Hits around which the surface is searched for, and the index of the patch of each."""
+    """Hits around which the surface is searched for, and as `part` the index of the patch that each
+    ray hit."""
 
     around: Doubtful
     part: Any
@@ -299,14 +320,16 @@ class _SearchedHits:
 
 @dataclass(frozen=True)
 class _SearchDistance:
-    """A length for each hit."""
+    """The distance from a hit within which the surface was found, as a record for
+    `compute_on_active`."""
 
     length: Real
 
 
 def _with_searched_distances(prepared: SurfaceTracer, hits: Hits, doubt: _DistanceDoubt) -> Hits:
-    """The hits, with large uncertainties replaced by distances within which the surface was seen.
-    All arrays are evaluated. If there is no large uncertainty, nothing else is computed."""
+    """The hits, with each large uncertainty replaced: the surface is searched for around the hit,
+    and the new uncertainty is the distance within which it was found, less the tolerance. All
+    arrays are evaluated. If there is no large uncertainty, nothing is searched."""
     backend, field = prepared.backend, prepared.field
     is_far = doubt.is_doubtful & (doubt.distance > _SEARCH_TOLERANCES * doubt.tolerance)
     has_far = dr.zeros(backend.UInt32, 1)
@@ -316,6 +339,7 @@ def _with_searched_distances(prepared: SurfaceTracer, hits: Hits, doubt: _Distan
         return hits
 
     def search(hit: _SearchedHits) -> _SearchDistance:
+        """The distance within which the surface was found."""
         sampled = field
         if field.has_patches:
             sampled = field.patch(dr.reinterpret_array(backend.UInt32, hit.part))
@@ -333,6 +357,7 @@ def _with_searched_distances(prepared: SurfaceTracer, hits: Hits, doubt: _Distan
 
 
 def _positions(o: Vec3, d: Vec3, t: Real) -> Vec3:
+    """The points (3,) at parameters t of rays, NaN where t is not finite."""
     return dr.select(dr.isfinite(t), dr.fma(type(o)(t), d, o), dr.nan)
 
 
@@ -340,6 +365,7 @@ def _positions(o: Vec3, d: Vec3, t: Real) -> Vec3:
 
 
 def _trace_on_device(surface: TracedSurface, rays: RayBatch) -> Hits:
+    """The hits as NumPy arrays, traced by WebGPU. rays: at least one ray, in single precision."""
     count = rays.count
     prepared = surface.prepare(rays.backend, many_rays=count >= _MIN_RAYS_FOR_CELLS)
     lanes = {
@@ -349,11 +375,14 @@ def _trace_on_device(surface: TracedSurface, rays: RayBatch) -> Hits:
     dr.eval(lanes)
 
     def compute(o: Vec3, d: Vec3, near: Real, far: Real) -> dict[str, Any]:
+        """The hits by name, for rays o + t d from t = near to t = far."""
         return vars(_first_hits(prepared, o, d, near, far)[1])
 
     directions = to_numpy(lanes["d"])
 
     def differences(rows: IntArray, expected: Arrays, computed: Arrays) -> str:
+        """A message on how the device's hits of some rays differ from the expected ones; "" if they
+        agree."""
         pair = Hits(**expected), Hits(**computed)
         return _compare_hits(*pair, directions[rows], surface.hit_tolerance)
 
@@ -379,10 +408,13 @@ _MAX_COUNT_CHANGE = 0.03
 def _compare_hits(
     expected: Hits, actual: Hits, directions: FloatArray, tolerance: HitTolerance
 ) -> str:
-    """A message on how a device's hits differ by more than rounding explains; "" if they do not.
+    """A message on how a device's hits of n rays differ from the expected ones by more than
+    rounding explains; "" if they do not.
 
-    A ray that runs along the surface, within the tolerance, may hit it anywhere there or not at
-    all, and may run out of steps.
+    directions: (n, 3) unit directions of the rays. tolerance: of the hits.
+
+    A ray that runs along the surface within the tolerance may hit it anywhere there, miss it, or
+    run out of steps. Such rays may differ.
     """
     hit, both = expected.is_hit | actual.is_hit, expected.is_hit & actual.is_hit
     normal = cast("FloatArray", np.where(expected.is_hit[:, None], expected.normal, actual.normal))
@@ -417,6 +449,7 @@ def _compare_hits(
 
 
 def _no_hits(rays: RayBatch) -> Hits:
+    """The `Hits` of no rays, as the kind of arrays that the rays have."""
     backend = rays.backend
     number, vector = dr.zeros(backend.Float, 0), dr.zeros(backend.Array3f, 0)
     count = dr.zeros(backend.UInt32, 0)
@@ -428,7 +461,10 @@ def _no_hits(rays: RayBatch) -> Hits:
 
 
 def _as_numpy(hits: Hits, n: int) -> Hits:
+    """The hits of n rays as NumPy arrays."""
+
     def flat(array: Any) -> Any:
+        """An array as a NumPy array with n rows."""
         values: Any = to_numpy(array) if dr.is_array_v(type(array)) else array
         return np.broadcast_to(values, (n, *values.shape[1:])).copy()
 

@@ -1,13 +1,14 @@
-"""`JumpTracer`: traces rays through fields with jumps (see `harnack.fields.capabilities`).
+"""`JumpTracer`: traces rays through fields with jumps, such as the winding number of a mesh. The
+flat pieces of surface at which such a field jumps (triangles) are called facets.
 
-A ray goes from one crossing of the jump surface to the next, by the loop of `March`.
+A ray is cut into intervals at the facets that it crosses. On each interval the field is continuous,
+and `March` traces the ray. At each crossing of a facet, the values before and behind it are
+compared with the level.
 
-The winding number of a mesh jumps at its triangles, and the jumps are exact. A ray is cut into
-intervals at the triangles that it crosses. On each interval the winding number w is an ordinary
-smooth field, and at each crossing the values on both sides are compared with the level. Crossings
-come from our own query and not from Embree's: whether a ray passes an edge must be decided by the
-same bits for both triangles of the edge *and* for the boundary sum, or w is wrong by 1 behind the
-edge; and the query must work in double precision.
+The crossings come from a query of this package and not from Embree, for two reasons. Whether a ray
+passes an edge must be decided by the same bits for both triangles of the edge and for the sum over
+the boundary; otherwise the winding number is wrong by 1 behind the edge. And the query must work in
+double precision.
 """
 
 from __future__ import annotations
@@ -42,11 +43,12 @@ _COARSE_FRACTION = 1e-4
 class JumpTraceState:
     """The state of rays through a field with jumps.
 
-    offset: `Field.initial_offset` plus all jumps since the start.
-    behind: the jump crossing that was passed last.
+    offset: the initial offset of the field at the start of the ray (`Field.initial_offset`) plus
+        all jumps since.
+    behind: the crossing of a facet that was passed last.
     march: the state of the march.
-    reported_facet: for rays that look for crossings: index of the facet to report for the last
-        crossing; None for other rays.
+    reported_facet: for rays that look for crossings, the index of the facet that is reported for
+        the last crossing; None for other rays.
     """
 
     offset: Real
@@ -56,19 +58,22 @@ class JumpTraceState:
 
     @property
     def active(self) -> Mask:
+        """Mask of the rays that go on."""
         return self.march.active
 
 
 @dataclass(frozen=True)
 class _CoincidentJumps:
-    """Jump crossings at the same point of a ray, up to rounding.
+    """Crossings of several facets at the same point of a ray, up to rounding.
 
-    jump: the sum of their jumps.
-    t, last: ray parameter and facet index of the last of them.
-    up, normal_up: index and normal of the first facet at which f jumps up; NO_FACET if none.
-    down, normal_down: index and normal of the first facet at which f jumps down; NO_FACET if none.
+    jump: the sum of the jumps of f at them.
+    t, last: the ray parameter and the facet index of the last crossing.
+    up, normal_up: the index and normal (3,) of the first facet at which f jumps up; NO_FACET if
+        there is none.
+    down, normal_down: the index and normal (3,) of the first facet at which f jumps down; NO_FACET
+        if there is none.
     folded: whether f jumps the other way at a facet parallel to the first.
-    active: whether there may be more of them.
+    active: whether there may be further crossings at this point.
     """
 
     jump: Real
@@ -84,15 +89,17 @@ class _CoincidentJumps:
 
 @dataclass(frozen=True)
 class JumpTracer:
-    """Traces rays through a field with jumps, from `start` to `end`.
+    """Traces rays o + t d, start <= t <= end, through a field with jumps. The flat pieces of
+    surface at which the field jumps are called facets.
 
-    Between two jump crossings the field is continuous, and `March` proves that ray interval as it
-    proves any ray. This class adds the order of the intervals.
+    march: marches rays through the continuous intervals between facets.
+    field: the field with jumps.
+    path: the rays.
 
-    A smooth hit is a point within the tolerance of a level of the function that continues the
-    interval. The level set of f may end at a facet. Within the tolerance of this end, a ray may
-    hit the continued level set although the facet cuts it off: mostly near singular edges, where
-    gradients grow without limit.
+    A smooth hit is a point within the tolerance of the level set of the function that continues the
+    field from its interval beyond the facets. The level set of the field itself may end at a facet.
+    Within the tolerance of such an end, a ray may hit the continued level set although the facet
+    cuts it off. That happens mostly near singular edges, where gradients grow without limit.
     """
 
     march: March
@@ -106,20 +113,21 @@ class JumpTracer:
         return self.march.backend
 
     def run(self, state: MarchState) -> tuple[MarchState, Any]:
-        """The end state of rays, and the index of the facet that each ray hit (NO_FACET: none).
+        """The end state of rays, and the index of the facet that each ray hit, NO_FACET for none.
 
-        Proof that no hit is missed: crossings come in order, so the intervals cover the ray. On
-        each interval `march` samples a continuous function, up to and including the last point,
-        where the values before and behind the facet are compared with the level. From there the ray
-        goes on with the step that the value behind the facet allows. So the part of the ray up to
-        `proved_to` is free of smooth levels, and every facet on it was compared with the level.
+        Proof that no hit is missed. The crossings of facets come in order, so the intervals between
+        them cover the ray. On each interval `march` samples a continuous function up to and
+        including its last point. There the values before and behind the facet are compared with the
+        level. The ray then goes on with the step that the value behind the facet allows. So no
+        smooth level lies on the ray before `proved_to`, and every facet before it was compared with
+        the level.
 
         Rays begin just before `start`, so that a facet at the very start is not skipped.
         """
         return self.finish(loop_while_active(self.begin(state), self.advance, "harnack intervals"))
 
     def begin(self, state: MarchState) -> JumpTraceState:
-        """Rays at their start."""
+        """The state of rays at their start. state: the start of the march."""
         real, vector, count = self.backend.Float, self.backend.Array3f, self.backend.UInt32
         o, d = self.path.origin, self.path.direction
         before = real(self.start * (1 - self.backend.machine_epsilon) - 1e-30)
@@ -129,7 +137,8 @@ class JumpTracer:
         return JumpTraceState(offset, start, state, reported)
 
     def finish(self, outer: JumpTraceState) -> tuple[MarchState, Any]:
-        """The state of rays, and the index of the facet that each ray hit, NO_FACET for none."""
+        """The end of rays as a `MarchState`, and the index of the facet that each ray hit, NO_FACET
+        for none."""
         count, end = self.backend.UInt32, outer.march
         at_facet = end.status == HIT_AT_JUMP
         status = dr.select(at_facet, count(int(RayStatus.HIT)), end.status)
@@ -138,7 +147,8 @@ class JumpTracer:
         return dataclasses.replace(end, status=status), facet
 
     def advance(self, outer: JumpTraceState) -> JumpTraceState:
-        """Rays after one interval: at the next crossing, the end of the ray, or a hit."""
+        """The state after each active ray has marched one interval: to the next facet, to the end
+        of the ray, or to a hit before that."""
         count = self.backend.UInt32
         o, d = self.path.origin, self.path.direction
         behind, now = outer.behind, outer.march
@@ -190,7 +200,15 @@ class JumpTracer:
         stopped: Mask,
     ) -> JumpTraceState:
         """The state, after an interval, of rays that look for crossings. A ray that has crossed the
-        level at a facet has passed that facet; it may be made active again."""
+        level at a facet has passed this facet, and the caller may make it active again.
+
+        previous: the state before the interval.
+        now: the march at the end of the interval.
+        ahead, last: the merged crossing at the end of the interval, and the last of the crossings
+            that were merged.
+        passed: mask of the rays that have passed the facet without crossing the level.
+        stopped: mask of the rays whose interval ends at a facet.
+        """
         spent = passed & (now.evaluations >= self.march.max_steps)
         status = dr.select(spent, self.backend.UInt32(int(RayStatus.OUT_OF_STEPS)), now.status)
         is_past = passed | (stopped & (now.status == HIT_AT_JUMP))
@@ -210,21 +228,24 @@ class JumpTracer:
     def _merge_coincident(
         self, first: JumpCrossing, active: Mask
     ) -> tuple[JumpCrossing, JumpCrossing, Mask]:
-        """Merge all jump crossings at the same t, up to rounding, into one with the sum of their
-        jumps.
+        """Merge all crossings of facets at the same t, up to rounding, into one whose jump is the
+        sum of their jumps.
 
-        Returns the merged crossing, the last of its crossings (from which the ray continues), and
-        the lanes on which it is uncertain whether the crossings are at the same point.
+        Returns the merged crossing, the last of the crossings that were merged (from which the ray
+        goes on), and a mask of lanes on which it is uncertain whether the crossings are at the same
+        point.
 
-        A ray through an edge or a vertex crosses several facets at once, in no particular order: f
+        first: the first of the crossings.
+
+        A ray through an edge or a vertex crosses several facets at once, in no particular order. f
         jumps there by the sum of their jumps, and there is no interval between them. The same holds
-        for facets in the same plane: facets that follow each other more closely than coordinates
-        are rounded count as at the same t, as rounding decides their order. The merged crossing has
-        the index and normal of the first facet whose jump has the sign of the sum.
+        for parallel facets that follow each other more closely than coordinates are rounded, as
+        rounding decides their order. The merged crossing has the index and normal of the first
+        facet whose jump has the sign of the sum.
 
-        Far from the origin of rays or of coordinates, rounding may be as large as the thickness of
-        a wall, whose two sides would cancel. So if rounding is no small part of the ray, parallel
-        facets whose jumps cancel make the crossing uncertain.
+        If the origin of the ray is far away, rounding may be as large as the thickness of a wall,
+        and the jumps of its two sides would cancel. So if rounding is no small part of the ray, a
+        crossing of parallel facets whose jumps cancel is uncertain.
         """
         real, count = self.backend.Float, self.backend.UInt32
         size = max_norm(self.path.origin)
@@ -232,7 +253,8 @@ class JumpTracer:
         sine = fmax(dr.abs(dr.dot(first.normal, self.path.direction)), real(_MIN_SINE))
         limit = fmax(fmin(first.t + tolerance / sine, self.end), first.t)
 
-        def body(now: _CoincidentJumps) -> _CoincidentJumps:
+        def add_next(now: _CoincidentJumps) -> _CoincidentJumps:
+            """The sums after the next crossing, if that is at the same point."""
             crossing = self._next(
                 JumpCrossing(now.t, now.last, 0.0, first.normal), limit, now.active
             )
@@ -265,7 +287,7 @@ class JumpTracer:
             folded=self.backend.Bool(False),
             active=self.backend.Bool(active) & (first.facet != NO_FACET),
         )
-        total = loop_while_active(start, body, "together")
+        total = loop_while_active(start, add_next, "together")
         up, down = total.jump > 0, total.jump < 0
         facet = dr.select(up, total.up, dr.select(down, total.down, first.facet))
         normal = dr.select(up, total.normal_up, dr.select(down, total.normal_down, first.normal))
@@ -275,7 +297,8 @@ class JumpTracer:
         return JumpCrossing(first.t, facet, real(total.jump), normal), behind, unclear
 
     def _next(self, behind: JumpCrossing, end: Real, active: Mask) -> JumpCrossing:
-        """The next crossing, as arrays of this backend; none if it lies beyond the end."""
+        """The next crossing of a facet after `behind`, as arrays of this backend. If there is none
+        up to the parameter `end`, its t is inf and its facet NO_FACET."""
         real, vector, count = self.backend.Float, self.backend.Array3f, self.backend.UInt32
         ahead = self.field.next_jump(self.path.origin, self.path.direction, behind, end, active)
         valid = real(ahead.t) <= end

@@ -1,4 +1,4 @@
-"""Cells around the largest component of a level set, or of a solid."""
+"""Finds cells that contain the largest connected component of a level set, or of a solid."""
 
 from __future__ import annotations
 
@@ -36,22 +36,28 @@ _CELLS: FieldCache[OccupancyGrid] = FieldCache()
 def largest_component_cells(
     field: Field, levels: tuple[float, ...], volume: Volume | None, solid: _Ends | None, across: int
 ) -> OccupancyGrid:
-    """Cells that contain the largest component of a level set in a volume, or of a solid {low <= f
-    <= high}: the component with the largest sum of projected areas along x, y and z.
+    """A grid of cells, with those marked that contain the largest component of a level set in a
+    volume, or of a solid {low <= f <= high} in it. The largest component is the one with the
+    largest sum of projected areas along x, y and z.
 
-    The cells also contain all components that are not separated from it by cells proved empty (see
-    `largest_connected_component`).
+    levels: the values of the level set.
+    solid: (low, high); None for the level set itself.
+    across: the number of cells along the longest side of the box of the volume.
 
-    A cell is left out if it, or each of its eight octants, is proved to contain no point of the
-    level set or no point of the volume. The first holds if the ball around the cell is within the
-    clearance of its center (or, if the center is outside of the domain of the field, of a point at
-    the boundary of the domain), the second by the signed distance of the volume. For a solid, cells
-    inside of it are kept, too, although they contain no level. For the rest of the proof see
-    `largest_connected_component`.
+    The marked cells also contain all components that no cells proved empty separate from the
+    largest one (see `largest_connected_component`).
+
+    A cell is not marked if it, or each of its eight octants, is proved to contain no point of the
+    level set or no point of the volume. There are two ways to prove this for the ball around a
+    cell. First, the radius of the ball is at most the clearance of its center, a proved lower bound
+    of the distance from the level set. If the center lies outside the domain of the field, a point
+    at the boundary of the domain takes its place. Second, the signed distance of the volume shows
+    that the ball lies outside. Cells inside a solid are marked, too, although they contain no
+    level. `largest_connected_component` has the rest of the proof.
 
     Raises:
         ValueError: the volume is not bounded; or most of the cells that could not be proved empty
-            are far from the surface, so that the groups would say nothing.
+            are far from the surface, so that they say nothing about components.
     """
     ends = None if volume is None else np.array(volume.bounds(), np.float64)
     if volume is None or ends is None or not np.isfinite(ends).all():
@@ -60,6 +66,7 @@ def largest_component_cells(
         )
 
     def build() -> OccupancyGrid:
+        """The cells, computed anew."""
         return _build_cells(field.with_levels(levels), levels, volume, solid, across)
 
     if field.parameters():  # they may change in place
@@ -70,12 +77,16 @@ def largest_component_cells(
 def _build_cells(
     field: Field, levels: tuple[float, ...], volume: Volume, solid: _Ends | None, across: int
 ) -> OccupancyGrid:
+    """The cells of `largest_component_cells`, which describes the parameters."""
     beyond = _distance_beyond(volume)
     to_domain = _projection_to_domain(field)
     in_solid = None if solid is None else _inside_solid(field, solid)
     to_levels = clearance_function(field, levels, "double")
 
     def clearance(points: FloatArray) -> FloatArray:
+        """Lower bounds (n,) of the distances of points (n, 3) from the level set, or from the
+        volume if that is farther; 0 inside the solid. They hold also for points outside the field's
+        domain."""
         clearances = np.maximum(beyond(points), 0.0)
         inner, distances = to_domain(points)
         finite = np.isfinite(distances)
@@ -98,7 +109,8 @@ def _build_cells(
 def _refuse_if_unproved(
     field: Field, levels: tuple[float, ...], solid: _Ends | None, cells: OccupancyGrid
 ) -> None:
-    """Raise ValueError if most cells that are left are far from the surface."""
+    """Raise ValueError if most of the marked cells have centers far from the surface, to first
+    order."""
     centers = cells.occupied_centers()
     if field.domain is not None:
         centers = centers[field.domain.contains_points(centers)]
@@ -117,16 +129,20 @@ def _refuse_if_unproved(
 
 
 def _projection_to_domain(field: Field) -> Callable[[FloatArray], tuple[FloatArray, FloatArray]]:
-    """A function of points (n, 3) that returns nearby points (n, 3) in the field's domain, outside
-    of which its promises need not hold, and the distances (n,) between the two, infinite where no
-    such point was found. If the returned point is at least c away from a set, the argument is at
-    least c minus this distance away from it.
+    """A function `project` of points (n, 3). It returns points (n, 3) in the field's domain near
+    them, and the distances (n,) between the two; the distance is inf if no such point was found.
+
+    The field's promises (proved bounds of f near a point) need not hold outside its domain. If the
+    returned point is at least c away from a set, the given point is at least c minus the distance
+    away from it.
     """
     domain = None if field.is_global else field.domain
     backend = choose_backend("double")
     prepared = None if domain is None else domain.prepare(backend)
 
     def project(points: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Points (n, 3) in the domain near the given ones, and the distances (n,) between the
+        two."""
         distances = np.zeros(len(points))
         if domain is None or prepared is None:
             return points, distances
@@ -147,12 +163,14 @@ def _projection_to_domain(field: Field) -> Callable[[FloatArray], tuple[FloatArr
 
 
 def _distance_beyond(volume: Volume) -> Callable[[FloatArray], FloatArray]:
-    """A function of points (n, 3): a lower bound of their distances from the volume, negative
-    inside."""
+    """A function of points (n, 3) that returns lower bounds (n,) of their distances from the
+    volume; they are negative inside the volume."""
     backend = choose_backend("double")
     prepared = volume.prepare(backend)
 
     def beyond(points: FloatArray) -> FloatArray:
+        """Lower bounds (n,) of the distances of points (n, 3) from the volume, with a margin for
+        rounding."""
         distance = to_numpy(prepared.signed_distance(to_vector3(backend, points)))
         rounding = 64 * float(np.finfo(np.float64).eps) * (1 + float(np.abs(points).max()))
         return np.broadcast_to(distance, len(points)) - rounding
@@ -163,12 +181,15 @@ def _distance_beyond(volume: Volume) -> Callable[[FloatArray], FloatArray]:
 def _samples(
     field: Field, levels: tuple[float, ...]
 ) -> Callable[[FloatArray], tuple[FloatArray, FloatArray, FloatArray]]:
-    """A function of points (n, 3): the gaps from f to the nearest level, |grad f|, and f."""
+    """A function of points (n, 3) that returns three arrays (n,): the differences between f and the
+    nearest level, |grad f|, and f."""
     backend = choose_backend("double")
     prepared = field.prepare(backend)
     targets = Levels(tuple(dr.opaque(backend.Float, level) for level in levels), field.period)
 
     def samples(points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """The difference between f and the nearest level, |grad f|, and f, each (n,), at points (n,
+        3)."""
         sample = prepared.evaluate(to_vector3(backend, points))
         arrays = (targets.gaps(sample.value).nearest, safe_norm(sample.gradient), sample.value)
         gap, slope, value = (np.broadcast_to(to_numpy(array), len(points)) for array in arrays)
@@ -178,11 +199,13 @@ def _samples(
 
 
 def _inside_solid(field: Field, solid: _Ends) -> Callable[[FloatArray], BoolArray]:
-    """A function of points (n, 3): whether low <= f <= high."""
+    """A function of points (n, 3) that returns the mask (n,) of points with low <= f <= high, where
+    solid = (low, high)."""
     backend = choose_backend("double")
     prepared = field.prepare(backend)
 
     def within(points: FloatArray) -> BoolArray:
+        """The mask (n,) of points (n, 3) in the solid."""
         value = to_numpy(prepared.evaluate(to_vector3(backend, points)).value)
         return np.broadcast_to((value >= solid[0]) & (value <= solid[1]), len(points))
 
@@ -190,7 +213,9 @@ def _inside_solid(field: Field, solid: _Ends) -> Callable[[FloatArray], BoolArra
 
 
 def validate_component_cells(largest: object) -> int:
-    """The number of cells along the longest side of the box, validated; 0 for all components.
+    """The value of the option `largest` as a number: 0 if it is False, 128 if it is True, else the
+    number itself. It is the number of cells along the longest side of the box, by which components
+    are told apart; 0 keeps all components.
 
     Raises:
         TypeError: neither a truth value nor an integer.

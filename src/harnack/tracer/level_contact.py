@@ -1,14 +1,16 @@
 """The rules by which a point of a ray counts as a hit or as a crossing, and the ways in which a ray
 can end.
 
-- First hits: a ray ends where f is within the `HitTolerance` of a level, or at a facet across which
-  f jumps past a level (`test_jump`).
-- Crossings: a ray goes on behind the level. `Contact` is its state near the level that it reached;
-  `Hysteresis` is the rule by which each crossing is counted once.
+- First hits: a ray ends where f is within the `HitTolerance` of a level, or at a facet (a flat
+piece of surface at which f jumps) if a level lies between the values on its two sides
+(`test_jump`).
+- Crossings: a ray goes on behind the level. `Contact` is its state near the level that it reached
+last, and `Hysteresis` is the rule by which each crossing is counted once.
 
-A level that was reached counts as lying a tolerance beyond its place until f has left the
-tolerance. The same mechanism serves all crossings of a ray and hits that require a change
-of sign. Rays that must cross start a little outside the extent, which the surface may touch.
+A level that a ray has reached counts as lying a tolerance beyond its true place until f has left
+the tolerance around it. All crossings of a ray are found in this way, and so are hits that require
+a change of sign. Rays of this kind start a little outside the extent of the surface, as the surface
+may touch the border of its extent.
 """
 
 from __future__ import annotations
@@ -34,7 +36,7 @@ if TYPE_CHECKING:
 
 
 class RayStatus(enum.IntEnum):
-    """The ways in which a ray ends."""
+    """The ways in which a ray can end."""
 
     MISS = 0
     """The ray is proved to meet no level between t_min and t_max."""
@@ -48,25 +50,27 @@ class RayStatus(enum.IntEnum):
 class HitTolerance:
     """How close to a level a point must be to count as a hit.
 
-    distance: a length; a point is a hit if |f - level| <= distance * |grad f|. To first order this
+    distance: a length. A point is a hit if |f - level| <= distance * |grad f|. To first order this
         is its distance from the surface (paper, Sec. 3.1.2); the exceptions are below.
-    per_length: added to `distance` for each unit of t: half the angle of a pixel makes the
-        tolerance grow with the footprint of the pixel.
-    value: in units of f; a point is also a hit if |f - level| <= value, whatever the gradient.
+    per_length: added to `distance` for each unit of t. With half the angle of a pixel, the
+        tolerance grows with the size of the pixel on the surface.
+    value: in units of f. A point is also a hit if |f - level| <= value, whatever the gradient.
 
-    Where |grad f| may be unbounded, as beside a vertical tangent or a pole of a formula
-    (`Field.is_steep`), |f - level| / |grad f| is no distance. There a point is a hit only if f is
-    proved to take the level within the tolerance, by its slope ahead or by its values beyond, or up
-    to the rounding of the point. At creases |grad f| jumps but is bounded: a crease that stays off
-    the level counts as a hit where it comes as near to the level in value. So do spikes and steps
-    that are narrower than the tolerance, as those of tanh(1e6 x) - y and of
-    0.5 + exp(-(1e5 x)^2). For fields that are no formulas and have poles, such as clouds of
-    dipoles, rays that pass a pole within the tolerance count as hits of every level.
+    Steep fields. |grad f| may be unbounded, for example beside a vertical tangent or a pole of a
+    formula (`Field.is_steep`). Then |f - level| / |grad f| is no distance. A point is a hit there
+    only if f is proved to take the level within the tolerance, by its slope or by its values
+    nearby, or up to the rounding of the point.
 
-    If rounding leaves the distance to the level uncertain by more than the tolerance, then this
-    uncertainty is the tolerance: about 1e-6 of the size of coordinates in single precision, 1e-15
-    in double precision, and far more where grad f is 0 on the surface, as where two sheets of it
-    meet (`Hits.uncertainty` tells how much).
+    Creases and spikes. At creases |grad f| jumps but is bounded. A crease at which f comes as near
+    to the level in value counts as a hit, even if f does not take the level. So do spikes and steps
+    that are narrower than the tolerance, such as those of tanh(1e6 x) - y and of 0.5 + exp(-(1e5
+    x)^2). Some fields that are no formulas have poles, such as clouds of dipoles: rays that pass a
+    pole within the tolerance count as hits of every level.
+
+    Rounding. If rounding leaves the distance to the level uncertain by more than the tolerance,
+    this uncertainty takes the place of the tolerance. It is about 1e-6 of the size of coordinates
+    in single precision, and 1e-15 in double precision. It is far more where grad f is 0 on the
+    surface, for example where two sheets of the surface meet (`Hits.uncertainty` tells how much).
     """
 
     distance: float = 1e-4
@@ -90,7 +94,10 @@ class HitTolerance:
 
 @dataclass(frozen=True)
 class PreparedHitTolerance:
-    """A `HitTolerance` on a backend."""
+    """A `HitTolerance` as kernel parameters of a backend.
+
+    distance: a length. per_length: added to it for each unit of t. value: in units of f.
+    """
 
     distance: Real
     per_length: Real
@@ -107,12 +114,15 @@ HIT_AT_JUMP = max(RayStatus) + 1
 
 @dataclass(frozen=True)
 class JumpTest:
-    """Result of the comparison of a sample with the facet at the end of its ray interval.
+    """The result of comparing a sample with the facet at the end of its interval of the ray. A
+    facet is a flat piece of surface at which f jumps.
 
     has_crossing: whether the interval ends at a facet.
     at_crossing: whether, further, the sample is accepted and lies at that facet.
-    is_hit: whether, further, a level lies between the values on both sides, up to the total error.
-    gaps: the gaps to the levels below and above; from the value behind the facet if `at_crossing`.
+    is_hit: whether, further, a level lies between the values of f before and behind the facet, up
+        to the total error of f.
+    gaps: the differences between f and the next levels below and above it; behind the facet on
+        lanes of `at_crossing`, else at the sample.
     normal: (3,) unit normal of the facet.
     """
 
@@ -123,8 +133,8 @@ class JumpTest:
     normal: Vec3
 
     def mark(self, status: Any, gradient: Vec3) -> tuple[Any, Vec3]:
-        """Status and gradient, replaced on rays that hit the facet by HIT_AT_JUMP and the facet's
-        normal."""
+        """The given status and gradient; on rays that hit the facet they are replaced by
+        HIT_AT_JUMP and the facet's normal."""
         marked = type(status)(dr.select(self.is_hit, HIT_AT_JUMP, status))
         return marked, dr.select(self.is_hit, self.normal, gradient)
 
@@ -132,18 +142,20 @@ class JumpTest:
 def test_jump(
     ahead: JumpCrossing, there: Mask, value: Real, total_error: Real, levels: Levels
 ) -> JumpTest:
-    """Compare the values on the two sides of a facet with the levels.
+    """Compare f before and behind a facet with the levels. A facet is a flat piece of surface at
+    which f jumps.
 
-    ahead: the crossing at the end of the ray interval.
-    there: lanes whose samples are accepted and lie at that crossing.
+    ahead: the crossing at the end of the interval of the ray; its facet is NO_FACET if there is
+        none.
+    there: mask of lanes whose samples are accepted and lie at that crossing.
     value: f there, before the jump, known up to `total_error`.
 
-    The facet belongs to the surface if a level lies between the values on its two sides. These are
-    known up to `total_error`, and a level within `total_error` of either value counts as between:
-    such a facet belongs to the surface or misses it by no more than rounding. To decide the other
-    way could lose a surface, for the march has proved that the level is not met *before* the facet,
-    which rounding may contradict by as much. Facets at the same t count as a single facet, with the
-    sum of their jumps (`JumpTracer._merge_coincident`).
+    The facet belongs to the surface if a level lies between the values on its two sides. A level
+    within `total_error` of either value counts as between them. Such a facet belongs to the surface
+    or misses it by no more than rounding. The opposite choice could lose a surface: the march has
+    proved that f does not take the level *before* the facet, and rounding may contradict this by as
+    much as `total_error`. Facets at the same t count as one facet with the sum of their jumps
+    (`JumpTracer._merge_coincident`).
     """
     has_crossing = ahead.facet != NO_FACET
     at_crossing = has_crossing & there
@@ -176,19 +188,20 @@ _ROOT_ITERATIONS = 4
 
 @dataclass(frozen=True)
 class Contact:
-    """The contact of a ray with the level that it reached last.
+    """The contact of each ray with the level that it reached last. A ray is in contact as long as f
+    is within the tolerance of that level.
 
-    side: the side of that level on which the ray is: 1 if f is larger, -1 if f is smaller; 0 as
-        long as no sample has been off the level at which the ray started. Without contact, only
-        whether it is 0 has a meaning.
-    is_touching: whether f is, or may still be, within the tolerance of that level.
+    side: the side of the level on which the ray is: 1 if f is larger, -1 if f is smaller; 0 as long
+        as all samples were at the level at which the ray started. If the ray is not in contact, it
+        only matters whether side is 0.
+    is_touching: whether the ray is in contact, or may still be.
     root: the ray parameter at which f last took the level, between two samples on different sides
-        of it; if the contact began beyond the level, the parameter at which it began.
-    gradient: (3,) of f at the root.
-    tolerance_excess: by how much f at the root may be farther from the level than the tolerance
-        allows, because of rounding. The root lies between the two samples.
-    before, after: the ray parameters of the two samples, or the root itself.
-    band: the band of the last sample.
+        of it. If the contact began beyond the level, the parameter at which it began.
+    gradient: (3,) gradient of f at the root.
+    tolerance_excess: by how much |f - level| at the root may exceed what the tolerance allows,
+        because of rounding.
+    before, after: the ray parameters of the two samples around the root, or the root itself.
+    band: the tolerance in value at the last sample (`Hysteresis.band`).
     """
 
     side: Real
@@ -202,7 +215,7 @@ class Contact:
 
     @classmethod
     def none(cls, backend: Backend) -> Contact:
-        """The contact of a ray before its first sample: none."""
+        """The state of a ray before its first sample: no contact."""
         zero = backend.Float(0)
         return cls(zero, backend.Bool(False), zero, backend.Array3f(0), zero, zero, zero, zero)
 
@@ -211,14 +224,14 @@ class Contact:
 class AcceptedPoint:
     """A sample at an accepted point of a ray.
 
-    t, value, gradient, slope: ray parameter of the point; f, its gradient (3,) and its derivative
-        along the ray at the point.
+    t, value, gradient, slope: the ray parameter of the point; f, its gradient (3,) and its
+        derivative along the ray there.
     before: (t, value, slope, gradient) of the accepted point before it.
-    excess: by how much f at these two points may be farther from a level than the tolerance allows,
-        if the error of f is more than the tolerance; 0 otherwise.
+    excess: by how much |f - level| at these two points may exceed what the tolerance allows, if the
+        error of f is larger than the tolerance; else 0.
     total_error: a bound of the error of the value.
-    is_near: whether the point would be a hit.
-    band: the tolerance in value (`Hysteresis.band`).
+    is_near: whether the point would be a hit of a ray that ends at levels.
+    band: the tolerance in value around a level (`Hysteresis.band`).
     is_end: whether the ray ends there.
     """
 
@@ -236,51 +249,53 @@ class AcceptedPoint:
 
 @dataclass(frozen=True)
 class Hysteresis:
-    """The rule by which contacts with a level begin, count as crossings, and end.
+    """The rule by which contacts of rays with a level begin, count as crossings, and end.
 
-    A first hit ends a ray where f is within the tolerance of a level. A ray that goes on must leave
-    the surface with a proof, and a single crossing must not be counted several times because of
-    rounding or because the ray runs along the surface. So a level that has been reached counts as
-    lying a tolerance *beyond* its place, until f has left the tolerance around it (hysteresis).
-    Then there is always a gap to it, and steps stay long.
+    A ray that looks for first hits ends where f is within the tolerance of a level. A ray that goes
+    on must leave the surface with a proof, and a crossing must not be counted several times because
+    of rounding or because the ray runs along the surface. So a ray that has reached a level is in
+    contact with it until f has left the tolerance around it. During contact the level counts as
+    lying a tolerance *beyond* its true place, as seen from the side of the ray (hysteresis). Then f
+    always differs from the moved level, and steps stay long.
 
     Let W be the largest of the tolerances in value (`band`) at the samples of a contact. The
     guarantees are:
 
     1. *Nothing is missed.* If f is farther than W from a level on one side at some point of the
-       ray, and on the other side at a later one, there is a crossing between them. Proof: in
-       contact on the side of larger values, the ray is proved free of `level - band`, the band
-       being that of the last sample, as a ray is proved free of a level before contact
-       (`March.advance`). So f > level - W as long as no crossing was noticed. Before the contact,
-       f was proved not to take the level at all. Beside a pole the band grows with the slope of f,
-       and may be larger than f anywhere behind it. So the band of a sample counts up to the next
-       sample only if the band there is not much smaller (`_MIN_BAND_RATIO`), or if both samples are
-       at most `_SHORT_STEP` tolerances apart (`may_reach`): a step that fails this test is made
-       shorter. So is a step to a sample without a finite error bound, as where an exponential
-       overflows.
+    ray, and on the other side at a later point, there is a crossing between the two points. Proof:
+    consider a ray in contact, on the side of larger values. It is proved not to take the value
+    `level - band`, by the same steps that prove a ray without contact free of a level
+    (`March.advance`); band is that of the last sample. So f > level - W as long as no crossing was
+    noticed. Before the contact, f was proved not to take the level at all. Beside a pole the band
+    grows with the slope of f, and may become larger than all later values of f. So the band of a
+    sample counts up to the next sample only if the band there is not much smaller
+    (`_MIN_BAND_RATIO`), or if the two samples are at most `_SHORT_STEP` tolerances apart
+    (`may_reach`). A step that fails this test is made shorter, and so is a step to a sample without
+    a finite error bound, for example where an exponential overflows.
     2. *Nothing is counted twice.* A crossing is noticed at a point where f is proved to be on the
-       other side of the level, `band/2` being more than its error; the next crossing is noticed
-       only where f is proved to be on the first side again. So crossings of a level alternate, and
-       between two noticed crossings f takes the level. A ray that starts within the tolerance of a
-       level is on neither side until a sample is half the tolerance off it: leaving it is no
-       crossing.
-    3. *Nothing sticks.* In contact, f is `band/2` or more away from the level beyond, up to its
-       error, so the gap that steps are solved for is at least a fifth of the band.
+    other side of the level: it differs from the level by `band/2`, which is more than its error.
+    The next crossing is noticed only where f is proved to be on the first side again. So crossings
+    of a level alternate in direction, and between two noticed crossings f takes the level. A ray
+    that starts within the tolerance of a level is on neither side until a sample differs from the
+    level by half the tolerance: leaving the level is no crossing.
+    3. *Nothing sticks.* In contact, f differs from the moved level by `band/2` or more, up to its
+    error. So the difference that steps are solved for is at least a fifth of the band.
 
-    The branch of an angle-valued f. Before contact, f lies between two neighboring periodic levels.
-    In contact, f is proved to stay nearer to the level reached than to all others. Both windows are
-    less than a period wide, so the value modulo the period tells where in the window f is. (An
-    enclosure behind a point takes the window at that point, and the two proved intervals share a
-    point, so their branches agree.)
+    Periodic f. Before contact, f lies between two neighboring periodic levels. In contact, f is
+    proved to stay nearer to the level reached than to all others. Each of these two windows is less
+    than a period wide, so the value modulo the period tells where in the window f is. (An enclosure
+    that reaches back from a point assumes the window at that point. It shares a point with the
+    interval proved before, so both are in the same window.)
 
     levels: all levels.
-    spacing: the difference between the two closest levels, inf for a single level.
-    is_free_before, is_free_after: whether the extent of the surface proves that the ray is free
-        before the interval that is marched, and behind it. Then f stays on the side of a level on
-        which it is at that end of the interval, and there it need be off the level by no more than
+    spacing: the difference between the two closest levels; inf for a single level.
+    is_free_before, is_free_after: whether the extent of the surface proves that the ray meets no
+        level before the interval that is marched, and behind it. Then f stays on one side of each
+        level there, and at that end of the interval it need differ from the level by no more than
         its error.
     start: the ray parameter at which the interval begins.
-    rounding: the distance from a facet by which rounding may displace a ray that starts on it.
+    rounding: the distance from a facet, at which f jumps, by which rounding may move a ray that
+        starts on it.
     """
 
     levels: Levels
@@ -298,7 +313,8 @@ class Hysteresis:
         start: Real,
         rounding: Real,
     ) -> Hysteresis:
-        """The rule for these levels. free: `is_free_before` and `is_free_after`."""
+        """The rule for these levels. free: the masks `is_free_before` and `is_free_after` of the
+        class: whether no level lies on the ray before and behind the interval that is marched."""
         period = levels.period
         spacing: Real = dr.inf if period is None else period
         for k, level in enumerate(levels.values):
@@ -311,37 +327,44 @@ class Hysteresis:
         return cls(levels, spacing, *free, start, rounding)
 
     def contact_tolerance(self, within: Real) -> Real:
-        """The level gap at which contact begins: `within`, the value tolerance of a hit, or less if
-        levels are close together."""
+        """The difference between f and a level below which contact begins: `within`, the value
+        tolerance of a hit, or a quarter of the spacing of levels if that is less."""
         return fmin(within, _MAX_BAND_OF_SPACING * self.spacing)
 
     def band(self, within: Real, rounding: Real) -> Real:
-        """The tolerance in value around a level: `within`, or more if f has a large rounding error,
-        but at most a fraction of the spacing of levels."""
+        """The tolerance in value around a level: `within`, the value tolerance of a hit, or 8 times
+        the bound `rounding` of the rounding error of f if that is more; but at most a quarter of
+        the spacing of levels."""
         return fmin(
             fmax(within, _MIN_BAND_ROUNDINGS * rounding), _MAX_BAND_OF_SPACING * self.spacing
         )
 
     def may_reach(self, now: Contact, band: Real, step: Real, tolerance: Real) -> Mask:
-        """Whether the band of the last sample may count for a step to a point with this band.
+        """Mask of rays on which the band (tolerance in value) of the last sample may count for a
+        step to a point. Rays without contact are in the mask.
 
-        tolerance: the hit tolerance at that point, a length.
+        now: the contact at the last sample.
+        band: the band at the point.
+        step: the length of the step.
+        tolerance: the hit tolerance at the point, a length.
         """
         comparable = now.band * _MIN_BAND_RATIO <= band
         return ~now.is_touching | comparable | (step <= _SHORT_STEP * tolerance)
 
     def must_sample_end(self, now: Contact, end: Real) -> Mask:
-        """Whether a ray that is proved free up to its end must still sample the end: in contact it
-        is only proved free of a level that counts as lying a band beyond its place."""
+        """Mask of rays that must sample their end even if they are proved free up to it. In
+        contact, a ray is proved free only of a level that counts as lying a band beyond its true
+        place, so it may still cross the true level. end: the ray parameter at which it ends."""
         return now.is_touching & (self.is_free_after | (end < dr.inf))
 
     def gaps(
         self, contact: Contact, value: Real, gaps: LevelGaps, band: Real, part: float = 1.0
     ) -> LevelGaps:
-        """The gaps to the levels as the hysteresis places them, from the gaps to the true levels.
+        """The differences between f and the next levels below and above it. In contact, the levels
+        are moved: the level that was reached counts as lying the fraction `part` of the band beyond
+        its place, and the steps end within the same fraction of half the way to the next level.
 
-        In contact the level counts as lying the fraction `part` of the band beyond its place, and
-        steps end within the same fraction of half the way to the next level.
+        value: f. gaps: the differences to the true levels. band: the tolerance in value.
         """
         x, far_gap = -self.levels.offset_to_nearest(value), part * _MAX_APPROACH * self.spacing
         band = part * band
@@ -353,7 +376,10 @@ class Hysteresis:
         )
 
     def update(self, now: Contact, active: Mask, seen: AcceptedPoint) -> tuple[Contact, Mask]:
-        """The contact behind an accepted point, and whether the ray has crossed the level."""
+        """The contact behind an accepted point, and the mask of rays that have crossed the level.
+
+        now: the contact before. active: mask of rays with an accepted point. seen: that point.
+        """
         x = -self.levels.offset_to_nearest(seen.value)
         touching = now.is_touching
         side = dr.select(touching, now.side, self._side(now, seen, x))
@@ -394,12 +420,15 @@ class Hysteresis:
     def update_at_jump(
         self, now: Contact, active: Mask, seen: AcceptedPoint, ahead: JumpCrossing, d: Vec3
     ) -> tuple[Contact, Mask]:
-        """The contact behind the facet `ahead`, and whether the jump of f there crosses the level.
+        """The contact behind the facet `ahead`, at which f jumps, and the mask of rays that cross
+        the level by this jump.
 
-        now: the contact at an accepted point just before the facet.
-        d: (3,) the direction of the ray.
+        now, seen: the contact and the sample at an accepted point just before the facet.
+        active: mask of the rays that pass a facet.
+        d: (3,) the unit direction of the ray.
 
-        A field with jumps has a single level here. A ray that starts on a facet is on neither side.
+        A field with jumps has a single level here. A ray that starts on a facet is on neither side
+        of the level.
         """
         x = -self.levels.offset_to_nearest(seen.value)
         one = type(x)(1)
@@ -425,14 +454,15 @@ class Hysteresis:
         ), crosses
 
     def _side(self, now: Contact, point: AcceptedPoint, x: Real) -> Real:
-        """The side from which a ray comes to the nearest level if it was not in contact with it: 1
-        if f is larger there, -1 if it is smaller, 0 if the side is not known.
+        """The side from which a ray without contact comes to the nearest level: 1 if f is larger
+        there, -1 if it is smaller, 0 if the side is not known.
 
-        x: f minus that level.
+        now: the state before the point. x: f at the point minus the level.
 
-        The ray was proved free, so a real-valued f is on the side of the last accepted value. If f
-        is periodic, that value may lie on either side of the level. Then the present value decides,
-        or the slope if the present value equals the level up to its error.
+        The ray was proved free of levels, so a real-valued f is on the side of the last accepted
+        value. If f is periodic, the last value may lie on either side of the level. Then the
+        present value decides, or the slope of f if the present value equals the level up to its
+        error.
         """
         if self.levels.period is None:
             is_above = point.before[1] > point.value - x
@@ -445,13 +475,19 @@ class Hysteresis:
 
 @dataclass(frozen=True)
 class _Bisection:
-    """The state of bisection: f takes the level between `before` and `behind`."""
+    """The state of bisection on each ray. f takes the level between the ray parameters `before` and
+    `behind`.
+
+    t, gradient: the next point to sample, and the gradient (3,) at the last one.
+    looks: the number of samples so far.
+    active: whether bisection goes on.
+    """
 
     before: Real
     behind: Real
     t: Real
     gradient: Vec3
-    looks: Any
+    sample_count: Any
     active: Mask
 
 
@@ -459,20 +495,24 @@ def refine_crossing(
     field: Field, levels: Levels, tolerance: PreparedHitTolerance, path: Ray, found: Contact,
     active: Mask,
 ) -> tuple[Real, Vec3, Any]:  # fmt: skip
-    """Refine a crossing by bisection.
+    """Refine crossings of rays with a level by bisection.
 
-    Returns the root, the gradient of f at the root, and the number of evaluations.
+    Returns the roots (ray parameters), the gradients (3,) of f there, and the number of
+    evaluations.
 
-    The cubic through the two points of the crossing is a bad approximation of f if a crease lies
-    between them. So f is evaluated at the root of the cubic. If it is farther from the level than
-    both the tolerance and the error of f, the bracket is narrowed by bisection, with f on different
-    sides of the level at its ends.
+    found: the crossings. Each has two points on different sides of the level, and as root that of
+        the cubic through their values and slopes.
+
+    The cubic is a bad approximation of f if f has a crease between the two points. So f is
+    evaluated at its root. If f differs from the level there by more than the tolerance and its
+    error, bisection narrows the interval, with f on different sides of the level at its ends.
     """
     side = -found.side
     count = dr.uint32_array_t(type(found.root))
     smallest = 4 * float(dr.epsilon(type(found.root)))
 
-    def body(now: _Bisection) -> _Bisection:
+    def bisect(now: _Bisection) -> _Bisection:
+        """One sample at the point t, and the half of the interval in which the level lies."""
         sample, size = field.evaluate(path.point(now.t)), max_norm(path.origin) + now.t
         x, steepness = -levels.offset_to_nearest(sample.value), safe_norm(sample.gradient)
         near = dr.abs(x) <= fmax(
@@ -482,24 +522,28 @@ def refine_crossing(
         before = dr.select(is_before, now.t, now.before)
         behind = dr.select(is_before, now.behind, now.t)
         goes_on = ~near & (behind - before > smallest * size)
-        is_first = near & (now.looks == 0)
+        is_first = near & (now.sample_count == 0)
         return _Bisection(
             before,
             behind,
             dr.select(goes_on, 0.5 * (before + behind), now.t),
             dr.select(is_first, now.gradient, sample.gradient),
-            now.looks + 1,
+            now.sample_count + 1,
             now.active & goes_on,
         )
 
     begin = _Bisection(found.before, found.after, found.root, found.gradient, count(0), active)
-    end = loop_while_active(begin, body, "harnack roots")
-    return end.t, end.gradient, end.looks
+    end = loop_while_active(begin, bisect, "harnack roots")
+    return end.t, end.gradient, end.sample_count
 
 
 def cubic_root(start: Real, end: Real, slope: Real, end_slope: Real) -> Any:
-    """A root in [0, 1] of the cubic with these values, of different signs, and these slopes at 0
-    and 1, by Newton's method, with bisection if Newton's method leaves the bracket."""
+    """A root in [0, 1] of a cubic that changes sign between 0 and 1. It is found by Newton's
+    method, with bisection if a step leaves the interval in which the sign changes.
+
+    start, end: the values of the cubic at 0 and 1, of different signs.
+    slope, end_slope: its derivatives there.
+    """
     # start + slope u + b u^2 + c u^3
     b = 3 * (end - start) - 2 * slope - end_slope
     c = slope + end_slope - 2 * (end - start)

@@ -1,17 +1,18 @@
-"""The marching loop, the only one of the tracer: it gives the first point of a ray on a level set,
-with a proof of every step.
+"""The marching loop, the only one of the tracer. It finds the first point of each ray at which a
+field takes a level, with a proof of every step.
 
-The loop depends neither on the kind of field nor on the kind of proof. It samples a field along the
-ray, and the enclosures of each sample tell how far the ray is free of levels.
+The loop depends neither on the kind of field nor on the kind of proof. It samples a field f along
+the ray. Each sample brings enclosures, intervals that provably contain the change of f along the
+ray, and they tell on which length the ray meets no level.
 
-Trial steps are aimed: an over-relaxed step ends just short of the point at which f is predicted to
-reach a level. Without this, half of the samples near the surface were rejected. The prediction is
-the cubic through the last two values and slopes for smooth fields, and the slope for approximate
-fields.
+Trial steps are aimed: a step is longer than the proved length, but it ends just short of the point
+    at which f is predicted to reach a level. Without this, half of the samples near the surface
+    were rejected. The prediction comes from the cubic through the last two values and slopes for
+    smooth fields, and from the slope alone for approximate fields.
 
 The state of the march is a record, which `backend.loops` takes apart and puts together for Dr.Jit's
-loop. The march compares samples with the facet at the end of an interval; the tracer that goes from
-facet to facet (`jump_tracer.JumpTracer`) calls the march, and not the other way round.
+loop. For fields with jumps, the march also compares the value at the end of its interval with the
+jump there. `jump_tracer.JumpTracer`, which goes from jump to jump, calls the march.
 """
 
 from __future__ import annotations
@@ -79,22 +80,23 @@ _RETRY_FRACTION = 0.125
 
 @dataclass(frozen=True)
 class MarchState:
-    """The state of rays during the march.
+    """The state of rays during the march, with one entry for each ray.
 
-    proved_to: ray parameter of the last accepted point; up to it the ray is proved free of levels.
-    proved_step: a length from there that is proved free, too.
+    proved_to: the ray parameter of the last accepted point; no level lies on the ray up to there.
+    proved_step: a length from there on which no level lies, either.
     trial_step: the length from there to the next trial point.
-    enclosure_reach: the length that the next enclosures should reach.
-    value, gradient: of f at `proved_to`; the value behind the facet if a facet was passed there.
-    tolerance_excess: by how much f at `proved_to` may be farther from a level than the tolerance
-        allows.
+    enclosure_reach: the length on which the next sample should enclose the change of f.
+    value, gradient: f and its gradient (3,) at `proved_to`; behind the jump, if f jumps there.
+    tolerance_excess: by how much |f - level| at `proved_to` may exceed what the tolerance allows,
+        because of rounding.
     evaluations: the number of evaluations of f so far.
-    accuracy_scale: the accuracy scale of the next sample (`Field.at_accuracy`); None for fields
-        with a single accuracy (Dr.Jit records a loop twice if a state in it never changes).
+    accuracy_scale: the accuracy scale of the next sample (`Field.at_accuracy`), larger for more
+        accurate samples; None for fields with a single accuracy (Dr.Jit records a loop twice if a
+        state in it never changes).
     status: the `RayStatus` of rays that have ended.
     active: whether the ray goes on.
-    contact: the state of contact with the level that was reached last; None for rays that end where
-        they reach a level.
+    contact: for rays that look for crossings, the state of their contact with the level that they
+        reached last; None for rays that end where they reach a level.
     """
 
     proved_to: Real
@@ -123,6 +125,8 @@ class MarchState:
     ) -> MarchState:
         """The state at the start of rays, before the first sample.
 
+        start, end: the ray parameters between which rays are traced; rays without start < end are
+            not active.
         has_detail: whether the field has variable accuracy.
         crosses: whether rays end where they have crossed a level, and not where they reach it.
         """
@@ -147,26 +151,28 @@ class MarchState:
 class _TrialSample:
     """The sample at the trial point of each ray, and quantities that are derived from it.
 
-    t: ray parameter of the trial point.
-    at_end: whether the ray (or the interval before the next facet) ends there.
-    coordinate_size: a bound of the absolute values of the coordinates there.
-    unproved_length: the length before the point that no step has proved yet.
-    on_ray: the sample of the field there, with its enclosures.
+    t: the ray parameter of the trial point.
+    at_end: whether the ray, or its interval before the next jump of f, ends there.
+    coordinate_size: a bound of the absolute values of coordinates on the ray up to there.
+    unproved_length: the length before the point that no step has proved free of levels yet.
+    on_ray: the sample of f there, with its enclosures (intervals that provably contain the change
+        of f along the ray).
     gradient_norm: the length of the gradient there.
-    gaps: from f to the levels on both sides; in contact, to the levels as the hysteresis places
-        them.
+    gaps: the differences between f and the next levels below and above; in contact with a level, to
+        levels that the hysteresis has moved.
     total_error: a bound of the rounding and truncation error of f.
-    value_tolerance: the largest level gap that makes a hit; in contact, a crossing.
-    band: in contact, the band of `Hysteresis.band`; else `value_tolerance`.
+    value_tolerance: the largest |f - level| at a hit; in contact, half of it.
+    band: in contact, the tolerance in value around a level (`Hysteresis.band`); else
+        `value_tolerance`.
     is_near: whether a level is near enough for a hit.
-    accepts_unknown_side: whether the point may be accepted although it is not known on which side
-        of a level it lies.
-    excess: as `MarchState.tolerance_excess`.
-    is_smooth: whether value and slope predict f.
-    passes_branch_level, needs_branch: the masks of `BranchTracker.gaps`; None if the sample knows
-        its branch on all lanes.
-    steep: bounds that rest on values of f; None for fields whose slopes are bounded.
-    extra_evaluations: the number of further evaluations of f, beyond the trial point.
+    accepts_unknown_side: whether the point may be accepted although rounding hides on which side of
+        a level it lies.
+    excess: by how much |f - level| may exceed `value_tolerance`, because of rounding.
+    is_smooth: whether value and slope at two points predict f.
+    passes_branch_level, needs_branch: for samples that gave f only modulo an integer, the two masks
+        that `BranchTracker.gaps` returns; else None.
+    steep: bounds that rest on ranges of values of f; None for fields whose slopes are bounded.
+    extra_evaluations: the number of evaluations of f besides that at the trial point.
     """
 
     t: Real
@@ -190,13 +196,14 @@ class _TrialSample:
 
     @property
     def value(self) -> Real:
-        """f at the points."""
+        """f at the trial points."""
         return self.on_ray.sample.value
 
     def gaps_after_jump(self, behind: LevelGaps) -> LevelGaps:
-        """The level gaps behind a facet for a field with unknown branch. A jump does not change the
-        gaps to the periodic levels. Lanes of `passes_branch_level` have gaps to the true levels,
-        and take those behind the facet."""
+        """The differences between f behind a jump and the next levels, for a field whose samples
+        give f only modulo 1. The jump is an integer, so the differences to levels modulo 1 stay as
+        they are. On lanes of `passes_branch_level` the differences are to true levels and are
+        replaced by those in `behind`."""
         down = dr.select(self.passes_branch_level, behind.below, self.gaps.below)
         return replace(
             self.gaps,
@@ -210,16 +217,19 @@ class March:
     """The parameters of the march: the levels, the hit tolerance and the lengths of trial steps.
 
     max_steps: the number of evaluations of f after which a ray is out of steps.
-    over_relaxation: trial steps are at most this many times as long as the proved steps.
-    hysteresis: for rays that end where they have crossed a level, and not where they reach it.
-    cone_radius: for cones that end where they come near a level (`pixel_cones`): their radius per
-        unit of t.
-    occupied: for rays that end where they reach a level: cells outside of which there is no level,
-        not even for a continuation of f behind a facet.
-    ray_end: the ray parameter at which these rays end.
-    only_component: whether levels may lie outside of the occupied cells; these do not count.
-    branch_tracker: determines the branch of samples that give f only modulo 1; None if all samples
-        know their branch.
+    over_relaxation: trial steps are at most this many times as long as proved steps.
+    hysteresis: for rays that end where they have crossed a level, the rule by which a crossing is
+        counted; None for rays that end where they reach a level.
+    cone_radius: for cones that end where they come near a level (`pixel_cones`), their radius per
+        unit of t; None for rays.
+    occupied: for rays that end where they reach a level, a grid of cells. Outside of its marked
+        cells there is no level, not even for the function that continues f behind a jump. None if
+        no cells are known.
+    ray_end: the ray parameter at which rays with `occupied` end.
+    only_component: whether levels may lie outside of the marked cells, but do not belong to the
+        surface.
+    branch_tracker: finds the integer that is missing in samples that give f only modulo 1; None if
+        there are no such samples.
     """
 
     backend: Backend
@@ -242,56 +252,62 @@ class March:
         state: MarchState,
         ahead: JumpCrossing | None = None,
     ) -> MarchState:
-        """March to the first level, or to the end.
+        """March each ray to the first level or to its end, and return the state there.
 
-        Proof that no hit is missed: `proved_to` is a point up to which the ray is free, and
-        `proved_step` a proved length from there. A trial point, `trial_step` from there, is
-        accepted only if `trial_step` is at most `proved_step`, or if an enclosure behind the trial
-        point covers the difference; then the ray is free up to the trial point. Otherwise the ray
-        goes back to proved_to + proved_step, which needs no such test. A ray ends as a miss when
-        proved_to + proved_step passes its end, and as a hit only at an accepted point. A point
-        whose sample is too coarse (`_refined_accuracy`) is not accepted but sampled again.
+        field, path: the function f and the rays.
+        end: the ray parameter at which each ray, or its interval before the next jump of f, ends.
+        ahead: for a field with jumps, the crossing of a facet (a flat piece of surface at which f
+            jumps) at `end`; its facet is NO_FACET on lanes without one. On lanes with one, the
+            point of the crossing is sampled as well. If this point is accepted, the ray has hit the
+            facet or passed it. A ray that has passed it ends as a miss, with the step that the
+            value behind the facet allows from there. `value` is then f behind the facet; but if the
+            facet was hit by a ray without `hysteresis`, f before it.
 
-        A hit is a point at which f is within the tolerance, less the truncation error, of a level;
-        or within twice the rounding error of f, if that is more. A trial point at which the level
-        is nearer than the error of f may lie behind the root, by less than the tolerance: it is a
-        hit (`_refined_accuracy`), so nothing is passed there. If it is no hit, because the error is
-        large, then it is not accepted by an enclosure behind it, and no step from it is proved: it
-        is not known on which side of the point the level lies.
+        Proof that no hit is missed. `proved_to` is a point before which no level lies, and
+        `proved_step` is a proved length from there. A trial point, at the distance `trial_step`
+        from `proved_to`, is accepted in two cases only: if `trial_step` is at most `proved_step`,
+        or if an enclosure that reaches back from the trial point covers the difference. In both
+        cases no level lies before the trial point. Otherwise the next trial point is proved_to +
+        proved_step, which needs no such test. A ray ends as a miss if proved_to + proved_step
+        passes its end, and as a hit only at an accepted point. A point whose sample is too coarse
+        (`_refined_accuracy`) is not accepted but sampled again.
 
-        In rounded arithmetic a surface could be missed between the enclosure ahead of a point and
-        the enclosure behind the next point. So for both, the level gaps are reduced by the rounding
-        of value and position together (`value_error_bound`).
+        Hits. At a hit, |f - level| is at most the tolerance less the truncation error of f, or at
+        most twice the rounding error of f if that is larger. If the level is nearer to f than the
+        error of f, the trial point may lie behind the root, by less than the tolerance. Then it is
+        a hit (`_refined_accuracy`), so no root is passed. If it is no hit, because the error is
+        large, then no enclosure that reaches back makes it accepted, and no step from it is proved,
+        as it is not known on which side of the point the level lies.
 
-        With `hysteresis` the ray does not end where it reaches a level. It goes on towards levels
-        as the hysteresis places them, and ends as a hit where it has crossed a level. There it may
-        be made active again, to go on to the next level.
+        Rounding. A surface could be missed between the enclosure that reaches ahead from a point
+        and the enclosure that reaches back from the next point. So for both enclosures the
+        differences between f and the levels are reduced by the rounding of value and position
+        (`value_error_bound`).
 
-        With `cone_radius`, a whole cone must stay clear of the levels: gaps shrink by |grad f|
-        times its radius, which grows with t. A tenth of a gap is reserved for the growth of the
-        cone, and no step is longer than the cone takes to grow by it, unless the level is never met
-        and f leaves it faster than the cone grows.
+        With `hysteresis`, the ray does not end where it reaches a level. It goes on towards levels
+        that the hysteresis has moved, and ends as a hit when it has crossed a level. The caller may
+        make it active again, to go on to the next level.
 
-        With `occupied`, the ray after a proved step is passed, too, as far as it lies in cells that
-        contain no level (`EmptySpaceGrid.empty_run` has the proof): a union of free
-        intervals is free.
+        With `cone_radius`, a whole cone must stay clear of the levels. The differences between f
+        and the levels shrink by |grad f| times the radius of the cone, which grows with t. A tenth
+        of a difference is reserved for this growth: no step is longer than the length on which the
+        cone grows by that much, unless the level is never met and f moves away from it faster than
+        the cone grows.
 
-        With `only_component`, levels outside of `occupied` belong to other components of the
-        surface. Proved steps end in occupied cells. A trial step that would end elsewhere is
-        replaced by the proved step. So no hit lies outside of the occupied cells, and levels that
-        are passed there do not count.
+        With `occupied`, the part of the ray behind a proved step is skipped, too, as far as it lies
+        in cells that contain no level (`EmptySpaceGrid.empty_run` has the proof).
 
-        ahead: for a field with jumps, the crossing at `end`, on lanes that have one. These lanes
-            sample the point of the crossing as well. If it is accepted, they hit the facet or have
-            passed it. A ray that has passed it ends as a miss, with the step that the value behind
-            the facet allows from there. `value` is then the value behind the facet; without
-            `hysteresis` not if the facet was hit.
+        With `only_component`, levels outside of the marked cells belong to other components of the
+        surface. Proved steps end in marked cells, and a trial step that would end elsewhere is
+        replaced by the proved step. So no hit lies outside of the marked cells, and levels that are
+        passed there do not count.
         """
 
-        def body(now: MarchState) -> MarchState:
+        def one_trial(now: MarchState) -> MarchState:
+            """One more trial point of each ray."""
             return self.next_trial(field, path, end, now, ahead)
 
-        return loop_while_active(state, body, "harnack")
+        return loop_while_active(state, one_trial, "harnack")
 
     def next_trial(
         self,
@@ -301,7 +317,8 @@ class March:
         now: MarchState,
         ahead: JumpCrossing | None = None,
     ) -> MarchState:
-        """The state after one more trial point of each ray; `advance` has the proof."""
+        """The state after one more trial point of each ray. Parameters and proof are those of
+        `advance`, whose loop calls this; now: the state before."""
         trial = self._sample_trial(field, path, end, now, ahead)
         if self.hysteresis is not None and now.contact is not None:
             trial = self._apply_hysteresis(trial, self.hysteresis, now.contact)
@@ -377,7 +394,9 @@ class March:
     def _sample_trial(
         self, field: Field, path: Ray, end: Real, now: MarchState, ahead: JumpCrossing | None
     ) -> _TrialSample:
-        """Sample f at the trial points of rays."""
+        """Sample f at the trial point of each ray, `trial_step` behind the last accepted point, and
+        derive all of a `_TrialSample`. ahead: the facet at the end of the interval, for a field
+        with jumps."""
         real = self.backend.Float
         t = now.proved_to + now.trial_step
         if ahead is not None or now.contact is not None:  # the end exactly
@@ -470,15 +489,18 @@ class March:
         is_near: Mask,
         touches: Mask,
     ) -> tuple[Mask, Any]:
-        """Whether f really takes the level near points that are near it in value, and the number of
-        evaluations that this test took.
+        """Mask of points at which f really takes the level nearby, and the number of evaluations
+        that this test took. It is for fields whose slopes are not bounded.
 
-        A point is near a level by its slope, or because f may equal the level within the rounding
-        of the point. The test asks whether f takes the level within the tolerance, or within twice
-        that rounding. It does if the enclosures prove it along the ray, or if a sample of f lies on
-        the other side of the level or at it (`steep.beyond`).
-
+        gaps: the differences between f at the point and the next levels.
+        size: a bound of the coordinates.
+        is_near: mask of points that count as near a level, by the slope of f or because rounding of
+            the point may hide the level.
         touches: whether f may equal the level up to rounding.
+
+        The test asks whether f takes the level within the tolerance, or within twice the rounding
+        of the point. It does if the enclosures (intervals that contain the change of f along the
+        ray) prove it, or if a sample of f lies at the level or on its other side (`steep.beyond`).
         """
         sample, p = ray_sample.sample, path.point(t)
         tolerance = dr.fma(t, self.tolerance.per_length, self.tolerance.distance)
@@ -507,8 +529,9 @@ class March:
     def _apply_hysteresis(
         self, trial: _TrialSample, hysteresis: Hysteresis, contact: Contact
     ) -> _TrialSample:
-        """The same sample with gaps to the levels as the hysteresis places them. The band includes
-        all rounding of f, or a ray would stick in a crease."""
+        """The same sample with gaps, the differences between f and the next levels, to levels that
+        the hysteresis has moved. The band (the tolerance in value around a level) includes all
+        rounding of f; otherwise a ray would get stuck in a crease."""
         band = hysteresis.band(
             trial.value_tolerance, trial.total_error - trial.on_ray.sample.truncation_error
         )
@@ -527,8 +550,9 @@ class March:
     def _accept(
         self, field: Field, trial: _TrialSample, now: MarchState, ahead: JumpCrossing | None
     ) -> tuple[Mask, Real | None, Mask]:
-        """Whether the ray is proved free up to the trial point, by a sample that is not too coarse;
-        the accuracy scale of the next sample; and whether this sample was too coarse."""
+        """Three arrays. The mask of trial points that are accepted: no level lies before them, and
+        their sample is not too coarse. The accuracy scale of the next sample. The mask of samples
+        that were too coarse."""
         accepted = now.trial_step <= now.proved_step
         if self.over_relaxation > 1:
             knows_side = trial.accepts_unknown_side | (trial.gaps.nearest > trial.total_error)
@@ -570,8 +594,14 @@ class March:
         ahead: JumpCrossing | None,
         jump: JumpTest | None,
     ) -> tuple[Contact, Mask, JumpTest | None, Real]:
-        """The contact behind the trial point, whether rays have crossed the level, the comparison
-        with the facet, and f behind the facet."""
+        """The contact with a level behind the trial point, the mask of rays that have crossed the
+        level, the comparison with the facet at the end of the interval, and f behind that facet.
+
+        now: the state before the trial point.
+        accepted: mask of accepted trial points.
+        ahead, jump: for a field with jumps, the facet at the end of the interval and its comparison
+            with the level; else None.
+        """
         value = trial.value
         previous = now.proved_to, now.value, dr.dot(now.gradient, path.direction), now.gradient
         is_last = trial.at_end if jump is None else trial.at_end & ~jump.has_crossing
@@ -594,7 +624,9 @@ class March:
         return contact, crosses, jump, value
 
     def _proved_step(self, trial: _TrialSample, gaps: LevelGaps, contact: Contact | None) -> Real:
-        """The length from the trial point that is proved free of levels with these gaps."""
+        """The length from the trial point on which no level lies. gaps: the differences between f
+        there and the next levels. contact: the contact with a level behind the point; None if rays
+        end at levels."""
         growth = _GROWTH_FRACTION * trial.gaps.nearest
         if self.cone_radius is not None:
             gaps = gaps.reduced_by(growth)
@@ -623,8 +655,13 @@ class March:
         forward: Real,
         trial: Real,
     ) -> tuple[Real, Real]:
-        """The proved step and the trial step, extended over empty cells that follow the proved
-        step."""
+        """The proved step and the trial step, extended over the empty cells that follow the proved
+        step.
+
+        point: the sample at the trial point, and `accepted` the mask of lanes on which it was
+            accepted.
+        forward, trial: the proved step and the trial step from there.
+        """
         free_to = dr.select(accepted, point.t + forward, self.ray_end)
         free_to = occupied.end_of_empty_run(path.origin, path.direction, free_to, self.ray_end)
         forward = fmax(forward, dr.select(free_to >= self.ray_end, dr.inf, free_to - point.t))
@@ -643,7 +680,9 @@ class March:
         contact: Contact | None,
         is_hit: Mask,
     ) -> Real:
-        """The length that the next enclosures should reach."""
+        """The length on which the next sample should enclose the change of f: a multiple of the
+        proved step `proved`, or a third of the present length if no step was proved. A ray that has
+        just left a level, or hit it, gets the rest of the ray again."""
         # After a step of zero, the next enclosures need reach only a third as far: bisection.
         candidate = fmin(now.enclosure_reach, end - trial.t)
         shorter = dr.select(dr.isfinite(candidate), candidate / 3, 1 + 16 * trial.coordinate_size)
@@ -662,7 +701,7 @@ class March:
         proved_step: Real,
         contact: Contact | None,
     ) -> Mask:
-        """Whether rays are proved free of levels up to their end."""
+        """Mask of rays on which no level lies up to their end."""
         farthest = float(dr.largest(self.backend.Float)) ** _MISS_EXPONENT
         proved_to = dr.select(accepted, trial.t, now.proved_to)
         is_free = proved_to + proved_step >= dr.select(end == dr.inf, farthest, end)
@@ -681,16 +720,20 @@ class March:
         size: Real,
         end: Real,
     ) -> Mask:
-        """Whether a level is near enough in value for a hit; see `advance`.
+        """Mask of trial points at which a level is near enough in value for a hit, as `advance`
+        states.
 
-        within: the largest level gap that the tolerance allows.
-        rounding: a bound of the rounding error of f.
+        gap: the difference between f and the nearest level.
+        within: the largest such difference that the tolerance allows.
+        total_error, rounding: bounds of the error of f, and of its part due to rounding.
+        size: a bound of the coordinates.
 
         A point is no hit if rounding leaves the distance to the surface uncertain by more than a
-        sixteenth of a size: the size of the coordinates or, if larger, the radius of the ball on
-        which f is proved to be smooth. On a ray without an end, a point is no hit either if it is
-        near a level only by rounding and rounding leaves t uncertain by more than that size: far
-        enough away, rounding would make a hit of every ray that is parallel to the surface.
+            sixteenth of a length L: the size of the coordinates or, if larger, the radius of the
+            ball in which f is proved to be smooth. On a ray without an end, there is a second
+            condition. If only rounding brings the point near the level, it is no hit if rounding
+            leaves t uncertain by more than L. Otherwise, far enough away, rounding would make a hit
+            of every ray parallel to the surface.
         """
         sample = ray_sample.sample
         near = gap <= fmax(within - sample.truncation_error, 2 * rounding)
@@ -711,12 +754,14 @@ class March:
         path: Ray,
         is_smooth: bool,
     ) -> Real:
-        """The next trial step, at least the proved step `forward`.
+        """The length of the next trial step, at least the proved step `forward`.
 
-        It is longer by over-relaxation, but not past the point at which f is predicted to reach a
-        level. The prediction need not be right: a trial must still be proved by an enclosure behind
-        it.
+        The trial step is longer by over-relaxation, but does not pass the point at which f is
+        predicted to reach a level. The prediction may be wrong without harm: a trial point is
+        accepted only if an enclosure of the change of f, back to the proved length, proves it.
 
+        gaps: the differences between f and the next levels.
+        now: the state at the last accepted point.
         is_smooth: whether value and slope at the last accepted point help to predict f. They do not
             for an approximate field, whose truncation error differs from point to point.
         """
@@ -731,11 +776,12 @@ class March:
         return fmin(self.over_relaxation * forward, fmax(target, forward))
 
     def _second_derivative(self, ray_sample: RaySample, now: MarchState, path: Ray) -> Real:
-        """The second derivative, at the trial point, of the cubic with the values and slopes of f
-        at the trial point and at the last accepted point, a length h before; 0 if no point was
+        """The second derivative at the trial point, along the ray, of the cubic that has the values
+        and slopes of f at the trial point and at the last accepted point; 0 if no point was
         accepted before.
 
-        With D the difference quotient and s0, s the slopes: 2 (2s + s0 - 3D)/h (Hermite).
+        With h the distance of the two points, D the difference quotient, and s0 and s the slopes at
+        the accepted and the trial point, it is 2 (2s + s0 - 3D)/h (Hermite).
         """
         h, slope, slope_before = (
             now.trial_step,
@@ -750,13 +796,14 @@ class March:
         return dr.select(has_before, 2 * (2 * slope + slope_before - 3 * rise / h) / h, 0)
 
     def _status(self, is_hit: Mask, is_free: Mask) -> Any:
-        """The status of a ray that ends here."""
+        """The `RayStatus` with which a ray ends: HIT on lanes of `is_hit`, MISS on other lanes of
+        `is_free`, else OUT_OF_STEPS."""
         ended = dr.select(is_free, int(RayStatus.MISS), int(RayStatus.OUT_OF_STEPS))
         return self.backend.UInt32(dr.select(is_hit, int(RayStatus.HIT), ended))
 
     def _deciding_gap(self, value: Real, ahead: JumpCrossing | None, at_end: Mask | None) -> Real:
-        """The gap from f to the nearest level; at a facet, the smaller of the gaps from f before
-        and behind the facet."""
+        """The difference between f and the nearest level; at a jump of f, the smaller of the
+        differences before and behind it. ahead: the facet at the end of the interval, or None."""
         gap = self.levels.gaps(value).nearest
         if ahead is not None:
             gap_behind = self.levels.gaps(value + ahead.jump).nearest
@@ -767,18 +814,20 @@ class March:
 def _refined_accuracy(
     scale: Real, gap: Real, total_error: Real, truncation: Real, within: Real
 ) -> tuple[Real, Mask]:
-    """The accuracy scale for a repeated sample, and whether the sample of this scale is too coarse.
+    """The accuracy scale with which a sample is repeated, and a mask of samples that are too
+    coarse.
 
     scale, total_error, truncation: the accuracy scale, total error and truncation error of the
         sample.
-    gap: the gap from f to the nearest level.
-    within: the value tolerance of a hit.
+    gap: the difference between f and the nearest level.
+    within: the largest such difference at a hit.
 
-    A sample is too coarse if its error shortens the step by much or decides about a hit, unless its
-    truncation error is a small part of `within` or of the rounding error, which a higher accuracy
-    does not reduce. With the truncation error that is allowed, the march still arrives at hits: its
-    steps end where a level is as near as `total_error`, and 1.25 times that is less than the gap
-    that makes a hit (within - truncation, or twice the rounding).
+    A sample is too coarse if its error shortens the step much or decides whether the point is a
+    hit. It is not too coarse if its truncation error is a small part of `within`, or of the
+    rounding error, which a higher accuracy does not reduce. With this allowance the march still
+    arrives at hits: its steps end where f is as near to a level as `total_error`, and 1.25
+    total_error is less than the difference that makes a hit (within - truncation, or twice the
+    rounding).
     """
     rounding = total_error - truncation
     allowed = fmax(
@@ -794,8 +843,11 @@ def _refined_accuracy(
 
 
 def _next_accuracy(scale: Real, gap: Real, truncation: Real, coarsest: float) -> Real:
-    """The accuracy scale of the next sample: 0 (coarsest) or at least 1, and never above `scale`,
-    the accuracy scale of this sample. truncation, gap: the truncation error and the level gap of
-    this sample."""
+    """The accuracy scale of the next sample: 0, the coarsest, or at least 1, and at most `scale`.
+
+    scale, gap, truncation: of this sample, the accuracy scale, the difference between f and the
+        nearest level, and the truncation error.
+    coarsest: the accuracy scale that 0 stands for.
+    """
     target = scale * dr.power(truncation / (_COARSE_FRACTION * gap), 1 / _TRUNCATION_ORDER)
     return dr.select(target > coarsest, fmin(fmax(target, 1), scale), 0)

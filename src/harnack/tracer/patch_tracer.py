@@ -1,12 +1,15 @@
-"""`PatchTracer`: traces rays through unions of patches (see `harnack.fields.capabilities`).
+"""`PatchTracer`: traces rays through unions of patches. A patch is a surface with a function and a
+box of its own, such as a face of a polygon mesh.
 
-Each patch lies in its own box and is marched by the loop of `March`. A ray gets the first hit of
-all patches.
+Each patch lies in its box, and `March` traces rays to it as to any level set. A ray gets the first
+hit of all patches.
 
-Patches are marched one after the other, as no single function has all of them as a level set, and a
-union of the faces of a polygon mesh would evaluate all faces at each step. A tree gives the proved
-boxes in the order in which a ray enters them. Each lane marches its own patch, which is a view of a
-single table of edges (`RecordTable.view`), so that no kernel depends on the mesh.
+The patches cannot be marched as one field: no single function has all of them as its level set, and
+    for the faces of a polygon mesh each step would evaluate every face. So a ray marches its
+    patches one after another, in the order in which it enters their boxes. A tree of the boxes
+    gives this order. At any time different lanes may be in different patches. All patches read
+    their edges from one table (`RecordTable.view`), so the compiled kernel is the same for every
+    mesh.
 """
 
 from __future__ import annotations
@@ -31,16 +34,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class PatchTraceState:
-    """The state of rays through a union of patches: the box entered last, and the nearest hit so
-    far.
+    """The state of rays through a union of patches.
 
-    enter, box: the ray parameter at which the ray entered the last box, and the index of the box.
-    t: ray parameter of the nearest hit so far, else the end of the ray; for a ray out of steps, the
-        parameter up to which it is proved free.
-    value, gradient, excess, status: of the march that ended there.
-    evaluations: the number of evaluations of all marches so far.
-    part: index of the patch that was hit, NO_PATCH for none.
-    active: whether there may be more patches.
+    enter, box: the ray parameter at which the ray entered the last box, and the index of this box.
+    t: the ray parameter of the nearest hit so far; without a hit the end of the ray; for a ray out
+        of steps, the parameter up to which no surface lies.
+    value, gradient, excess, status: the results of the march that gave this t (`MarchState`).
+    evaluations: the number of evaluations of functions in all marches so far.
+    part: the index of the patch that was hit, NO_PATCH for none.
+    active: whether the ray may meet further patches.
     """
 
     enter: Real
@@ -57,11 +59,12 @@ class PatchTraceState:
 
 @dataclass(frozen=True)
 class PatchTracer:
-    """Traces rays through a union of patches, from `start` to `end`.
+    """Traces rays o + t d, start <= t <= end, to the first of many patches. A patch is a surface
+    with a function and a box of its own.
 
-    Each patch is marched as any field is. This class adds the order of the patches, and the
-    interval in which the ray must be followed in each.
-
+    march: marches rays to one level set.
+    field: the union of patches.
+    path: the rays.
     any_hit: whether a ray may end at any hit, and not only at the first.
     """
 
@@ -73,19 +76,20 @@ class PatchTracer:
     any_hit: bool = False
 
     def run(self, state: MarchState) -> tuple[MarchState, Any]:
-        """The end state of rays, and the index of the patch that each ray hit (NO_PATCH: none).
+        """The end state of rays, and the index of the patch that each ray hit, NO_PATCH for none.
 
-        Proof that no hit is missed: a patch lies in its box, and all boxes that the ray meets come
-        in the order in which it enters them. Each patch is marched from the entry into its box to
-        the exit, or to the first hit so far if that comes before. So up to a hit the ray is free of
-        every patch whose box it entered before the hit, and all other patches lie behind the hit. A
-        ray that is out of steps in a patch is proved free up to its entry into that box.
+        Proof that no hit is missed. Each patch lies in its box, and the boxes come in the order in
+        which the ray enters them. In each box the ray marches from its entry to its exit, or to the
+        first hit so far if that is nearer. So at the end no patch whose box the ray entered before
+        the hit lies before the hit, and all patches whose boxes it would enter later lie behind the
+        hit. If a ray runs out of steps in a patch, no surface lies before its entry into the box of
+        this patch.
         """
         end_state = loop_while_active(self.begin(state), self.advance, "harnack parts")
         return self.finish(end_state)
 
     def begin(self, state: MarchState) -> PatchTraceState:
-        """Rays before the first box."""
+        """The state of rays before they enter the first box. state: the state at their start."""
         real, count = self.march.backend.Float, self.march.backend.UInt32
         return PatchTraceState(
             enter=real(-1),
@@ -101,7 +105,8 @@ class PatchTracer:
         )
 
     def finish(self, walk: PatchTraceState) -> tuple[MarchState, Any]:
-        """The state of rays, and the index of the patch that each ray hit, NO_PATCH for none."""
+        """The end of rays as a `MarchState`, and the index of the patch that each ray hit, NO_PATCH
+        for none."""
         backend = self.march.backend
         before = MarchState.at(backend, self.start, self.end, walk.active, has_detail=False)
         end = dataclasses.replace(
@@ -117,8 +122,8 @@ class PatchTracer:
         return end, walk.part
 
     def advance(self, walk: PatchTraceState) -> PatchTraceState:
-        """Rays after one more patch: the next patch whose box they enter before the first hit so
-        far."""
+        """The state after each active ray has marched one more patch: the next one whose box it
+        enters before the first hit so far. Rays without such a patch end."""
         backend, path = self.march.backend, self.path
         after = PatchEntry(walk.enter, walk.enter, walk.box)
         entry = self.field.next_patch(

@@ -1,17 +1,17 @@
-"""Pixel cones: tests whether a surface may cover a part of a pixel although the pixel's ray misses
-it.
+"""Pixel cones: tests whether a surface may cover a part of a pixel although the ray through its
+middle misses it.
 
 The cover of a surface is the surface moved outwards by the radius of the cone (Thomas et al. 1989;
-Hart 1996, Section 3). A cone whose ray enters the cover and leaves it again on the same side is
-covered in part; one whose ray gets a radius behind the surface is covered completely. All this is
+Hart 1996, Section 3). A cone is covered in part if its ray enters the cover and leaves it again on
+the same side. It is covered completely if its ray gets one radius behind the surface. All this is
 to first order: the distance to a level is taken as |f - level| / |grad f|, which is right only
 close to a smooth surface.
 
-Cones only select pixels: with `antialias="cones"`, pixels whose cone may be covered in part get all
-samples, and their rays give the color. Hart's coverage by a half plane (1996, Eq. 22), composited
-over the background, was tried and left out: its error was as large as that of 9 rays a pixel on
-letters, and two to four times as large where surfaces end, have creases or are thinner than the
-cone.
+Cones only select pixels. With `antialias="cones"`, pixels whose cone may be covered in part get all
+samples, and the rays of these samples give the color. Hart's coverage by a half plane (1996, Eq.
+22), composited over the background, was tried and left out. Its error was as large as that of 9
+rays a pixel on letters, and two to four times as large where surfaces end, have creases or are
+thinner than the cone.
 """
 
 from __future__ import annotations
@@ -48,12 +48,15 @@ _NEGLIGIBLE = 1e-12
 
 @dataclass(frozen=True)
 class _CoverState:
-    """The state of a ray in the cover.
+    """The state of a ray in the cover, the layer around the surface whose thickness is the radius
+    of the cone.
 
-    t, height, slope: of the last sample; the height over the surface is in radii of the cone, and
-        less than 0 behind the surface.
-    step: from there to the next sample.
-    sample_count: the number of samples.
+    t, height, slope: the ray parameter of the last sample, the height over the surface there in
+        radii of the cone, and the derivative of the height along the ray. The height is negative
+        behind the surface.
+    step: the length from there to the next sample.
+    sample_count: the number of samples so far.
+    active: whether the ray goes on.
     """
 
     t: Real
@@ -68,9 +71,10 @@ class _CoverState:
 class PixelCones:
     """Cones around rays o + t d, |d| = 1, that may touch a level set.
 
+    prepared: the tracer of the level set.
     radius: the radius of a cone per unit of t.
-    bounding_balls: (middle, depth, size): the common center of two balls, one of radius `depth`
-        inside the extent of the surface and one of radius `size` around the extent; None for an
+    bounding_balls: (middle, depth, size): the common center of a ball of radius `depth` inside the
+        extent of the surface and of a ball of radius `size` around the extent; None for an
         unbounded extent.
     solid: (low, high) for a solid {low <= f <= high}; None for a surface with two sides.
     """
@@ -83,13 +87,15 @@ class PixelCones:
     solid: tuple[Real, Real] | None = None
 
     def partially_covered(self, t_max: Real, active: Mask) -> tuple[Mask, Any]:
-        """Whether the surface covers each cone in part, but not completely, in its first passage
-        that begins before t_max; and the number of evaluations of the field.
+        """The mask of cones that the surface covers in part but not completely, and the number of
+        evaluations of the field. Only the first passage of each ray through the cover that begins
+        before t_max is examined. The cover is the layer around the surface whose thickness is the
+        radius of the cone.
 
-        The march to the cover is `March.advance`, for levels that lie nearer in value by
-        |grad f| times the radius: a step that is proved for those keeps the ray a radius off the
-        surface, to first order. Within the cover steps are predicted and not proved. Nothing is
-        missed by that but surfaces in the cover of another one.
+        A ray marches to the cover with proofs (`March.advance`). Levels then count as nearer in
+        value by |grad f| times the radius. So a proved step keeps the ray a radius off the surface,
+        to first order. Within the cover steps are predicted and not proved. That can only miss a
+        second surface within the cover of the first.
         """
         backend, prepared = self.prepared.backend, self.prepared
         real = backend.Float
@@ -112,6 +118,8 @@ class PixelCones:
         level, side = now.value + gap, dr.select(gap < 0, real(1), -1)
 
         def sample_at(t: Real) -> tuple[Real, Real]:
+            """The height over the surface at parameters t, in radii of the cone, and its derivative
+            along the ray."""
             field = (
                 prepared.field
                 if now.accuracy_scale is None
@@ -121,6 +129,7 @@ class PixelCones:
             return self._height(sample.value, sample.gradient, t, side, level)
 
         def body(last: _CoverState) -> _CoverState:
+            """The state after one more sample within the cover."""
             t = last.t + last.step
             height, slope = sample_at(t)
             step = _next_step(
@@ -142,7 +151,12 @@ class PixelCones:
     def _height(
         self, value: Real, gradient: Vec3, t: Real, side: Real, level: Real
     ) -> tuple[Real, Real]:
-        """The height over the surface in radii, and its slope along the ray."""
+        """The height over the surface, in radii of the cone, and its derivative along the ray.
+
+        value, gradient, t: f, its gradient (3,) and the ray parameter of a sample.
+        side, level: the level, and 1 or -1 if the ray comes to it from larger or smaller f. They
+            are not used for a solid.
+        """
         period = self.prepared.levels.period
         offset = value - level
         if period is not None:
@@ -158,12 +172,12 @@ class PixelCones:
         return dr.select(has_slope, height / radius, dr.inf), slope
 
     def _clip(self) -> tuple[Real, Real]:
-        """The interval of rays on which their cones can touch the surface.
+        """The interval (start, end) of ray parameters on which the cones can touch the surface.
 
-        The surface's extent is scaled up about a point in it until it holds all points within the
-        radius of the cone; equally, the ray is scaled down. Proof that it holds them: a convex C
-        that holds the ball of radius h about m = 0 holds h u for every unit vector u, so that
-        (1 + a) C = C + a C holds C moved by any vector of length a h.
+        The surface's extent is enlarged about a point m in it by a factor, until it contains all
+        points within the radius of the cone. (Here the ray is shrunk instead, which is equivalent.)
+        Proof: let a convex set C contain the ball of radius h about m = 0. Then it contains h u for
+        every unit vector u. So (1 + a) C = C + a C contains C moved by any vector of length a h.
         """
         real = self.prepared.backend.Float
         start, end = real(0), real(dr.inf)
@@ -179,15 +193,22 @@ class PixelCones:
         return real(start), real(end)
 
 
-def _next_step(height: Real, slope: Real, second: Real, longest: Real) -> Real:
-    """The step to where the cone is predicted to be lowest, a radius behind the surface, or outside
-    of the cover, whichever comes first; second: the second derivative of the height."""
+def _next_step(height: Real, slope: Real, second_derivative: Real, longest: Real) -> Real:
+    """The length of the next step of a ray in the cover, at most `longest`: to where the cone is
+    predicted to be lowest over the surface, to a radius behind the surface, or to the outside of
+    the cover, whichever comes first.
+
+    height, slope, second_derivative: the height over the surface in radii of the cone, and its
+        first and second derivatives along the ray.
+    """
     real = cast("Any", type(height))
     to_behind = (height + 1 + _AIM_MARGIN) / fmax(-slope, real(_NEGLIGIBLE))
     lowest = dr.select(
-        second > _NEGLIGIBLE, (1 + _AIM_MARGIN) * -slope / fmax(second, real(_NEGLIGIBLE)), dr.inf
+        second_derivative > _NEGLIGIBLE,
+        (1 + _AIM_MARGIN) * -slope / fmax(second_derivative, real(_NEGLIGIBLE)),
+        dr.inf,
     )
     rest = fmax(_END_HEIGHT + _AIM_MARGIN - height, real(0))
-    root = dr.sqrt(slope * slope + 2 * fmax(second, real(0)) * rest)
+    root = dr.sqrt(slope * slope + 2 * fmax(second_derivative, real(0)) * rest)
     outward = 2 * rest / fmax(slope + root, real(_NEGLIGIBLE))
     return fmin(dr.select(slope < 0, fmin(to_behind, lowest), outward), longest)

@@ -1,8 +1,8 @@
-"""The function `crossings`, which gives the crossings of rays with a surface, and its result
+"""The function `crossings`, which gives all points at which rays cross a surface, and its result
 `RayCrossings`.
 
-`find_crossings` finds them one after the other while a kernel is recorded. `RayCrossings` is the
-result for users: NumPy arrays for NumPy rays, Dr.Jit arrays for Dr.Jit rays.
+`find_crossings` finds the crossings of each ray one after another while a kernel is recorded.
+`RayCrossings` is the result for users: NumPy arrays for NumPy rays, Dr.Jit arrays for Dr.Jit rays.
 """
 
 from __future__ import annotations
@@ -50,15 +50,19 @@ _HONORED = (
 
 @dataclass(frozen=True)
 class CrossingArrays:
-    """The first k crossings of n rays, as Dr.Jit arrays.
+    """The first k crossings of n rays, as Dr.Jit arrays. Crossing j of ray i is at i k + j in
+    arrays of n k entries.
 
-    t: (n k) ray parameters, with crossing j of ray i at i k + j; inf if a ray has fewer crossings.
-    gradient: (n k, 3) of f at the crossing, or the normal of the facet; 0 for no crossing.
-    sheet: (n k) index of the facet that was crossed, NO_FACET for none.
+    t: (n k) ray parameters; inf if a ray has fewer crossings.
+    gradient: (n k, 3) the gradient of f at the crossing, or the normal of the facet; 0 for no
+        crossing. A facet is a flat piece of surface at which f jumps.
+    sheet: (n k) the index of the facet that was crossed, NO_FACET for none.
     side: (n k) 1 if f rises through the level along the ray, -1 if it falls, 0 for no crossing.
-    count: (n) number of crossings, at most k.
-    end: (n) ray parameter up to which the ray was followed; inf if it was followed to its end.
-    evaluations, status: (n) as in `RayCrossings`.
+    count: (n) the number of crossings, at most k.
+    end: (n) the ray parameter up to which the ray was followed; inf if it was followed to its end.
+    evaluations: (n) the number of evaluations of f.
+    status: (n) a `RayStatus`: MISS if the ray has no further crossings, HIT if it has k,
+        OUT_OF_STEPS if the ray behind `end` is not known.
     """
 
     t: Real
@@ -73,11 +77,12 @@ class CrossingArrays:
 
 @dataclass(frozen=True)
 class _SearchState:
-    """The state of rays, and the number of crossings that they have found.
+    """The state of rays that look for crossings, and the number of crossings that each has found.
 
     march: the state of the march; None for a field with jumps.
-    sheets: the state of `JumpTracer`, which includes that of the march; None without jumps.
-    count: the number of crossings.
+    sheets: for a field with jumps, the state of `JumpTracer`, which includes the state of the
+        march; else None.
+    count: the number of crossings so far.
     """
 
     march: MarchState | None
@@ -86,16 +91,18 @@ class _SearchState:
 
     @property
     def active(self) -> Mask:
+        """Mask of the rays that go on."""
         return self.now.active
 
     @property
     def now(self) -> MarchState:
-        """The state of the march."""
+        """The state of the march, for all kinds of fields."""
         state = self.march if self.sheets is None else self.sheets.march
         assert state is not None
         return state
 
     def with_march(self, now: MarchState, count: Any) -> _SearchState:
+        """This state with another state of the march and another number of crossings."""
         if self.sheets is None:
             return _SearchState(now, None, count)
         return _SearchState(None, dataclasses.replace(self.sheets, march=now), count)
@@ -106,8 +113,9 @@ def find_crossings(
 ) -> CrossingArrays:
     """The first k crossings of rays o + t d, |d| = 1, for t_min <= t <= t_max.
 
-    `Hysteresis` states the guarantees and proves them: between two crossings the ray is a single
-    march, in which contacts may begin and end any number of times.
+    `Hysteresis`, the rule by which a crossing is counted, states the guarantees and proves them. A
+    ray is marched from one crossing to the next without a new start: what is known of f at a
+    crossing is used behind it, and the ray may reach and leave levels any number of times.
     """
     backend = prepared.backend
     real, vector, count = backend.Float, backend.Array3f, backend.UInt32
@@ -122,6 +130,9 @@ def find_crossings(
     tracer = JumpTracer(march, prepared.field, path, start, end)
 
     def advance(now: _SearchState) -> _SearchState:
+        """The state after each active ray has gone to its next crossing, to the next jump of f, or
+        to its end. A crossing is written to the arrays outside, in the next free place of its
+        ray."""
         next_state, facet = now, None
         if now.sheets is None:
             after = march.advance(prepared.field, path, end, now.now)
@@ -164,8 +175,8 @@ def find_crossings(
         begin = _SearchState(None, tracer.begin(state), dr.zeros(count, n))
     walk = loop_while_active(begin, advance, "harnack crossings")
     final = walk.now
-    rays, none = dr.arange(count, n * k) // k, real(0)
-    roots = Contact(side, backend.Bool(False), t, gradient, none, before, behind, none)
+    rays, zero = dr.arange(count, n * k) // k, real(0)
+    roots = Contact(side, backend.Bool(False), t, gradient, zero, before, behind, zero)
     origins, directions = gather_vectors(backend, o, rays), gather_vectors(backend, d, rays)
     t, gradient, samples = prepared.refined_crossings(origins, directions, roots, dr.isfinite(t))
     evaluations = final.evaluations + dr.block_reduce(dr.ReduceOp.Add, samples, k)
@@ -177,28 +188,29 @@ def find_crossings(
 
 @dataclass(frozen=True)
 class RayCrossings:
-    """The first k crossings of n rays with the level set, in order.
+    """The first k crossings of n rays with the level set, in the order along each ray.
 
-    As NumPy arrays, or as tensors if the rays were; if they were Dr.Jit arrays, as Dr.Jit arrays,
-    in which (n, k) is flat: crossing j of ray i is at i k + j.
+    They are NumPy arrays; tensors if the rays were tensors; Dr.Jit arrays if the rays were Dr.Jit
+    arrays. The latter are flat: crossing j of ray i is at i k + j.
 
-    t: (n, k) ray parameter of the crossing, inf if a ray has fewer crossings. It lies between two
-        samples with f on different sides of the level: at the root of the cubic through their
-        values and slopes, or of a bisection if there is a crease between them.
-    position: (n, k, 3) point at t, NaN for no crossing.
-    normal: (n, k, 3) unit normal grad f/|grad f|, to the side of larger f; zero for no crossing.
-    primitive_index: (n, k) index of the facet, such as a triangle, that was crossed; -1 if no facet
-        was crossed.
+    t: (n, k) the ray parameter of the crossing, inf if a ray has fewer crossings. It lies between
+        two samples with f on different sides of the level: at the root of the cubic through their
+        values and slopes, or found by bisection if there is a crease between them.
+    position: (n, k, 3) the point at t, NaN for no crossing.
+    normal: (n, k, 3) the unit normal grad f/|grad f|, which points to the side of larger f; zero
+        for no crossing.
+    primitive_index: (n, k) the index of the facet that was crossed, a flat piece of surface at
+        which f jumps, such as a triangle; -1 if no facet was crossed.
     side: (n, k) integers: 1 if f rises through the level along the ray, -1 if it falls through it,
         0 for no crossing.
-    count: (n,) number of crossings, at most k.
-    traced_to: (n,) ray parameter up to which the ray was followed: inf if it was followed to its
-        end; else the point just behind the last crossing at which that was noticed, or the point at
-        which the ray ran out of steps.
-    status: (n,) a `RayStatus`, of the end of the ray. MISS: the ray is proved to have no other
-        crossings. HIT: there are k crossings, and the rest of the ray was not examined.
-        OUT_OF_STEPS: the ray behind `traced_to` is not known.
-    evaluations: (n,) number of evaluations of the field.
+    count: (n,) the number of crossings, at most k.
+    traced_to: (n,) the ray parameter up to which the ray was followed: inf if it was followed to
+        its end; else the point just behind the last crossing at which this crossing was noticed, or
+        the point at which the ray ran out of steps.
+    status: (n,) a `RayStatus`. MISS: the ray is proved to have no other crossings. HIT: there are k
+        crossings, and the rest of the ray was not examined. OUT_OF_STEPS: the ray behind
+        `traced_to` is not known.
+    evaluations: (n,) the number of evaluations of the field.
     """
 
     t: Any
@@ -225,25 +237,28 @@ def crossings(
     options: TraceOptions | None = None,
     **keywords: Unpack[TraceKeywords],
 ) -> RayCrossings:
-    """The first crossings of rays with a level set of a field, in order.
+    """The first crossings of rays with a level set of a field, in the order along each ray.
 
     If f goes farther than the tolerance to both sides of the level, the crossing is not missed, and
-    no crossing is counted twice. Touching a level without passing to its other side is no crossing,
-    and neither is starting on it. If levels are closer in value than four tolerances, a quarter of
-    their distance is the tolerance; rays run out of steps if that is below rounding. Otherwise the
-    tolerance is at least eight times the rounding error of f, in single precision about 1e-5 of the
-    size of the coordinates: if f goes less far than that to one side, the crossing may not count.
+    no crossing is counted twice. If a ray touches a level without passing to its other side, or
+    starts on it, that is no crossing. If levels are closer in value than four tolerances, a quarter
+    of their distance takes the place of the tolerance; rays run out of steps if that is below
+    rounding. Otherwise the tolerance is at least eight times the rounding error of f, in single
+    precision about 1e-5 of the size of the coordinates: if f goes less far than that to one side,
+    the crossing may not count.
 
-    surface, origins, directions, t_min, t_max, options, keywords: as in `trace`, but for `side`,
-        `largest`, `require_crossing` and `backend`, which crossings do not have. `max_steps` is for
-        the whole ray.
+    surface, origins, directions, t_min, t_max, options, keywords: the surface, the rays and the
+        options, as `trace` takes them. The options `side`, `largest`, `require_crossing` and
+        `backend` do not exist here. `max_steps` is for the whole ray.
     max_crossings: the number of crossings of each ray to return, at least 1.
 
-    With Dr.Jit rays, t and position carry derivatives as those of `trace` do.
+    With Dr.Jit rays, t and position carry derivatives with respect to rays, level, and vertices of
+    a `SolidAngle`, if these have derivatives enabled.
 
     Raises:
-        TypeError, ValueError: as `trace`; also for several levels of a field with jumps.
-        NotImplementedError: a field with patches.
+        TypeError, ValueError: wrong rays, levels or options, which `trace` lists; also several
+            levels of a field with jumps.
+        NotImplementedError: a union of patches, which has a function for each patch.
     """
     target, choices = surface_and_options("crossings", surface, options, keywords, _HONORED)
     traced = TracedSurface.of(target, choices).with_call_cache()
@@ -268,6 +283,7 @@ def crossings(
 
 
 def _check_count(max_crossings: Any) -> int:
+    """`max_crossings` as an int of at least 1; TypeError or ValueError otherwise."""
     try:
         k = operator.index(max_crossings)
     except TypeError:
@@ -283,7 +299,9 @@ def _check_count(max_crossings: Any) -> int:
 def trace_crossings(
     surface: TracedSurface, rays: RayBatch, k: int, *, differentiable: bool
 ) -> RayCrossings:
-    """The first k crossings as `RayCrossings` of Dr.Jit arrays."""
+    """The first k crossings of each ray as a `RayCrossings` of Dr.Jit arrays. differentiable:
+    whether t and positions are to carry derivatives, if rays, levels or field have derivatives
+    enabled."""
     backend, o, d = rays.backend, rays.origin, rays.direction
     prepared = surface.prepare(backend, crosses=True)
     with dr.suspend_grad():
@@ -299,8 +317,8 @@ def trace_crossings(
     if differentiable and needs_derivatives(prepared, o, d):
         with dr.suspend_grad():
             status = dr.select(is_found, backend.UInt32(int(RayStatus.HIT)), int(RayStatus.MISS))
-            none = dr.zeros(backend.Float, dr.width(t))
-            ends = MarchResult(t, none, found.gradient, none, none, status, found.sheet, found.side)
+            zero = dr.zeros(backend.Float, dr.width(t))
+            ends = MarchResult(t, zero, found.gradient, zero, zero, status, found.sheet, found.side)
         t, normal = attach_derivatives(prepared, o, d, ends, normal)
         normal = refuse_derivative(prepared, o, d, "normal", normal)
         end = refuse_derivative(prepared, o, d, "traced_to", end)
@@ -314,20 +332,22 @@ def trace_crossings(
 
 
 def empty_crossings(backend: Backend) -> RayCrossings:
-    """The crossings of no rays."""
+    """The `RayCrossings` of no rays, as Dr.Jit arrays."""
     number, vector = dr.zeros(backend.Float, 0), dr.zeros(backend.Array3f, 0)
     count, side = dr.zeros(backend.UInt32, 0), dr.zeros(backend.Int32, 0)
     return RayCrossings(number, vector, vector, side, side, count, number, count, count)
 
 
 def crossings_to_numpy(hits: RayCrossings, n: int, k: int) -> RayCrossings:
-    """Crossings of n rays as NumPy arrays."""
+    """The crossings of n rays, k for each, as NumPy arrays of shapes (n, k, ...) and (n,)."""
 
     def each(array: Any) -> Any:
+        """An array of crossings as a NumPy array (n, k, ...)."""
         values = to_numpy(array)
         return values.reshape(n, k, *values.shape[1:])
 
     def of_ray(array: Any) -> Any:
+        """An array of rays as a NumPy array (n,)."""
         return np.broadcast_to(to_numpy(array), (n,)).copy()
 
     return RayCrossings(

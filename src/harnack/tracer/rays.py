@@ -1,4 +1,4 @@
-"""`RayBatch`: the rays of a call, as users give them, on a backend."""
+"""`RayBatch`: the rays of a call, as users give them, checked and on a backend."""
 
 from __future__ import annotations
 
@@ -21,8 +21,9 @@ if TYPE_CHECKING:
 class RayBatch:
     """Rays o + t d, t_min <= t <= t_max, |d| = 1, on a backend.
 
-    count: the number of rays; the arrays have this width, or 1.
-    is_numpy: whether they came as NumPy arrays, which results then are; else Dr.Jit arrays.
+    count: the number of rays; each array has this width, or 1.
+    is_numpy: whether the rays came as NumPy arrays; then results are NumPy arrays, too, else Dr.Jit
+        arrays.
     is_tensor: whether results are to be tensors.
     """
 
@@ -41,8 +42,8 @@ class RayBatch:
     ) -> RayBatch:
         """The rays of the arguments of `trace` and `crossings`.
 
-        precision: None for that of the input: of Dr.Jit arrays their own; of others double where
-            origins or directions are arrays of float64, else single.
+        precision: "single" or "double"; None for that of the input. Dr.Jit arrays have a precision.
+            Other rays are double if origins or directions are arrays of float64, else single.
 
         Raises:
             TypeError, ValueError: shapes that do not match, numbers that are not finite, directions
@@ -72,13 +73,15 @@ class RayBatch:
 
     @property
     def arrays(self) -> tuple[Vec3, Vec3, Real, Real]:
-        """Origin, direction, t_min and t_max."""
+        """The arrays origin (3,), direction (3,), t_min and t_max."""
         return self.origin, self.direction, self.t_min, self.t_max
 
 
 def _uploaded(
     backend: Backend, origins: Any, directions: Any, t_min: Any, t_max: Any
 ) -> tuple[Vec3, Vec3, Real, Real]:
+    """Origins, unit directions, t_min and t_max as arrays of a backend, checked. Raises ValueError
+    for arrays that do not match or are no rays."""
     o = as_kernel_parameters(to_vector3(backend, origins, "origins"))
     d = as_kernel_parameters(to_vector3(backend, directions, "directions"))
     near, far = to_float(backend, t_min, "t_min"), to_float(backend, t_max, "t_max")
@@ -96,6 +99,8 @@ def _uploaded(
 
 
 def _check_numpy_rays(lengths: FloatArray, near: FloatArray, far: FloatArray) -> None:
+    """Raise ValueError for directions of length zero, a negative t_min, and t_max < t_min. lengths:
+    (n,) largest absolute coordinates of the directions. near, far: (n,) t_min and t_max."""
     zero = np.flatnonzero(~(lengths >= np.finfo(lengths.dtype).smallest_normal))
     if zero.size:
         raise ValueError(

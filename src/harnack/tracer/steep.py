@@ -1,15 +1,15 @@
-"""Hits and steps where the slope of a field has no bound (`Field.is_steep`).
+"""Hits and steps of rays in fields whose slope has no bound (`Field.is_steep`).
 
-|f - level| / |grad f| estimates the distance to the level only if f does not bend within it. Beside
-a vertical tangent or a pole f may bend by any amount: at x = 1e-6 the slope of sqrt(|x|) + 0.5 is
-500, so the level 0 should be 0.001 away, but f never takes it. So before a point counts as a hit, f
-is sampled on the other side of the level; and steps that slopes do not prove may be proved by
-ranges of values (`arithmetic.values`).
+|f - level| / |grad f| estimates the distance to the level only if f is nearly linear up to there.
+Beside a vertical tangent or a pole f may bend by any amount. For example, the slope of sqrt(|x|) +
+0.5 at x = 1e-6 is 500, so the level 0 should be 0.001 away, but f never takes it. So before a point
+counts as a hit, f is sampled on the other side of the level. Steps that slopes do not prove may be
+proved by ranges of values (`arithmetic.values`).
 
-The same holds for a formula that is steep only within the rounding of coordinates, such as
-max(-1, min(1, 1e9 y)), whose slope is 0 on both sides. A rounded point there has a level within its
-error, which ends all steps. The ray hits if f is seen on the other side of the level, and is
-undecided otherwise.
+The same holds for a formula that is steep only within the rounding of coordinates, such as max(-1,
+min(1, 1e9 y)), whose slope is 0 on both sides. At a rounded point near y = 0, a level lies within
+the error of f, and no step is proved. Such a ray hits if f is found on the other side of the level,
+and is undecided otherwise.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ _CONTINUITY_FACTOR = 1024.0
 
 
 def values_between(field: Field, p: Vec3, q: Vec3, slack: Real | None = None) -> Values | None:
-    """The values of a field on a box around two points, larger by `slack`; None for a field without
-    a formula of its values."""
+    """The range of values of a field on the box with corners p and q, enlarged by `slack` on all
+    sides; None for a field that is no formula of ranges of coordinates."""
     coordinates = Values.between(p, q, slack)
     formula: Any = getattr(field, "formula", None)
     if formula is None:
@@ -71,20 +71,20 @@ def largest_change(field: Field, p: Vec3, value: Real, reach: Real) -> Real:
 
 @dataclass(frozen=True)
 class SteepPlace:
-    """What the values of a field prove at a trial point.
+    """What ranges of values of f prove at a trial point of a ray.
 
-    error: a bound of the error of f there, by its own rounding and by the rounding of the point;
-        infinite where no bound is known. |grad f| times the rounding of the point is no bound. None
-        for fields without a formula of their values.
-    is_level: whether a level may be the value of f at the exact point: it lies in the range of f
-        around the rounded point, or so near to this range that rounding may keep a ray from coming
-        nearer, and f is proved to be continuous there. It is no proof that f takes the level
-        (`beyond`).
-    free: a length of the path on which no value of f is a level, because f stays away from levels
-        or has no value at all; 0 where no length is proved.
+    error: a bound of the error of f there, from the rounding of f and of the point; inf if no bound
+        is known. (|grad f| times the rounding of the point is no bound here.) None for fields
+        without a formula of their values.
+    is_level: whether f at the exact point may be a level. It may if f is proved to be continuous
+        there, and the level lies in the range of f around the rounded point, or so near to this
+        range that rounding may keep a ray from coming nearer. It does not prove that f takes the
+        level; `beyond` tests that.
+    free: a length of the path on which f does not take a level, because it stays away from levels
+        or has no value at all; 0 if no length is proved.
     ahead: the length of the path on which values were bounded.
-    fall, rise: bounds of how much smaller and larger f is on that length than at the point;
-        infinite where no bound is known.
+    fall, rise: bounds of how far f falls and rises on that length from its value at the point; inf
+        if no bound is known.
     """
 
     error: Real | None
@@ -98,14 +98,18 @@ class SteepPlace:
     def at(
         cls, field: Field, levels: Levels, path: Ray, t: Real, ahead: Real, sample: Sample
     ) -> SteepPlace:
-        """The bounds at the parameter t, with the sample there. ahead: the length of the path on
-        which values are bounded.
+        """The bounds at the parameter t of rays.
 
-        Proof of the error. The exact point lies in the box of all points that are at most `slack`
-        from the rounded point in each coordinate, so f there lies in the range on the box.
+        ahead: the length of the path on which values are bounded.
+        sample: the sample at t.
 
-        Proof of the length. All points of the path on it lie in the box around its ends, rounding
-        included, and all values of f in the box lie in its range, which contains no level.
+        Proof of the error. The exact point differs from the rounded point by at most `slack` in
+        each coordinate. So it lies in a box around the rounded point, and f there lies in the range
+        of f on this box.
+
+        Proof of the length. All points of the path on this length lie in the box around its two
+        ends, rounding included. All values of f in the box lie in its range, and the range contains
+        no level.
         """
         p, value = path.point(t), sample.value
         real = cast("Any", type(t))
@@ -140,41 +144,43 @@ class SteepPlace:
         return cls(error, is_level & valid, free, ahead, fall, rise)
 
     def free_of(self, gaps: LevelGaps) -> Real:
-        """A length of the path on which f changes by less than these gaps; 0 where no length is
-        proved. For levels at other places than `free`, as those of a ray in contact
+        """The length `ahead` of the path if f changes on it by less than `gaps`, the differences to
+        the next levels below and above; 0 otherwise. It serves levels at other places than those of
+        `free`: a ray that looks for crossings moves the level that it has reached
         (`Hysteresis`)."""
         return dr.select((self.fall < gaps.below) & (self.rise < gaps.above), self.ahead, 0)
 
 
 @dataclass(frozen=True)
 class _SearchState:
-    """The state of the test `beyond`.
+    """The state of the test `beyond` for each point.
 
-    looks, sides: the number of samples, and of the samples after the search.
-    passed: whether a level was passed.
-    low, high: the search for the point at which f comes nearest to a level: lengths along the first
-        way between which it does.
-    inner, least: a length between these, and the level gap there.
+    looks, sides: the number of all samples, and of those after the search along the first
+        direction.
+    passed: whether a sample was at a level or on its other side.
+    active: whether the test goes on.
+    low, high: two lengths along the first direction between which f comes nearest to a level.
+    inner, least: a length between them, and the difference between f and the level there.
     """
 
-    looks: Any
-    sides: Any
+    count: Any
+    side_count: Any
     passed: Mask
     active: Mask
     low: Real
     high: Real
     inner: Real
-    least: Real
+    least_gap: Real
 
 
 def passes(levels: Levels, value: Real, low: Real, high: Real, gaps: LevelGaps) -> Mask:
-    """Whether all numbers of a range are on the other side of a level than a value, or at the
-    level.
+    """Mask of lanes on which all numbers from low to high are on the other side of a level than
+    `value`, or at the level.
 
-    Numbers are compared with the level itself: beside a pole, differences of values round it away,
-    as 1e28 + 1 does.
+    gaps: the differences between `value` and the next levels; they are used for periodic levels.
 
-    gaps: from the value to the levels; they place periodic levels.
+    Numbers are compared with the level itself. Beside a pole, a difference of values would lose the
+    level by rounding, as 1e28 + 1 does.
     """
     if levels.period is not None:
         return (high - value <= -gaps.below) | (low - value >= gaps.above)
@@ -185,7 +191,8 @@ def passes(levels: Levels, value: Real, low: Real, high: Real, gaps: LevelGaps) 
 
 
 def holds(levels: Levels, value: Real, low: Real, high: Real, gaps: LevelGaps) -> Mask:
-    """Whether a level lies in a range; see `passes`."""
+    """Mask of lanes on which a level lies in the range from low to high. value, gaps: f at a point,
+    and the differences between it and the next levels; they are used for periodic levels."""
     if levels.period is not None:
         is_held = (low - value <= -gaps.below) & (high - value >= -gaps.below)
         return is_held | ((low - value <= gaps.above) & (high - value >= gaps.above))
@@ -207,44 +214,52 @@ def beyond(
     searches: Mask,
     active: Mask,
 ) -> tuple[Mask, Any]:
-    """Whether f takes a level within `reach` of p, and how many evaluations of f that took.
+    """Mask of points p for which f is found to take a level at a distance of at most `reach`, and
+    the number of evaluations of f that this took.
 
-    ways: two directions, each with the slope of f along it.
+    gaps: the differences between f at p and the next levels.
+    ways: two unit directions (3,), each with the slope of f along it.
     value: f at p.
-    gaps: from f at p to the `levels`.
-    searches: lanes on which a search is made, as the ray can come no nearer.
+    searches: mask of points around which a search is made if the first samples do not decide, since
+        the ray can come no nearer.
+    active: mask of points that are tested.
 
-    Proof. At another point, at most `reach` away, f is on the other side of the level, and on the
-    box around both it is continuous and has values everywhere: so it takes the level between them
-    (up to its rounding there). Or f is the level at the other point, up to rounding, as where it
-    touches the level and turns back. The points are along the first way where the slope says that
-    the level is, twice as far, and at `reach`; and the next two along the second way. Where f may
-    be the level at p, up to the rounding of p, others follow: along the first way by golden
-    sections towards where f comes nearest to the level, then back along the second way, as rounding
-    may have put p behind the level, and from the nearest place half of `reach` along each axis.
-    Ranges around p are no proof: they hold numbers that are no values of f, and so do those beside
-    a jump: f is at the level up to rounding only where it is continuous on a box that is many times
-    as large as this rounding. If the level is not found, nothing is proved: the ray goes on, and
-    comes nearer if it meets the surface.
+    Proof. Either f at another point q, at most `reach` away, is on the other side of the level, and
+    on the box around p and q f is continuous and has values everywhere. Then f takes the level
+    between them, up to its rounding at q. Or f at q is the level up to rounding, for example
+    because it touches the level and turns back.
+
+    Points q. Along the first direction: where the slope says that the level is, twice as far, and
+    at `reach`. Along the second direction: twice as far as its slope says, and at `reach`. If f may
+    be the level at p up to the rounding of p, further points follow: along the first direction by
+    golden sections towards the point where f comes nearest to the level; then back along the second
+    direction, as rounding may have put p behind the level; and half of `reach` along each axis from
+    the nearest point.
+
+    Ranges of f around p prove nothing, as they may contain numbers that f does not take. The same
+    holds for ranges beside a jump. So f counts as the level up to rounding only if it is continuous
+    on a box that is many times as large as this rounding. If the level is not found, nothing is
+    proved: the ray goes on, and comes nearer if it meets the surface.
     """
     epsilon = float(dr.epsilon(backend.Float))
     shortest = 4 * epsilon * reach
 
-    def body(now: _SearchState) -> _SearchState:
-        is_first, is_far = now.looks < 3, (now.looks == 2) | (now.looks == 4)
-        is_search = now.looks >= _TRIAL_COUNT
-        is_side = is_search & ((now.high - now.low <= shortest) | (now.looks >= _MAX_SAMPLES))
-        is_behind = is_side & (now.sides == 0)
+    def sample_once(now: _SearchState) -> _SearchState:
+        """The state after one more sample q."""
+        is_first, is_far = now.count < 3, (now.count == 2) | (now.count == 4)
+        is_search = now.count >= _TRIAL_COUNT
+        is_side = is_search & ((now.high - now.low <= shortest) | (now.count >= _MAX_SAMPLES))
+        is_behind = is_side & (now.side_count == 0)
         direction = dr.select(is_first | (is_search & ~is_behind), ways[0][0], ways[1][0])
         slope = dr.abs(dr.select(is_first, ways[0][1], ways[1][1]))
-        factor = dr.select(now.looks == 0, backend.Float(1), 2)
+        factor = dr.select(now.count == 0, backend.Float(1), 2)
         distance = dr.select(is_far, reach, fmin(factor * gaps.nearest / slope, reach))
         behind, ahead = now.inner - now.low, now.high - now.inner
         section = now.inner + _GOLDEN_SECTION * dr.select(ahead >= behind, ahead, -behind)
         section = dr.select(is_behind, -reach, dr.select(is_side, now.inner, section))
         distance = dr.select(is_search, section, distance)
-        side = dr.select((now.sides & 1) == 0, 0.5 * reach, -0.5 * reach)
-        axis = (now.sides - 1) >> 1  # no axis if sides is 0: 0 - 1 is a large number
+        side = dr.select((now.side_count & 1) == 0, 0.5 * reach, -0.5 * reach)
+        axis = (now.side_count - 1) >> 1  # no axis if the count is 0: 0 - 1 is a large number
         offset = type(p)(*(dr.select(is_side & (axis == k), side, 0) for k in range(3)))
         q = dr.fma(type(p)(distance), direction, p) + offset
         # In coordinates in which q is rounded more coarsely than this, the box is q itself.
@@ -269,36 +284,49 @@ def beyond(
         gap = dr.select(dr.isfinite(nearest), nearest, dr.inf)
         now = _narrowed(now, distance, gap, is_search & ~is_side)
         passed |= now.passed
-        samples, sides = now.looks + 1, now.sides + dr.select(is_side, 1, 0)
-        active = (
-            now.active & ~passed & ((samples < _TRIAL_COUNT) | (searches & (sides < _SIDE_COUNT)))
+        samples, side_count = (
+            now.count + 1,
+            now.side_count + dr.select(is_side, 1, 0),
         )
-        return replace(now, looks=samples, sides=sides, passed=passed, active=active)
+        active = (
+            now.active
+            & ~passed
+            & ((samples < _TRIAL_COUNT) | (searches & (side_count < _SIDE_COUNT)))
+        )
+        return replace(
+            now,
+            count=samples,
+            side_count=side_count,
+            passed=passed,
+            active=active,
+        )
 
     begin = _SearchState(
         backend.UInt32(0), backend.UInt32(0), backend.Bool(False), backend.Bool(active),
         backend.Float(0), backend.Float(reach), backend.Float(0), backend.Float(gaps.nearest),
     )  # fmt: skip
-    end = loop_while_active(begin, body, "harnack beyond")
-    return end.passed, end.looks
+    end = loop_while_active(begin, sample_once, "harnack beyond")
+    return end.passed, end.count
 
 
 def _narrowed(now: _SearchState, length: Real, gap: Real, is_search: Mask) -> _SearchState:
-    """The state of the search after a sample at another length, with its gap to a level."""
-    nearer, is_farther = gap <= now.least, length > now.inner
+    """The state of the search for the point nearest to a level, after a sample at another length
+    along the first direction. gap: the difference between f there and the level. is_search: lanes
+    whose sample belongs to the search; others do not change."""
+    nearer, is_farther = gap <= now.least_gap, length > now.inner
     end, is_low = dr.select(nearer, now.inner, length), nearer == is_farther
     return replace(
         now,
         low=dr.select(is_search & is_low, end, now.low),
         high=dr.select(is_search & ~is_low, end, now.high),
         inner=dr.select(is_search & nearer, length, now.inner),
-        least=dr.select(is_search & nearer, gap, now.least),
+        least_gap=dr.select(is_search & nearer, gap, now.least_gap),
     )
 
 
 def down_or_up(gradient: Vec3, gaps: LevelGaps, otherwise: Vec3) -> Vec3:
-    """The unit vector along which f goes to the nearer level; `otherwise` where the gradient has no
-    direction."""
+    """The unit vector (3,) along which f goes to the nearer level: against the gradient if that
+    level is below f, else along it; `otherwise` if the gradient is zero or not finite."""
     direction = safe_normalize(gradient)
     direction = dr.select(gaps.below < gaps.above, -direction, direction)
     finite = dr.isfinite(direction.x + direction.y + direction.z)

@@ -1,4 +1,4 @@
-"""`Surface`: the level sets of a field, and the part of them that is meant."""
+"""`Surface`: the level sets of a field, or the boundary of a solid, and the volumes that cut it."""
 
 from __future__ import annotations
 
@@ -29,7 +29,8 @@ SIDES: tuple[Side, ...] = get_args(Side)
 
 
 class SurfaceKeywords(TypedDict, total=False):
-    """The keywords of `Surface`, which every verb takes beside a bare field."""
+    """The keywords of `Surface`. Every verb (`trace`, `render`, `mesh`, ...) takes them beside a
+    field that is given without a `Surface`."""
 
     level: Any
     clip: Volume | None
@@ -44,27 +45,29 @@ class Surface:
 
     Every verb takes a `Surface` in place of a field: `trace`, `crossings`, `render`, `animate`,
     `view`, `page`, `mesh`, `signed_distance`, `curvature`. Keywords of these verbs that are named
-    as here are shorthand: `trace(field, ..., level=2.0)` traces `Surface(field, 2.0)`.
+    as the parameters here are shorthand: `trace(field, ..., level=2.0)` traces `Surface(field,
+    2.0)`.
 
     field: the function f.
     level: a number or several, which may be Dr.Jit numbers; None for the field's default. For an
         angle-valued field levels are taken modulo its period. The attribute `levels` is a tuple.
-    clip: a volume. The surface is what lies in it and in the field's own domain.
-    section: another volume, which cuts the surface open: the faces of a solid on it may have a
-        material of their own.
+    clip: a volume. The surface is the part of the level set in this volume and in the field's own
+        domain.
+    section: another volume, which cuts the surface open. If a solid is cut, the faces of the cut
+        may have a material of their own.
     side: "surface" for the level set itself; "below", "above" or "between" for the boundary of the
-        closed solid on which f <= level, f >= level, or f is between two levels, with faces where
-        a volume cuts it. None is "below" for a `Solid` that is meshed, or whose inside a picture
-        shows, and else "surface".
-    largest: True for the largest connected component alone, as far as components are separated by
-        cells proved empty: 128 cells along the longest side of the box, or this number of them.
-        Largest is the component, of the part within domain and clip, with the largest sum of
-        projected areas along x, y and z. Meshes tell components apart by their triangles.
+        closed solid on which f <= level, f >= level, or f is between two levels, with faces where a
+        volume cuts it. None means "below" for a `Solid` that is meshed, or whose inside a picture
+        shows, and "surface" otherwise.
+    largest: True for the largest connected component alone. Components are told apart by cells that
+        are proved empty: 128 cells along the longest side of the box, or the given number. The
+        largest component, within domain and clip, is the one with the largest sum of projected
+        areas along x, y and z. Meshes tell components apart by their triangles.
 
     Raises:
         TypeError: `field` is no field, or another argument has a wrong type.
         ValueError: a level that is not finite or that the field cannot have; an unknown side, or a
-            number of levels that it does not have.
+            number of levels that does not suit the side.
     """
 
     field: Field
@@ -107,14 +110,14 @@ class Surface:
             )
 
     def replace(self, **changes: Any) -> Surface:
-        """This surface with other arguments, by their names in the constructor."""
+        """This surface with some arguments changed, which are named as in the constructor."""
         arguments: dict[str, Any] = {"field": self.field, "level": self.levels, **self.keywords}
         arguments |= changes
         return Surface(**arguments)
 
     @property
     def keywords(self) -> dict[str, Any]:
-        """The keyword arguments but for `level`."""
+        """The keyword arguments of this surface but for `level`, by name."""
         return {
             "clip": self.clip, "section": self.section, "side": self.side, "largest": self.largest,
         }  # fmt: skip
@@ -131,12 +134,15 @@ class Surface:
 
     @property
     def solid_range(self) -> tuple[float, float] | None:
-        """The values (low, high) of f on the closed solid; None for the level set itself."""
+        """The interval (low, high) of the values of f on the closed solid; None if the surface is
+        the level set itself."""
         return side_range(self.side, self.level_values)
 
 
 def side_range(side: Side | None, levels: Sequence[float]) -> tuple[float, float] | None:
-    """The values (low, high) of f on the closed solid on a side of levels; None for a level set."""
+    """The interval (low, high) of the values of f on the closed solid that `side` describes; one
+    end may be infinite. None if `side` means the level set itself. levels: one level, or two for
+    "between"."""
     if side is None or side == "surface":
         return None
     low = -math.inf if side == "below" else levels[0]
@@ -144,7 +150,8 @@ def side_range(side: Side | None, levels: Sequence[float]) -> tuple[float, float
 
 
 def intersection_of(volumes: Sequence[Volume | None]) -> Volume | None:
-    """The intersection of volumes; None, for all of space, if there are none."""
+    """The intersection of volumes. Entries that are None stand for all of space, and so does the
+    result None."""
     distinct = list(dict.fromkeys(volume for volume in volumes if volume is not None))
     if not distinct:
         return None
@@ -152,14 +159,16 @@ def intersection_of(volumes: Sequence[Volume | None]) -> Volume | None:
 
 
 def level_number(level: Any) -> float:
-    """A level as a Python number. Raises TypeError for a level that is no number."""
+    """A level, which may be a Dr.Jit number, as a Python float. Raises TypeError for a level that
+    is no number."""
     if dr.is_array_v(type(level)):
         return float(dr.detach(level)[0])
     return as_number(level, "level must be a number, or several, such as 0.5 or 2 * math.pi")
 
 
 def as_number(number: Any, message: str) -> float:
-    """A number as Python's; TypeError, which begins with `message`, for anything else."""
+    """A number as a Python float. Raises TypeError, with a text that begins with `message`, for
+    anything else."""
     check_no_derivatives("a level or setting that is no Dr.Jit number", number)
     try:
         return float("nothing" if isinstance(number, str | bool | np.bool_) else number)
@@ -168,6 +177,8 @@ def as_number(number: Any, message: str) -> float:
 
 
 def _check_side(side: Any, levels: Sequence[Any]) -> Side | None:
+    """The option `side`, checked. Raises ValueError if it is unknown, or if the number of levels
+    does not suit it."""
     if side is not None and not is_one_of(side, SIDES):
         names = ", ".join(f'"{name}"' for name in SIDES)
         raise ValueError(f"side must be one of {names}, not {side!r}{did_you_mean(side, SIDES)}")
@@ -186,6 +197,8 @@ def _check_side(side: Any, levels: Sequence[Any]) -> Side | None:
 
 
 def _in_order(levels: tuple[Any, ...], side: Side | None) -> tuple[Any, ...]:
+    """The levels unchanged. Raises ValueError if side is "between" and they are not in ascending
+    order."""
     if side == "between" and not level_number(levels[0]) < level_number(levels[1]):
         low, high = map(level_number, levels)
         raise ValueError(f'side="between" needs level=(low, high), low < high, not {(low, high)}')
@@ -193,7 +206,7 @@ def _in_order(levels: tuple[Any, ...], side: Side | None) -> tuple[Any, ...]:
 
 
 def _as_levels(level: Any) -> tuple[Any, ...]:
-    """The levels, given as a number or several numbers, as a tuple."""
+    """The levels as a tuple. level: a number or several, which may be a tensor."""
     if is_tensor(level):
         numbers = tensor_to_array(level, "level")
         backend = backend_of(numbers)

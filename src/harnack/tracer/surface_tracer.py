@@ -1,7 +1,7 @@
-"""A surface on a backend, and the ways to advance its rays.
+"""`SurfaceTracer`: a surface prepared on a backend, with methods that trace rays to it.
 
-Renderers and `trace` call `SurfaceTracer` for first hits, occlusion and clipping, mostly while a
-kernel is being recorded. `trace_queued` traces many rays with few lanes.
+Renderers and `trace` call it for first hits, for occlusion and to clip rays, mostly while a kernel
+is being recorded. `trace_queued` traces many rays with few lanes.
 """
 
 from __future__ import annotations
@@ -40,22 +40,25 @@ __all__ = ["RayTracer", "SmoothTracer", "TracerFactory", "trace_queued"]
 
 
 class RayTracer(Protocol):
-    """Advances rays. Each call of `advance` makes one trial point, one interval, or one patch."""
+    """Interface to the ways to trace rays: through smooth fields, fields with jumps, and unions of
+    patches. One call of `advance` makes one trial point, or marches one interval between jumps, or
+    one patch. `walk` is the state of this tracer."""
 
     def begin(self, state: MarchState) -> Any:
-        """Rays at their start."""
+        """The tracer's own state of rays at their start, from the common one."""
         ...
 
     def advance(self, walk: Any, /) -> Any:
-        """The rays after one more trial point, interval or patch."""
+        """The state after one more trial point, interval or patch of each active ray."""
         ...
 
     def finish(self, walk: Any, /) -> tuple[MarchState, Any]:
-        """The state of rays, and the index of the facet or patch that each ray hit."""
+        """The end of rays as a `MarchState`, and the index of the facet or patch that each ray
+        hit."""
         ...
 
     def run(self, state: MarchState) -> tuple[MarchState, Any]:
-        """The result of `finish` for rays that were advanced to their end."""
+        """The result of `finish` for rays that are advanced from `state` until all have ended."""
         ...
 
 
@@ -65,7 +68,11 @@ TracerFactory: TypeAlias = "Callable[[Ray, Real, Real], RayTracer]"
 
 @dataclass(frozen=True)
 class SmoothTracer:
-    """Traces rays through a field without jumps and patches."""
+    """Traces rays to a level set of a continuous function.
+
+    march: the parameters of the march.
+    path, end: the rays, and the ray parameter at which each ends.
+    """
 
     march: March
     field: Field
@@ -73,25 +80,27 @@ class SmoothTracer:
     end: Real
 
     def begin(self, state: MarchState) -> MarchState:
-        """Rays at their start."""
+        """The state of rays at their start, unchanged."""
         return state
 
     def advance(self, walk: MarchState) -> MarchState:
-        """Rays after one more trial point."""
+        """The state after one more trial point of each ray."""
         return self.march.next_trial(self.field, self.path, self.end, walk)
 
     def finish(self, walk: MarchState) -> tuple[MarchState, Any]:
-        """The state of rays; no ray hits a facet."""
+        """The end state of rays, and NO_FACET, as a smooth field has no facets to hit."""
         return walk, self.march.backend.UInt32(NO_FACET)
 
     def run(self, state: MarchState) -> tuple[MarchState, Any]:
-        """The end state of rays (`March.advance` has the proof)."""
+        """The end state of rays that march from `state` to a hit or to their end, and NO_FACET.
+        `March.advance` has the proof that no hit is missed."""
         return self.finish(self.march.advance(self.field, self.path, self.end, state))
 
 
 @dataclass(frozen=True)
 class _QueuedRay:
-    """The whole state of a lane: a ray from `start` to `end`, and the state of its tracer."""
+    """A ray from `start` to `end` with the state `walk` of its tracer: all that a lane needs when
+    it takes the ray from the queue."""
 
     origin: Vec3
     direction: Vec3
@@ -111,24 +120,31 @@ def trace_queued(
     tracer_of: TracerFactory, path: Ray, start: Real, end: Real, state: MarchState,
     collect: Callable[[MarchState, Any], Ends],
 ) -> Ends:  # fmt: skip
-    """Trace many rays with few lanes: a lane that has finished a ray fetches the next.
+    """Trace many rays with few lanes: a lane that has finished a ray takes the next one from a
+    queue.
 
-    Returns `collect(state, index)` for each ray, evaluated. State and index are those that
+    Returns `collect(state, index)` for each ray, evaluated: state and index are what
     `RayTracer.run` returns.
 
-    collect: gives a record of arrays of the end state and the index. Each array is written
-        separately, which takes a good part of the time of a step.
+    tracer_of: makes the tracer of rays from the rays, their start and their end.
+    path, start, end: the rays, and the ray parameters between which each is traced.
+    state: the state of rays at their start.
+    collect: makes a record of arrays from the end state and the index. Each array of the record is
+        written to memory separately, which takes a good part of the time of a step; so it should
+        hold only what is needed.
 
-    Rays differ in length, and a packet of a processor waits for its longest ray. Bounces of light
-    paths go in all directions: there the longest ray of a packet took three to six times as many
-    samples as the mean ray (measured).
+    Rays need different numbers of steps, and a packet of a processor waits for its longest ray. For
+    light paths that were reflected in all directions, the longest ray of a packet took three to six
+    times as many samples as the mean ray (measured). With the queue no lane waits.
     """
     proofs: EnclosureKinds = path.proofs
 
     def tracer(ray: _QueuedRay) -> RayTracer:
+        """The tracer of the rays that are in the lanes now."""
         return tracer_of(Ray(ray.origin, ray.direction, proofs), ray.start, ray.end)
 
     def advance(ray: _QueuedRay) -> _QueuedRay:
+        """The rays in the lanes after one more step."""
         return dataclasses.replace(ray, walk=tracer(ray).advance(ray.walk))
 
     begin = tracer_of(path, start, end).begin(state)
@@ -149,21 +165,22 @@ _AT_JUMP_ROUNDINGS = 8.0
 
 @dataclass(frozen=True)
 class MarchResult:
-    """The ends of rays, as Dr.Jit arrays.
+    """How rays ended, as Dr.Jit arrays with one entry for each ray.
 
-    t: ray parameter up to which the ray is proved free of levels; inf for a miss.
-    value, gradient: f and its gradient (3,) at t. If a facet was hit, f just before it, and the
-        facet's unit normal, to the side of larger f.
-    tolerance_excess: by how much f at t may be farther from the level than the tolerance allows.
+    t: the ray parameter up to which no level lies on the ray: the hit, or inf for a miss.
+    value, gradient: f and its gradient (3,) at t. At a hit on a facet, f just before the facet, and
+        the facet's unit normal, which points to the side of larger f.
+    tolerance_excess: by how much |f - level| at t may exceed what the tolerance allows, because of
+        rounding.
     evaluations: the number of evaluations of f.
     status: a `RayStatus`.
-    facet: index of the facet (see `harnack.fields.capabilities`) that was hit, at t; NO_FACET for
-        other rays.
-    side: if hits require a crossing, 1 if f rises through the level along the ray, -1 if it falls
-        through it; else None. If hits require a crossing, t and gradient are those of the root, and
+    facet: the index of the facet (a flat piece of surface at which f jumps) that was hit; NO_FACET
+        for other rays.
+    side: if hits require a crossing, 1 if f rises through the level along the ray and -1 if it
+        falls; otherwise None. If hits require a crossing, t and gradient are those of the root, and
         `value` is f a little behind it.
-    patch: for a union of patches, the index of the patch that was hit, NO_PATCH for other rays; for
-        other fields None.
+    patch: for a union of patches, the index of the patch that was hit, NO_PATCH for rays without a
+        hit; None for other fields.
     """
 
     t: Real
@@ -178,14 +195,14 @@ class MarchResult:
 
     @property
     def at_jump(self) -> Mask:
-        """Mask of the rays that hit a facet."""
+        """Mask of the rays that hit a facet, a flat piece of surface at which f jumps."""
         return self.facet != NO_FACET
 
 
 @dataclass(frozen=True)
 class _EndState:
-    """The data of a `MarchResult`: attributes of a `MarchState`, and the index of the facet or
-    patch."""
+    """What `SurfaceTracer.first_hit` needs of the end of rays: some attributes of a `MarchState`,
+    and as `sheet` the index of the facet or patch that was hit."""
 
     proved_to: Real
     value: Real
@@ -198,40 +215,49 @@ class _EndState:
 
     @classmethod
     def of(cls, end: MarchState, sheet: Any) -> _EndState:
-        """The data of an end state."""
+        """These attributes of an end state. sheet: the index of the facet or patch that was hit."""
         names = (field.name for field in dataclasses.fields(cls) if field.name != "sheet")
         return cls(**{name: getattr(end, name) for name in names}, sheet=sheet)
 
 
 @dataclass(frozen=True)
 class _EndStatus:
-    """The status with which rays ended, and nothing else."""
+    """What `SurfaceTracer.occluded` needs of the end of rays: their `RayStatus` alone."""
 
     status: Any
 
     @classmethod
     def of(cls, end: MarchState, sheet: Any) -> _EndStatus:
-        """The status of an end state."""
+        """The status of an end state; the index of the facet or patch is not used."""
         del sheet
         return cls(end.status)
 
 
 @dataclass(frozen=True)
 class SurfaceTracer:
-    """A surface on a backend. Its methods can be called while a kernel is being recorded.
+    """A surface prepared on a backend. Its methods can be called while a kernel is being recorded,
+    except with `uses_ray_queue`.
 
+    levels: the values of the field that belong to the surface.
     volume: a volume that contains the surface; None for all of space.
-    region: where the field may be evaluated, for rays that look for crossings; it contains
-        `volume`. None for all of space.
-    occupied: cells outside of which there is no level; None if no cells are known.
-    only_component: whether only the surface within `occupied` is traced; levels outside may exist
-        and do not count.
+    proofs: the classes of enclosures (intervals that provably contain the change of f along a ray)
+        by which steps are proved.
+    max_steps: the number of evaluations of the field after which a ray is out of steps.
+    over_relaxation: trial steps are at most this many times as long as proved steps.
+    require_crossing: whether a ray hits only where f passes to the other side of a level.
+    region: the volume in which the field may be evaluated, for rays that look for crossings; it
+        contains `volume`. None for all of space.
+    occupied: a grid of cells, in which those that may contain a level are marked; None if there is
+        none.
+    only_component: whether only levels in the marked cells of `occupied` belong to the surface.
+        Otherwise there are no levels outside of these cells.
     section: the volume that cuts the surface open, one of the volumes whose intersection is
         `volume`; None if nothing cuts it open.
-    uses_ray_queue: whether rays are traced at once: if a sample is not cheap, by few lanes that
-        share a queue. Then the methods cannot be called while a kernel is being recorded.
-    known_branch_volume: outside of it f has the branch of f = 0. None if all samples know their
-        branch.
+    uses_ray_queue: whether rays are traced at once when a method is called, if samples are not
+        cheap: by few lanes that share a queue of rays. Then no kernel may be being recorded.
+    known_branch_volume: for a field whose samples give f only modulo 1, a volume outside of which
+        no level and no number that differs from a level by an integer lies between f and 0. This
+        determines f from its value modulo 1. None for other fields.
     """
 
     backend: Backend
@@ -251,53 +277,58 @@ class SurfaceTracer:
     known_branch_volume: Volume | None = None
 
     def sample(self, p: Vec3) -> Sample:
-        """The field at p."""
+        """The sample of the field (value, gradient, error bounds) at points p (3,)."""
         return self.field.evaluate(p)
 
     def sample_with_branch(self, p: Vec3, value: Real) -> Sample:
-        """The sample at p, on the branch nearest to `value`. f must differ from `value` by less
-        than a half."""
+        """The sample at p, for a field that may give f only modulo 1. The integer is chosen for
+        which f is nearest to `value`, so f must differ from `value` by less than a half."""
         if self.known_branch_volume is None:
             return self.sample(p)
         sample = self.field.evaluate_modulo_one(p)
         return sample.shifted(dr.round(value - sample.value))
 
     def hit_surface(self, hit: MarchResult) -> SurfaceTracer:
-        """The surface that was hit: for a field with patches the patch, else this surface."""
+        """The surface that each ray hit: the patch that was hit if the field is a union of patches,
+        else this surface."""
         if hit.patch is None:
             return self
         patch = dr.select(hit.patch == NO_PATCH, self.backend.UInt32(0), hit.patch)
         return replace(self, field=self.field.patch(patch))
 
     def level_counts(self, p: Vec3) -> Mask:
-        """Whether levels count at points p (see `only_component`)."""
+        """Mask of the points p at which a level belongs to the surface. If only the largest
+        component is traced, these are the points in its cells; else all points."""
         if self.occupied is None or not self.only_component:
             return self.backend.Bool(True)
         return self.occupied.cell(p).empty_distance == 0
 
     def is_resolved(self, o: Vec3, end: Real) -> Mask:
-        """Whether, everywhere on rays up to `end`, it is known in spite of rounding whether levels
-        count there (see `only_component`)."""
+        """Mask of rays on which rounding leaves no doubt in which cell a point lies, from the
+        origin o to the parameter `end`. Only tracing the largest component alone needs that; else
+        all rays are in the mask."""
         if self.occupied is None or not self.only_component:
             return self.backend.Bool(True)
         return self.occupied.is_resolved(o, end)
 
     def clip(self, o: Vec3, d: Vec3, t_min: Real, t_max: Real) -> tuple[Real, Real]:
-        """The part of [t_min, t_max] that can hold the surface; empty unless start < end."""
+        """The interval (start, end) of parameters, within [t_min, t_max], on which rays o + t d can
+        meet the surface. It is empty unless start < end."""
         if self.volume is None:
             return t_min, t_max
         return self.volume.clip(o, d, t_min, t_max)
 
     def occluded(self, o: Vec3, d: Vec3, t_min: Real, t_max: Real, active: Mask = True) -> Mask:
-        """Whether rays meet the surface between t_min and t_max. Rays that are out of steps count
-        as occluded: a ray that is not proved free must not let light through."""
+        """Mask of the rays o + t d that meet the surface for t between t_min and t_max. A ray that
+        is out of steps counts as meeting it, as light must not pass where nothing is proved."""
         end = self._march(o, d, t_min, t_max, active, _EndStatus.of, any_hit=True)
         return end.status != int(RayStatus.MISS)
 
     def first_hit(
         self, o: Vec3, d: Vec3, t_min: Real, t_max: Real, active: Mask = True
     ) -> MarchResult:
-        """The first hit of rays o + t d, |d| = 1, for t_min <= t <= t_max. Inactive rays miss."""
+        """The first hits of rays o + t d, |d| = 1, t_min <= t <= t_max, as a `MarchResult`.
+        Inactive rays miss."""
         end = self._march(o, d, t_min, t_max, active, _EndState.of)
         facet, t, gradient, excess, side = (
             end.sheet,
@@ -325,8 +356,13 @@ class SurfaceTracer:
     def refined_crossings(
         self, o: Vec3, d: Vec3, contact: Contact, active: Mask
     ) -> tuple[Real, Vec3, Any]:
-        """Roots of crossings, the gradients there, and the number of evaluations of f for them. The
-        roots of `contact` are kept if f has jumps or no creases."""
+        """The roots (ray parameters) at which rays cross the level, the gradients of f there, and
+        the number of evaluations of f that this took.
+
+        contact: the crossings, each with a first approximation of the root. This is returned
+            unchanged if f has jumps or no creases.
+        active: mask of the rays with a crossing.
+        """
         if self.field.has_jumps or not self.field.has_creases:
             return (
                 contact.root,
@@ -339,7 +375,8 @@ class SurfaceTracer:
     def begin_march(
         self, o: Vec3, d: Vec3, t_min: Real, t_max: Real, active: Mask, *, crosses: bool
     ) -> tuple[March, Ray, Real, Real, MarchState]:
-        """The march, its rays, their start and end (ray parameters), and the state at the start.
+        """The march, the rays with unit directions, the ray parameters of their start and end after
+        clipping, and their state at the start.
 
         crosses: whether rays end where they have crossed a level, and not where they reach it.
         """
@@ -353,25 +390,30 @@ class SurfaceTracer:
             start, end, hysteresis = self._crossing_interval(
                 path, real(t_min), real(t_max), start, end
             )
-        occupied, free_to = None if crosses else self.occupied, start
+        # Up to empty_until the ray lies in cells that contain no level. If the field has no jumps,
+        # the ray starts there.
+        occupied, empty_until = None if crosses else self.occupied, start
         if occupied is not None:
-            may_hold = backend.Bool(active) & (start < end)
-            start, end = dr.select(may_hold, start, 0), dr.select(may_hold, end, 0)
-            free_to = occupied.end_of_empty_run(path.origin, path.direction, start, end)
+            is_nonempty = backend.Bool(active) & (start < end)
+            start, end = dr.select(is_nonempty, start, 0), dr.select(is_nonempty, end, 0)
+            empty_until = occupied.end_of_empty_run(path.origin, path.direction, start, end)
             if not self.field.has_jumps:
-                start = free_to
+                start = empty_until
         state = MarchState.at(backend, start, end, active, has_detail=has_detail, crosses=crosses)
         if occupied is not None and self.field.has_jumps and not self.only_component:
-            # Facets in empty cells are still compared with the level.
-            state = replace(state, proved_step=free_to - start)
+            # Facets in empty cells have to be compared with the level. So the ray starts before
+            # them, and its first proved step leads to empty_until.
+            state = replace(state, proved_step=empty_until - start)
         if occupied is not None and self.only_component:
-            # Where it is uncertain, by rounding, in which cell a point is, nothing can be proved.
-            unclear = state.active & ~self.is_resolved(path.origin, end)
+            # If rounding leaves it uncertain in which cell a point lies, nothing can be proved.
+            in_uncertain_cell = state.active & ~self.is_resolved(path.origin, end)
             out = backend.UInt32(int(RayStatus.OUT_OF_STEPS))
-            status = dr.select(unclear, out, state.status)
-            state = replace(state, active=state.active & ~unclear, status=status)
+            status = dr.select(in_uncertain_cell, out, state.status)
+            state = replace(state, active=state.active & ~in_uncertain_cell, status=status)
         tracker = None
         if self.known_branch_volume is not None and not crosses:
+            # Outside of the volume the branch is that of f = 0. A ray that starts inside needs f at
+            # its start: if that is not cheap, its first sample is made with the branch.
             tracker = BranchTracker(self.levels)
             entry, _ = self.known_branch_volume.clip(path.origin, path.direction, t_min, t_max)
             outside = (entry > t_min) & (start <= entry)
@@ -399,17 +441,23 @@ class SurfaceTracer:
     def _crossing_interval(
         self, path: Ray, t_min: Real, t_max: Real, start: Real, end: Real
     ) -> tuple[Real, Real, Hysteresis]:
-        """The interval of rays to search for crossings, given the one that can hold the surface.
+        """The interval (start, end) of ray parameters on which rays look for crossings, and the
+        `Hysteresis` (the rule by which a crossing is counted).
 
-        The surface may touch the ends of the latter, so that within it f is on one side only.
-        Beyond it the ray is free. So the interval is made a little longer, as far as the ray goes,
-        and for a ray that leaves a flat solid at a small angle longer still.
+        t_min, t_max: the ends of the ray.
+        start, end: the ends of the part of the ray in the proved extent of the surface.
 
-        Proof that it is enough where f is convex along the ray. Let f be W below the level at some
-        point of the extent and pass the level at its end, and e be the error of f there: W >= 8 e
-        (`Hysteresis.band`). Behind the end f rises at least as steeply as on the way to it, which
-        is no longer than end - start: a seventh of that behind the end it is 8/7 e above the level,
-        which a sample there shows.
+        The surface may touch the ends of this part, and then f does not change sign within it.
+        Outside the part the ray meets no surface. So the part is made a little longer at both ends,
+        but not longer than the ray; and longer still for a ray that leaves a flat solid at a small
+        angle.
+
+        Proof that this suffices if f is convex along the ray. Suppose that f is W below the level
+        at some point of the extent, and reaches the level at the end of the extent. Let e be the
+        error of f there; W >= 8 e (`Hysteresis.band`). Behind the end, f rises at least as steeply
+        as on average before it, and the way from that point to the end is at most end - start. So
+        (end - start)/7 behind the end, f is at least W/7 >= 8/7 e above the level, which a sample
+        there shows.
         """
         never, size = self.backend.Bool(False), max_norm(path.origin)
         rounding = _AT_JUMP_ROUNDINGS * self.backend.machine_epsilon * (size + t_min)
@@ -418,14 +466,14 @@ class SurfaceTracer:
         first, last = t_min, t_max
         if self.region is not None:
             first, last = self.region.clip(path.origin, path.direction, t_min, t_max)
-        may_hold = start < end
+        is_nonempty = start < end
         length = dr.select(dr.isfinite(start) & dr.isfinite(end), end - start, 0)
         margin = _MARGIN_OF_LENGTH * length
         before = fmax(start - fmax(_MARGIN_OF_SIZE * (size + dr.abs(start)), margin), first)
         after = fmin(end + fmax(_MARGIN_OF_SIZE * (size + dr.abs(end)), margin), last)
         free_before, free_after = before > first, after < last
-        start, end = dr.select(may_hold, before, start), dr.select(may_hold, after, end)
-        free = may_hold & free_before, may_hold & free_after
+        start, end = dr.select(is_nonempty, before, start), dr.select(is_nonempty, after, end)
+        free = is_nonempty & free_before, is_nonempty & free_after
         return start, end, Hysteresis.of(self.levels, free, start, rounding)
 
     def _march(
@@ -439,15 +487,18 @@ class SurfaceTracer:
         *,
         any_hit: bool = False,
     ) -> Ends:
-        """A record of the end state of rays and the index of the facet or patch that each ray hit.
+        """Trace rays, and return `collect(end state, index)`, where the index is that of the facet
+        or patch that each ray hit.
 
-        any_hit: whether any hit will do if it is found with less work than the first.
+        any_hit: whether a ray may end at any hit, if that takes less work than finding the first
+            hit.
         """
         march, path, start, end, state = self.begin_march(
             o, d, t_min, t_max, active, crosses=self.require_crossing
         )
 
         def tracer(path: Ray, start: Real, end: Real) -> RayTracer:
+            """The tracer for this kind of field."""
             to_end = replace(march, ray_end=end)
             if self.field.has_jumps:
                 return JumpTracer(to_end, self.field, path, start, end)

@@ -1,8 +1,9 @@
-"""`TraceOptions`, how a surface is traced; and the rule by which verbs take keywords in place of
-`Surface` and `TraceOptions`.
+"""`TraceOptions`, how a surface is traced; and the rule by which verbs (`trace`, `render`, `mesh`,
+...) take keywords in place of `Surface` and `TraceOptions`.
 
-Keywords are shorthand for a bare field, and for no `options`. Beside an object that holds them they
-raise, since either could be meant; and an option that a verb cannot honor raises, by its name.
+Beside a bare field, a verb takes the keywords of `Surface`; without `options`, it takes those of
+`TraceOptions`. Keywords beside an object that holds them raise an error, since either could be
+meant. An option that a verb cannot honor raises an error that names it.
 """
 
 from __future__ import annotations
@@ -25,7 +26,8 @@ _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 
 class TraceKeywords(SurfaceKeywords, total=False):
-    """The keywords of `Surface` and of `TraceOptions`, which verbs take as shorthand."""
+    """The keywords of `Surface` and of `TraceOptions`, which verbs (`trace`, `render`, ...) take in
+    place of these objects."""
 
     tolerance: float | HitTolerance | None
     enclosures: EnclosureChoice
@@ -101,11 +103,12 @@ class TraceOptions:
 
     @property
     def enclosure_kinds(self) -> EnclosureKinds:
-        """The classes of enclosures that are chosen."""
+        """The classes of enclosures that are chosen. An enclosure is an interval that provably
+        contains the change of f along a ray; steps are proved by it."""
         return choose_enclosures(self.enclosures)
 
     def replace(self, **changes: Any) -> TraceOptions:
-        """These options with other values."""
+        """These options with some values changed, by name."""
         return replace(self, **changes)
 
 
@@ -122,15 +125,19 @@ def surface_and_options(
     keywords: Mapping[str, Any],
     honored: Sequence[str],
 ) -> tuple[Surface, TraceOptions]:
-    """The surface and the options of a call of a verb, of which some may be given as keywords.
+    """The surface and the options of a call of a verb (`trace`, `render`, ...). Some options may be
+    given as keywords.
 
-    honored: the names of the keywords that the verb honors; the others have to have their defaults.
+    surface: a field or a `Surface`.
+    keywords: the keywords of the call that are options of `Surface` or `TraceOptions`.
+    honored: the names of the options that the verb honors; all other options must have their
+        defaults.
 
     Raises:
-        TypeError: a keyword that there is not, or that the verb does not honor, also within
+        TypeError: a keyword that does not exist, or that the verb does not honor, also within
             `surface` and `options`; a keyword of `Surface` beside a `Surface`, or of `TraceOptions`
             beside `options`; `surface` is neither a field nor a `Surface`.
-        ValueError: as `Surface` and `TraceOptions` raise it.
+        ValueError: a value that `Surface` or `TraceOptions` refuses.
     """
     for name in keywords:
         if name in (*SURFACE_OPTIONS, *TRACE_OPTIONS) and name not in honored:
@@ -160,10 +167,11 @@ def surface_and_options(
 def trace_options(
     verb: str, options: TraceOptions | None, keywords: Mapping[str, Any], honored: Sequence[str]
 ) -> TraceOptions:
-    """The options of a call of a verb, or those of traces among its keywords.
+    """The `TraceOptions` of a call of a verb: `options`, or made from those keywords that are
+    options of traces. honored: the names of the options that the verb honors.
 
     Raises:
-        TypeError: both are given; one is set that the verb does not honor.
+        TypeError: both are given; or an option is set that the verb does not honor.
     """
     choices = trace_options_among(options, keywords)
     for option in fields(TraceOptions):
@@ -173,13 +181,16 @@ def trace_options(
 
 
 def _refusal(verb: str, name: str, honored: Sequence[str]) -> str:
+    """The text of the error for an option that a verb does not have; it lists the options that it
+    has."""
     return (
         f"{verb} has no {name}; of the options of surfaces and traces it has {', '.join(honored)}"
     )
 
 
 def trace_options_among(options: Any, keywords: Mapping[str, Any]) -> TraceOptions:
-    """The `options` of a call, or those of traces among its keywords.
+    """The `TraceOptions` of a call: `options`, or made from those keywords that are options of
+    traces.
 
     Raises:
         TypeError: both are given; `options` is no `TraceOptions`.
@@ -198,7 +209,8 @@ def trace_options_among(options: Any, keywords: Mapping[str, Any]) -> TraceOptio
 
 
 def shorthand_parameters() -> dict[str, inspect.Parameter]:
-    """The keywords of `Surface` and `TraceOptions`, by name, as parameters of a verb."""
+    """The options of `Surface` and `TraceOptions`, by name, as keyword-only parameters for
+    signatures."""
     kinds: tuple[Callable[..., Any], ...] = (Surface, TraceOptions)
     return {
         name: parameter.replace(kind=parameter.KEYWORD_ONLY)
@@ -209,8 +221,8 @@ def shorthand_parameters() -> dict[str, inspect.Parameter]:
 
 
 def shows_keywords(*honored: str) -> Callable[[_Function], _Function]:
-    """Return a decorator of a verb that takes `**keywords: Unpack[TraceKeywords]`: its signature
-    shows those that it honors by name, with their defaults."""
+    """Return a decorator of a verb that takes `**keywords: Unpack[TraceKeywords]`. The signature of
+    the decorated verb shows the keywords named in `honored`, with their defaults."""
     shorthand = shorthand_parameters()
     return shows_parameters([shorthand[name] for name in honored])
 
@@ -218,13 +230,14 @@ def shows_keywords(*honored: str) -> Callable[[_Function], _Function]:
 def shows_parameters(
     parameters: Sequence[inspect.Parameter], *, keeps_others: bool = False
 ) -> Callable[[_Function], _Function]:
-    """Return a decorator of a function of `**keywords`: its signature shows these parameters by
-    name in place of the keywords.
+    """Return a decorator of a function that takes `**keywords`. The signature of the decorated
+    function shows these parameters by name.
 
-    keeps_others: whether there may be other keywords as well.
+    keeps_others: whether the signature still shows `**keywords`, as there may be other ones.
     """
 
     def decorate(verb: _Function) -> _Function:
+        """The same function with the changed signature."""
         signature = inspect.signature(verb)
         shown = list(signature.parameters.values())
         variadic = [parameter for parameter in shown if parameter.kind is parameter.VAR_KEYWORD]

@@ -1,4 +1,5 @@
-"""`TracedSurface`: a `Surface` with `TraceOptions`, and the data that a call prepares of both."""
+"""`TracedSurface`: a `Surface` with `TraceOptions`, and the data that one call prepares from
+both."""
 
 from __future__ import annotations
 
@@ -50,10 +51,19 @@ _FIRST_HITS_ONLY = (
 class TracedSurface:
     """A surface and how rays are traced to it, for one call of the library.
 
-    field, levels, clip, section, side, largest: as in `Surface`.
-    tolerance: None for one that follows the size of the surface (`hit_tolerance`).
-    max_steps, over_relaxation, require_crossing: as in `TraceOptions`.
-    enclosures: the classes of enclosures.
+    field: the function f.
+    levels: the values of f on the surface, which may be Dr.Jit numbers.
+    clip, section: volumes that cut the surface; None for all of space. The faces of a solid on
+        `section` may have a material of their own.
+    side: "surface" or None for the level set; "below", "above" or "between" for a solid.
+    largest: the number of cells along the longest side of the box by which the largest component is
+        told apart; 0 for all components.
+    tolerance: of hits; None for one that follows the size of the surface (`hit_tolerance`).
+    enclosures: the classes of enclosures by which steps are proved. An enclosure is an interval
+        that provably contains the change of f along a ray.
+    max_steps: the number of evaluations of f after which a ray is out of steps.
+    over_relaxation: trial steps are at most this many times as long as proved steps.
+    require_crossing: whether a ray hits only where f passes to the other side of the level.
     """
 
     field: Field
@@ -80,7 +90,7 @@ class TracedSurface:
 
     @classmethod
     def of(cls, surface: Surface, options: TraceOptions) -> TracedSurface:
-        """The surface with the options of a call.
+        """A surface with the options of a call, as a `TracedSurface`.
 
         Raises:
             ValueError, NotImplementedError: options that this surface cannot have.
@@ -99,7 +109,8 @@ class TracedSurface:
 
     @property
     def surface(self) -> Surface:
-        """The surface without the options."""
+        """The field with its levels, volumes and side as a `Surface`, without the options of
+        traces."""
         return Surface(
             self.field, self.levels, clip=self.clip, section=self.section, side=self.side,
             largest=self.largest,
@@ -107,7 +118,7 @@ class TracedSurface:
 
     @property
     def options(self) -> TraceOptions:
-        """The options without the surface."""
+        """The options of traces as a `TraceOptions`, without the surface."""
         return TraceOptions(
             tolerance=self.tolerance, enclosures=self.enclosures, max_steps=self.max_steps,
             over_relaxation=self.over_relaxation, require_crossing=self.require_crossing,
@@ -116,10 +127,12 @@ class TracedSurface:
     def validate_crossings(self, option: str) -> None:
         """Raise an error if crossings of this surface cannot be traced.
 
-        ValueError for several levels of a field with jumps, as a jump may cross more than one level
-        at once; NotImplementedError for a field with patches.
-
         option: the name of the verb or option that needs crossings, for the message.
+
+        Raises:
+            ValueError: the field has jumps and there are several levels; a jump may cross more than
+                one level at once.
+            NotImplementedError: the field is a union of patches, each with a function of its own.
         """
         if self.field.has_patches:
             raise NotImplementedError(
@@ -144,23 +157,25 @@ class TracedSurface:
 
     @property
     def solid_range(self) -> tuple[float, float] | None:
-        """The values (low, high) of f on the closed solid; None for the level set itself."""
+        """The interval (low, high) of the values of f on the closed solid; None if the surface is
+        the level set itself."""
         return side_range(self.side, self.level_values)
 
     def with_call_cache(self, *, begins: bool = False) -> TracedSurface:
-        """This surface with a cache for a single call of the library, so that field, extent and
-        cells are prepared only once. Copies by `dataclasses.replace` share the cache.
+        """This surface with a cache for a single call of the library, so that its field, extent and
+        cells are prepared only once. Copies made by `dataclasses.replace` share the cache. A
+        surface that has a cache is returned unchanged.
 
-        begins: start with an empty cache, as users may have changed the field in place since the
-            last call.
+        begins: whether to start with an empty cache in any case, as users may have changed the
+            field in place since the last call.
         """
         return (
             self if self._call_cache is not None and not begins else replace(self, _call_cache={})
         )
 
     def memoize(self, key: Any, compute: Callable[[], _T]) -> _T:
-        """The result of `compute()`, cached for this field, these levels and the key. Without a
-        cache (outside of a call of the library), `compute` is called each time."""
+        """The result of `compute()`. Within a call of the library it is cached for this field,
+        these levels and the key; otherwise `compute` is called each time."""
         if self._call_cache is None:
             return compute()
         full_key = key, id(self.field), self.level_values
@@ -182,29 +197,32 @@ class TracedSurface:
 
     @property
     def hit_tolerance(self) -> HitTolerance:
-        """The tolerance of hits: the one that was set, or one that follows the size of the
-        volume."""
+        """The tolerance of hits: the one that was set, or else 1e-4 of the longest side of the box
+        of the volume to which rays are clipped (1e-4 if this box is unbounded)."""
         return default_tolerance(self.volume) if self.tolerance is None else self.tolerance
 
     def for_rays(self, count: int) -> TracedSurface:
-        """The same surface, prepared for this many rays (`Field.for_ray_count`)."""
+        """The same surface with the field prepared for this many rays (`Field.for_ray_count`)."""
         return replace(self, field=self.field.for_ray_count(count))
 
     def evaluator(self, backend: Backend) -> Field:
-        """The field, prepared for a backend and cached, with and without derivatives apart."""
+        """The field, prepared for its levels and for a backend. It is cached; a field with
+        derivatives enabled and one without have separate entries."""
         is_followed = any(dr.grad_enabled(parameter) for parameter in self.field.parameters())
         key = "field", backend, is_followed
         return self.memoize(key, lambda: self.field.with_levels(self.level_values).prepare(backend))
 
     def target_levels(self, backend: Backend) -> Levels:
-        """The levels on a backend."""
+        """The levels as kernel parameters of a backend, with the period of the field."""
         levels = tuple(
             as_kernel_parameters(to_float(backend, level, "level")) for level in self.levels
         )
         return Levels(levels, self.field.period)
 
     def _occupied(self) -> OccupancyGrid | None:
-        """The cells that may contain a level that counts; None if no cells are known."""
+        """The grid of cells in which those are marked that may contain a level of the surface; None
+        if no cells are known. If only the largest component is traced, the marked cells are those
+        of this component."""
         if not self.largest:
             return self.memoize("cells", lambda: self.field.occupied_cells(self.level_values))
         volume = intersection_of([self.field.domain, self.extent, self.clip])
@@ -217,8 +235,9 @@ class TracedSurface:
     ) -> SurfaceTracer:
         """The tracer of this surface, with all data on a backend, for use in a recorded kernel.
 
-        crosses: whether rays will look for crossings.
-        many_rays: whether there will be so many rays that it pays to search for empty cells first.
+        crosses: whether rays will look for crossings, and not for first hits.
+        many_rays: whether there will be so many rays that it pays to compute first which cells
+            contain no level.
         """
         if self.largest and crosses:
             raise ValueError(_FIRST_HITS_ONLY)
@@ -257,10 +276,17 @@ def traced_surface(
     verb: str = "a trace",
     **keywords: Any,
 ) -> TracedSurface:
-    """A surface with the options of a call of a verb, or with keywords in place of both.
+    """A surface with the options of a call of a verb (`trace`, `render`, ...), as a
+    `TracedSurface`.
+
+    surface: a `TracedSurface`, which is returned; a `Surface`; or a field, with keywords of
+        `Surface`.
+    options: a `TraceOptions`; or keywords in its place.
+    verb: the name of the verb, for messages.
 
     Raises:
-        TypeError, ValueError: as `surface_and_options`, `Surface` and `TraceOptions` raise them.
+        TypeError, ValueError: keywords that contradict the objects beside them, or values that
+            `Surface` or `TraceOptions` refuses.
     """
     if isinstance(surface, TracedSurface) and options is None and not keywords:
         return surface
@@ -269,7 +295,8 @@ def traced_surface(
 
 
 def check_has_inside(surface: TracedSurface) -> None:
-    """Raise ValueError for the boundary of a solid of a field that rays cannot see as closed."""
+    """Raise ValueError if this is the boundary of a solid, and the field is of a kind that has no
+    closed solids: angle-valued, with jumps, or a union of patches."""
     field = surface.field
     if surface.solid_range is None:
         return
@@ -287,14 +314,15 @@ def check_has_inside(surface: TracedSurface) -> None:
 
 
 def default_tolerance(volume: Volume | None) -> HitTolerance:
-    """1e-4 of the longest side of the box of a volume; 1e-4 if it has no bounds."""
+    """The default tolerance of hits: 1e-4 of the longest side of the box of a volume; the length
+    1e-4 if the volume is None or unbounded."""
     side = math.nan if volume is None else float(np.ptp(np.array(volume.bounds()), axis=0).max())
     is_bounded = math.isfinite(side) and side > 0
     return HitTolerance(_RELATIVE_TOLERANCE * side if is_bounded else _UNBOUNDED_TOLERANCE)
 
 
 def _with_reduced_levels(levels: tuple[float, ...]) -> tuple[float, ...]:
-    """The levels, and for those farther from 0 than a half also their remainders modulo 1, which
-    |f| reaches sooner."""
+    """The levels; and for those beyond 1/2 in absolute value also their remainders modulo 1, in
+    [-1/2, 1/2], which |f| reaches closer to 0."""
     remainders = dict.fromkeys(math.remainder(level, 1) for level in levels if abs(level) > 0.5)
     return levels + tuple(level for level in remainders if level not in levels)
