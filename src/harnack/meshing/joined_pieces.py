@@ -128,7 +128,7 @@ class _Cut:
         center = 0.5 * (low + high)
         scaled = (vertices - center) / size
         rays = _rays(scaled, faces[rows])
-        pieces, owner = split_intersecting_faces(rays, scaled, faces[rows], covered_whole=True)
+        pieces, owner = split_intersecting_faces(rays, scaled, faces[rows], cuts_coplanar=True)
         closed_rays = _rays(scaled, faces if closed is None else closed)
         front, back = windings_of_sides(closed_rays, pieces)
         edges = pieces - np.roll(pieces, 1, axis=1)
