@@ -237,13 +237,13 @@ class TriangleTree:
             self.tree.backend.Array3f,
         )
         t_after, n_after = real(after[0]), index(after[1])
-        inside = self._slab_test(frame, reach)
+        may_meet_box = self._make_box_test(frame, reach)
 
         def visit(node: VisitedNode, state: LoopValues) -> tuple[Mask, LoopValues]:
             """Enter a node if the ray comes near its box before the best crossing so far."""
             limit = fmin(state[0], t_max)
-            open_ = inside(node, t_after, limit)
-            return open_, for_each_primitive(node, open_ & node.is_leaf, nearer, state)
+            is_met = may_meet_box(node, t_after, limit)
+            return is_met, for_each_primitive(node, is_met & node.is_leaf, nearer, state)
 
         def nearer(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
             """Take the crossing with a record's triangle if it is after `after` and before the best
@@ -251,13 +251,13 @@ class TriangleTree:
             best, number, sign, normal = state
             t, new_sign = signed_crossing(row, frame)
             n = index(fmax(row[NUMBER_COLUMN], real(0)))
-            later = (t > t_after) | ((t == t_after) & (n > n_after) & (n_after != NO_TRIANGLE))
-            first = (t < best) | ((t == best) & (n < number))
+            is_after = (t > t_after) | ((t == t_after) & (n > n_after) & (n_after != NO_TRIANGLE))
+            is_before_best = (t < best) | ((t == best) & (n < number))
             passed = new_sign != 0
             if reach > 0:
                 within = (t > 2 * reach) & (t < t_max - 2 * reach)
                 passed |= within & _is_beside(row, frame, reach)
-            chosen = active & passed & later & first & (t <= t_max)
+            chosen = active & passed & is_after & is_before_best & (t <= t_max)
             return (
                 dr.select(chosen, t, best),
                 dr.select(chosen, n, number),
@@ -271,12 +271,12 @@ class TriangleTree:
 
     def signed_crossings_ahead(self, frame: RayFrame, t_min: Real, active: Mask = True) -> Real:
         """The sum of the signs of all crossings of a ray with t > t_min (`signed_crossing`)."""
-        real, inside = self.tree.backend.Float, self._slab_test(frame)
+        real, may_meet_box = self.tree.backend.Float, self._make_box_test(frame)
 
         def visit(node: VisitedNode, state: LoopValues) -> tuple[Mask, LoopValues]:
             """Enter a node if the ray comes near its box ahead of t_min."""
-            open_ = inside(node, real(t_min), real(dr.inf))
-            return open_, for_each_primitive(node, open_ & node.is_leaf, add, state)
+            is_met = may_meet_box(node, real(t_min), real(dr.inf))
+            return is_met, for_each_primitive(node, is_met & node.is_leaf, add, state)
 
         def add(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
             """Add the sign of the crossing with a record's triangle, if it is ahead of t_min."""
@@ -296,12 +296,12 @@ class TriangleTree:
         A computed t belongs to a point of the triangle within a few units of the ray. So the error
         of t is that distance divided by the cosine of the angle between ray and normal. If t may
         therefore lie on either side of an end of the interval, the sum is not certain."""
-        real, inside = self.tree.backend.Float, self._slab_test(frame)
+        real, may_meet_box = self.tree.backend.Float, self._make_box_test(frame)
 
         def visit(node: VisitedNode, state: LoopValues) -> tuple[Mask, LoopValues]:
             """Enter a node if the ray comes near its box between 0 and `end`."""
-            open_ = inside(node, real(0), real(end))
-            return open_, for_each_primitive(node, open_ & node.is_leaf, add, state)
+            is_met = may_meet_box(node, real(0), real(end))
+            return is_met, for_each_primitive(node, is_met & node.is_leaf, add, state)
 
         def add(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
             """Add the sign of the crossing with a record's triangle, if it is between 0 and `end`;
@@ -336,11 +336,11 @@ class TriangleTree:
         def visit(node: VisitedNode, state: LoopValues) -> tuple[Mask, LoopValues]:
             """Enter a node if its box, slightly enlarged, meets the vertical ray."""
             x0, y0, z0, x1, y1, z1 = node.head
-            open_ = (
+            is_met = (
                 (high_x >= x0) & (low_x <= x1) & (high_y >= y0) & (low_y <= y1)
                 & (height - pad <= dr.select(up, z1, -z0))
             )  # fmt: skip
-            return open_, for_each_primitive(node, open_ & node.is_leaf, add, state)
+            return is_met, for_each_primitive(node, is_met & node.is_leaf, add, state)
 
         def add(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
             """Add the sign of the crossing with a record's triangle, if it is ahead."""
@@ -349,7 +349,7 @@ class TriangleTree:
 
         return traverse(self.tree, visit, (real(0),), active)[0]
 
-    def _slab_test(self, frame: RayFrame, reach: float = 0.0) -> Any:
+    def _make_box_test(self, frame: RayFrame, reach: float = 0.0) -> Any:
         """Make a function that tells whether rays come near a node's box.
 
         The function takes a node and two t. It returns a mask: whether the ray comes within `reach`
@@ -411,7 +411,7 @@ def signed_crossing(row: list[Real], frame: RayFrame | VerticalRayFrame) -> tupl
     ab, bc, ac = edge_function(a, b), edge_function(b, c), edge_function(a, c)
     up_a, up_b, up_c = a[1] > 0, b[1] > 0, c[1] > 0
 
-    def upwards(from_up: Mask, to_up: Mask, left: Real) -> Real:
+    def crossing_sign(from_up: Mask, to_up: Mask, left: Real) -> Real:
         """How an edge crosses the half-line v = 0, u > 0: 1 upwards, -1 downwards, 0 if it does
         not.
 
@@ -423,7 +423,9 @@ def signed_crossing(row: list[Real], frame: RayFrame | VerticalRayFrame) -> tupl
         )
 
     sign = row[PARITY_COLUMN] * (
-        upwards(up_a, up_b, ab) + upwards(up_b, up_c, bc) - upwards(up_a, up_c, ac)
+        crossing_sign(up_a, up_b, ab)
+        + crossing_sign(up_b, up_c, bc)
+        - crossing_sign(up_a, up_c, ac)
     )
     a, b, c = (*a, frame.depth(p)), (*b, frame.depth(q)), (*c, frame.depth(r))
     close = _EDGE_ROUNDINGS * float(dr.epsilon(frame.o)) * (1 + dr.max(dr.abs(frame.o)))
@@ -473,22 +475,22 @@ def _crossing_depth(
     is_first = (squares[0] >= squares[1]) & (squares[0] >= squares[2])
     is_last = squares[2] > squares[1]
 
-    def of_longest(first: Real, second: Real, last: Real) -> Real:
+    def select_longest(first: Real, second: Real, last: Real) -> Real:
         """The number of the longest edge, of one number for each of the edges ab, bc and ac."""
         return dr.select(is_first, first, dr.select(is_last, last, second))
 
     start, end, apex = (
-        tuple(of_longest(*numbers) for numbers in zip(*choice, strict=True))
+        tuple(select_longest(*numbers) for numbers in zip(*choice, strict=True))
         for choice in ((a, b, a), (b, c, c), (c, a, b))
     )
     e = end[0] - start[0], end[1] - start[1]
-    share = dr.rcp(of_longest(*squares))
+    share = dr.rcp(select_longest(*squares))
     along = -dr.fma(start[0], e[0], start[1] * e[1]) * share
     aside = dr.fma(apex[0] - start[0], e[0], (apex[1] - start[1]) * e[1]) * share
     zero = type(ab)(0)
     along, aside = clamp(along, zero, 1), clamp(aside, zero, 1)
     max_w = fmin((1 - along) / (1 - aside), fmin(along / aside, type(ab)(1)))
-    w = clamp(of_longest(ab, bc, -ac) / (bc - ac + ab), zero, max_w)
+    w = clamp(select_longest(ab, bc, -ac) / (bc - ac + ab), zero, max_w)
     s = clamp(dr.fma(-w, aside, along), zero, 1 - w)
     t = dr.fma(s, end[2] - start[2], dr.fma(w, apex[2] - start[2], start[2]))
     near = close * close
