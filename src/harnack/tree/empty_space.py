@@ -177,10 +177,12 @@ def refine_cells(
 def nonempty_cells(
     lower: FloatArray, upper: FloatArray, clearance: Clearance, most: int, finest: int
 ) -> BoxCells:
-    """The leaves of the octree of a box that are not proved to be free of a set: cells of equal
-    size. There are none if all of the box is proved empty.
+    """The leaves of the octree of a box that are not proved to be free of a set, of equal size.
+    There are none if all of the box is proved empty.
 
-    XX
+    lower, upper: the corners (3,) of the box.
+    clearance: gives proved lower bounds of the distances of points from the set.
+    most: refinement stops before a round that would test more cells than this.
     finest: the largest number of rounds; each halves the edges."""
     root = BoxCells(np.array(lower)[None], np.array(upper) - np.array(lower))
     return refine_cells(root, clearance, most, finest).occupied
