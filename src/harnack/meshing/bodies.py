@@ -233,17 +233,14 @@ def _union_of_components(components: list[TriangleMesh], within: float) -> Trian
 
     bodies = [_manifold_of_component(component) for component in components]
     clockwise = [body for body, is_outward in bodies if not is_outward]
-    # windings[k]: the points around which the components so far wind at least k + 1 times.
-    windings = [Manifold() for _ in range(len(clockwise) + 1)]
+    # sets[k]: the points around which the components so far wind at least k + 1 times.
+    sets = [Manifold() for _ in range(len(clockwise) + 1)]
     for solid in (body for body, is_outward in bodies if is_outward):
-        shared = [windings[k] ^ solid for k in range(len(windings) - 1)]
-        windings = [
-            windings[0] + solid,
-            *(a + b for a, b in zip(windings[1:], shared, strict=True)),
-        ]
+        shared = [sets[k] ^ solid for k in range(len(sets) - 1)]
+        sets = [sets[0] + solid, *(a + b for a, b in zip(sets[1:], shared, strict=True))]
     for solid in clockwise:
-        windings = [after + (before - solid) for before, after in itertools.pairwise(windings)]
-    surface = apart_of(windings[0], within)
+        sets = [after + (before - solid) for before, after in itertools.pairwise(sets)]
+    surface = apart_of(sets[0], within)
     check_manifold(surface.faces, surface.vertices)
     return surface
 
