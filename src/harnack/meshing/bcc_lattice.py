@@ -99,8 +99,8 @@ class BccLattice:
         """(n, 3) indices of the cells that are not proved to be free of the level set. They are
         found by octrees, each of which subdivides a block of cells.
 
-        clearance: gives for points (k, 3) proved lower bounds (k,) of their distances from the level
-            set.
+        clearance: gives for points (k, 3) proved lower bounds (k,) of their distances from the
+            level set.
         most_faces: the largest number of triangles; a cell makes about three.
 
         Raises:

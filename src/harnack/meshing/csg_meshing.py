@@ -108,7 +108,8 @@ _MERGED_WITHIN, _MENDED_WITHIN = (0.5, 0.25, 0.1), 0.5
 # in tolerances; the second is the number of rounds.
 _FAR_OFF, _SPLITS = 1.8, 2
 
-# Meshes the level set of an angle, which ends at its curve: field, level -> vertices and faces.
+# Meshes a level set of a solid angle, which ends at the boundary curve: takes the field and the
+# level, and returns the mesh.
 AngleMesher = Callable[[SolidAngle, float], TriangleMesh]
 
 
@@ -131,23 +132,25 @@ intersection is correct there as well.
 
 @dataclass
 class CsgMesher:
-    """Meshes solids in the box from `lower` to `upper`, (3,) each.
+    """Meshes solids and their Boolean combinations (CSG) in the box from `lower` to `upper`, (3,)
+    each.
 
-    tolerance: a length, for midpoints of edges and centers of faces.
+    tolerance: a length, the largest distance of midpoints of edges and centers of faces from the
+        surface.
     spacing: the largest size of cells.
     per_wave: the smallest number of cells along a wave (`Field.min_wavelength`); None for no such
         limit.
-    mesh_angle: meshes a level set of an angle, which ends at a curve.
+    mesh_angle: meshes a level set of a `SolidAngle`; the mesh ends at the field's boundary curve.
     most_faces: the largest number of triangles of each level set.
     report: receives messages about the progress.
     evaluations: the number of evaluations of fields so far, in points.
     levels: the number of level sets meshed so far.
     smallest_cell: the smallest size of cells used for them.
     uploads: the prepared fields that were meshed so far.
-    intersected_with: the solids that everything meshed next is intersected with
-        (`IntersectedOperands`).
-    irrelevant_region_cache: the operands, and the region in which they leave nothing, of the last
-        call that computed such a region.
+    intersected_with: solids, with levels, that everything meshed next will be intersected with, so
+        that it need not be meshed where they are empty (`IntersectedOperands`).
+    irrelevant_region_cache: the value of `intersected_with` for which a region was computed last,
+        and this region, in which these solids leave nothing.
     """
 
     lower: FloatArray
@@ -166,8 +169,8 @@ class CsgMesher:
     irrelevant_region_cache: tuple[IntersectedOperands, IrrelevantRegion] | None = None
 
     def mesh_sublevel(self, solid: Solid, level: float) -> Manifold:
-        """The points of the box where the function of `solid` is at most `level`. Outside of the
-        box the result has no meaning.
+        """Mesh the set {solid <= level} in the box: the points where the solid's function is at
+        most `level`. Returns a manifold3d solid, which has no meaning outside of the box.
 
         Raises:
             MeshingError: a part cannot be meshed.
@@ -212,8 +215,9 @@ class CsgMesher:
         return to_manifold(self.mesh_smooth_level(solid, level)[0])
 
     def _mesh_boolean(self, solid: BooleanSolid, level: float) -> Manifold:
-        """The mesh of {solid <= level}, of a union or an intersection. Complements in an
-        intersection are meshed as the solids that are cut away."""
+        """Mesh the set {solid <= level} for a union or an intersection: its operands are meshed and
+        combined by manifold3d. A complement in an intersection is not meshed; its solid is meshed
+        and cut away."""
         from manifold3d import Manifold, OpType
 
         indices = range(len(solid.parts))
@@ -228,9 +232,9 @@ class CsgMesher:
         return Manifold.batch_boolean([common, *cut_away], OpType.Subtract)
 
     def _mesh_operand(self, solid: BooleanSolid, number: int, level: float) -> Manifold:
-        """The mesh of operand `number` of a union or an intersection; for a complement in an
-        intersection, the mesh of the solid that is cut away. In an intersection the operand need be
-        meshed only where the other operands may leave something of it (`IntersectedOperands`)."""
+        """Mesh operand `number` of a union or an intersection, at the level; for a complement in an
+        intersection, mesh the solid that is cut away. In an intersection, the operand is meshed
+        only where the other operands may leave something of it (`IntersectedOperands`)."""
         previous, part = self.intersected_with, solid.parts[number]
         if not solid.is_union:
             others = [operand for operand in solid.parts if operand is not part]
@@ -272,9 +276,9 @@ class CsgMesher:
         )
 
     def _empty_region(self) -> IrrelevantRegion | None:
-        """The region in which the other operands, `intersected_with`, are proved to leave nothing;
-        None if there are no other operands. Both sides of a wall use the region computed for the
-        first."""
+        """The region in which the solids `intersected_with` are proved to be empty, so that nothing
+        need be meshed there; None if there are no such solids. It is computed once for the same
+        `intersected_with`, as for the two sides of a wall."""
         if not self.intersected_with:
             return None
         if (
@@ -285,8 +289,8 @@ class CsgMesher:
         functions = [self.function(solid, level) for solid, level in self.intersected_with]
 
         def clearance(points: FloatArray) -> FloatArray:
-            """(n,) for each point (n, 3) the radius of a ball about it in which some operand is
-            proved to leave nothing; 0 if none is."""
+            """(n,) for each point (n, 3) the radius of a ball about it in which one of the solids
+            is proved to have no points; 0 if there is no such ball."""
             radii = np.zeros(len(points))
             for solid in functions:
                 outside = np.flatnonzero(solid.values(points) > 0)
@@ -298,8 +302,9 @@ class CsgMesher:
         return region
 
     def mesh_smooth_level(self, field: Field, level: float) -> tuple[TriangleMesh, bool]:
-        """The boundary of {f <= level}, meshed as one level set. Also whether it is the whole
-        boundary: if not, it was closed outside of the box, in a way that has no meaning.
+        """Mesh the boundary of the set {field <= level} in the box as one level set. Returns the
+        closed mesh; and whether the set is known to lie in the box. If not, the mesh is closed at
+        or outside of the faces of the box by triangles that have no meaning.
         """
         hull = _finite_extent(field, level)
         lower, upper = self.lower, self.upper
@@ -324,7 +329,8 @@ class CsgMesher:
         return surface, is_whole
 
     def function(self, field: Field, level: float) -> LevelFunction:
-        """f - level, continued beyond the field's domain."""
+        """The function field - level, continued beyond the field's domain by its values at the
+        closest points of the domain."""
         return _DomainExtendedFunction(
             field, level, most_faces=self.most_faces, uploads=self.uploads
         )
@@ -335,8 +341,8 @@ class CsgMesher:
         return box_manifold(self.lower - pad, self.upper + pad)
 
     def _mesh_wall(self, wall: BandSolid, level: float) -> Manifold:
-        """The mesh of the points where the wall's field is within half_width + level of the wall's
-        own level.
+        """Mesh a wall: the points where its field g satisfies |g - wall.level| <= wall.half_width +
+        level.
 
         Raises:
             MeshingError: the wall is thinner than the tolerance, or its field has a period and is
@@ -364,9 +370,10 @@ class CsgMesher:
         return to_manifold(self._between_angle_levels(field, low, high))
 
     def _check_wall_thickness(self, field: Field, low: float, high: float) -> None:
-        """Raise MeshingError if the wall {low <= field <= high} is about as thin as the tolerance
-        of both of its sides together: they would meet. The thickness is (high - low) over the
-        median length of the gradient, near the wall in a coarse lattice.
+        """Raise MeshingError if the wall {low <= field <= high} is thinner than twice the
+        tolerance, since the meshes of its two sides would meet. The thickness is estimated as (high
+        - low) over the median length of the gradient, at those points of a coarse lattice that are
+        nearest to the wall.
         """
         lattice = BccLattice.covering_box(
             self.lower, self.upper, float((self.upper - self.lower).max()) / 8
@@ -390,7 +397,7 @@ class CsgMesher:
         levels end at the same vertices, those of the curve.
 
         Raises:
-            MeshingError: they do not.
+            MeshingError: the two surfaces do not end at the same vertices.
         """
         inner, outer = self.mesh_angle(field, low), self.mesh_angle(field, high)
         count = sum(map(len, field.loops))
@@ -403,8 +410,8 @@ class CsgMesher:
         return TriangleMesh(vertices, np.concatenate([outer.faces, index[inner.faces][:, ::-1]]))
 
     def _mesh_offset(self, solid: MeshSolid, level: float) -> Manifold:
-        """The mesh of {solid <= level}: the points within the distance `level` of a meshed solid,
-        or if `level` is negative those deeper inside than -level.
+        """Mesh an offset of a solid that is given by a mesh: the points within the distance `level`
+        of it; or, if `level` is negative, its points deeper inside than -level.
 
         Offsets of meshes have creases wherever the mesh has, too many for cells to be refined
         beside them. So cells are small from the beginning; and since f is a distance, it is linear
@@ -436,8 +443,8 @@ class CsgMesher:
         return to_manifold(surface)
 
     def _mesh_transformed(self, solid: TransformedSolid, level: float) -> Manifold:
-        """The mesh of a transformed solid: the original is meshed in the box that is mapped back,
-        and the mesh is then mapped by the affine map."""
+        """Mesh the set {solid <= level} for a solid under an affine map: the original solid is
+        meshed in the box to which the inverse map takes this box, and its mesh is then mapped."""
         matrix, offset = np.array(solid.map.matrix), np.array(solid.map.translation_vector)
         ends = np.stack([self.lower, self.upper])
         corners = np.stack(np.meshgrid(*ends.T, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -462,8 +469,8 @@ class CsgMesher:
 
 
 def _is_complement_free(solid: Solid) -> bool:
-    """Whether no complement is meshed for a solid: neither it nor its operands are complements or
-    walls."""
+    """Whether neither a solid nor any of its operands is a complement or a wall. (A wall is meshed
+    with a complement.)"""
     if isinstance(solid, BooleanSolid):
         return all(_is_complement_free(operand) for operand in solid.parts)
     if isinstance(solid, TransformedSolid | OffsetSolid):
