@@ -393,8 +393,8 @@ class CsgMesher:
             )
 
     def _between_angle_levels(self, field: SolidAngle, low: float, high: float) -> TriangleMesh:
-        """The closed surface around the points between two levels of an angle. The surfaces of both
-        levels end at the same vertices, those of the curve.
+        """The closed surface around the points between two levels of a solid angle: the surfaces of
+        both levels, which end at the same vertices, those of the boundary curve.
 
         Raises:
             MeshingError: the two surfaces do not end at the same vertices.
@@ -479,7 +479,8 @@ def _is_complement_free(solid: Solid) -> bool:
 
 
 def is_single_level_set(solid: Solid) -> bool:
-    """Whether a solid is meshed as one level set, not by Boolean operations or with exact edges."""
+    """Whether a solid is meshed as one level set. Other solids are meshed by Boolean operations, or
+    by a method of their own that makes their edges exact."""
     if isinstance(solid, SublevelSolid):
         return not isinstance(solid.field, Solid) or is_single_level_set(solid.field)
     if isinstance(solid, TransformedSolid):
@@ -495,8 +496,9 @@ def _sublevel_bounds(solid: MeshSolid, level: float) -> tuple[FloatArray, FloatA
 
 
 def _finite_extent(field: Field, level: float) -> Volume | None:
-    """A volume with finite bounds that contains {f <= level}; None if no such volume is known. The
-    field's domain does not count, since a surface that ends there is cut by it."""
+    """A volume with finite bounds that contains {field <= level}; None if no such volume is known.
+    The field's own domain does not count as such a volume, since the set may go on beyond the
+    domain."""
     if isinstance(field, Solid):
         extent = field.sublevel_extent(level)
     else:
@@ -510,17 +512,17 @@ def _finite_extent(field: Field, level: float) -> Volume | None:
 
 
 def _underlying_field(field: Field) -> Field:
-    """The field of a sublevel solid; any other field itself."""
+    """The field that a `SublevelSolid` was made of; any other field itself."""
     return field.field if isinstance(field, SublevelSolid) else field
 
 
 @dataclass
 class _DomainExtendedFunction(LevelFunction):
-    """A field, continued beyond its domain: outside of the domain it has the value of the closest
-    point of the domain.
+    """The function field - level, continued beyond the field's domain: outside of the domain it has
+    the value of the closest point of the domain.
 
-    Proof that the clearance of p's closest point is a clearance of p: the closest points of two
-    points are no farther from each other than the two points are.
+    Proof that a lower bound of the distance from the level set at p's closest point is such a bound
+    at p: the closest points of two points are no farther from each other than the two points are.
     """
 
     def sample(self, points: FloatArray) -> LevelSamples:
@@ -533,7 +535,7 @@ class _DomainExtendedFunction(LevelFunction):
         return super().clearance(self._closest(points))
 
     def _closest(self, points: FloatArray) -> FloatArray:
-        """The closest points (n, 3) of the field's domain.
+        """For each of the points (n, 3), the closest point of the field's domain.
 
         Raises:
             MeshingError: points lie outside of a domain that is neither a box nor a ball.
@@ -574,12 +576,12 @@ _MARGIN = 0.01
 
 @dataclass(frozen=True)
 class SolidMeshResult:
-    """The closed mesh of a solid.
+    """The closed mesh of a solid, and facts about how it was computed.
 
     spacing: the smallest size of cells.
     evaluations: the number of evaluations of fields, in points.
-    levels: the number of level sets that it was made of.
-    size: the longest edge of the solid's box; tolerances relate to it.
+    levels: the number of level sets that the mesh was made of.
+    size: the longest edge of the box around the solid; relative tolerances are fractions of it.
     """
 
     surface: TriangleMesh
@@ -590,8 +592,8 @@ class SolidMeshResult:
 
 
 def solid_and_level(field: Field, solid: Any, level: float | None) -> tuple[Solid, float]:
-    """The solid that the argument `solid` of `mesh` describes, and its level: {solid <= level} is
-    meant.
+    """The solid that the argument `solid` of `mesh` describes, and its level. The set {solid <=
+    level} is to be meshed.
 
     solid: True if the field itself is a solid, or values (low, high), between which the field is
         inside the solid.
@@ -615,11 +617,11 @@ def solid_and_level(field: Field, solid: Any, level: float | None) -> tuple[Soli
 
 
 def solid_value_range(field: Field, solid: Any, level: float | None) -> tuple[float, float]:
-    """The values (low, high) of the field between which a solid lies, from the argument that
-    describes it.
+    """The values (low, high) of the field between which a solid lies; either may be infinite. They
+    come from the argument `solid` of `mesh`.
 
     Raises:
-        ValueError, TypeError: as `solid_and_level`.
+        ValueError: the argument is True, or a level is given too, or the field has no such levels.
     """
     if solid is True:
         raise ValueError(
@@ -644,27 +646,27 @@ def mesh_solid(
     check: Callable[[TriangleMesh, float], None],
     report: Callable[[str], None],
 ) -> SolidMeshResult:
-    """The boundary of {solid <= level} in a volume: the points where the solid's function is at
-    most the level.
+    """Mesh the boundary of the part of {solid <= level} in a volume.
 
     volume: None for all of space.
     tolerance: how far triangles may be from the surface.
-    spacing: the size of cells, or None; only without it smaller cells are tried if an attempt
+    spacing: the size of cells. None for a default size; then smaller cells are tried if an attempt
         fails.
     angle_mesher: given a tolerance and a size of cells, both lengths, returns a function that
-        meshes level sets of angles.
+        meshes level sets of solid angles.
     most_faces: the largest number of triangles of a level set.
     check: called with a surface, none of whose triangles pass through each other, and the size of
-        the solid's box; raises if the surface fails its checks, the last of which is that it is
-        near the level.
+        the solid's box. It raises an error if the surface fails a check; the check of distances
+        from the level set comes last.
     report: receives messages about the progress.
 
-    If a few places are too far from the level, these are mended (`project_outliers`). If mending is
-    not enough, or another check fails in known places, smaller cells are tried, and half of the
-    tolerance: beside a thin part, triangles within the tolerance may be anywhere.
+    If vertices or centers of triangles are too far from the level set in a few places, they are
+    moved nearer to it (`project_outliers`). If that is not enough, or another check fails in known
+    places, smaller cells and half of the tolerance are tried: beside a part thinner than the
+    tolerance, triangles within the tolerance may pass through each other.
 
     Raises:
-        MeshingError: the solid has no bounds, or is empty, or a part cannot be meshed.
+        MeshingError: the solid is not bounded, or is empty, or an operand cannot be meshed.
     """
     lower, upper = _bounds(solid, level, volume)
     size = float((upper - lower).max())
@@ -712,14 +714,15 @@ def _check_and_mend(
     size: float,
     check: Callable[[TriangleMesh, float], None],
 ) -> TriangleMesh:
-    """The surface, if it passes the check. If it fails only because a few places are too far from
-    the level, the surface with these places moved nearer to the level.
+    """Check a surface, and return it. If it fails only because a few vertices or centers of
+    triangles are too far from the level set, return the surface with these places moved nearer to
+    it.
 
-    size: the size of the solid's box, which `check` needs.
-    check: as in `mesh_solid`.
+    size: the longest edge of the solid's box, which `check` needs.
+    check: called with the surface and the size; raises an error if the surface fails a check.
 
     Raises:
-        MeshingError: another check fails, or moving does not help.
+        MeshingError: another check fails, or the moved surface fails one.
     """
     try:
         check(surface, size)
@@ -736,20 +739,21 @@ def _check_and_mend(
 
 
 def apart_of(whole: Manifold, tolerance: float) -> TriangleMesh:
-    """The surface of a solid made by Boolean operations; triangles that pass through each other are
-    mended.
+    """The surface of a solid made by Boolean operations, with vertices moved where triangles would
+    pass through each other.
 
     tolerance: a length; mending moves the surface by at most half of it.
 
     Raises:
-        MeshingError: the solid is empty, or mending does not help.
+        MeshingError: the solid is empty, or triangles still pass through each other.
     """
     return _without_crossings(_Assembly(whole), tolerance)
 
 
 def _without_crossings(parts: TriangleMesh | _Assembly, tolerance: float) -> TriangleMesh:
-    """The surface, mended where triangles pass through each other. Slivers of assembled parts are
-    removed first: if mending then fails, fewer are removed and it is tried again.
+    """The surface of `parts`, with vertices moved where triangles would pass through each other.
+    From an assembly, slivers (thin triangles) are removed first. If triangles still pass through
+    each other in the end, fewer slivers are removed and it is tried again.
 
     tolerance: a length; mending moves the surface by at most half of it.
 
@@ -773,15 +777,18 @@ def _without_crossings(parts: TriangleMesh | _Assembly, tolerance: float) -> Tri
 
 @dataclass(frozen=True)
 class _Assembly:
-    """A solid made by Boolean operations of meshes, and the volume that it was cut by; None for all
-    of space."""
+    """A solid made by Boolean operations of meshes.
+
+    whole: the manifold3d solid.
+    volume: the volume that it was cut by; None for all of space."""
 
     whole: Manifold
     volume: Volume | None = None
 
     def without_slivers(self, length: float) -> TriangleMesh:
-        """The surface without short edges and slivers, whose removal moves it by up to `length`,
-        and without components that are only rounding error."""
+        """The surface of the solid without short edges and slivers (thin triangles), and without
+        components that are only rounding error. Removing edges and slivers moves the surface by up
+        to `length`."""
         simpler = without_short_edges(self.whole, length) if length > 0 else self.whole
         surface = drop_degenerate_components(from_manifold(simpler))
         return surface if self.volume is None else _snap_to_boxes(surface, self.volume)
@@ -790,8 +797,9 @@ class _Assembly:
 def _mesh_in_volume(
     mesher: CsgMesher, solid: Solid, level: float, volume: Volume | None
 ) -> TriangleMesh | _Assembly:
-    """The boundary of {solid <= level} in the volume; None stands for all of space. It is a mesh if
-    it is one whole level set, else an assembly of the meshes of operands."""
+    """Mesh the boundary of the part of {solid <= level} in the volume; None stands for all of
+    space. Returns a mesh if the boundary is one whole level set, else an assembly of the meshes of
+    operands."""
     if volume is None and is_single_level_set(solid):
         return mesher.mesh_smooth_level(solid, level)[0]
     lower, upper = mesher.lower, mesher.upper
@@ -808,7 +816,7 @@ def _mesh_in_volume(
 
 def _bounds(solid: Solid, level: float, volume: Volume | None) -> tuple[FloatArray, FloatArray]:
     """The lower and upper corners (3,) of a box that contains the part of {solid <= level} in the
-    volume.
+    volume, with a margin.
 
     Raises:
         MeshingError: there is no finite box, or it is empty.
@@ -839,8 +847,8 @@ def _as_tuple(x: FloatArray) -> tuple[float, float, float]:
 
 
 def _snap_to_boxes(surface: TriangleMesh, volume: Volume) -> TriangleMesh:
-    """The surface, with vertices within rounding of a face of a box put onto it. The boxes are
-    `volume` itself, or those that it is the intersection of."""
+    """The surface, with vertices that are within rounding of a face of a box moved onto the face.
+    The boxes are `volume` itself or, if it is an intersection of volumes, the boxes among these."""
     boxes = volume.volumes if isinstance(volume, VolumeIntersection) else (volume,)
     vertices = surface.vertices
     for box in boxes:

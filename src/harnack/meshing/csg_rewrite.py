@@ -97,14 +97,14 @@ def _factors(solid: Solid, level: float) -> list[SolidAtLevel]:
     return [(solid, level)]
 
 
-def _image(solid: Solid, transformed: TransformedSolid, level: float) -> SolidAtLevel:
-    """The image of the set {solid <= level} under the affine map of the solid `transformed`, as a
-    solid and its level."""
+def _image(solid: Solid, placed: TransformedSolid, level: float) -> SolidAtLevel:
+    """The image of the set {solid <= level} under the affine map of the solid `placed`, as a solid
+    and its level."""
     if isinstance(solid, Complement):
         return Complement(
-            TransformedSolid(solid.field, transformed.map)
-        ), level * transformed.map.value_factor
-    return TransformedSolid(solid, transformed.map), level * transformed.map.value_factor
+            TransformedSolid(solid.field, placed.map)
+        ), level * placed.map.value_factor
+    return TransformedSolid(solid, placed.map), level * placed.map.value_factor
 
 
 def _key(solid: Solid, level: float) -> Hashable:
