@@ -174,7 +174,8 @@ def sample_delaunay_points(
     root: cells that fill the box, and how many times they are to be halved.
     boundary: the curve at which the level set ends.
     walls: the lower and upper corners (3,) of the box, if points on its faces have to stay on them;
-        else None. seed: of the random moves of points.
+        else None.
+    seed: of the random moves of points.
     finer: sets of balls; cells of the octree are halved again, once for each set that has a ball
         which meets them.
 
@@ -377,18 +378,13 @@ def to_multiple_roots(
     """
     x = points
     for k in range(_SERIES_STEPS):
-        after_first = newton_to_level(
+        once = newton_to_level(
             function, x, samples if k == 0 else function.sample(x), max_step, None, steps=1
         )
-        after_second = newton_to_level(
-            function, after_first, function.sample(after_first), max_step, None, steps=1
-        )
-        first_length, second_length = (
-            row_norms(after_first - x),
-            row_norms(after_second - after_first),
-        )
+        twice = newton_to_level(function, once, function.sample(once), max_step, None, steps=1)
+        first_length, second_length = row_norms(once - x), row_norms(twice - once)
         ratio = second_length / np.maximum(first_length, 1e-300)
         is_slow = (ratio > _RATE_RANGE[0]) & (ratio < _RATE_RANGE[1])
         factor = np.where(is_slow, 1 / (1 - np.minimum(ratio, _RATE_RANGE[1])), 1.0)
-        x = after_first + factor[:, None] * (after_second - after_first)
+        x = once + factor[:, None] * (twice - once)
     return x
