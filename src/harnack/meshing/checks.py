@@ -545,11 +545,12 @@ def check_manifold(faces: IntArray, vertices: FloatArray | None = None) -> None:
         MeshingError: the faces are no manifold; a LocalizedMeshingError if vertices are given.
     """
 
-    def fail(message: str, where: IntArray) -> Never:
-        """Raise the error; `where` has the indices of the vertices at which the check failed."""
+    def fail(message: str, vertex_ids: IntArray) -> Never:
+        """Raise the error of a failed check; `vertex_ids` are the indices of the vertices at which
+        it failed."""
         if vertices is None:
             raise MeshingError(message)
-        raise LocalizedMeshingError(message, vertices[where])
+        raise LocalizedMeshingError(message, vertices[vertex_ids])
 
     pairs = half_edges(faces)
     edges = Edges.of(pairs)

@@ -349,16 +349,17 @@ def _cut(surface: TriangleMesh, boundary: _ClipBoundary) -> TriangleMesh:
 
 
 def _sphere_cuts(a: FloatArray, b: FloatArray, center: FloatArray, radius: float) -> FloatArray:
-    """The points (n, 3) where segments from `a` to `b` pass through a sphere. a, b: (n, 3); of each
-    segment one end is inside of the sphere.
+    """The points (n, 3) where segments from `a` to `b`, both (n, 3), pass through a sphere. One end
+    of each segment is inside of the sphere, the other end outside.
 
-    A point is o + t d from the center, with o the offset of the inner end, d the direction to the
-    other end, and t^2 d.d + 2 t o.d = radius^2 - o.o = room.
+    Proof. Relative to the center, the point is o + t d, with o the inner end and d the vector from
+    it to the outer end. |o + t d| = radius means t^2 d.d + 2 t o.d = room, with room = radius^2 -
+    o.o.
     """
     is_a_in = np.linalg.norm(a - center, axis=1) < np.linalg.norm(b - center, axis=1)
     start, end = np.where(is_a_in[:, None], a, b), np.where(is_a_in[:, None], b, a)
     o, d = start - center, end - start
-    dd, od = ((d * d).sum(axis=1), (o * d).sum(axis=1))
+    d_squared, o_dot_d = ((d * d).sum(axis=1), (o * d).sum(axis=1))
     room = np.maximum(radius**2 - (o * o).sum(axis=1), 0)
-    fraction = room / (od + np.sqrt(od * od + dd * room))
+    fraction = room / (o_dot_d + np.sqrt(o_dot_d * o_dot_d + d_squared * room))
     return start + fraction[:, None] * d

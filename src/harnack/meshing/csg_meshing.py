@@ -98,8 +98,8 @@ __all__ = [
 # For offsets of meshes: the size of cells, in tolerances; and the number of secant steps that find
 # the level on an edge of a cell.
 _OFFSET_CELLS, _SECANT_STEPS = 6.0, 2
-# In lattices of at least this many cells, cells are left out at once in which the other operands
-# of an intersection leave nothing.
+# In lattices of at least this many cells, the cells in which the other operands of an intersection
+# leave nothing are left out from the start.
 _MANY_CELLS = 100_000
 # How far surfaces of offsets may be moved, in tolerances: by merging coplanar triangles, tried in
 # this order until the result can be mended; and by the mending of crossing triangles afterwards.
@@ -114,8 +114,8 @@ AngleMesher = Callable[[SolidAngle, float], TriangleMesh]
 
 
 IntersectedOperands: TypeAlias = tuple[tuple[Solid, float], ...]
-"""Solids, with levels, that the meshed solid will be intersected with. Where one of these solids is
-proved to have no points, nothing need be meshed.
+"""Solids, with levels, with which the meshed solid will be intersected. In a region in which one of
+these solids is proved to have no points, nothing need be meshed.
 
 Proof for a tree of unions, intersections and complements. Outside of complements, these are the
 operands of all intersections around the meshed solid. Inside a complement, they are only the

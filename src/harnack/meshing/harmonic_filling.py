@@ -109,7 +109,7 @@ class HarmonicFilling:
 
 
 def harmonic_patches(
-    vertices: FloatArray, faces: IntArray, edges: IntArray, asked: HoleFillingOptions
+    vertices: FloatArray, faces: IntArray, edges: IntArray, options: HoleFillingOptions
 ) -> HarmonicFilling:
     """Fill the holes of a mesh by harmonic fillings that end at its boundary edges. If that fails,
     holes of three edges are filled by triangles, and all other holes by harmonic fillings.
@@ -122,16 +122,16 @@ def harmonic_patches(
         MeshingError: fillings could not be computed, or intersect the mesh or each other.
     """
     try:
-        return _fill_all_holes(vertices, faces, edges, asked)
+        return _fill_all_holes(vertices, faces, edges, options)
     except MeshingError as error:
         missing = triangle_fills(vertices, faces, edges)
         if not len(missing):
             raise
         first = error
-    asked.report(f"once more, with triangles in {len(missing):,} holes of three edges")
+    options.report(f"once more, with triangles in {len(missing):,} holes of three edges")
     together = np.concatenate([faces, missing])
     try:
-        filling = _fill_all_holes(vertices, together, checked_boundary_edges(together), asked)
+        filling = _fill_all_holes(vertices, together, checked_boundary_edges(together), options)
     except MeshingError as error:
         raise MeshingError(
             f"{first}; and with triangles in {len(missing):,} holes of three edges: {error}"
@@ -407,8 +407,8 @@ def _collapse_midpoint(x: FloatArray, faces: IntArray, middle: int, ends: list[i
             continue
         moved = np.where(star == middle, end, star)
         is_kept = ~(star == end).any(axis=1)
-        one, other = _unit_normals(x[star[is_kept]]), _unit_normals(x[moved[is_kept]])
-        cosine = float((one * other).sum(axis=1).min(initial=1.0))
+        before, after = _unit_normals(x[star[is_kept]]), _unit_normals(x[moved[is_kept]])
+        cosine = float((before * after).sum(axis=1).min(initial=1.0))
         new_faces = np.concatenate([others, moved[is_kept]])
         is_moved = np.arange(len(new_faces)) >= len(others)
         candidates.append((len(intersecting_faces(x, new_faces, is_moved)), -cosine, new_faces))
@@ -418,7 +418,7 @@ def _collapse_midpoint(x: FloatArray, faces: IntArray, middle: int, ends: list[i
             "subdivide the mesh there, or choose a smaller `cell_size`",
             x[[middle]],
         )
-    return min(candidates, key=lambda one: one[:2])[2]
+    return min(candidates, key=lambda candidate: candidate[:2])[2]
 
 
 def _unit_normals(corners: FloatArray) -> FloatArray:

@@ -534,7 +534,9 @@ def _graph_laplacian(ends: IntArray, weight: FloatArray, count: int) -> Any:
     """The Laplacian (count, count) of a graph, as a sparse matrix: -weight for each edge, and at
     each vertex the sum of the weights of its edges.
 
-    ends: (k, 2) the vertices of each edge. weight: (k,). count: the number of vertices.
+    ends: (k, 2) the vertices of each edge.
+    weight: (k,) the weights of the edges.
+    count: the number of vertices.
     """
     import scipy.sparse  # imported here: it takes half a second
 

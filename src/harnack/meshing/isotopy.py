@@ -110,13 +110,14 @@ def isotopy_of(
     spacing: float,
     walls: Walls,
 ) -> IsotopyCoverage:
-    """On which tetrahedra the topology of the mesh is proved to be that of the level set.
+    """Find out on which tetrahedra the topology of a mesh is proved to be that of the level set.
 
     points, tetrahedra: the points, and the indices (m, 4) of the corners of the tetrahedra.
 
     is_cut: (m,) whether a tetrahedron holds a point of the mesh.
     faces: (k, 3) the triangles of the mesh; its first vertices are the points of the tetrahedra.
-    boundary: the curve. spacing: the size of cells.
+    boundary: the curve at which the level set ends.
+    spacing: the size of cells, a length.
     walls: the lower and the upper corner (3,) of the box, on whose faces the surface may end;
         None if it does not end there.
     """
@@ -219,12 +220,12 @@ def _linear_gradients(
     sign = np.sign(function.values(corners[rows].mean(axis=1)))
     has_two = in_mesh.sum(axis=1) == 2
     for k, triple in enumerate(triples):
-        those = np.flatnonzero(has_two & in_mesh[:, k])
-        a, b, c = (corners[rows[those], corner] for corner in triple)
+        chosen = np.flatnonzero(has_two & in_mesh[:, k])
+        a, b, c = (corners[rows[chosen], corner] for corner in triple)
         normal = np.cross(b - a, c - a)
-        inward = ((corners[rows[those], k] - a) * normal).sum(axis=1)
-        owners.append(rows[those])
-        slopes.append(normal * (np.sign(inward) * sign[those])[:, None])
+        inward = ((corners[rows[chosen], k] - a) * normal).sum(axis=1)
+        owners.append(rows[chosen])
+        slopes.append(normal * (np.sign(inward) * sign[chosen])[:, None])
     return _LinearGradients(np.concatenate(owners), np.concatenate(slopes))
 
 
@@ -315,8 +316,9 @@ def _proved_regular(
     with corners (n, k, 3): f and F have no zero there, or grad f . grad F > 0. Simplices are halved
     up to five times for that.
 
-    start: (n,) the values of F at the first corners.
-    slope: (n, 3) grad F, or in (c) the vector n.
+    start: (n,) the values of F at the first corners of the simplices.
+    slope: (n, 3) grad F on each simplex; for condition (c), the vector n of the theorem, and
+        `start` is 0.
     free: (3,) 1 for coordinates in which points may move, 0 for coordinates that a face of the box
         fixes."""
     owner, first = np.arange(len(corners)), corners[:, 0]

@@ -101,7 +101,8 @@ class _Cut:
 
     tree: of the faces that were cut.
     unit: (n, 3) the vertices of the mesh, scaled.
-    faces: (j, 3) the faces that were cut. pieces: (k, 3, 3).
+    faces: (j, 3) the faces that were cut.
+    pieces: (k, 3, 3) the triangles into which they were cut.
     owner: (k,) the face of the mesh that each piece is a part of.
     front, back: (k,) the winding numbers on the two sides of each piece.
     is_thick: (k,) whether a piece is thick enough for its winding numbers to be right."""
@@ -266,7 +267,8 @@ def neighbors(x: FloatArray, faces: IntArray) -> IntArray:
 def _wedges(ends: FloatArray, third: FloatArray, is_along: BoolArray) -> IntArray:
     """Pairs (k, 2) of faces around an edge that have material between them.
 
-    ends: (2, 3) the ends of the edge. third: (n, 3) the third corners of its faces.
+    ends: (2, 3) the ends of the edge.
+    third: (n, 3) the third corners of its faces.
     is_along: (n,) whether a face runs the edge from the first end to the second.
 
     Faces are visited counter-clockwise, as seen against the direction of the edge. Material begins

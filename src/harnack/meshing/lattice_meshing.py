@@ -106,7 +106,8 @@ class MissedPartsError(MeshingError):
         self.places, self.thickness, self.size = places, thickness, size
 
     def may_be_fixed_by(self, smaller: float) -> bool:
-        """Whether smaller cells may find the part. smaller: their size, as a fraction of `size`.
+        """Whether smaller cells may find the missed part. smaller: the size of the smaller cells,
+        as a fraction of `size`.
 
         They cannot if they too would miss a part that is at least two of the smaller cells long and
         thinner than a quarter of such a cell. Such a part is beside a cusp or the tip of a cone,
@@ -572,7 +573,8 @@ def _check_nothing_missed(
     long. The points from which they are searched are found here; `check_no_missed_parts` does the
     search.
 
-    points, samples: of the lattice. corners: (m, 4) of all tetrahedra.
+    points, samples: points (n, 3) of the lattice, and samples of the function at them.
+    corners: (m, 4) the corners of all tetrahedra.
     first: the mesh before refinement.
     faces: the faces of it that count.
     box: the lower and the upper corner of the box where the level set counts.
@@ -619,7 +621,8 @@ def _wall_faces(
     """Faces (m, 3) of tetrahedra that lie on the faces of the box and cover the negative part of
     it.
 
-    corners: (k, 4) of the tetrahedra. is_wall: (n,) the mask of the points on the faces of the box.
+    corners: (k, 4) the indices of the corners of each tetrahedron.
+    is_wall: (n,) the mask of the points on the faces of the box.
 
     A tetrahedron has such a face if exactly three of its corners are on the box and the function is
     at most 0 at the fourth. The faces are counter-clockwise as seen from outside of the box."""
@@ -743,8 +746,9 @@ def _march(
     Where parts of the surface touch in a moved point, the point is moved back to its original
     position, until no parts touch.
 
-    points, samples: of the lattice. corners: (m, 4) of the tetrahedra.
-    is_fixed: (n,) the mask of the points that are not moved.
+    points, samples: points (n, 3) of the lattice, and samples of the function at them.
+    corners: (m, 4) the indices of the corners of each tetrahedron.
+    is_fixed: (n,) the mask of the points that must not be moved.
     is_wall: (n,) the mask of the points that count as on the level.
     walls: the lower and the upper corner of the box, on whose faces points stay; or None.
 
@@ -853,7 +857,8 @@ def _may_be_cut(value: FloatArray, is_on: BoolArray, corners: IntArray) -> BoolA
     corners (m, 4): the tetrahedron has corners on both sides of the level set, or at least three
     corners on it.
 
-    value: (n,) the function at the points. is_on: (n,) which points are on the level."""
+    value: (n,) the function at the points.
+    is_on: (n,) whether each point is on the level set."""
     code = np.where(is_on, _ON_LEVEL, np.where(value > 0, _ABOVE, _BELOW)).astype(np.uint8)
     code_sum = np.zeros(len(corners), np.uint8)
     for column in corners.T:

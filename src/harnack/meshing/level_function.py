@@ -56,17 +56,17 @@ class LevelSamples:
 
     def replaced(self, rows: Any, others: LevelSamples) -> LevelSamples:
         """A copy in which the samples at points `rows` (indices or a mask) are `others`."""
-        value, gradient, reach = (
+        value, gradient, radius = (
             self.value.copy(),
             self.gradient.copy(),
             self.quarter_period_radius.copy(),
         )
-        value[rows], gradient[rows], reach[rows] = (
+        value[rows], gradient[rows], radius[rows] = (
             others.value,
             others.gradient,
             others.quarter_period_radius,
         )
-        return LevelSamples(value, gradient, reach)
+        return LevelSamples(value, gradient, radius)
 
     @property
     def distance(self) -> FloatArray:

@@ -121,7 +121,7 @@ class PointsOnLevel:
         jumps &= (np.minimum(np.abs(ahead), np.abs(behind)) > _MIN_JUMP) & (area[rows] > 0)
         return cls(points[jumps], np.where(ahead > 0, 1.0, -1.0)[jumps, None] * normal[jumps])
 
-    def some(self, rows: Any) -> PointsOnLevel:
+    def select(self, rows: Any) -> PointsOnLevel:
         """The selected points, with their normals. rows: their indices, or a mask."""
         return PointsOnLevel(self.points[rows], self.normals[rows])
 
@@ -130,7 +130,7 @@ class PointsOnLevel:
         is_in = ((self.points > lower) & (self.points < upper)).all(axis=1)
         if volume is not None:
             is_in &= volume.contains_points(self.points)
-        return self.some(is_in)
+        return self.select(is_in)
 
 
 @dataclass(frozen=True)
@@ -175,12 +175,14 @@ class LostParts:
         """Find the parts of a level set that a mesh has lost.
 
         known: points on the level set, near which the mesh should be.
-        surface: the mesh. spacing: the size of its cells."""
+        surface: the mesh.
+        tolerance: the largest distance that is no sign of a lost part.
+        spacing: the size of the mesh's cells, a length."""
         corner = surface.vertices[surface.faces]
-        distant = known.some(_are_farther(known.points, corner, tolerance))
+        distant = known.select(_are_farther(known.points, corner, tolerance))
         beyond = _are_farther(distant.points, corner, max(tolerance, _ALLOWED_CELLS * spacing))
         within = _bound_of_distances(distant.points, corner) if len(distant.points) else tolerance
-        shown = distant.some(_spread(len(distant.points), _MAX_MEASURED))
+        shown = distant.select(_spread(len(distant.points), _MAX_MEASURED))
         thickness, is_inside = _thicknesses(function, shown, spacing)
         is_thin = np.isfinite(thickness)
         thickness = thickness[is_thin]

@@ -210,9 +210,9 @@ def squared_distance_in_nearby_leaf(tree: PackedTree, x: Vec3, column: int) -> R
         node after the last sibling is `end`. After the last sibling, go down to the first child of
         the sibling with the nearest center.
 
-        best: the smallest squared distance of a sibling's center. nearest_leaf: the leaf of that
-            sibling, NO_TRIANGLE for an inner node. first, after: its first child, and the node
-            after its subtree."""
+        best: the smallest squared distance of a sibling's center so far.
+        nearest_leaf: the leaf of that sibling, NO_TRIANGLE for an inner node.
+        first, after: the first child of that sibling, and the node after its subtree."""
         head = tree.head(i)
         middle = 0.5 * (vector(*head[:3]) + vector(*head[3:6]))
         square = dr.squared_norm(middle - x)

@@ -88,7 +88,7 @@ def _edges(faces: IntArray) -> tuple[IntArray, IntArray]:
 
 def _normals(corners: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Unit normals (m, 3) of triangles (m, 3, 3), 0 for triangles without a normal; and their
-    heights (m,) over their longest edges."""
+    heights (m,) above their longest edges."""
     u, v = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     normal = np.cross(u, v)
     area = np.sqrt(np.einsum("ni,ni->n", normal, normal))
@@ -102,7 +102,9 @@ def _candidates(corners: FloatArray, normals: FloatArray, heights: FloatArray) -
     """The indices (k,) of triangles in whose plane other triangles may lie. Of two triangles in one
     plane, the one with the smaller height is always among them.
 
-    corners: (m, 3, 3). normals: (m, 3) unit normals. heights: (m,) over the longest edges.
+    corners: (m, 3, 3) the corners of all triangles.
+    normals: (m, 3) their unit normals.
+    heights: (m,) their heights over their longest edges.
 
     A plane is a point of R^4: its unit normal and its distance from the origin. The normal is
     turned so that its first coordinate that is larger than 0.3 in magnitude is positive. For two

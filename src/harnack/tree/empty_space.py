@@ -257,7 +257,8 @@ class EmptySpaceGrid:
     def empty_run(self, p: Vec3, d: Vec3, length: Real) -> Real:
         """A length s for which p + s d is proved to stay in empty cells; it may exceed `length`.
 
-        p, d: the start, and the direction. length: the length at which the search may stop.
+        p, d: the start and the direction of each ray.
+        length: the length at which the search may stop.
 
         Proof. All cells less than empty_distance cells away from a point's cell are empty, and so
         are the margins around them. These cells form a cube, and with their margins a cube larger

@@ -192,7 +192,8 @@ def _next_foreign_crossing(
 
     corner: three index arrays, the first, second and third vertices of all faces.
     ends: the two vertices, two index arrays with an entry for each ray.
-    end: the largest t. after: (t, number), the crossing behind which the search begins.
+    end: the largest t.
+    after: (t, number of a face), the crossing behind which the search begins.
 
     Returns t and the number of the face; NO_TRIANGLE if there is none."""
     index = tree.tree.backend.UInt32
@@ -216,7 +217,8 @@ def _next_foreign_crossing(
 def _cut_up(pieces: FloatArray, rows: IntArray, knives: FloatArray) -> tuple[FloatArray, IntArray]:
     """Cut triangles by the planes of other triangles, the knives.
 
-    pieces: (n, 3, 3) the triangles. knives: (k, 3, 3).
+    pieces: (n, 3, 3) the triangles that are cut.
+    knives: (k, 3, 3) the triangles whose planes cut them.
     rows: (k,) the index of the triangle that each knife cuts. A knife cuts only where its triangle,
         not only its plane, meets the piece.
 
@@ -288,7 +290,8 @@ def _cut_meets_triangle(pieces: FloatArray, heights: FloatArray, knives: FloatAr
     """(k,) whether the segment in which the plane of a knife cuts a triangle meets the knife's
     triangle.
 
-    pieces, knives: (k, 3, 3). heights: (k, 3) of the corners of pieces above the planes.
+    pieces, knives: (k, 3, 3) the triangles that are cut, and the triangles whose planes cut them.
+    heights: (k, 3) the signed distances of the corners of pieces from the planes.
 
     The segment is clipped by the three edges of the knife: low and high are the ends of what is
     left, as fractions of the segment."""

@@ -433,8 +433,8 @@ def signed_crossing(row: list[Real], frame: RayFrame | VerticalRayFrame) -> tupl
         """How an edge crosses the half-line v = 0, u > 0: 1 upwards, -1 downwards, 0 if it does
         not.
 
-        from_up, to_up: whether v > 0 at the ends of the edge. left: the `edge_function` of its
-            ends."""
+        from_up, to_up: whether v > 0 at the ends of the edge.
+        left: the `edge_function` of its ends."""
         one = type(left)(1)
         return dr.select(~from_up & to_up & (left > 0), one, 0) - dr.select(
             from_up & ~to_up & (left < 0), one, 0
