@@ -219,7 +219,8 @@ def _are_apart(a: Corners, b: Corners, shared: list[list[Mask]]) -> Mask:
       shared corner has both ends strictly on one side of the other triangle's plane, or if the line
       of the edge passes two edges of the other triangle on different sides (`_edge_may_pierce`).
       For triangles in one plane all these signs are 0, and nothing is proved.
-    - *A line*, for triangles in one plane: see `_are_beside_edge`.
+    - *A line*, for triangles in one plane: an edge of one triangle lies on a line that has the two
+      triangles on its two sides (`_are_beside_edge`).
     """
     is_shared_a = [shared[i][0] | shared[i][1] | shared[i][2] for i in range(3)]
     is_shared_b = [shared[0][k] | shared[1][k] | shared[2][k] for k in range(3)]
@@ -344,8 +345,9 @@ def _are_beside_edge(a: Corners, b: Corners, shared_count: Real) -> Mask:
       of e, and m'.x > 0 at the two other corners of the other triangle. So points of both triangles
       have m'.x = 0, and the shared corner is the only such point of the other triangle. Another
       plane through the shared corner is tried as well (`_are_opposite_at_corner`).
-    - Two shared corners, the ends of e: m'.x < 0 at the last corner of one triangle and > 0 at that
-      of the other. So points of both have m'.x = 0, and lie on e.
+    - Two shared corners, the ends of e: m'.x < 0 at the last corner of one triangle, and m'.x > 0
+      at the last corner of the other triangle. So points of both triangles have m'.x = 0 and lie on
+      e.
     """
     has_none, has_one = shared_count < 0.5, (shared_count > 0.5) & (shared_count < 1.5)
     has_two = (shared_count > 1.5) & (shared_count < 2.5)

@@ -307,7 +307,8 @@ def _near_pairs(corner: FloatArray, among: BoolArray | None) -> IntArray:
     batches: list[IntArray] = []
 
     def add_if_overlapping(first: IntArray, second: IntArray) -> None:
-        """Append those of the pairs `first`, `second`, both (k,), whose boxes overlap."""
+        """Append the pairs of triangles whose boxes overlap, of the pairs with indices `first` and
+        `second`, both (k,)."""
         keep = (lower[first] <= upper[second]).all(axis=1)
         keep &= (lower[second] <= upper[first]).all(axis=1)
         batches.append(np.column_stack([first[keep], second[keep]]))
@@ -446,8 +447,8 @@ class MeshingError(ValueError):
     """A level set could not be meshed. The message says why, and names a remedy."""
 
     def may_be_fixed_by(self, smaller: float) -> bool:
-        """Whether smaller cells may help: cells whose size is `smaller` times that of the cells
-        that failed."""
+        """Whether smaller cells may help. smaller: their size, as a fraction of the size of the
+        cells that failed."""
         del smaller
         return True
 

@@ -74,8 +74,8 @@ def largest_body(surface: TriangleMesh) -> TriangleMesh:
 
 
 def drop_degenerate_components(surface: TriangleMesh) -> TriangleMesh:
-    """The closed surface without those connected components that are only rounding error, such as
-    the remainder of a solid minus itself."""
+    """Remove the connected components of a closed surface that are only rounding error, such as
+    what remains of a solid minus itself."""
     x, faces = surface.vertices, surface.faces
     if not len(faces):
         return surface

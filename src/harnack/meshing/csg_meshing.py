@@ -253,10 +253,10 @@ class CsgMesher:
     def _mesh_level_set(self, function: LevelFunction, lattice: BccLattice) -> TriangleMesh:
         """The level set of `function` in the cells of `lattice`, as a closed mesh.
 
-        If there are many cells, those in which the other operands are proved to leave nothing are
-        left out. If there are few, all are meshed, so that copies of a surface are the same bit by
-        bit. Should that fail, cells are left out as well: a function may jump where nothing is
-        left, as the angle about an axis does, or have no value beyond a surface.
+        If there are many cells, the cells in which the other operands are proved to leave nothing
+        are left out. If there are few cells, all are meshed, so that copies of a surface are the
+        same bit by bit. If that fails, cells are left out as well: in these cells a function may
+        jump, as the angle about an axis does, or have no finite value.
         """
         region: IrrelevantRegion | None = None
         if math.prod(lattice.counts.tolist()) < _MANY_CELLS:

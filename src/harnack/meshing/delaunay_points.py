@@ -80,8 +80,8 @@ class BoundaryCurve:
     @classmethod
     def of(cls, loops: tuple[FloatArray, ...], longest: float) -> BoundaryCurve:
         """The curve that consists of closed loops (k, 3). Its points are first the vertices of the
-        loops, in their order; then those that divide edges longer than `longest` into equal
-        parts."""
+        loops, in their order; then the points that divide edges longer than the length `longest`
+        into equal parts."""
         points = [*loops]
         inner_points: list[FloatArray] = []
         edges: list[tuple[int, int]] = []
@@ -124,9 +124,9 @@ class BoundaryCurve:
 class TetrahedronPoints:
     """The points of a Delaunay triangulation, with samples of the function f - level at them.
 
-    points: (n, 3), those of the boundary curve first.
-    is_on_level: (n,) whether points are on the level set; those of the curve count as on it.
-    samples: of f - level at all points; 0 at those of the curve.
+    points: (n, 3); the points of the boundary curve come first.
+    is_on_level: (n,) whether points are on the level set; points of the curve count as on it.
+    samples: of f - level at all points; 0 at the points of the curve.
     """
 
     points: FloatArray
@@ -168,8 +168,8 @@ def sample_delaunay_points(
     finer: tuple[RefinementBalls, ...] = (),
 ) -> TetrahedronPoints:
     """Choose the points of a Delaunay triangulation around a level set, and sample the function at
-    them. They are the corners and centers of the cells of an octree around the level set, those
-    near it moved onto it, and the points of the boundary curve.
+    them. They are the corners and centers of the cells of an octree around the level set, moved
+    onto the level set if they are near it, and the points of the boundary curve.
 
     root: cells that fill the box, and how many times they are to be halved.
     boundary: the curve at which the level set ends.

@@ -59,8 +59,9 @@ def distance_from_triangles(point: FloatArray, corner: FloatArray) -> float:
 def distances_from_triangles(points: FloatArray, corner: FloatArray) -> FloatArray:
     """(k,) the distances of points (k, 3), each from the triangle with the same index in `corner`
     (k, 3, 3); or the distances of a single point (3,) from all triangles. They are upper bounds
-    that differ from the distances only by rounding. A distance is the smallest of those from the
-    triangle's edges and, if the projection of the point lies in the triangle, from its plane."""
+    that differ from the distances only by rounding. A distance is the smallest distance of the
+    point from the triangle's edges and, if the projection of the point lies in the triangle, from
+    its plane."""
     distance = np.full(len(corner), np.inf)
     for k in range(3):
         start, edge = corner[:, k], corner[:, k - 1] - corner[:, k]

@@ -6,13 +6,15 @@ with the faces around the loop (Liepa, Filling Holes in Meshes, 2003); or, for l
 with the smallest area (Barequet and Sharir 1995). The two may differ: the smallest area may cut
 through a tube where the smallest angles go around it. Edges are split and flipped until triangles
 are as large as those around the hole. Then the filling is faired, so that it bends as little as
-possible: the sum of squared Laplacians of positions, over the new vertices and those of the loop,
-    is minimized, while all vertices of the mesh stay (Botsch and Kobbelt 2004). So the filling
-    continues the surface around it, tangents included. The weights of the Laplacians are computed
-    from the filling before this step. If the step is repeated, with long edges split in between, it
-    converges to surfaces whose mean curvature is harmonic, such as spheres and cylinders.
+possible: the sum of squared Laplacians of positions, over the new vertices and the vertices of the
+    loop, is minimized, while all vertices of the mesh stay (Botsch and Kobbelt 2004). So the
+    filling continues the surface around it, tangents included. The weights of the Laplacians are
+    computed from the filling before this step. If the step is repeated, with long edges split in
+    between, it converges to surfaces whose mean curvature is harmonic, such as spheres and
+    cylinders.
 
-Nothing is proved about such fillings. `fill_holes` checks them and returns those that pass.
+Nothing is proved about such fillings. `fill_holes` checks the fillings and returns the ones that
+pass the checks.
 """
 
 from __future__ import annotations
@@ -118,7 +120,7 @@ def fill_holes(
 
 def _drop_unused(x: FloatArray, faces: IntArray, input_count: int) -> tuple[FloatArray, IntArray]:
     """Remove the vertices that no face uses; returns vertices and faces. The first `input_count`
-    vertices, those of the input mesh, are kept in any case."""
+    vertices, which belong to the input mesh, are kept in any case."""
     used = np.zeros(len(x), np.bool_)
     used[:input_count] = True
     used[faces] = True

@@ -124,8 +124,8 @@ class _Cut:
     ) -> _Cut:
         """Cut the faces `rows` (indices) of a mesh along each other.
 
-        closed: all faces of the mesh, including those without an area, if `faces` lacks these;
-            winding numbers are counted with it."""
+        closed: all faces of the mesh, including faces without an area, with which winding numbers
+            are computed. None if `faces` has all of them."""
         corner = vertices[faces]
         low, high = corner.min(axis=(0, 1)), corner.max(axis=(0, 1))
         size = float(2.0 ** np.ceil(np.log2(0.5 * float((high - low).max()))))

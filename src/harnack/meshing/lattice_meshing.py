@@ -591,7 +591,8 @@ def _check_nothing_missed(
 def _refinable_points(
     lattice: BccLattice, does_matter: BoolArray | None
 ) -> Callable[[FloatArray], BoolArray]:
-    """A function from points (n, 3) to the mask (n,) of those where triangles may be refined.
+    """Make a function from points (n, 3) to a mask (n,): whether triangles may be refined at each
+    point.
 
     These points are farther than one and a half cells from the faces of the box, and neither in an
     irrelevant cell nor in a cell beside one. does_matter: the mask of the relevant cells, one entry
@@ -706,7 +707,7 @@ class _InitialMesh:
 
     vertices, faces: (n, 3), (m, 3). The first vertices are the points of the tetrahedra; the others
         lie on edges that the level set crosses.
-    points: the points of the tetrahedra; those near the level set were moved onto it.
+    points: the points of the tetrahedra; points near the level set were moved onto it.
     rows: (k,) the indices of the tetrahedra that the level set may pass through.
     crossed: (k,) for each of these tetrahedra, whether the level set crosses one of its edges.
     ends: (j, 2) the indices of the two end points of each edge that the level set crosses."""
@@ -819,7 +820,8 @@ def _snap_points(
     it is.
 
     Returns:
-        The points (n, 3); their samples; and the mask (n,) of those on the level.
+        The points (n, 3); samples of the function at them; and the mask (n,) of the points on the
+        level set.
     """
     size = float(lattice.size.min())
     near = np.flatnonzero((samples.distance < _SNAP_DISTANCE * size) & ~is_fixed)

@@ -257,7 +257,8 @@ def pack_tree(
     """Upload a tree to a backend, for `traverse`.
 
     levels: for each level of the tree, leaves first, the numbers (k, c) of its nodes, c >= 6. The
-        first six of each are read at every visit of the node, the others only on demand.
+        first six numbers of a node are read at every visit of the node, the further numbers only on
+        demand.
     primitives: (leaves, leaf_size, j) the numbers of the primitive in each slot
         (`BalancedTree.values_in_slots`).
 

@@ -65,8 +65,8 @@ class BoxTree:
         """The next box that each ray o + t d, |d| = 1, enters after the pair `after` = (t, number).
 
         A ray that has not left a box before t = start enters it at max(t of its first point in the
-        box, start). Boxes are ordered by this t, and those at the same t by number. Repeated calls,
-        the first with after = (t, NO_BOX) for any t < start, visit every box that the ray meets for
+        box, start). Boxes are ordered by this t, and at the same t by number. Repeated calls, the
+        first with after = (t, NO_BOX) for any t < start, visit every box that the ray meets for
         start <= t <= end exactly once. Boxes are enlarged a little, so that rounding never skips a
         box that the ray meets.
 

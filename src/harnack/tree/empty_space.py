@@ -5,8 +5,7 @@ remaining cells: octrees, uniform grids, and connected components of cells.
   empty.
 - `EmptySpaceGrid`: equal cubes on a backend, and the length for which a ray stays in empty cubes.
 - `OccupancyGrid`: such a grid of the cells that may contain a set of points, computed by an octree.
-- `largest_connected_component`: the largest group of cells that cells proved empty separate from
-  the others.
+- `largest_connected_component`: the largest group of connected cells that are not proved empty.
 
 A component is a group of cells that are not proved empty and are connected by faces, edges and
 corners. If a single component is to be drawn, the cells of all other components count as empty:
@@ -218,7 +217,11 @@ class EmptySpaceGrid:
 
     A point outside of the grid is treated like its nearest cell.
 
-    backend, origin, cell_size, shape, empty_distance: as in `GridData`, uploaded.
+    origin: (3,) the lower corner of the grid.
+    cell_size: the width of a cell.
+    shape: the number of cells along x, y and z.
+    empty_distance: for each cell, x fastest, the chessboard distance, in cells, to the nearest cell
+        that is not proved empty.
     margin: an empty cell enlarged on all sides by this number of cells is empty too.
     """
 

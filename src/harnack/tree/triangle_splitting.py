@@ -2,8 +2,8 @@
 them.
 
 The set of points whose winding number is above 1/2, for a closed mesh that crosses itself, is
-bounded by parts of the mesh's triangles. If each triangle is cut along the others, every piece lies
-as a whole either on the boundary of the set, or off it.
+bounded by parts of the mesh's triangles. If each triangle is cut along all other triangles, every
+piece lies as a whole either on the boundary of the set, or off it.
 """
 
 from __future__ import annotations
@@ -223,8 +223,8 @@ def _cut_up(pieces: FloatArray, rows: IntArray, knives: FloatArray) -> tuple[Flo
         not only its plane, meets the piece.
 
     In each round every piece is cut by one of the knives that meet it: the knife in the middle of
-    the piece's list. The remaining knives of the list are passed on to those of the new pieces that
-    they meet. So the number of knives of a piece falls by about half in each round.
+    the piece's list. The remaining knives of the list are passed on to the new pieces that they
+    meet. So the number of knives of a piece falls by about half in each round.
 
     Returns:
         The pieces (j, 3, 3), and the index (j,) of the triangle that each is a piece of.
