@@ -231,8 +231,9 @@ def _are_apart(a: Corners, b: Corners, shared: list[list[Mask]]) -> Mask:
     by_plane &= shared_count < 2.5
 
     def by_edges_or_line(*numbers: Any) -> Mask:
-        """Whether the second or the third condition holds. numbers: the corners of `a` and `b`; for
-        each corner of `a` and of `b` whether it is shared; and the number of shared corners."""
+        """Whether the two triangles are apart by the condition on edges or by the condition on a
+        line (`_are_apart`). numbers: the corners of `a` and `b`; for each corner of `a` and of `b`
+        whether it is shared; and the number of shared corners."""
         first, second = cast("tuple[Corners, Corners]", (numbers[:3], numbers[3:6]))
         in_first, in_second, count = (list(numbers[6:9]), list(numbers[9:12]), numbers[12])
         may_pierce = _edge_may_pierce(first, second, _sides(first, second), in_second)

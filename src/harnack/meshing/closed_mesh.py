@@ -449,8 +449,8 @@ def _resolve_after_rounding(
     as in some repaired meshes.
 
     Raises:
-        LocalizedMeshingError: the rounded surface is not closed; or mending fails, although no
-            triangles of the original surface cross.
+        LocalizedMeshingError: the rounded surface is not closed; or triangles still cross, although
+            no triangles of the original surface do.
     """
     check_manifold(rounded.faces, rounded.vertices)
     try:

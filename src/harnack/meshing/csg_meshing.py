@@ -173,7 +173,7 @@ class CsgMesher:
         most `level`. Returns a manifold3d solid, which has no meaning outside of the box.
 
         Raises:
-            MeshingError: a part cannot be meshed.
+            MeshingError: the solid or one of its operands cannot be meshed.
         """
         from manifold3d import Manifold
 
@@ -232,9 +232,10 @@ class CsgMesher:
         return Manifold.batch_boolean([common, *cut_away], OpType.Subtract)
 
     def _mesh_operand(self, solid: BooleanSolid, number: int, level: float) -> Manifold:
-        """Mesh operand `number` of a union or an intersection, at the level; for a complement in an
-        intersection, mesh the solid that is cut away. In an intersection, the operand is meshed
-        only where the other operands may leave something of it (`IntersectedOperands`)."""
+        """Mesh the set {operand <= level} for the operand with index `number` of a union or an
+        intersection; for a complement in an intersection, mesh the solid that is cut away. In an
+        intersection, the operand is meshed only where the other operands may leave something of it
+        (`IntersectedOperands`)."""
         previous, part = self.intersected_with, solid.parts[number]
         if not solid.is_union:
             others = [operand for operand in solid.parts if operand is not part]

@@ -48,7 +48,7 @@ class RefinementBalls:
     """Balls of equal radius; cells that meet one of them are halved once more.
 
     points: (n, 3) their centers.
-    radius: of all balls.
+    radius: the radius of every ball.
     """
 
     points: FloatArray
@@ -302,10 +302,11 @@ def _move_onto_level(
 ) -> tuple[FloatArray, LevelSamples, BoolArray]:
     """Move points that are near the level set onto it.
 
-    size: (n,) of the cells at the points.
+    size: (n,) the edge of the smallest cell at each point.
     free: (n,) the smallest permitted distances from the boundary curve.
     samples: of the function at the points.
-    walls: a box; points on its faces stay on them. None if there is none.
+    walls: the lower and upper corners (3,) of the box, if points on its faces have to stay on them;
+        else None.
 
     Returns the points (n, 3); their samples; and a mask (n,) of the points that are on the level
     set. A point stays where it is if Newton's method does not converge, or would move it by more

@@ -229,8 +229,8 @@ def simplify_mesh(
 
     The library manifold3d simplifies the surface: it keeps some of the vertices and moves the
     surface by less than a fraction of the tolerance; half of the tolerance is left for all other
-    errors. Triangles that then pass through each other are mended. If mending or the check fails, a
-    smaller fraction is tried.
+    errors. If triangles then pass through each other, vertices near them are moved. If they still
+    do, or the check fails, a smaller fraction is tried.
 
     check: raises MeshingError if a surface, none of whose triangles pass through each other, fails
         its checks.

@@ -321,7 +321,8 @@ def _values(field: WindingNumber | None, points: FloatArray) -> FloatArray:
 
 
 def _turned(faces: IntArray, is_turned: BoolArray) -> IntArray:
-    """Faces (m, 3), with the orientation reversed where the mask (m,) is set."""
+    """Reverse the orientation of those faces (m, 3) for which the mask (m,) is set; returns all
+    faces."""
     return np.where(is_turned[:, None], faces[:, ::-1], faces)
 
 

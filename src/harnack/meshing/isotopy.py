@@ -112,7 +112,8 @@ def isotopy_of(
 ) -> IsotopyCoverage:
     """Find out on which tetrahedra the topology of a mesh is proved to be that of the level set.
 
-    points, tetrahedra: the points, and the indices (m, 4) of the corners of the tetrahedra.
+    points, tetrahedra: points with samples of the function, and for each tetrahedron the indices
+        (m, 4) of its corners among them.
 
     is_cut: (m,) whether a tetrahedron holds a point of the mesh.
     faces: (k, 3) the triangles of the mesh; its first vertices are the points of the tetrahedra.
@@ -230,7 +231,8 @@ def _linear_gradients(
 
 
 def _triple_keys(triples: IntArray, point_count: int) -> IntArray:
-    """One number for each triple (k, 3) of point indices, the same for any order of the three.
+    """(k,) an integer for each triple (k, 3) of point indices: the same for any order of the three
+    indices, and different for different triples.
 
     point_count: more than the largest index, and less than two million."""
     a, b, c = np.sort(triples, axis=1).T

@@ -134,8 +134,8 @@ def check_no_missed_parts(
     points, samples: points (n, 3) of a lattice, and samples of the function at them.
     is_beside: (n,) whether each point is a corner of a tetrahedron that the mesh cuts.
     surface: the vertices and faces of the mesh.
-    size: of a cell, a length.
-    box: the lower and the upper corner of the box in which the level set counts.
+    size: the size of a cell, a length.
+    box: the lower and the upper corner (3,) of the box in which the level set counts.
     elsewhere: the radius of a ball around each point within which the level set does not count.
 
     The signs at the points of a lattice do not show a wall between two points. Newton's method,
