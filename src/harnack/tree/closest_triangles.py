@@ -239,7 +239,7 @@ def squared_distance_in_nearby_leaf(tree: PackedTree, x: Vec3, column: int) -> R
     leaf = dr.while_loop(start, is_running, body, label="to a leaf")[5]
 
     def add(slot: Any, square: Real) -> LoopValues:
-        """Take the point in a slot of the leaf into account."""
+        """Update the smallest squared distance by that of the point in a slot of the leaf."""
         row = tree.primitive(leaf, slot, backend.Bool(True))
         point = vector(*row[column : column + 3])
         return slot + 1, fmin(square, dr.squared_norm(point - x))
