@@ -8,12 +8,13 @@ box, the center of the face takes the place of the missing center, and tetrahedr
 So the tetrahedra fill the box, and the tetrahedra at all faces of a cell together contain the cell.
 If the cells are cubes, dihedral angles are 60 and 90 degrees (Labelle and Shewchuk 2007).
 
-Cells that are proved empty need no tetrahedra. Proof. Let the level set meet chosen cells only, and
-let a tetrahedron at a face of a chosen cell have its other apex in a cell that is not chosen. That
-cell holds no level, so its center and all of its corners, also those of the face, are on one side
-of the level. Then the level crosses only such faces of the tetrahedron as contain the center of the
-chosen cell. The tetrahedron behind such a face belongs to a face of the chosen cell as well, so the
-surface goes on there.
+Cells that are proved to hold no point of the level set need no tetrahedra. Proof. Let the level set
+meet chosen cells only, and take a tetrahedron between a chosen cell and a cell that is not chosen.
+The cell that is not chosen holds no point of the level set, so its center and all of its corners,
+also those of the face between the two cells, are on one side of the level. Then the level set
+crosses only those faces of the tetrahedron that contain the center of the chosen cell. The
+tetrahedron behind such a face belongs to a face of the chosen cell as well, so the surface goes on
+there.
 """
 
 from __future__ import annotations
@@ -41,7 +42,8 @@ _MAX_ROOT_CELLS = 200_000
 
 @dataclass(frozen=True)
 class BccLattice:
-    """A body-centered lattice that fills a box.
+    """A body-centered lattice that fills a box: its points are the corners and centers of equal
+    cells.
 
     lower: (3,) the lower corner of the box.
     size: (3,) the edges of each cell.
@@ -60,9 +62,11 @@ class BccLattice:
     def covering_box(
         cls, lower: FloatArray, upper: FloatArray, spacing: float, layers: int = 0
     ) -> BccLattice:
-        """A lattice whose cells fill a box; they are as nearly cubes of edge `spacing` as possible.
+        """A lattice whose cells fill a box. Cells have edges of at most `spacing`, as nearly equal
+        as an integer number of cells along each side allows.
 
-        layers: how many layers of cells are added around the box.
+        lower, upper: the corners (3,) of the box.
+        layers: how many layers of cells are added on all sides of the box.
 
         Raises:
             MeshingError: the box has no volume.
@@ -80,25 +84,27 @@ class BccLattice:
         return self.lower + self.counts * self.size
 
     def points(self, coordinates: IntArray) -> FloatArray:
-        """Points (n, 3) in space, from their lattice coordinates; those on the box lie exactly on
-        it."""
+        """Points (n, 3) in space, from their integer lattice coordinates (n, 3). Points on the
+        boundary of the box lie exactly on it."""
         x = self.lower + 0.5 * self.size * coordinates
         x = np.where(coordinates == 0, self.lower, x)
         return np.where(coordinates == 2 * self.counts, self.upper, x)
 
     def is_on_box(self, coordinates: IntArray) -> BoolArray:
-        """(n,) whether points lie on the box."""
+        """(n,) whether points, given by lattice coordinates (n, 3), lie on the boundary of the
+        box."""
         return ((coordinates == 0) | (coordinates == 2 * self.counts)).any(axis=1)
 
     def nonempty_cells(self, clearance: Clearance, most_faces: int) -> IntArray:
-        """(n, 3) indices of the cells that are not proved empty. They are found by octrees, each of
-        which subdivides a block of cells.
+        """(n, 3) indices of the cells that are not proved to be free of the level set. They are
+        found by octrees, each of which subdivides a block of cells.
 
-        clearance: the radius of a ball about each point that is proved to hold no level.
+        clearance: gives for points (k, 3) proved lower bounds (k,) of their distances from the
+            level set.
         most_faces: the largest number of triangles; a cell makes about three.
 
         Raises:
-            MeshingError: there are too many cells.
+            TriangleLimitError: there are too many cells.
         """
         # A surface across the box passes through at least this many cells.
         max_cells = min(MOST_CELLS, most_faces)
@@ -128,17 +134,18 @@ class BccLattice:
     def relevant_cells(
         self, clearance: Clearance, matter: IntArray, values: Clearance, most_faces: int
     ) -> tuple[IntArray, BoolArray]:
-        """Choose the cells to be meshed. The surface matters only in relevant cells; all points of
-        irrelevant cells, also those that they share with relevant cells, count as positive.
+        """Choose the cells to be meshed, if the surface is needed only in some cells, the relevant
+        ones. In irrelevant cells, also at the points that they share with relevant cells, the
+        function counts as positive.
 
         Two kinds of relevant cells are chosen: cells that may hold the level set; and cells that
         have an irrelevant neighbor and a center at which the function is not positive. Then every
         tetrahedron with corners of both signs belongs to a chosen cell: the center of a cell that
-        is not chosen has the sign of its relevant corners, and if one of its corners is irrelevant
-        all of these are positive.
+        is not chosen has the sign of its relevant corners, and if one of its corners belongs to an
+        irrelevant cell, its center and all of its corners are positive.
 
-        clearance: returns (n,) the radius of a ball about each point that is proved to hold no
-            level.
+        clearance: gives for points (n, 3) proved lower bounds (n,) of their distances from the
+            level set.
         matter: (k, 3) indices of the relevant cells (`nonempty_cells`).
         values: returns (n,) the function's values at points.
         most_faces: the largest number of triangles.
@@ -147,7 +154,7 @@ class BccLattice:
         shape `counts`.
 
         Raises:
-            MeshingError: too many cells are chosen.
+            TriangleLimitError: too many cells are chosen.
         """
         is_relevant = np.zeros(tuple(self.counts.tolist()), np.bool_)
         is_relevant[tuple(matter.T)] = True
@@ -161,8 +168,8 @@ class BccLattice:
         return matter[chosen], is_relevant
 
     def interior_cells(self, cells: BoolArray) -> BoolArray:
-        """A mask, of the shape `counts`, of the cells in the mask `cells` whose neighbors are all
-        in `cells` as well. Neighbors share a corner; there are none outside of the box."""
+        """The cells of a mask whose neighbors in the lattice all belong to the mask as well, as a
+        mask. Cells that share a corner are neighbors. Both masks have the shape `counts`."""
         padded = np.pad(cells, 1, constant_values=True)
         inner = cells.copy()
         for shift in itertools.product((0, 1, 2), repeat=3):
@@ -199,7 +206,8 @@ class BccLattice:
         return distinct_rows(np.concatenate(layers))
 
     def tetrahedra(self, cells: IntArray) -> tuple[IntArray, IntArray]:
-        """The tetrahedra at all faces of the cells with indices (k, 3).
+        """The tetrahedra at all faces of the cells with indices `cells` (k, 3); each belongs to an
+        edge of a face.
 
         Returns the lattice coordinates (n, 3) of their corners, each point once, and for each
         tetrahedron the indices (m, 4) of its corners among these points.
@@ -241,7 +249,8 @@ def distinct_rows(rows: IntArray) -> IntArray:
 
 
 def triangle_limit_error(cells: float, most: int) -> TriangleLimitError:
-    """The error for a mesh of too many cells.
+    """The error to raise if a mesh would need too many cells; its message names the limit and
+    remedies.
 
     cells: about how many cells hold the surface.
     most: the largest number of cells.
@@ -260,6 +269,7 @@ def _flat_indices(coordinates: IntArray, shape: IntArray) -> IntArray:
 
 
 def _lattice_coordinates(keys: IntArray, shape: IntArray) -> IntArray:
-    """The coordinates (n, 3) that `_flat_indices` turned into the integers `keys` (n,)."""
+    """The inverse of `_flat_indices`: the integer coordinates (n, 3) of the points with the indices
+    `keys` (n,) in a flattened array of the shape `shape` (3,)."""
     xy, z = np.divmod(keys, shape[2])
     return np.stack([*np.divmod(xy, shape[1]), z], axis=1)

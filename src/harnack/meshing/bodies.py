@@ -39,16 +39,18 @@ _GROWTH = 1e-9
 
 
 def closed_parts(x: FloatArray, raw: IntArray, joined: IntArray) -> list[IntArray]:
-    """The closed components of a mesh, each as an array of indices of faces. A component is closed
-    if its faces run every edge as often in one direction as in the other. Empty if there are more
-    than 200 such components.
+    """The closed components of a mesh: connected groups of faces, each as an array of indices of
+    faces. A component is closed if its faces run every edge as often in one direction as in the
+    other. The list is empty if there are more than 200 of them.
 
     x: (n, 3) the vertices.
-    raw: (m, 3) the faces as in the input. Components that touch are told apart here if each has
-        vertices of its own.
-    joined: (m, 3) the same faces, with one vertex for all vertices at the same position. Components
-        that `raw` does not close are looked for here. Faces are connected at edges: the two faces
-        at an edge; at an edge of more faces, those that have the material between them.
+    raw: (m, 3) the faces as in the input. They are searched first. Components that touch are told
+        apart here if each has vertices of its own.
+    joined: (m, 3) the same faces, with one vertex for all vertices at the same position. The faces
+        that belong to no component of `raw` are searched here.
+
+    Faces are connected at edges: the two faces at an edge of two faces; at an edge of more faces,
+    those that have the material between them.
     """
     parts: list[IntArray] = []
     is_left = np.ones(len(raw), np.bool_)
@@ -97,8 +99,8 @@ def volume_of(x: FloatArray, faces: IntArray) -> float:
 
 
 def nested(x: FloatArray, parts: list[IntArray]) -> list[list[int]]:
-    """For each closed component, the indices of the components that contain all of it, the smallest
-    first. Components may touch, since each is tested at points a little inside of it.
+    """For each closed component, the indices of the components that contain all of it, in order of
+    increasing volume. Components may touch, since each is tested at points a little inside of it.
 
     x: (n, 3) the vertices.
     parts: the faces (k, 3) of each component.
@@ -131,7 +133,8 @@ def mended_by_cuts(x: FloatArray, faces: IntArray, within: float) -> TriangleMes
     where they cross, and the boundary is made of the pieces (`boundary_of_solid`).
 
     faces: (m, 3).
-    within: a length; slivers, which arise where faces cross, may be moved by up to it.
+    within: a length; to remove slivers, which arise where faces cross, the surface may be moved by
+        half of it.
 
     Raises:
         MeshingError: nothing is left, or pieces do not fit together.
@@ -144,8 +147,9 @@ def mended_by_cuts(x: FloatArray, faces: IntArray, within: float) -> TriangleMes
 def united_parts(
     x: FloatArray, faces: IntArray, parts: list[IntArray], within: float
 ) -> TriangleMesh:
-    """The boundary of the points around which closed components, all together, wind at least once.
-    Components may touch, contain and intersect each other, and wind clockwise.
+    """The boundary of the set of points around which closed components, all together, wind at least
+    once. Components may touch, contain and intersect each other, and may be inside out (wind
+    clockwise).
 
     Proof. Let L_k be the points around which the components so far wind at least k times. Add
     another component, and let P be the set of points inside of it. If it winds counter-clockwise,
@@ -175,11 +179,11 @@ def united_parts(
 
 
 def _make_overlap(parts: list[TriangleMesh]) -> list[TriangleMesh]:
-    """The components, moved where they are in contact only up to rounding, so that they overlap
-    there. Otherwise their union would have gaps without a width.
+    """The components, with vertices moved where two components are in contact only up to rounding,
+    so that they overlap there. Otherwise their union would have gaps as thin as rounding errors.
 
-    A face counts as in contact with an earlier component if it is parallel to one of its faces,
-    faces the opposite way, and is a distance away from its plane that is not 0 but at most
+    A face counts as in contact with an earlier component if that component has a parallel face that
+    looks the opposite way, and the distance from the plane of that face is not 0 but at most
     `_CONTACT_DISTANCE`. The face's vertices are then moved along its normal, into the earlier
     component, by `_OVERLAP`. Both lengths are relative to the size of all components.
     """
@@ -208,14 +212,16 @@ def _make_overlap(parts: list[TriangleMesh]) -> list[TriangleMesh]:
 
 
 def _unit_normals(corner: FloatArray) -> FloatArray:
-    """(m, 3) unit normals of triangles `corner` (m, 3, 3); 0 for triangles without an area."""
+    """(m, 3) unit normals, by the right-hand rule, of triangles with corners `corner` (m, 3, 3); 0
+    for triangles without an area."""
     normal = area_normals(corner)
     return normal / np.maximum(row_norms(normal), 1e-300)[:, None]
 
 
 def _union_of_components(components: list[TriangleMesh], within: float) -> TriangleMesh:
-    """The boundary of the points around which the components wind at least once, as `united_parts`
-    describes it. The components must not be in contact up to rounding (`_make_overlap`).
+    """The boundary of the set of points around which the closed components, all together, wind at
+    least once; `united_parts` has the proof. No two components may be in contact only up to
+    rounding (`_make_overlap`).
 
     within: a length by which slivers at intersections may be moved.
 
@@ -225,7 +231,7 @@ def _union_of_components(components: list[TriangleMesh], within: float) -> Trian
     """
     from manifold3d import Manifold
 
-    bodies = [_manifold_of_component(shell) for shell in components]
+    bodies = [_manifold_of_component(component) for component in components]
     clockwise = [body for body, is_outward in bodies if not is_outward]
     # sets[k]: the points around which the components so far wind at least k + 1 times.
     sets = [Manifold() for _ in range(len(clockwise) + 1)]
@@ -240,8 +246,8 @@ def _union_of_components(components: list[TriangleMesh], within: float) -> Trian
 
 
 def _manifold_of_component(component: TriangleMesh) -> tuple[Manifold, bool]:
-    """The body that a closed component bounds, and whether the component's faces look outwards, so
-    that it winds counter-clockwise around the points of the body.
+    """The solid that a closed component bounds, and whether the component's faces look outwards. If
+    they do, the component winds counter-clockwise around the points of the solid.
 
     Raises:
         MeshError: the component intersects itself.

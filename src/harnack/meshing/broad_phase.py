@@ -1,10 +1,10 @@
 """The broad phase of the intersection test: the pairs of triangles that may meet. All other pairs
 are proved apart, in floating point.
 
-Each triangle walks a tree of boxes, and the pairs whose boxes overlap are listed: about eight for
-each triangle. They are then tested side by side, since tests within the walk would wait for each
-other. Nearly all are separated by a sign that rounding cannot change; the remaining pairs are for
-exact arithmetic (`checks.intersecting_faces`).
+For each triangle a tree of bounding boxes is searched, and the pairs whose boxes overlap are
+listed: about eight for each triangle. The listed pairs are then tested in parallel, one pair in
+    each lane. Nearly all pairs are proved apart by the sign of a determinant that rounding cannot
+    change. The remaining pairs are decided by exact arithmetic (`checks.intersecting_faces`).
 """
 
 from __future__ import annotations
@@ -54,8 +54,8 @@ _UNDERFLOW = 1e-290
 
 
 def near_pairs(vertices: FloatArray, faces: IntArray, among: BoolArray | None) -> IntArray:
-    """Pairs (k, 2) of faces (m, 3) that may have more in common than the vertices that they share,
-    each pair once. All other pairs are proved to have no more in common (`_are_apart`).
+    """Pairs (k, 2) of faces (m, 3) that may meet in more points than the vertices that they share;
+    each pair once. All other pairs are proved to meet only in shared vertices (`_are_apart`).
 
     vertices: (n, 3), all finite.
     among: (m,) mask of chosen faces; pairs without a chosen face are left out. None if all are
@@ -84,9 +84,9 @@ def near_pairs(vertices: FloatArray, faces: IntArray, among: BoolArray | None) -
 
 @dataclass(frozen=True)
 class _FaceBoxTree:
-    """The bounding boxes of faces in a tree.
+    """A tree of the bounding boxes of all faces, on the device.
 
-    tree: on the device; its primitives are the boxes.
+    tree: the nodes, and as primitives the boxes.
     records: (m, 8) for each face the lower and the upper corner of its box, the face's index, and 1
         if it is chosen, else 0.
     order: (m,) indices of the faces, leaf by leaf.
@@ -98,7 +98,10 @@ class _FaceBoxTree:
 
     @classmethod
     def of(cls, corners: FloatArray, chosen: BoolArray) -> _FaceBoxTree:
-        """The tree of triangles `corners` (m, 3, 3). chosen: (m,) mask of the chosen ones."""
+        """Build the tree over the bounding boxes of triangles.
+
+        corners: (m, 3, 3) the corners of the triangles.
+        chosen: (m,) mask of the chosen triangles."""
         a, b, c = (corners[:, k] for k in range(3))
         lower, upper = np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
         hierarchy = build_balanced_tree(0.5 * (lower + upper), leaf_size=_LEAF_SIZE)
@@ -118,7 +121,7 @@ class _FaceBoxTree:
         room: the largest number of pairs that can be stored.
 
         Returns two index arrays on the device, of the first and of the second faces of the pairs,
-        in no order; or None if there are more than `room` pairs.
+        in arbitrary order; or None if there are more than `room` pairs.
         """
         backend = self.tree.backend
         real, vector, integer = backend.Float, backend.Array3f, backend.UInt32
@@ -161,7 +164,8 @@ class _FaceBoxTree:
 
 @dataclass(frozen=True)
 class _PairTests:
-    """Proofs that pairs of faces are apart.
+    """Tests, on the device, that prove of pairs of faces that they have nothing in common but
+    shared vertices.
 
     points: the record table of the vertices.
     corners: three index arrays on the device: the first, second and third vertices of all faces.
@@ -177,13 +181,16 @@ class _PairTests:
         a, b, c = (backend.UInt32(np.ascontiguousarray(column, np.uint32)) for column in faces.T)
         return cls(RecordTable.upload(backend, vertices), (a, b, c))
 
-    def unseparated(self, one: Any, other: Any) -> IntArray:
+    def unseparated(self, first: Any, second: Any) -> IntArray:
         """(k, 2) the pairs of faces that are not proved apart, sorted.
 
-        one, other: index arrays on the device, of the first and of the second faces of all pairs.
+        first, second: index arrays on the device, of the first and of the second faces of all
+            pairs.
         """
         backend = self.points.backend
-        vertex_ids = [[dr.gather(backend.UInt32, k, i) for k in self.corners] for i in (one, other)]
+        vertex_ids = [
+            [dr.gather(backend.UInt32, k, i) for k in self.corners] for i in (first, second)
+        ]
         triangles = [
             tuple(backend.Array3f(*self.points.read_record(name)[:3]) for name in ids)
             for ids in vertex_ids
@@ -191,7 +198,7 @@ class _PairTests:
         shared = [[name == another for another in vertex_ids[1]] for name in vertex_ids[0]]
         a, b = cast("tuple[Corners, Corners]", triangles)
         rows = dr.compress(~_are_apart(a, b, shared))
-        pairs = [to_numpy(dr.gather(backend.UInt32, i, rows)) for i in (one, other)]
+        pairs = [to_numpy(dr.gather(backend.UInt32, i, rows)) for i in (first, second)]
         unsorted_pairs = np.stack(pairs, axis=1).astype(np.int64)
         return unsorted_pairs[np.lexsort(unsorted_pairs.T[::-1])]
 
@@ -212,7 +219,8 @@ def _are_apart(a: Corners, b: Corners, shared: list[list[Mask]]) -> Mask:
       shared corner has both ends strictly on one side of the other triangle's plane, or if the line
       of the edge passes two edges of the other triangle on different sides (`_edge_may_pierce`).
       For triangles in one plane all these signs are 0, and nothing is proved.
-    - *A line*, for triangles in one plane: see `_are_beside_edge`.
+    - *A line*, for triangles in one plane: an edge of one triangle lies on a line that has the two
+      triangles on its two sides (`_are_beside_edge`).
     """
     is_shared_a = [shared[i][0] | shared[i][1] | shared[i][2] for i in range(3)]
     is_shared_b = [shared[0][k] | shared[1][k] | shared[2][k] for k in range(3)]
@@ -223,8 +231,9 @@ def _are_apart(a: Corners, b: Corners, shared: list[list[Mask]]) -> Mask:
     by_plane &= shared_count < 2.5
 
     def by_edges_or_line(*numbers: Any) -> Mask:
-        """The second and the third condition. numbers: the corners of `a` and `b`, for each corner
-        whether it is shared, and the number of shared corners."""
+        """Whether the two triangles are apart by the condition on edges or by the condition on a
+        line (`_are_apart`). numbers: the corners of `a` and `b`; for each corner of `a` and of `b`
+        whether it is shared; and the number of shared corners."""
         first, second = cast("tuple[Corners, Corners]", (numbers[:3], numbers[3:6]))
         in_first, in_second, count = (list(numbers[6:9]), list(numbers[9:12]), numbers[12])
         may_pierce = _edge_may_pierce(first, second, _sides(first, second), in_second)
@@ -244,9 +253,10 @@ def _are_apart(a: Corners, b: Corners, shared: list[list[Mask]]) -> Mask:
 
 
 def _sides(base: Corners, triangle: Corners) -> list[tuple[Mask, Mask]]:
-    """For each corner of `triangle` two masks: whether it is proved to be above the plane of the
-    triangle `base`, and whether below it. Above is the side to which the normal of `base` points,
-    by the right-hand rule. Both are False where rounding leaves the side undecided."""
+    """For each corner of `triangle`, two masks: whether the corner is proved to be above the plane
+    of the triangle `base`, and whether it is proved to be below. Above is the side to which the
+    normal of `base` points, by the right-hand rule. Both masks are False if rounding leaves the
+    side undecided."""
     u, v = base[1] - base[0], base[2] - base[0]
     normal = dr.cross(u, v)
     error_scale = ROUNDING * dr.norm(u) * dr.norm(v)
@@ -261,7 +271,7 @@ def _sides(base: Corners, triangle: Corners) -> list[tuple[Mask, Mask]]:
 def _on_one_side(sides: list[tuple[Mask, Mask]], shared: list[Mask]) -> Mask:
     """Whether all corners of a triangle that are not shared are above a plane, or all below it.
 
-    sides: of the corners, from `_sides`.
+    sides: for each corner two masks, whether it is above the plane and whether below (`_sides`).
     shared: whether each corner is shared with the other triangle.
     """
     above, below = (
@@ -277,11 +287,13 @@ def _edge_may_pierce(
     """Whether an edge of the triangle `piercing` may pass through the triangle `pierced`. Edges
     with a shared corner are not considered.
 
-    An edge is proved not to if both of its ends are strictly on one side of the plane of `pierced`,
-    or if its line passes one edge of `pierced` on the left and another on the right.
+    An edge is proved not to pass through `pierced` if both of its ends are strictly on one side of
+    the plane of `pierced`, or if its line passes one edge of `pierced` on the left and another edge
+    on the right.
 
-    sides: of the corners of `piercing` (`_sides`).
-    shared: whether each corner of `piercing` is shared.
+    sides: for each corner of `piercing` two masks, whether it is above the plane of `pierced` and
+        whether below (`_sides`).
+    shared: for each corner of `piercing`, whether it is a corner of `pierced` as well.
     """
     pierces = False
     for i, j in ((0, 1), (1, 2), (2, 0)):
@@ -299,7 +311,8 @@ def _edge_may_pierce(
 
 
 def _shared_corners_first(tri: Corners, shared: list[Mask], count: Real) -> Corners:
-    """The corners of the triangle `tri`, turned cyclically so that shared corners come first.
+    """The corners of the triangle `tri` in the same cyclic order, begun so that shared corners come
+    first.
 
     shared: whether each corner is shared.
     count: how many are, from 0 to 2; with three or none the order has no meaning.
@@ -318,20 +331,24 @@ def _shared_corners_first(tri: Corners, shared: list[Mask], count: Real) -> Corn
 
 def _are_beside_edge(a: Corners, b: Corners, shared_count: Real) -> Mask:
     """Whether two triangles are proved to lie on two sides of a plane that contains an edge of one
-    of them and is at right angles to that triangle. Shared corners come first in `a` and `b`;
-    shared_count is how many there are.
+    of them and is at right angles to that triangle.
 
-    Proof. All vectors start at the first end of the edge e. Let m be the vector as it was computed,
-    nearly at right angles to e, and m' = m - (m.e/|e|^2) e without rounding. Then m'.e = 0 exactly,
-    and for a vector x, m'.x differs from m.x by at most |m.e| |x|/|e|, which is only rounding.
+    a, b: the corners of the triangles, the shared ones first.
+    shared_count: the number of shared corners.
+
+    Proof. All vectors start at the first end of the edge e. Let m be the computed vector, in the
+    triangle's plane and nearly at right angles to e, and m' = m - (m.e/|e|^2) e without rounding.
+    Then m'.e = 0 exactly, and for a vector x, m'.x differs from m.x by at most |m.e| |x|/|e|, which
+    is only rounding.
     - No shared corner: m'.x <= 0 on the triangle of e, and m'.x > 0 on the other triangle (a
       separating axis).
     - One shared corner, where e starts: m'.x = 0 on e, m'.x < 0 at the third corner of the triangle
       of e, and m'.x > 0 at the two other corners of the other triangle. So points of both triangles
-      have m'.x = 0, and the shared corner is the only such point of the other triangle. Or see
-      `_are_opposite_at_corner`.
-    - Two shared corners, the ends of e: m'.x < 0 at the last corner of one triangle and > 0 at that
-      of the other. So points of both have m'.x = 0, and lie on e.
+      have m'.x = 0, and the shared corner is the only such point of the other triangle. Another
+      plane through the shared corner is tried as well (`_are_opposite_at_corner`).
+    - Two shared corners, the ends of e: m'.x < 0 at the last corner of one triangle, and m'.x > 0
+      at the last corner of the other triangle. So points of both triangles have m'.x = 0 and lie on
+      e.
     """
     has_none, has_one = shared_count < 0.5, (shared_count > 0.5) & (shared_count < 1.5)
     has_two = (shared_count > 1.5) & (shared_count < 2.5)
@@ -364,8 +381,8 @@ def _are_beside_edge(a: Corners, b: Corners, shared_count: Real) -> Mask:
 def _are_opposite_at_corner(a: Corners, b: Corners) -> Mask:
     """Whether a plane through the first corner, which both triangles share, is proved to have the
     other corners of `a` on one side and those of `b` on the other. For each triangle, the mean
-    direction is the sum of the unit vectors along both edges at that corner. The plane is at right
-    angles to the difference of the two triangles' unit mean directions."""
+    direction is the sum of the unit vectors along both edges at that corner. The normal of the
+    plane is the difference of the two triangles' unit mean directions."""
     edges = [one[k] - one[0] for one, k in itertools.product((a, b), (1, 2))]
     mean_directions = [dr.normalize(edges[k]) + dr.normalize(edges[k + 1]) for k in (0, 2)]
     plane_normal = dr.normalize(mean_directions[1]) - dr.normalize(mean_directions[0])

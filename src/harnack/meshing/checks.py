@@ -1,10 +1,10 @@
 """Checks that every mesh of a level set has to pass, with exact predicates.
 
-The predicates are signs of determinants. They tell on which side of a plane a point lies, or on
-which side of a line in a plane. A determinant is computed in floating point, with a bound of its
-rounding error (Shewchuk, Adaptive Precision Floating-Point Arithmetic and Fast Robust Geometric
-Predicates, 1997). Where that leaves the sign undecided, it is computed in integers: all coordinates
-are integers times the same power of two.
+The predicates are signs of determinants. A sign tells on which side of a plane a point lies or, in
+two dimensions, on which side of a line. A determinant is computed in floating point, with a bound
+of its rounding error (Shewchuk, Adaptive Precision Floating-Point Arithmetic and Fast Robust
+Geometric Predicates, 1997). Where that leaves the sign undecided, it is computed in integers: all
+coordinates are integers times the same power of two.
 
 Every mesh that `mesh` returns has passed checks: vertices and centers of triangles are tested by
 samples of the field, faces that pass through each other are found by exact predicates, and the
@@ -113,14 +113,14 @@ def _scaled(points: FloatArray) -> FloatArray:
 def _signs_with_fallback(
     value: FloatArray, error: FloatArray, zero: BoolArray, points: FloatArray, exact: Any
 ) -> SignArray:
-    """(n,) the signs of numbers that are known up to an error. Where the error leaves a sign
-    undecided, it is computed exactly.
+    """(n,) the signs of numbers that are known up to an error. A sign that the error leaves
+    undecided is computed exactly.
 
     value: (n,) the approximate numbers.
     error: (n,) bounds of their errors.
     zero: (n,) mask of the numbers that are known to be 0.
     points: (n, k, d) the points that determine each number.
-    exact: computes the numbers without rounding from points as `_integers` returns them.
+    exact: computes the numbers without rounding from points with integer coordinates (`_integers`).
     """
     signs: SignArray = np.sign(value).astype(np.int8)
     signs[zero] = 0
@@ -166,9 +166,11 @@ _MAX_AT_ONCE = 1 << 19
 
 
 def misoriented_faces(function: LevelFunction, vertices: FloatArray, faces: IntArray) -> IntArray:
-    """Indices of the faces whose normal does not point to the side where the function is larger:
-    the normal, by the right-hand rule, has no positive dot product with the function's gradient at
-    the face's center."""
+    """Indices of the faces (m, 3) that are turned over, so that their normal does not point to the
+    side on which the function is larger: the normal, by the right-hand rule, has no positive dot
+    product with the function's gradient at the face's center.
+
+    vertices: (n, 3)."""
     corner = vertices[faces]
     normal = area_normals(corner)
     slope = function.sample(corner.mean(axis=1)).gradient
@@ -178,16 +180,16 @@ def misoriented_faces(function: LevelFunction, vertices: FloatArray, faces: IntA
 def intersecting_faces(
     vertices: FloatArray, faces: IntArray, among: BoolArray | None = None
 ) -> IntArray:
-    """Indices of the faces (m, 3) that meet another face in more than corners and edges that both
-    share, decided exactly. Two kinds of pairs are found: an edge of one face passes through the
-    other face, or both faces lie in one plane and overlap.
+    """Indices (k,) of the faces (m, 3) that meet another face in more than the corners and edges
+    that both faces have, decided exactly. Two kinds of pairs are found: an edge of one face passes
+    through the other face, or both faces lie in one plane and overlap.
 
     Two triangles in different planes meet beyond their shared corners if and only if an edge of one
-    passes through the other, with its ends on both sides of the other's plane, or ends on it. Ends
-    on other triangles are not looked for: if the surface goes on behind such an end, one of its
-    edges passes through. Two triangles in one plane overlap, whatever they share, unless the line
-    of an edge has them on its two sides (separating axes). So faces that occur twice, or are folded
-    back onto their neighbors, are found. Only pairs whose bounding boxes overlap are tested.
+    passes through the other, with its ends on both sides of the other's plane, or ends on it. Edges
+    that only end on another triangle are not looked for: if the surface goes on behind such an end,
+    another edge passes through. Two triangles in one plane overlap, whatever they share, unless the
+    line of an edge has them on its two sides (separating axes). So faces that occur twice, or are
+    folded back onto their neighbors, are found. Only pairs whose bounding boxes overlap are tested.
 
     vertices: (n, 3).
     among: (m,) mask of chosen faces; pairs without a chosen face are not tested. None if all are
@@ -208,17 +210,20 @@ def intersecting_faces(
 
 
 def touching_pairs(vertices: FloatArray, faces: IntArray) -> tuple[IntArray, FloatArray]:
-    """Pairs (k, 2) of faces (m, 3) that touch, decided exactly. They touch if a corner or an edge
-    of one face lies on the other face; a corner that both share does not count. Also (k, 3) the
-    place: that corner, or the middle of that edge.
+    """Find the pairs of faces (m, 3) that touch, decided exactly. Two faces touch if a corner or an
+    edge of one face lies on the other face; a corner that both faces have does not count.
 
-    No pair is missed that `intersecting_faces` does not have. If all of a face lies on another, so
-    do its edges. If edges meet between their ends, and neither lies in the plane of the other face,
-    an edge passes through a face. Faces that share two corners have no more in common unless they
-    overlap in one plane. If two faces share one corner, and their planes differ, the planes meet in
-    a line through that corner, on which each face has a segment that begins at the corner. If both
-    segments run the same way, either an edge passes through a face; or the shorter segment is an
-    edge at the corner that lies in the other face's plane.
+    Returns the pairs (k, 2); and for each pair a point (k, 3) of contact, the corner or the middle
+    of the edge.
+
+    Every pair of faces that meet is in this list or has its faces in the result of
+    `intersecting_faces`. Proof. If all of a face lies on another face, so do its edges. If two
+    edges meet between their ends, and neither edge lies in the plane of the other's face, an edge
+    passes through a face. Faces that share two corners have no more in common unless they overlap
+    in one plane. If two faces share one corner and their planes differ, the planes meet in a line
+    through that corner, and each face meets the line in a segment that begins at the corner. The
+    faces meet off the corner only if both segments run in the same direction. Then either an edge
+    passes through a face, or the shorter segment is an edge that lies on the other face.
 
     vertices: (n, 3).
     """
@@ -226,8 +231,8 @@ def touching_pairs(vertices: FloatArray, faces: IntArray) -> tuple[IntArray, Flo
     contacts: list[FloatArray] = []
 
     def add(pairs: IntArray, touches: BoolArray, p: FloatArray, q: FloatArray) -> None:
-        """List those pairs (k, 2) that the mask `touches` selects, with the points midway between
-        the points p and q (k, 3)."""
+        """Add the pairs (k, 2) selected by the mask `touches` (k,) to the result, and as their
+        points of contact the points midway between p and q, both (k, 3)."""
         batches.append(pairs[touches])
         contacts.append(0.5 * (p + q)[touches])
 
@@ -257,9 +262,9 @@ def touching_pairs(vertices: FloatArray, faces: IntArray) -> tuple[IntArray, Flo
 def _pairs_in_doubt(
     vertices: FloatArray, faces: IntArray, among: BoolArray | None
 ) -> Generator[tuple[IntArray, tuple[SignArray, SignArray]]]:
-    """Generate, in batches, the pairs (k, 2) of faces that are not proved apart. With each batch
-    come two arrays (k, 3) of `_side_signs`: of the second faces' corners for the planes of the
-    first faces, and of the first faces' corners for the planes of the second faces.
+    """Generate, in batches, the pairs (k, 2) of faces that floating point does not prove to have
+    only vertices in common. With each batch come two arrays (k, 3) of signs: on which side of the
+    first face's plane the corners of the second face lie, and the reverse (`_side_signs`).
 
     among: (m,) mask of chosen faces; pairs without a chosen face are left out. None if all are
         chosen.
@@ -302,7 +307,8 @@ def _near_pairs(corner: FloatArray, among: BoolArray | None) -> IntArray:
     batches: list[IntArray] = []
 
     def add_if_overlapping(first: IntArray, second: IntArray) -> None:
-        """Append those of the pairs `first`, `second`, both (k,), whose boxes overlap."""
+        """Append the pairs of triangles whose boxes overlap, of the pairs with indices `first` and
+        `second`, both (k,)."""
         keep = (lower[first] <= upper[second]).all(axis=1)
         keep &= (lower[second] <= upper[first]).all(axis=1)
         batches.append(np.column_stack([first[keep], second[keep]]))
@@ -326,12 +332,12 @@ def _near_pairs(corner: FloatArray, among: BoolArray | None) -> IntArray:
 
 
 def _are_separated(vertices: FloatArray, faces: IntArray, pairs: IntArray) -> BoolArray:
-    """(k,) whether the two faces of each pair (k, 2) are proved to have nothing but common vertices
-    in common. That is proved if the plane of one face has all vertices of the other face that are
-    not common strictly on one side. False where rounding leaves it undecided.
+    """(k,) whether the two faces of each pair (k, 2) are proved to meet only in shared vertices.
+    That is proved if all vertices of one face that are not shared lie strictly on one side of the
+    plane of the other face. False if rounding leaves it undecided.
 
-    See `broad_phase.ROUNDING` for the error of the determinants, here `height`, whose signs tell
-    the sides.
+    The sign of the determinant `height` tells the side; its rounding error is bounded by
+    `broad_phase.ROUNDING` times a product of lengths.
     """
     apart = np.zeros(len(pairs), np.bool_)
     for first, second in (pairs.T, pairs.T[::-1]):
@@ -355,9 +361,10 @@ def _are_separated(vertices: FloatArray, faces: IntArray, pairs: IntArray) -> Bo
 
 
 def _side_signs(vertices: FloatArray, base: IntArray, other: IntArray) -> SignArray:
-    """(k, 3) for each corner of the faces `other` (k, 3), on which side of the plane of the face
-    `base` (k, 3) it lies, exactly: 1 below, from where the corners of `base` run clockwise, -1
-    above, and 0 on the plane. Corners that both faces share get 0."""
+    """(k, 3) for each corner of the faces `other` (k, 3), on which side of the plane of the face in
+    the same row of `base` (k, 3) it lies, decided exactly. The sign is 1 below the plane, from
+    where the corners of `base` run clockwise; -1 above the plane; and 0 on it. Corners that both
+    faces have get 0."""
     a, b, c = (vertices[base[:, i]] for i in range(3))
     signs = np.zeros((len(other), 3), np.int8)
     for i in range(3):
@@ -386,9 +393,10 @@ def _edge_pierces(
 
 
 def _share_area(first: FloatArray, second: FloatArray) -> BoolArray:
-    """(k,) whether triangles `first` and `second` (k, 3, 3), two and two in one plane, have an area
-    in common. They do unless the line of an edge separates them (separating axes). They are
-    projected to two dimensions along the coordinate axis that is nearest to their normal."""
+    """(k,) whether triangles in the same row of `first` and `second` (k, 3, 3), which lie in one
+    plane, have an area in common. They do unless the line of an edge separates them (separating
+    axes). For the test they are projected to two dimensions, along the coordinate axis nearest to
+    their normal."""
     normal = np.abs(area_normals(first))
     axes = np.array([[1, 2], [2, 0], [0, 1]])[normal.argmax(axis=1)]
     flat = [np.take_along_axis(t, axes[:, None].repeat(3, axis=1), axis=2) for t in (first, second)]
@@ -403,9 +411,9 @@ def _share_area(first: FloatArray, second: FloatArray) -> BoolArray:
 
 def _segments_meet(triangle: FloatArray, p: FloatArray, q: FloatArray) -> BoolArray:
     """(k,) whether segments from `p` to `q` (k, 3) meet the triangles (k, 3, 3) in whose planes
-    they lie. They do unless the line of an edge of the triangle, or that of the segment, has the
-    triangle and the segment on its two sides (separating axes). False for triangles without an
-    area."""
+    they lie. A segment meets its triangle unless an edge's line has the segment strictly on its
+    outer side, or the segment's line has the triangle strictly on one side (separating axes). False
+    for triangles without an area."""
     normal = np.abs(area_normals(triangle))
     axes = np.array([[1, 2], [2, 0], [0, 1]])[normal.argmax(axis=1)]
     a = np.take_along_axis(triangle, axes[:, None].repeat(3, axis=1), axis=2)
@@ -436,17 +444,17 @@ def _is_in_angle(triangle: FloatArray, p: FloatArray) -> BoolArray:
 
 
 class MeshingError(ValueError):
-    """A level set could not be meshed; the message says why, and a remedy."""
+    """A level set could not be meshed. The message says why, and names a remedy."""
 
     def may_be_fixed_by(self, smaller: float) -> bool:
-        """Whether smaller cells may help: cells whose size is `smaller` times that of the cells
-        that failed."""
+        """Whether smaller cells may help. smaller: their size, as a fraction of the size of the
+        cells that failed."""
         del smaller
         return True
 
 
 class EmptySurfaceError(MeshingError):
-    """No cell holds the level."""
+    """The level set is empty: no cell of the lattice contains a point of it."""
 
 
 class LocalizedMeshingError(MeshingError):
@@ -461,7 +469,8 @@ class LocalizedMeshingError(MeshingError):
 
 
 class OffLevelError(LocalizedMeshingError):
-    """Vertices and centers of faces are too far from the level; the locations are these points."""
+    """Vertices and centers of faces are too far from the level set; `locations` holds these
+    points."""
 
 
 class SelfIntersectionError(LocalizedMeshingError):
@@ -497,9 +506,10 @@ _MAX_FAILURES_FOR_RETRY, _REQUIRED_FAILURE_REDUCTION = 20, 0.5
 def is_retry_promising(
     now: MeshingError, before: MeshingError | None, smallest: float = 1.0
 ) -> bool:
-    """Whether it is worthwhile to try smaller cells after an attempt failed. It is not if smaller
-    cells cannot help, or if there are many failures and hardly fewer than in the attempt before:
-    along a pole, or where jump surfaces cross, cells of every size fail.
+    """Whether it is worthwhile to try smaller cells after an attempt failed. It is not worthwhile
+    if smaller cells cannot help, or if there are more than 20 failures and more than half as many
+    as in the attempt before. Along a pole of the function, or where surfaces on which it jumps
+    cross, cells of every size fail.
 
     now: the error of the last attempt.
     before: the error of the attempt before it, or None.
@@ -526,8 +536,9 @@ def euler_characteristic(faces: IntArray, edges: Edges | None = None) -> int:
 
 
 def check_manifold(faces: IntArray, vertices: FloatArray | None = None) -> None:
-    """Raise unless faces (m, 3) form a manifold: every edge has one or two faces, two faces run
-    their edge in opposite directions, and the faces around every vertex are joined by edges.
+    """Raise an error unless faces (m, 3) form a manifold: every edge has one or two faces, two
+    faces run their common edge in opposite directions, and the faces around every vertex are joined
+    by edges.
 
     vertices: (n, 3), for the locations of failures.
 
@@ -535,11 +546,12 @@ def check_manifold(faces: IntArray, vertices: FloatArray | None = None) -> None:
         MeshingError: the faces are no manifold; a LocalizedMeshingError if vertices are given.
     """
 
-    def fail(message: str, where: IntArray) -> Never:
-        """Raise the error; `where` has the indices of the vertices at which the check failed."""
+    def fail(message: str, vertex_ids: IntArray) -> Never:
+        """Raise the error of a failed check; `vertex_ids` are the indices of the vertices at which
+        it failed."""
         if vertices is None:
             raise MeshingError(message)
-        raise LocalizedMeshingError(message, vertices[where])
+        raise LocalizedMeshingError(message, vertices[vertex_ids])
 
     pairs = half_edges(faces)
     edges = Edges.of(pairs)
@@ -566,8 +578,8 @@ def check_manifold(faces: IntArray, vertices: FloatArray | None = None) -> None:
 
 
 def check_no_self_intersection(vertices: FloatArray, faces: IntArray) -> None:
-    """Raise if a vertex is not finite, or if faces pass through each other or lie on each other;
-    decided exactly.
+    """Raise an error if a vertex (n, 3) is not finite, or if faces (m, 3) pass through each other
+    or lie on each other; decided exactly.
 
     Raises:
         MeshingError: a vertex is not finite; a SelfIntersectionError, with the faces, if faces
@@ -587,7 +599,8 @@ def check_no_self_intersection(vertices: FloatArray, faces: IntArray) -> None:
 
 
 def check_triangle_limit(expected: float, most: int) -> None:
-    """Raise TriangleLimitError if more triangles are expected than may be made."""
+    """Raise TriangleLimitError if the number `expected` of triangles is larger than `most`, the
+    limit `max_triangles`."""
     if expected > most:
         raise TriangleLimitError(
             f"the mesh takes about {expected:.2g} triangles, and max_triangles is {most:,}: choose "
@@ -596,8 +609,8 @@ def check_triangle_limit(expected: float, most: int) -> None:
 
 
 def check_inside(vertices: FloatArray, volume: Volume, slack: float) -> None:
-    """Raise MeshingError if a vertex (n, 3) lies farther than the length `slack` outside of a
-    volume."""
+    """Raise MeshingError if one of the vertices (n, 3) lies outside of a volume, by more than the
+    length `slack`."""
     out = ~volume.padded(slack).contains_points(vertices)
     if out.any():
         raise MeshingError(
@@ -613,26 +626,27 @@ def check_near_level(
     tolerance: float,
     volume: Volume | None,
 ) -> None:
-    """Raise unless all vertices (n, 3) and all centers of faces (m, 3) are within `tolerance`, a
-    length, of the level. That is decided by samples of the function.
+    """Raise an error unless all vertices (n, 3) and all centers of faces (m, 3) are within
+    `tolerance`, a length, of the level set f = 0, where f is the field minus its level. That is
+    decided by samples of f.
 
     A point passes if |f|/|grad f| <= tolerance, by the gradient. It passes as well if f has
     different signs at two points on a line through it, on both sides of it and at the same distance
-    of at most the tolerance: a continuous f then has its level between them. Fourteen lines are
+    of at most the tolerance: a continuous f is then 0 between them. Fourteen lines are
     tried: the normal of the face, or the mean normal at the vertex, and 13 fixed lines. These are
-    askew to the axes, since many parts have faces in coordinate planes, where rounding would decide
-    the sign. Every cone of 28 degrees about its axis contains one of their directions; the corner
-    of a cube contains a cone of 35 degrees.
+        askew to the axes, since many parts have faces in coordinate planes, where rounding would
+        decide the sign. Every cone of half-angle 28 degrees contains one of these directions; the
+        corner of a cube contains a cone of half-angle 35 degrees.
 
     volume: a solid is cut at the boundary of this volume, so that f counts as positive outside of
         it. None if there is no such volume.
 
-    Not tested are the boundary vertices of an angle's level set, which are on its curve, where the
-    angle has no value; and the centers of triangles whose edges are all no longer than half of the
-    tolerance, since their corners are tested.
+    Two kinds of points are not tested: vertices on the boundary curve of a level set of a field
+    such as `SolidAngle`, since f has no value there; and centers of triangles with no edge longer
+    than half of the tolerance, since their corners are tested.
 
     Raises:
-        OffLevelError: points are farther from the level; they are its locations.
+        OffLevelError: some points are farther away; `locations` holds them.
     """
     off_level, count = points_off_level(function, vertices, faces, tolerance, volume)
     if len(off_level):
@@ -651,9 +665,10 @@ def points_off_level(
     tolerance: float,
     volume: Volume | None,
 ) -> tuple[FloatArray, int]:
-    """The vertices and centers of faces that are not within `tolerance` of the level, (k, 3), and
-    the number of points that were tested. `check_near_level` says which points are tested, and
-    how."""
+    """Find the vertices (n, 3) and centers of faces (m, 3) that are not within `tolerance` of the
+    level set, by samples of the function. `check_near_level` describes the test and the parameters.
+
+    Returns these points (k, 3), and the number of points that were tested."""
     corner = vertices[faces]
     normal = area_normals(corner)
     longest = np.stack([row_norms(corner[:, k] - corner[:, k - 1]) for k in range(3)]).max(axis=0)
@@ -679,8 +694,9 @@ def points_off_level(
 
 
 def _askew_lines() -> FloatArray:
-    """(13, 3) unit vectors along the axes and the face and space diagonals of a cube that is turned
-    so that none of them is near to a coordinate plane or to a plane's diagonal."""
+    """(13, 3) unit vectors along the axes, the face diagonals and the space diagonals of a cube.
+    The cube is turned so that no vector is near a coordinate plane or a plane at 45 degrees to two
+    axes."""
     directions = np.array(list(itertools.product((-1.0, 0.0, 1.0), repeat=3)))[14:]
     frame: FloatArray = np.linalg.qr([[7, 7, -3], [3, -16, -7], [19, 7, -13]])[0]
     return (directions / row_norms(directions)[:, None]) @ frame
@@ -696,7 +712,7 @@ def _is_positive(
 
 
 def point_text(x: FloatArray) -> str:
-    """A point (3,) as messages show it."""
+    """The coordinates of a point (3,) as text for messages, with four digits."""
     return "(" + ", ".join(f"{c:.4g}" for c in x) + ")"
 
 
@@ -721,8 +737,8 @@ def _vertex_fans(faces: IntArray, edges: Edges) -> tuple[int, IntArray]:
 
     edges: the `Edges` of `half_edges(faces)`.
 
-    Returns the number of fans of all vertices together, and (3m,) the index of the fan that each
-    corner of a face belongs to, face by face.
+    Returns the number of fans of all vertices together, and (3m,) the index of the fan of each
+    corner: entry 3 i + k is that of corner k of face i.
     """
     import scipy.sparse  # imported here: it takes half a second
     import scipy.sparse.csgraph as csgraph_module

@@ -42,8 +42,9 @@ def largest_component(surface: TriangleMesh) -> TriangleMesh:
 
 
 def largest_body(surface: TriangleMesh) -> TriangleMesh:
-    """The body with the largest volume of a closed surface: an outer shell, and the shells of its
-    cavities, which are turned inwards and so have a negative volume.
+    """The body with the largest volume that a closed surface bounds. A body has an outer shell and
+    the shells of its cavities. A shell is a connected component of the surface; the shells of
+    cavities are turned inwards, so that their volumes are negative.
 
     Proof that each cavity is given to the right outer shell. Shells are closed, connected, and do
     not meet; the surface bounds a set. Around a shell that is turned inwards there is a connected
@@ -53,7 +54,7 @@ def largest_body(surface: TriangleMesh) -> TriangleMesh:
     the shell's winding number there, which is an integer.
 
     Raises:
-        MeshingError: a cavity lies in no shell.
+        MeshingError: a shell that is turned inwards lies in no outer shell.
     """
     shells = Shells.of(surface)
     bodies = shells.volumes.copy()
@@ -73,8 +74,8 @@ def largest_body(surface: TriangleMesh) -> TriangleMesh:
 
 
 def drop_degenerate_components(surface: TriangleMesh) -> TriangleMesh:
-    """The closed surface without those connected components that are only rounding error, such as
-    the remainder of a solid minus itself."""
+    """Remove the connected components of a closed surface that are only rounding error, such as
+    what remains of a solid minus itself."""
     x, faces = surface.vertices, surface.faces
     if not len(faces):
         return surface
@@ -111,8 +112,8 @@ def component_facts(surface: TriangleMesh) -> list[dict[str, Any]]:
 
 def faces_to_flip(surface: TriangleMesh) -> npt.NDArray[np.bool_]:
     """(m,) mask of the faces of a closed surface that have to be turned over so that no component
-    is inside out. These are the faces of components that have a negative volume and lie in no other
-    component, so that they are no cavities."""
+    is inside out. These are the faces of the components that have a negative volume and lie in no
+    other component; a component of negative volume within another one is a cavity."""
     shells = Shells.of(surface)
     is_inside_out = (shells.volumes < 0) & (shells.nesting_depths() == 0)
     return is_inside_out[shells.component_of_face]
@@ -136,7 +137,7 @@ class Shells:
 
     @classmethod
     def of(cls, surface: TriangleMesh) -> Shells:
-        """The components of a surface."""
+        """Find the connected components of a closed surface, their volumes and their boxes."""
         number = np.unique(_component_of_faces(surface), return_inverse=True)[1]
         corners = surface.vertices[surface.faces]
         offset = corners[:, 0] - surface.vertices[surface.faces].mean(axis=(0, 1))
@@ -155,9 +156,9 @@ class Shells:
         return winding_around(self.corners[self.component_of_face == around], point)
 
     def nesting_depths(self) -> IntArray:
-        """(k,) for each component, how often all other components together wind around a point of
-        it. If no two components meet, it is more than 0 for components inside the material of
-        others."""
+        """(k,) for each component, the winding number of all other components together around a
+        point of it. If no two components meet, it is more than 0 for components inside the material
+        of other components."""
         depth = np.zeros(len(self.volumes), np.int64)
         for k in range(len(depth)) if len(depth) > 1 else ():
             point = self.corners[np.argmax(self.component_of_face == k)].mean(axis=0)
@@ -169,7 +170,7 @@ class Shells:
 
     def bound(self) -> npt.NDArray[np.bool_]:
         """(m,) mask of the faces that bound the set of points around which all components together
-        wind at least once. No two components may meet.
+        wind at least once. It is right only if no two components meet.
 
         Proof. The winding number just outside of a component is that of the other components, and
         just inside it is larger by one, or for a component that is turned inwards smaller by one.
@@ -209,7 +210,7 @@ _SNAP_DISTANCE = 0.25
 
 @dataclass(frozen=True)
 class _ClipBoundary:
-    """A plane or a sphere that bounds a volume.
+    """A plane or a sphere, at which a surface is cut. One side of it counts as inside.
 
     center: (3,) a point of the plane, or the center of the sphere.
     normal: (3,) the plane's unit normal, outwards; unused for a sphere.
@@ -221,8 +222,8 @@ class _ClipBoundary:
     radius: float | None
 
     def heights(self, x: FloatArray) -> FloatArray:
-        """(n,) signed distances of points `x` (n, 3) from the boundary, negative inside of the
-        volume."""
+        """(n,) signed distances of points `x` (n, 3) from the boundary, negative inside (behind the
+        plane's normal, or in the sphere)."""
         if self.radius is None:
             return (x - self.center) @ self.normal
         return np.linalg.norm(x - self.center, axis=1) - self.radius
@@ -236,8 +237,9 @@ class _ClipBoundary:
 
 
 def clip_to_volume(surface: TriangleMesh, volume: Volume) -> TriangleMesh:
-    """The part of a surface inside of a volume. The edges along which it is cut lie exactly on
-    planes; for a sphere they are chords. Vertices inside keep their order and come first.
+    """The part of a surface inside of a volume. The new edges at which it is cut lie exactly on the
+    volume's planes; on a sphere they are chords. The vertices that are kept come first and keep
+    their order.
 
     Raises:
         MeshingError: the volume is neither a box, a ball, a half-space, a convex hull nor an
@@ -259,19 +261,24 @@ def clip_to_volume(surface: TriangleMesh, volume: Volume) -> TriangleMesh:
 
 
 def _snap_to_box(vertices: FloatArray, box: Box) -> FloatArray:
-    """The vertices (n, 3); those within rounding of a face of the box are put onto it."""
+    """The vertices (n, 3), of which those that are within rounding of the plane of a face of the
+    box are moved onto that plane."""
     for end in box.bounds():
         near = np.abs(vertices - end) <= _ON_BOUNDARY * (1 + np.abs(end))
         vertices = np.where(near, end, vertices)
     return vertices
 
 
-def _snap_to_boundary(surface: TriangleMesh, side: _ClipBoundary) -> tuple[FloatArray, FloatArray]:
-    """The vertices (n, 3), some of them moved onto the boundary `side`, and their signed distances
-    (n,) from it.
+def _snap_to_boundary(
+    surface: TriangleMesh, boundary: _ClipBoundary
+) -> tuple[FloatArray, FloatArray]:
+    """Move vertices that are very near the plane or sphere `boundary` onto it, since cutting beside
+    them would leave slivers.
 
-    Vertices are moved in the surface's tangent plane, if that takes less than a quarter of their
-    shortest edge. Vertices on the boundary edges of the surface itself are not moved.
+    Returns the vertices (n, 3), and their signed distances (n,) from the plane or sphere.
+
+    A vertex is moved in the surface's tangent plane, if the move is shorter than a quarter of the
+    vertex's shortest edge. Vertices on the boundary edges of the surface itself are not moved.
     """
     x, faces = surface.vertices, surface.faces
     corner = x[faces]
@@ -282,26 +289,27 @@ def _snap_to_boundary(surface: TriangleMesh, side: _ClipBoundary) -> tuple[Float
         np.minimum.at(shortest_edge, faces[:, k], shortest_of_face)
         np.add.at(vertex_normals, faces[:, k], normals)
     vertex_normals /= np.maximum(np.linalg.norm(vertex_normals, axis=1), 1e-300)[:, None]
-    h = side.heights(x)
+    h = boundary.heights(x)
     moved = x
     for _ in range(4):
-        slope = side.slopes(moved)
+        slope = boundary.slopes(moved)
         tangential = slope - (slope * vertex_normals).sum(axis=1)[:, None] * vertex_normals
         squared_length = np.maximum((tangential * tangential).sum(axis=1), 1e-3)
-        moved = moved - (side.heights(moved) / squared_length)[:, None] * tangential
+        moved = moved - (boundary.heights(moved) / squared_length)[:, None] * tangential
     is_snapped = np.linalg.norm(moved - x, axis=1) < _SNAP_DISTANCE * shortest_edge
-    is_snapped &= np.abs(side.heights(moved)) <= 1e-9 * shortest_edge
+    is_snapped &= np.abs(boundary.heights(moved)) <= 1e-9 * shortest_edge
     is_snapped[np.unique(boundary_edges(faces))] = False
     return np.where(is_snapped[:, None], moved, x), np.where(is_snapped, 0.0, h)
 
 
-def _cut(surface: TriangleMesh, side: _ClipBoundary) -> TriangleMesh:
-    """The part of a surface whose signed distance `h` from the boundary `side` is not positive.
-    Along edges the distance counts as linear; from a sphere it is exact (`_sphere_cuts`)."""
+def _cut(surface: TriangleMesh, boundary: _ClipBoundary) -> TriangleMesh:
+    """The part of a surface on the inner side of the plane or sphere `boundary`, where the signed
+    distance `h` from it is not positive. Edges are cut where they meet the plane or the sphere, and
+    the faces there are divided into triangles."""
     faces = surface.faces
     if not len(faces):
         return surface
-    vertices, h = _snap_to_boundary(surface, side)
+    vertices, h = _snap_to_boundary(surface, boundary)
     h = np.where(np.abs(h) <= _ON_BOUNDARY * float(np.ptp(vertices, axis=0).max()), 0.0, h)
     is_out = (h > 0)[faces]
     # Faces on the boundary with no corner inside are left out.
@@ -313,13 +321,13 @@ def _cut(surface: TriangleMesh, side: _ClipBoundary) -> TriangleMesh:
     a, b = keys // len(vertices), keys % len(vertices)
     fraction = (h[a] / (h[a] - h[b]))[:, None]
     points = vertices[a] + fraction * (vertices[b] - vertices[a])
-    if side.radius is not None:
-        points = _sphere_cuts(vertices[a], vertices[b], side.center, side.radius)
+    if boundary.radius is not None:
+        points = _sphere_cuts(vertices[a], vertices[b], boundary.center, boundary.radius)
     first_new = len(vertices)
 
     def crossing(i: IntArray, j: IntArray) -> IntArray:
-        """The vertices where edges from i to j, both (k,), meet the boundary; i itself where it
-        lies on the boundary."""
+        """(k,) the indices of the vertices where edges from vertices i to j, both (k,), meet the
+        plane or sphere: i itself if it lies on it, else the new vertex on the edge."""
         index = np.searchsorted(keys, edge_keys(np.column_stack([i, j]), len(vertices)))
         return np.where(h[i] == 0, i, first_new + index)
 
@@ -341,16 +349,17 @@ def _cut(surface: TriangleMesh, side: _ClipBoundary) -> TriangleMesh:
 
 
 def _sphere_cuts(a: FloatArray, b: FloatArray, center: FloatArray, radius: float) -> FloatArray:
-    """The points (n, 3) where segments from `a` to `b` pass through a sphere. a, b: (n, 3); of each
-    segment one end is inside of the sphere.
+    """The points (n, 3) where segments from `a` to `b`, both (n, 3), pass through a sphere. One end
+    of each segment is inside of the sphere, the other end outside.
 
-    A point is o + t d from the center, with o the offset of the inner end, d the direction to the
-    other end, and t^2 d.d + 2 t o.d = radius^2 - o.o = room.
+    Proof. Relative to the center, the point is o + t d, with o the inner end and d the vector from
+    it to the outer end. |o + t d| = radius means t^2 d.d + 2 t o.d = room, with room = radius^2 -
+    o.o.
     """
     is_a_in = np.linalg.norm(a - center, axis=1) < np.linalg.norm(b - center, axis=1)
     start, end = np.where(is_a_in[:, None], a, b), np.where(is_a_in[:, None], b, a)
     o, d = start - center, end - start
-    dd, od = ((d * d).sum(axis=1), (o * d).sum(axis=1))
+    d_squared, o_dot_d = ((d * d).sum(axis=1), (o * d).sum(axis=1))
     room = np.maximum(radius**2 - (o * o).sum(axis=1), 0)
-    fraction = room / (od + np.sqrt(od * od + dd * room))
+    fraction = room / (o_dot_d + np.sqrt(o_dot_d * o_dot_d + d_squared * room))
     return start + fraction[:, None] * d

@@ -1,5 +1,5 @@
-"""Closed meshes: their conversion to and from manifold3d's solids, other shapes as such solids, and
-their export to files that are closed as well."""
+"""Closed meshes: their conversion to and from solids of the library manifold3d (class `Manifold`),
+other shapes as such solids, and export to files in which they stay closed."""
 
 from __future__ import annotations
 
@@ -53,7 +53,8 @@ _MAX_CELLS = 1_000_000
 
 
 def to_manifold(surface: TriangleMesh) -> Manifold:
-    """The solid that a closed mesh bounds; its faces run counter-clockwise as seen from outside.
+    """Convert a closed mesh to the manifold3d solid that it bounds. The faces of the mesh run
+    counter-clockwise as seen from outside of the solid.
 
     Raises:
         MeshingError: the mesh is not closed.
@@ -73,14 +74,15 @@ def to_manifold(surface: TriangleMesh) -> Manifold:
 
 
 def mesh_manifold(solid: MeshSolid) -> Manifold | None:
-    """The solid of a `MeshSolid`. If its mesh intersects itself, that is the union of the
-    components of the mesh; None if a component intersects itself or is a cavity.
+    """Convert a `MeshSolid` to a manifold3d solid. If its mesh intersects itself, the result is the
+    union of the solids of the mesh's components, or None if a component intersects itself or is a
+    cavity.
 
-    Components that are in contact only up to rounding would leave gaps of that thickness, with
-    walls that add to the area, or pass through each other. So if the area of the union differs from
-    that of the solid's boundary, or if triangles of the union cross, the faces of all components
-    are first moved outwards by a tiny length. If that does not help either, the first union of the
-    right area is returned, or None.
+    Components that are in contact only up to rounding would leave gaps as thin as rounding, whose
+    walls add to the area, or would pass through each other. So if the area of the union differs
+    from that of the solid's boundary, or if triangles of the union cross, the faces of all
+    components are first moved outwards by a tiny length. If that does not help either, the first
+    union of the right area is returned, or None.
 
     Raises:
         MeshingError: more than two faces meet at an edge.
@@ -114,14 +116,14 @@ def mesh_manifold(solid: MeshSolid) -> Manifold | None:
 
 
 def _grown_part(part: Manifold, length: float) -> Manifold:
-    """The part, its faces moved outwards by a length (`grown`); the same part if the length is
+    """The solid `part` with its faces moved outwards by `length`; the same solid if the length is
     0."""
     return part if length == 0 else to_manifold(grown(from_manifold(part), length))
 
 
 def grown(surface: TriangleMesh, length: float) -> TriangleMesh:
-    """A closed surface, offset outwards: vertices are moved along their normals, so that faces move
-    by about `length`. Components that touch up to rounding overlap then."""
+    """A closed surface with its vertices moved outwards along their normals, so far that faces move
+    by about `length`. Components that touched only up to rounding then overlap."""
     x, faces = surface.vertices, surface.faces
     mesh = trimesh.Trimesh(x, faces, process=False)
     normals = np.array(mesh.vertex_normals)
@@ -132,23 +134,23 @@ def grown(surface: TriangleMesh, length: float) -> TriangleMesh:
 
 
 def without_short_edges(solid: Manifold, length: float) -> Manifold:
-    """A solid without short edges and slivers; removing these moves its surface by up to `length`.
-    If the volume changes by more than such moves explain, the solid is returned as it is:
-    manifold3d may lose a part where slivers are as thin as rounding."""
+    """Remove short edges and slivers (thin triangles) of a solid, which moves its surface by up to
+    `length`. If the volume changes by more than 2 * length * area, the solid is returned as it was:
+    manifold3d may lose a part of a solid with slivers as thin as rounding."""
     simpler = solid.simplify(length)
     max_change = 2 * length * solid.surface_area()
     return simpler if abs(simpler.volume() - solid.volume()) <= max_change else solid
 
 
 def from_manifold(manifold: Manifold) -> TriangleMesh:
-    """The triangles of a solid."""
+    """The triangle mesh of the surface of a manifold3d solid."""
     mesh = manifold.to_mesh64()
     vertices = np.array(mesh.vert_properties, np.float64)[:, :3]
     return TriangleMesh(vertices, np.array(mesh.tri_verts, np.int64))
 
 
 def box_manifold(lower: FloatArray, upper: FloatArray) -> Manifold:
-    """The box between two corners (3,) as a solid."""
+    """The box between two corners (3,) as a manifold3d solid."""
     from manifold3d import Manifold
 
     x, y, z = (float(v) for v in upper - lower)
@@ -159,16 +161,17 @@ def box_manifold(lower: FloatArray, upper: FloatArray) -> Manifold:
 def extruded_manifold(
     outline: Outline, height: float, twist: float, taper: float, tolerance: float
 ) -> Manifold:
-    """The outline over 0 <= z <= height as a solid. Its end is turned by `twist` degrees and scaled
-    by the factor `taper`.
+    """A plane outline, extruded from z = 0 to z = height, as a manifold3d solid. The cross-section
+    at the upper end is the outline turned by `twist` degrees and scaled by the factor `taper`.
 
-    Without a twist the faces are flat, and exact. With a twist the vertices lie on the surface, and
-    faces are within `tolerance` of it. Proof: let a triangle have edges of at most L, let a map
-    take it to the curved surface, and let M bound the second derivatives of the map along lines.
-    The triangle lies in a ball of radius L/sqrt(3), so that linear interpolation of the map between
-    the corners errs by at most M/2 times the square of that radius, M L^2/6. Let the map turn by
-    the angle a and change the scale by k within a unit of length, at distances up to R from the
-    axis; then M = q (a + a^2 R) + k (1 + 2 a R), with q = max(1, taper).
+    Without a twist the faces are flat, and exact. With a twist the vertices lie on the exact
+    surface, and faces are within `tolerance` (a length) of it. Proof. Take a triangle of the
+    straight extrusion with edges of at most L, and the map that turns and scales the extrusion. Let
+    M bound the second derivatives of the map along lines. The triangle lies in a ball of radius
+    L/sqrt(3), so that linear interpolation of the map between the corners errs by at most M/2 times
+    the square of that radius, M L^2/6. Let the map turn by the angle a (in radians) and change the
+    scale by k per unit of z, at distances up to R from the axis; then M = q (a + a^2 R) + k (1 + 2
+    a R), with q = max(1, taper).
 
     Raises:
         MeshingError: the tolerance is so small that there are millions of faces.
@@ -202,9 +205,10 @@ def extruded_manifold(
 
 
 def revolved_manifold(outline: Outline, tolerance: float) -> Manifold:
-    """The outline in the (r, z) plane, revolved about the z axis, as a solid. Vertices lie on the
-    surface, and faces are within `tolerance` of it: between n segments around, the largest distance
-    of a chord from its arc is r (1 - cos(pi/n)) <= r (pi/n)^2/2.
+    """An outline in the (r, z) plane, revolved about the z axis, as a manifold3d solid. Vertices
+    lie on the exact surface, and faces are within `tolerance` (a length) of it: if a circle of
+    radius r is divided into n segments, a chord is at most r (1 - cos(pi/n)) <= r (pi/n)^2/2 from
+    its arc.
 
     Raises:
         MeshingError: the tolerance is so small that there are too many segments.
@@ -221,8 +225,8 @@ def revolved_manifold(outline: Outline, tolerance: float) -> Manifold:
 
 
 def _cross_section(outline: Outline) -> tuple[CrossSection, float]:
-    """The cross-section of an outline times a scale for which it is not rounded
-    (`scale_for_clipper`), and that scale."""
+    """The manifold3d cross-section of an outline, scaled so that manifold3d does not round its
+    coordinates (`scale_for_clipper`); and the factor by which it was scaled."""
     from manifold3d import CrossSection
 
     loops, scale = scale_for_clipper(outline)
@@ -232,12 +236,13 @@ def _cross_section(outline: Outline) -> tuple[CrossSection, float]:
 def volume_manifold(
     volume: Volume, lower: FloatArray, upper: FloatArray, tolerance: float
 ) -> Manifold:
-    """The part of a volume in the box from `lower` to `upper`, as a solid. Polytopes are exact; a
-    ball becomes a polyhedron whose vertices lie on the sphere and whose faces are within
-    `tolerance` of it.
+    """The part of a volume in the box from `lower` to `upper`, (3,) each, as a manifold3d solid.
+    Polytopes are exact; a ball becomes a polyhedron whose vertices lie on the sphere and whose
+    faces are within `tolerance` of it.
 
     Raises:
-        MeshingError: the volume is of another kind, or a ball would have millions of faces.
+        MeshingError: the volume is neither a box, a ball, a half-space, a convex hull nor an
+            intersection of these; or a ball would have millions of faces.
     """
     from manifold3d import Manifold
 
@@ -261,18 +266,17 @@ def volume_manifold(
 
 
 def _ball_manifold(ball: Ball, tolerance: float) -> Manifold:
-    """A geodesic polyhedron whose vertices lie on the sphere and whose faces are within `tolerance`
-    of it.
+    """A ball as a manifold3d solid: a geodesic polyhedron whose vertices lie on the sphere and
+    whose faces are within `tolerance` (a length) of it.
 
     Proof. Let n be the number of segments around, and r the radius. The octahedron's faces are
     divided into equilateral triangles, whose vertices are then moved onto the sphere. The mean
     length of edges along a side of the octahedron is (r pi/2)/(n/4) = 2 pi r/n, and all edges are
     at most sqrt(3) times as long. So the circle through the corners of a triangle has a radius of
-    at most edge/sqrt(3) <= 2 pi r/n, and the triangle is at most half of the square of that radius,
-    over r, from the sphere.
+    at most c = edge/sqrt(3) <= 2 pi r/n, and the triangle is at most c^2/(2 r) from the sphere.
 
     Raises:
-        MeshingError: so fine that it has millions of faces.
+        MeshingError: the tolerance is so small that there are millions of faces.
     """
     from manifold3d import Manifold
 
@@ -370,9 +374,9 @@ def _grid_spacing(x: FloatArray) -> float:
 
 
 def _quantize(mesh: trimesh.Trimesh, step: float) -> trimesh.Trimesh:
-    """The mesh with its vertices rounded to the grid of spacing `step`. If triangles cross then,
-    the mesh is mended there; if it still does not pass its checks, it is simplified. A mesh with
-    colors or textures is neither mended nor simplified.
+    """Round the vertices of a closed mesh to the grid of spacing `step`, and return the result. If
+    triangles cross after rounding, vertices near them are moved; if the mesh still does not pass
+    its checks, it is simplified. A mesh with colors or textures is only rounded.
 
     Raises:
         MeshingError: nothing makes the mesh on the grid closed and free of intersections.
@@ -402,8 +406,8 @@ def _quantize(mesh: trimesh.Trimesh, step: float) -> trimesh.Trimesh:
 
 
 def _simplify_until_valid(original: TriangleMesh, step: float) -> TriangleMesh | None:
-    """The mesh on the grid of spacing `step`, simplified by manifold3d, without slivers and without
-    triangles that cross; None if no simplification leads to that."""
+    """Simplify a closed mesh by manifold3d and round it to the grid of spacing `step`, so that no
+    triangles cross. Two strengths of simplification are tried; None if both fail."""
     for steps in _SIMPLIFY_STEPS:
         simpler = from_manifold(without_short_edges(to_manifold(original), steps * step))
         x, faces, is_kept = _merge_on_grid(simpler, step)
@@ -439,13 +443,14 @@ def _merge_on_grid(surface: TriangleMesh, step: float) -> tuple[FloatArray, IntA
 def _resolve_after_rounding(
     rounded: TriangleMesh, original: TriangleMesh, length: float
 ) -> TriangleMesh | None:
-    """The rounded surface, mended where triangles cross; mending moves it by no more than `length`.
-    None if no triangles cross; and if mending fails and triangles of the original surface cross
-    too, as those of a repaired mesh may.
+    """Move vertices of a rounded surface near triangles that cross, by no more than `length`, until
+    no triangles cross; and return the result. None if the rounded surface can be used as it is: no
+    triangles cross; or they cannot be separated, but triangles of the original surface cross too,
+    as in some repaired meshes.
 
     Raises:
-        LocalizedMeshingError: the rounded surface is not closed; or mending fails, although no
-            triangles of the original surface cross.
+        LocalizedMeshingError: the rounded surface is not closed; or triangles still cross, although
+            no triangles of the original surface do.
     """
     check_manifold(rounded.faces, rounded.vertices)
     try:

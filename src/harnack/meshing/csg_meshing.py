@@ -98,8 +98,8 @@ __all__ = [
 # For offsets of meshes: the size of cells, in tolerances; and the number of secant steps that find
 # the level on an edge of a cell.
 _OFFSET_CELLS, _SECANT_STEPS = 6.0, 2
-# In lattices of at least this many cells, cells are left out at once in which the other operands
-# of an intersection leave nothing.
+# In lattices of at least this many cells, the cells in which the other operands of an intersection
+# leave nothing are left out from the start.
 _MANY_CELLS = 100_000
 # How far surfaces of offsets may be moved, in tolerances: by merging coplanar triangles, tried in
 # this order until the result can be mended; and by the mending of crossing triangles afterwards.
@@ -108,13 +108,14 @@ _MERGED_WITHIN, _MENDED_WITHIN = (0.5, 0.25, 0.1), 0.5
 # in tolerances; the second is the number of rounds.
 _FAR_OFF, _SPLITS = 1.8, 2
 
-# Meshes the level set of an angle, which ends at its curve: field, level -> vertices and faces.
+# Meshes a level set of a solid angle, which ends at the boundary curve: takes the field and the
+# level, and returns the mesh.
 AngleMesher = Callable[[SolidAngle, float], TriangleMesh]
 
 
 IntersectedOperands: TypeAlias = tuple[tuple[Solid, float], ...]
-"""Solids, with levels, that the meshed solid will be intersected with. Where one of these solids is
-proved to have no points, nothing need be meshed.
+"""Solids, with levels, with which the meshed solid will be intersected. In a region in which one of
+these solids is proved to have no points, nothing need be meshed.
 
 Proof for a tree of unions, intersections and complements. Outside of complements, these are the
 operands of all intersections around the meshed solid. Inside a complement, they are only the
@@ -131,23 +132,25 @@ intersection is correct there as well.
 
 @dataclass
 class CsgMesher:
-    """Meshes solids in the box from `lower` to `upper`, (3,) each.
+    """Meshes solids and their Boolean combinations (CSG) in the box from `lower` to `upper`, (3,)
+    each.
 
-    tolerance: a length, for midpoints of edges and centers of faces.
+    tolerance: a length, the largest distance of midpoints of edges and centers of faces from the
+        surface.
     spacing: the largest size of cells.
     per_wave: the smallest number of cells along a wave (`Field.min_wavelength`); None for no such
         limit.
-    mesh_angle: meshes a level set of an angle, which ends at a curve.
+    mesh_angle: meshes a level set of a `SolidAngle`; the mesh ends at the field's boundary curve.
     most_faces: the largest number of triangles of each level set.
     report: receives messages about the progress.
     evaluations: the number of evaluations of fields so far, in points.
     levels: the number of level sets meshed so far.
     smallest_cell: the smallest size of cells used for them.
     uploads: the prepared fields that were meshed so far.
-    intersected_with: the solids that everything meshed next is intersected with
-        (`IntersectedOperands`).
-    irrelevant_region_cache: the operands, and the region in which they leave nothing, of the last
-        call that computed such a region.
+    intersected_with: solids, with levels, that everything meshed next will be intersected with, so
+        that it need not be meshed where they are empty (`IntersectedOperands`).
+    irrelevant_region_cache: the value of `intersected_with` for which a region was computed last,
+        and this region, in which these solids leave nothing.
     """
 
     lower: FloatArray
@@ -166,11 +169,11 @@ class CsgMesher:
     irrelevant_region_cache: tuple[IntersectedOperands, IrrelevantRegion] | None = None
 
     def mesh_sublevel(self, solid: Solid, level: float) -> Manifold:
-        """The points of the box where the function of `solid` is at most `level`. Outside of the
-        box the result has no meaning.
+        """Mesh the set {solid <= level} in the box: the points where the solid's function is at
+        most `level`. Returns a manifold3d solid, which has no meaning outside of the box.
 
         Raises:
-            MeshingError: a part cannot be meshed.
+            MeshingError: the solid or one of its operands cannot be meshed.
         """
         from manifold3d import Manifold
 
@@ -212,8 +215,9 @@ class CsgMesher:
         return to_manifold(self.mesh_smooth_level(solid, level)[0])
 
     def _mesh_boolean(self, solid: BooleanSolid, level: float) -> Manifold:
-        """The mesh of {solid <= level}, of a union or an intersection. Complements in an
-        intersection are meshed as the solids that are cut away."""
+        """Mesh the set {solid <= level} for a union or an intersection: its operands are meshed and
+        combined by manifold3d. A complement in an intersection is not meshed; its solid is meshed
+        and cut away."""
         from manifold3d import Manifold, OpType
 
         indices = range(len(solid.parts))
@@ -228,9 +232,10 @@ class CsgMesher:
         return Manifold.batch_boolean([common, *cut_away], OpType.Subtract)
 
     def _mesh_operand(self, solid: BooleanSolid, number: int, level: float) -> Manifold:
-        """The mesh of operand `number` of a union or an intersection; for a complement in an
-        intersection, the mesh of the solid that is cut away. In an intersection the operand need be
-        meshed only where the other operands may leave something of it (`IntersectedOperands`)."""
+        """Mesh the set {operand <= level} for the operand with index `number` of a union or an
+        intersection; for a complement in an intersection, mesh the solid that is cut away. In an
+        intersection, the operand is meshed only where the other operands may leave something of it
+        (`IntersectedOperands`)."""
         previous, part = self.intersected_with, solid.parts[number]
         if not solid.is_union:
             others = [operand for operand in solid.parts if operand is not part]
@@ -249,10 +254,10 @@ class CsgMesher:
     def _mesh_level_set(self, function: LevelFunction, lattice: BccLattice) -> TriangleMesh:
         """The level set of `function` in the cells of `lattice`, as a closed mesh.
 
-        If there are many cells, those in which the other operands are proved to leave nothing are
-        left out. If there are few, all are meshed, so that copies of a surface are the same bit by
-        bit. Should that fail, cells are left out as well: a function may jump where nothing is
-        left, as the angle about an axis does, or have no value beyond a surface.
+        If there are many cells, the cells in which the other operands are proved to leave nothing
+        are left out. If there are few cells, all are meshed, so that copies of a surface are the
+        same bit by bit. If that fails, cells are left out as well: in these cells a function may
+        jump, as the angle about an axis does, or have no finite value.
         """
         region: IrrelevantRegion | None = None
         if math.prod(lattice.counts.tolist()) < _MANY_CELLS:
@@ -272,9 +277,9 @@ class CsgMesher:
         )
 
     def _empty_region(self) -> IrrelevantRegion | None:
-        """The region in which the other operands, `intersected_with`, are proved to leave nothing;
-        None if there are no other operands. Both sides of a wall use the region computed for the
-        first."""
+        """The region in which the solids `intersected_with` are proved to be empty, so that nothing
+        need be meshed there; None if there are no such solids. It is computed once for the same
+        `intersected_with`, as for the two sides of a wall."""
         if not self.intersected_with:
             return None
         if (
@@ -285,8 +290,8 @@ class CsgMesher:
         functions = [self.function(solid, level) for solid, level in self.intersected_with]
 
         def clearance(points: FloatArray) -> FloatArray:
-            """(n,) for each point (n, 3) the radius of a ball about it in which some operand is
-            proved to leave nothing; 0 if none is."""
+            """(n,) for each point (n, 3) the radius of a ball about it in which one of the solids
+            is proved to have no points; 0 if there is no such ball."""
             radii = np.zeros(len(points))
             for solid in functions:
                 outside = np.flatnonzero(solid.values(points) > 0)
@@ -298,8 +303,9 @@ class CsgMesher:
         return region
 
     def mesh_smooth_level(self, field: Field, level: float) -> tuple[TriangleMesh, bool]:
-        """The boundary of {f <= level}, meshed as one level set. Also whether it is the whole
-        boundary: if not, it was closed outside of the box, in a way that has no meaning.
+        """Mesh the boundary of the set {field <= level} in the box as one level set. Returns the
+        closed mesh; and whether the set is known to lie in the box. If not, the mesh is closed at
+        or outside of the faces of the box by triangles that have no meaning.
         """
         hull = _finite_extent(field, level)
         lower, upper = self.lower, self.upper
@@ -324,7 +330,8 @@ class CsgMesher:
         return surface, is_whole
 
     def function(self, field: Field, level: float) -> LevelFunction:
-        """f - level, continued beyond the field's domain."""
+        """The function field - level, continued beyond the field's domain by its values at the
+        closest points of the domain."""
         return _DomainExtendedFunction(
             field, level, most_faces=self.most_faces, uploads=self.uploads
         )
@@ -335,8 +342,8 @@ class CsgMesher:
         return box_manifold(self.lower - pad, self.upper + pad)
 
     def _mesh_wall(self, wall: BandSolid, level: float) -> Manifold:
-        """The mesh of the points where the wall's field is within half_width + level of the wall's
-        own level.
+        """Mesh a wall: the points where its field g satisfies |g - wall.level| <= wall.half_width +
+        level.
 
         Raises:
             MeshingError: the wall is thinner than the tolerance, or its field has a period and is
@@ -364,9 +371,10 @@ class CsgMesher:
         return to_manifold(self._between_angle_levels(field, low, high))
 
     def _check_wall_thickness(self, field: Field, low: float, high: float) -> None:
-        """Raise MeshingError if the wall {low <= field <= high} is about as thin as the tolerance
-        of both of its sides together: they would meet. The thickness is (high - low) over the
-        median length of the gradient, near the wall in a coarse lattice.
+        """Raise MeshingError if the wall {low <= field <= high} is thinner than twice the
+        tolerance, since the meshes of its two sides would meet. The thickness is estimated as (high
+        - low) over the median length of the gradient, at those points of a coarse lattice that are
+        nearest to the wall.
         """
         lattice = BccLattice.covering_box(
             self.lower, self.upper, float((self.upper - self.lower).max()) / 8
@@ -386,11 +394,11 @@ class CsgMesher:
             )
 
     def _between_angle_levels(self, field: SolidAngle, low: float, high: float) -> TriangleMesh:
-        """The closed surface around the points between two levels of an angle. The surfaces of both
-        levels end at the same vertices, those of the curve.
+        """The closed surface around the points between two levels of a solid angle: the surfaces of
+        both levels, which end at the same vertices, those of the boundary curve.
 
         Raises:
-            MeshingError: they do not.
+            MeshingError: the two surfaces do not end at the same vertices.
         """
         inner, outer = self.mesh_angle(field, low), self.mesh_angle(field, high)
         count = sum(map(len, field.loops))
@@ -403,8 +411,8 @@ class CsgMesher:
         return TriangleMesh(vertices, np.concatenate([outer.faces, index[inner.faces][:, ::-1]]))
 
     def _mesh_offset(self, solid: MeshSolid, level: float) -> Manifold:
-        """The mesh of {solid <= level}: the points within the distance `level` of a meshed solid,
-        or if `level` is negative those deeper inside than -level.
+        """Mesh an offset of a solid that is given by a mesh: the points within the distance `level`
+        of it; or, if `level` is negative, its points deeper inside than -level.
 
         Offsets of meshes have creases wherever the mesh has, too many for cells to be refined
         beside them. So cells are small from the beginning; and since f is a distance, it is linear
@@ -436,8 +444,8 @@ class CsgMesher:
         return to_manifold(surface)
 
     def _mesh_transformed(self, solid: TransformedSolid, level: float) -> Manifold:
-        """The mesh of a transformed solid: the original is meshed in the box that is mapped back,
-        and the mesh is then mapped by the affine map."""
+        """Mesh the set {solid <= level} for a solid under an affine map: the original solid is
+        meshed in the box to which the inverse map takes this box, and its mesh is then mapped."""
         matrix, offset = np.array(solid.map.matrix), np.array(solid.map.translation_vector)
         ends = np.stack([self.lower, self.upper])
         corners = np.stack(np.meshgrid(*ends.T, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -462,8 +470,8 @@ class CsgMesher:
 
 
 def _is_complement_free(solid: Solid) -> bool:
-    """Whether no complement is meshed for a solid: neither it nor its operands are complements or
-    walls."""
+    """Whether neither a solid nor any of its operands is a complement or a wall. (A wall is meshed
+    with a complement.)"""
     if isinstance(solid, BooleanSolid):
         return all(_is_complement_free(operand) for operand in solid.parts)
     if isinstance(solid, TransformedSolid | OffsetSolid):
@@ -472,7 +480,8 @@ def _is_complement_free(solid: Solid) -> bool:
 
 
 def is_single_level_set(solid: Solid) -> bool:
-    """Whether a solid is meshed as one level set, not by Boolean operations or with exact edges."""
+    """Whether a solid is meshed as one level set. Other solids are meshed by Boolean operations, or
+    by a method of their own that makes their edges exact."""
     if isinstance(solid, SublevelSolid):
         return not isinstance(solid.field, Solid) or is_single_level_set(solid.field)
     if isinstance(solid, TransformedSolid):
@@ -488,8 +497,9 @@ def _sublevel_bounds(solid: MeshSolid, level: float) -> tuple[FloatArray, FloatA
 
 
 def _finite_extent(field: Field, level: float) -> Volume | None:
-    """A volume with finite bounds that contains {f <= level}; None if no such volume is known. The
-    field's domain does not count, since a surface that ends there is cut by it."""
+    """A volume with finite bounds that contains {field <= level}; None if no such volume is known.
+    The field's own domain does not count as such a volume, since the set may go on beyond the
+    domain."""
     if isinstance(field, Solid):
         extent = field.sublevel_extent(level)
     else:
@@ -503,17 +513,17 @@ def _finite_extent(field: Field, level: float) -> Volume | None:
 
 
 def _underlying_field(field: Field) -> Field:
-    """The field of a sublevel solid; any other field itself."""
+    """The field that a `SublevelSolid` was made of; any other field itself."""
     return field.field if isinstance(field, SublevelSolid) else field
 
 
 @dataclass
 class _DomainExtendedFunction(LevelFunction):
-    """A field, continued beyond its domain: outside of the domain it has the value of the closest
-    point of the domain.
+    """The function field - level, continued beyond the field's domain: outside of the domain it has
+    the value of the closest point of the domain.
 
-    Proof that the clearance of p's closest point is a clearance of p: the closest points of two
-    points are no farther from each other than the two points are.
+    Proof that a lower bound of the distance from the level set at p's closest point is such a bound
+    at p: the closest points of two points are no farther from each other than the two points are.
     """
 
     def sample(self, points: FloatArray) -> LevelSamples:
@@ -526,7 +536,7 @@ class _DomainExtendedFunction(LevelFunction):
         return super().clearance(self._closest(points))
 
     def _closest(self, points: FloatArray) -> FloatArray:
-        """The closest points (n, 3) of the field's domain.
+        """For each of the points (n, 3), the closest point of the field's domain.
 
         Raises:
             MeshingError: points lie outside of a domain that is neither a box nor a ball.
@@ -567,12 +577,12 @@ _MARGIN = 0.01
 
 @dataclass(frozen=True)
 class SolidMeshResult:
-    """The closed mesh of a solid.
+    """The closed mesh of a solid, and facts about how it was computed.
 
     spacing: the smallest size of cells.
     evaluations: the number of evaluations of fields, in points.
-    levels: the number of level sets that it was made of.
-    size: the longest edge of the solid's box; tolerances relate to it.
+    levels: the number of level sets that the mesh was made of.
+    size: the longest edge of the box around the solid; relative tolerances are fractions of it.
     """
 
     surface: TriangleMesh
@@ -583,8 +593,8 @@ class SolidMeshResult:
 
 
 def solid_and_level(field: Field, solid: Any, level: float | None) -> tuple[Solid, float]:
-    """The solid that the argument `solid` of `mesh` describes, and its level: {solid <= level} is
-    meant.
+    """The solid that the argument `solid` of `mesh` describes, and its level. The set {solid <=
+    level} is to be meshed.
 
     solid: True if the field itself is a solid, or values (low, high), between which the field is
         inside the solid.
@@ -608,11 +618,11 @@ def solid_and_level(field: Field, solid: Any, level: float | None) -> tuple[Soli
 
 
 def solid_value_range(field: Field, solid: Any, level: float | None) -> tuple[float, float]:
-    """The values (low, high) of the field between which a solid lies, from the argument that
-    describes it.
+    """The values (low, high) of the field between which a solid lies; either may be infinite. They
+    come from the argument `solid` of `mesh`.
 
     Raises:
-        ValueError, TypeError: as `solid_and_level`.
+        ValueError: the argument is True, or a level is given too, or the field has no such levels.
     """
     if solid is True:
         raise ValueError(
@@ -637,27 +647,27 @@ def mesh_solid(
     check: Callable[[TriangleMesh, float], None],
     report: Callable[[str], None],
 ) -> SolidMeshResult:
-    """The boundary of {solid <= level} in a volume: the points where the solid's function is at
-    most the level.
+    """Mesh the boundary of the part of {solid <= level} in a volume.
 
     volume: None for all of space.
     tolerance: how far triangles may be from the surface.
-    spacing: the size of cells, or None; only without it smaller cells are tried if an attempt
+    spacing: the size of cells. None for a default size; then smaller cells are tried if an attempt
         fails.
     angle_mesher: given a tolerance and a size of cells, both lengths, returns a function that
-        meshes level sets of angles.
+        meshes level sets of solid angles.
     most_faces: the largest number of triangles of a level set.
     check: called with a surface, none of whose triangles pass through each other, and the size of
-        the solid's box; raises if the surface fails its checks, the last of which is that it is
-        near the level.
+        the solid's box. It raises an error if the surface fails a check; the check of distances
+        from the level set comes last.
     report: receives messages about the progress.
 
-    If a few places are too far from the level, these are mended (`project_outliers`). If mending is
-    not enough, or another check fails in known places, smaller cells are tried, and half of the
-    tolerance: beside a thin part, triangles within the tolerance may be anywhere.
+    If vertices or centers of triangles are too far from the level set in a few places, they are
+    moved nearer to it (`project_outliers`). If that is not enough, or another check fails in known
+    places, smaller cells and half of the tolerance are tried: beside a part thinner than the
+    tolerance, triangles within the tolerance may pass through each other.
 
     Raises:
-        MeshingError: the solid has no bounds, or is empty, or a part cannot be meshed.
+        MeshingError: the solid is not bounded, or is empty, or an operand cannot be meshed.
     """
     lower, upper = _bounds(solid, level, volume)
     size = float((upper - lower).max())
@@ -705,14 +715,15 @@ def _check_and_mend(
     size: float,
     check: Callable[[TriangleMesh, float], None],
 ) -> TriangleMesh:
-    """The surface, if it passes the check. If it fails only because a few places are too far from
-    the level, the surface with these places moved nearer to the level.
+    """Check a surface, and return it. If it fails only because a few vertices or centers of
+    triangles are too far from the level set, return the surface with these places moved nearer to
+    it.
 
-    size: the size of the solid's box, which `check` needs.
-    check: as in `mesh_solid`.
+    size: the longest edge of the solid's box, which `check` needs.
+    check: called with the surface and the size; raises an error if the surface fails a check.
 
     Raises:
-        MeshingError: another check fails, or moving does not help.
+        MeshingError: another check fails, or the moved surface fails one.
     """
     try:
         check(surface, size)
@@ -729,20 +740,21 @@ def _check_and_mend(
 
 
 def apart_of(whole: Manifold, tolerance: float) -> TriangleMesh:
-    """The surface of a solid made by Boolean operations; triangles that pass through each other are
-    mended.
+    """The surface of a solid made by Boolean operations, with vertices moved where triangles would
+    pass through each other.
 
     tolerance: a length; mending moves the surface by at most half of it.
 
     Raises:
-        MeshingError: the solid is empty, or mending does not help.
+        MeshingError: the solid is empty, or triangles still pass through each other.
     """
     return _without_crossings(_Assembly(whole), tolerance)
 
 
 def _without_crossings(parts: TriangleMesh | _Assembly, tolerance: float) -> TriangleMesh:
-    """The surface, mended where triangles pass through each other. Slivers of assembled parts are
-    removed first: if mending then fails, fewer are removed and it is tried again.
+    """The surface of `parts`, with vertices moved where triangles would pass through each other.
+    From an assembly, slivers (thin triangles) are removed first. If triangles still pass through
+    each other in the end, fewer slivers are removed and it is tried again.
 
     tolerance: a length; mending moves the surface by at most half of it.
 
@@ -766,15 +778,18 @@ def _without_crossings(parts: TriangleMesh | _Assembly, tolerance: float) -> Tri
 
 @dataclass(frozen=True)
 class _Assembly:
-    """A solid made by Boolean operations of meshes, and the volume that it was cut by; None for all
-    of space."""
+    """A solid made by Boolean operations of meshes.
+
+    whole: the manifold3d solid.
+    volume: the volume that it was cut by; None for all of space."""
 
     whole: Manifold
     volume: Volume | None = None
 
     def without_slivers(self, length: float) -> TriangleMesh:
-        """The surface without short edges and slivers, whose removal moves it by up to `length`,
-        and without components that are only rounding error."""
+        """The surface of the solid without short edges and slivers (thin triangles), and without
+        components that are only rounding error. Removing edges and slivers moves the surface by up
+        to `length`."""
         simpler = without_short_edges(self.whole, length) if length > 0 else self.whole
         surface = drop_degenerate_components(from_manifold(simpler))
         return surface if self.volume is None else _snap_to_boxes(surface, self.volume)
@@ -783,8 +798,9 @@ class _Assembly:
 def _mesh_in_volume(
     mesher: CsgMesher, solid: Solid, level: float, volume: Volume | None
 ) -> TriangleMesh | _Assembly:
-    """The boundary of {solid <= level} in the volume; None stands for all of space. It is a mesh if
-    it is one whole level set, else an assembly of the meshes of operands."""
+    """Mesh the boundary of the part of {solid <= level} in the volume; None stands for all of
+    space. Returns a mesh if the boundary is one whole level set, else an assembly of the meshes of
+    operands."""
     if volume is None and is_single_level_set(solid):
         return mesher.mesh_smooth_level(solid, level)[0]
     lower, upper = mesher.lower, mesher.upper
@@ -801,7 +817,7 @@ def _mesh_in_volume(
 
 def _bounds(solid: Solid, level: float, volume: Volume | None) -> tuple[FloatArray, FloatArray]:
     """The lower and upper corners (3,) of a box that contains the part of {solid <= level} in the
-    volume.
+    volume, with a margin.
 
     Raises:
         MeshingError: there is no finite box, or it is empty.
@@ -832,8 +848,8 @@ def _as_tuple(x: FloatArray) -> tuple[float, float, float]:
 
 
 def _snap_to_boxes(surface: TriangleMesh, volume: Volume) -> TriangleMesh:
-    """The surface, with vertices within rounding of a face of a box put onto it. The boxes are
-    `volume` itself, or those that it is the intersection of."""
+    """The surface, with vertices that are within rounding of a face of a box moved onto the face.
+    The boxes are `volume` itself or, if it is an intersection of volumes, the boxes among these."""
     boxes = volume.volumes if isinstance(volume, VolumeIntersection) else (volume,)
     vertices = surface.vertices
     for box in boxes:

@@ -19,13 +19,14 @@ from harnack.fields.solids.transforms import TransformedSolid
 __all__ = ["drop_cancelled_operands", "factor_common_operands", "flatten_csg"]
 
 SolidAtLevel: TypeAlias = tuple[Solid, float]
-"""A solid f and a level: they stand for the points where f is at most the level."""
+"""A solid and a level. They stand for the set of points where the solid's function is at most the
+level."""
 
 
 def factor_common_operands(union: BooleanSolid, level: float) -> Solid | None:
-    """Factor common operands out of a union: (A & B) | (A & C) becomes A & (B | C). Returns a solid
-    f such that {f <= 0} is {union <= level}; None if no two operands of the union have anything in
-    common."""
+    """Factor operands that several intersections of a union have in common out of the union: (A &
+    B) | (A & C) becomes A & (B | C). Returns a solid with the function f such that {f <= 0} is
+    {union <= level}; None if no two of the intersections have a common operand."""
     terms = [{_key(*factor): factor for factor in _factors(part, level)} for part in union.parts]
     common_key, times = Counter(key for term in terms for key in term).most_common(1)[0]
     if times < 2:
@@ -42,9 +43,8 @@ def factor_common_operands(union: BooleanSolid, level: float) -> Solid | None:
 
 
 def flatten_csg(solid: BooleanSolid) -> BooleanSolid:
-    """The solid with nested operations of the same kind made one, unions in a union or
-    intersections in an intersection. Everything that is cut away from an operand is then cut away
-    at once."""
+    """Merge nested operations of the same kind: unions in a union, or intersections in an
+    intersection. Then everything that is cut away from an operand is cut away in one operation."""
     parts: list[Solid] = []
     for operand in solid.parts:
         if isinstance(operand, BooleanSolid) and operand.is_union == solid.is_union:
@@ -55,11 +55,12 @@ def flatten_csg(solid: BooleanSolid) -> BooleanSolid:
 
 
 def drop_cancelled_operands(solid: BooleanSolid, level: float) -> BooleanSolid | None:
-    """In an intersection, drop what is cut away from its unions anyway: (A | C) - C becomes A - C,
-    since C and its complement have only their boundary in common. Returns None if nothing is left
-    of a union. A solid that is a union itself is returned as it is.
+    """Drop operands of unions that the intersection around them cuts away again: (A | C) - C
+    becomes A - C, since C and its complement have only their boundary in common. Returns the new
+    intersection; None if no operand of a union is left, so that the intersection is empty. If
+    `solid` itself is a union, it is returned as it is.
 
-    level: {solid <= level} is meant.
+    level: the set {solid <= level} is to be meshed.
     """
     if solid.is_union:
         return solid
@@ -77,8 +78,8 @@ def drop_cancelled_operands(solid: BooleanSolid, level: float) -> BooleanSolid |
 
 
 def _factors(solid: Solid, level: float) -> list[SolidAtLevel]:
-    """Solids with levels; {solid <= level} is the intersection of the sets {factor <= its
-    level}."""
+    """The factors of a solid: pairs of a solid and its level such that {solid <= level} is the
+    intersection of the sets {factor <= level of the factor}."""
     if isinstance(solid, BooleanSolid) and not solid.is_union:
         return [factor for part in solid.parts for factor in _factors(part, level)]
     if isinstance(solid, OffsetSolid):
@@ -96,16 +97,19 @@ def _factors(solid: Solid, level: float) -> list[SolidAtLevel]:
     return [(solid, level)]
 
 
-def _image(solid: Solid, of: TransformedSolid, level: float) -> SolidAtLevel:
-    """The image of {solid <= level} under the affine map of `of`: a solid and its level."""
+def _image(solid: Solid, placed: TransformedSolid, level: float) -> SolidAtLevel:
+    """The image of the set {solid <= level} under the affine map of the solid `placed`, as a solid
+    and its level."""
     if isinstance(solid, Complement):
-        return Complement(TransformedSolid(solid.field, of.map)), level * of.map.value_factor
-    return TransformedSolid(solid, of.map), level * of.map.value_factor
+        return Complement(
+            TransformedSolid(solid.field, placed.map)
+        ), level * placed.map.value_factor
+    return TransformedSolid(solid, placed.map), level * placed.map.value_factor
 
 
 def _key(solid: Solid, level: float) -> Hashable:
-    """A key for {solid <= level}: sets with equal keys are equal sets of points, made of the same
-    field object."""
+    """A key for the set {solid <= level}. Two sets with equal keys are made of the same field
+    object and consist of the same points."""
     if isinstance(solid, Complement):
         return "complement", _key(solid.field, -level)
     if isinstance(solid, OffsetSolid):
@@ -117,7 +121,7 @@ def _key(solid: Solid, level: float) -> Hashable:
 
 
 def _with_level_zero(solid: Solid, level: float) -> Solid:
-    """A solid f for which {f <= 0} is {solid <= level}."""
+    """A solid with the function f such that {f <= 0} is {solid <= level}."""
     if level == 0:
         return solid
     if isinstance(solid, Complement):
@@ -126,15 +130,15 @@ def _with_level_zero(solid: Solid, level: float) -> Solid:
 
 
 def _intersection(factors: Iterable[SolidAtLevel]) -> Solid:
-    """The intersection of the sets {solid <= level}, as a solid of level 0; with one factor that
-    solid alone."""
+    """The intersection of the sets {solid <= level} of all factors, as a solid with level 0. If
+    there is a single factor, it is that solid itself."""
     parts = tuple(_with_level_zero(*factor) for factor in factors)
     return parts[0] if len(parts) == 1 else BooleanSolid(parts, is_union=False)
 
 
 def _union(parts: Sequence[Solid]) -> Solid:
-    """The union of solids. If there are complements among them, it is written as the complement of
-    an intersection, so that no solid has to be cut away from all of space."""
+    """The union of solids. If one of them is a complement, it is written as the complement of an
+    intersection, so that no solid has to be cut away from all of space."""
     if any(isinstance(operand, Complement) for operand in parts):
         return Complement(BooleanSolid(tuple(~operand for operand in parts), is_union=False))
     return BooleanSolid(tuple(parts), is_union=True)

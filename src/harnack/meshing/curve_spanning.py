@@ -1,7 +1,9 @@
-"""Meshes of an angle's level set that ends at a curve, made from Delaunay's tetrahedra.
+"""Meshes of level sets of a solid angle, which end at the field's boundary curve, made from a
+Delaunay tetrahedralization.
 
-If a check fails in known places, cells are made smaller there alone and the mesh is computed again.
-If that does not help, or the places are not known, cells are made smaller everywhere.
+If a check fails in known places, the cells of the octree are made smaller in these places only and
+the mesh is computed again. If that does not help, or the places are not known, cells are made
+smaller everywhere.
 """
 
 from __future__ import annotations
@@ -59,19 +61,19 @@ def restore_curve_edges(
     cut: int,
     height: float,
 ) -> tuple[FloatArray, IntArray]:
-    """Restore the edges of the boundary curve that were subdivided for the tetrahedra, so that of
-    the vertices (n, 3) only the first `kept`, those of the curve, are on the boundary. Returns
-    vertices and faces.
+    """Restore the edges of the boundary curve that were subdivided for the tetrahedra, so that the
+    boundary of the mesh has the vertices of the given curve only. Returns the vertices (n, 3) and
+    the faces (k, 3).
 
-    Long edges of a curve are subdivided so that cells near them need not be as large. The extra
-    points are moved off their edge into the surface, by at most `height`, and the gap beside the
-    edge is filled with triangles, so that the mesh ends at the given curve. These triangles are
-    thin, unavoidably: the surface twists about the edge, and a triangle along all of the edge is
-    within the tolerance only if its height is about the tolerance.
+    Long edges of a curve are subdivided so that cells near them may be smaller than they are. The
+    extra points are moved off their edge into the surface, by at most `height`, and the gap beside
+    the edge is filled with triangles, so that the mesh ends at the given curve. These triangles are
+    unavoidably thin: the surface twists about the edge, so a triangle that has all of the edge as a
+    side is within the tolerance only if its height is about the tolerance.
 
-    faces: (m, 3).
-    kept, cut: the vertices before index `kept` are those of the curve; from there to index `cut`
-        they are the extra points on its edges.
+    vertices, faces: (n, 3), (m, 3) the mesh.
+    kept, cut: vertices 0 to kept - 1 are those of the curve; vertices kept to cut - 1 are the extra
+        points on its edges.
     height: the largest distance by which extra points are moved.
     """
     if cut == kept:
@@ -106,18 +108,19 @@ def _push_inward(
     ends: IntArray,
     height: float,
 ) -> FloatArray:
-    """All vertices (n, 3), after the extra points on edges of the curve were moved off their edges
-    and onto the surface.
+    """Move the extra points on edges of the curve off their edges and onto the surface; returns all
+    vertices (n, 3).
 
     inner: (k,) indices of the extra points.
     edge: (k,) index of the edge that each of them is on.
     ends: (m, 2) the two vertices at the ends of each edge.
     height: the largest distance from the edge, a length.
 
-    Over each edge the distances of its points from it form a parabola, so that the triangles that
-    fill the gap lie below the chain of points. A point is first moved into the surface, along the
-    mean direction to its neighbors at right angles to the edge. It is then turned about the edge
-    towards the level set: it keeps its position along the edge and its distance from it.
+    The distances of an edge's points from the edge form a parabola over it, so that the triangles
+    that fill the gap lie between the edge and the chain of points. A point is first moved into the
+    surface, along the mean direction to its neighbors at right angles to the edge. It is then
+    turned about the edge towards the level set: it keeps its position along the edge and its
+    distance from it.
     """
     points = vertices[inner]
     a, along = vertices[ends[:, 0]], vertices[ends[:, 1]] - vertices[ends[:, 0]]
@@ -144,15 +147,15 @@ def _push_inward(
 
 
 def _unit_perpendicular(vectors: FloatArray, along: FloatArray) -> FloatArray:
-    """The unit vectors (k, 3) along the components of `vectors` (k, 3) at right angles to the unit
-    vectors `along` (k, 3)."""
+    """(k, 3) unit vectors: each of `vectors` (k, 3) without its component along the unit vector in
+    the same row of `along` (k, 3), scaled to length 1."""
     part = vectors - (vectors * along).sum(axis=1)[:, None] * along
     return part / np.maximum(np.linalg.norm(part, axis=1), 1e-300)[:, None]
 
 
 def _triangulate_gap(chain: list[int]) -> list[tuple[int, int, int]]:
-    """Triangles between a chain of points, given by their indices, and the straight edge between
-    the ends of the chain."""
+    """Triangles, as triples of indices, that fill the gap between a chain of points and the
+    straight edge between the ends of the chain. chain: the indices of the points."""
     if len(chain) < 3:
         return []
     middle = len(chain) // 2
@@ -186,10 +189,10 @@ class SpanningMesh:
     faces: (m, 3).
     curve: the boundary curve, with its edges as subdivided.
     spacing: the size of cells.
-    finer: balls in which cells were halved; once more for each entry.
-    crossings: how often the level set crosses edges of the tetrahedra.
+    finer: sets of balls; cells were halved once for each set with a ball that they meet.
+    crossings: how often, and in which direction, the level set crosses each edge of the tetrahedra.
     isotopy: on how many tetrahedra the topology is proved.
-    turned: how many faces are turned over.
+    turned: how many faces look to the side on which the function is smaller.
     """
 
     vertices: FloatArray
@@ -204,7 +207,8 @@ class SpanningMesh:
 
 @dataclass(frozen=True)
 class _SpanningInput:
-    """The function and the box in which its level set is meshed.
+    """What all attempts to mesh a level set have in common: the function and the box in which its
+    level set is meshed.
 
     lower, upper: (3,) the corners of the box.
     walls: the same corners, if the surface may end at the faces of the box; else None.
@@ -230,10 +234,12 @@ def mesh_spanning_curve(
     tolerance: float,
     report: Callable[[str], None],
 ) -> SpanningMesh:
-    """The mesh of an angle's level set within the tolerance, none of whose triangles pass through
-    each other. If triangles do, or are turned over, cells are made smaller there and the mesh is
-    computed again; triangles that are still turned over at the end are counted in the result.
+    """Mesh a level set of a solid angle within the tolerance, so that no triangles pass through
+    each other. If triangles pass through each other or are turned over, cells are made smaller
+    there and the mesh is computed again. Triangles that are still turned over in the last attempt
+    are counted in the result.
 
+    spacing: the first size of cells, a length.
     attempts: the number of sizes of cells that are tried, each smaller than the one before.
     box: the lower and upper corners (3,) of the box that cells fill.
     has_walls: whether the surface may end at the faces of the box.
@@ -281,8 +287,8 @@ def mesh_spanning_curve(
 
 
 def _curve_loops(function: LevelFunction) -> tuple[FloatArray, ...]:
-    """The loops (k, 3) of the curve at which the function's angle is discontinuous, without edges
-    that are run in both directions."""
+    """The closed loops, each an array (k, 3) of vertices, of the boundary curve of the function's
+    solid angle. Edges that are run in both directions are left out."""
     assert isinstance(function.field, SolidAngle)
     return cancel_opposite_edges(function.field.loops)
 
@@ -290,11 +296,12 @@ def _curve_loops(function: LevelFunction) -> tuple[FloatArray, ...]:
 def _mesh_with_retries(
     task: _SpanningInput, spacing: float, attempts: int, finer: tuple[RefinementBalls, ...]
 ) -> SpanningMesh:
-    """The mesh in cells of the size `spacing`, which are made smaller in places where a check
-    fails. If that does not help, or the places are not known, the mesh in smaller cells everywhere.
+    """Mesh the level set in cells of the size `spacing`, which are made smaller in places where a
+    check fails. If that does not help, or the places are not known, mesh it in smaller cells
+    everywhere.
 
     attempts: how many sizes of cells may be tried.
-    finer: balls in which cells are halved from the beginning.
+    finer: sets of balls in which cells are halved from the beginning.
 
     Raises:
         MeshingError: no attempt succeeds.
@@ -318,11 +325,12 @@ def _mesh_with_retries(
 def _mesh_in_cells(
     task: _SpanningInput, spacing: float, finer: tuple[RefinementBalls, ...]
 ) -> SpanningMesh:
-    """The first triangles of the mesh, in cells of the size `spacing`, and how many tetrahedra have
-    a proved isotopy. Cells are halved once more in each entry of `finer` that they meet.
+    """The mesh before refinement, in cells of the size `spacing`, and on how many tetrahedra its
+    topology is proved. Cells are halved once for each entry of `finer` that has a ball which meets
+    them.
 
     Raises:
-        MeshingError: a check fails, or edges of the curve are in no tetrahedron.
+        MeshingError: a check fails, or edges of the curve are edges of no tetrahedron.
     """
     function, walls = task.function, task.walls
     curve = BoundaryCurve.of(_curve_loops(function), _MAX_EDGE_CELLS * spacing)
@@ -349,13 +357,15 @@ def _tetrahedralize(
     curve: BoundaryCurve,
     finer: tuple[RefinementBalls, ...],
 ) -> tuple[BoundaryCurve, TetrahedronPoints, Tetrahedra]:
-    """A tetrahedral mesh that contains every edge of the curve. Edges that are missing, since other
-    points are too near to them, are halved, and it is computed again.
+    """Compute a Delaunay tetrahedralization that contains every edge of the boundary curve. Edges
+    of the curve that are missing in it, because other points are too near to them, are halved, and
+    it is computed again.
 
-    root: cells that fill the box, and how many times they are to be subdivided.
-    finer: balls in which cells are halved once more.
+    root: cells that fill the box, and how many times they are to be halved.
+    finer: sets of balls; cells are halved once more for each set that has a ball which meets them.
 
-    Returns the curve with its edges as subdivided, the points with samples, and the tetrahedra.
+    Returns the curve with its edges as subdivided, the points with samples of the function, and the
+    tetrahedra.
 
     Raises:
         MeshingError: edges of the curve are missing after all halvings.
@@ -377,8 +387,10 @@ def _check_boundary(
     walls: tuple[FloatArray, FloatArray] | None,
 ) -> None:
     """Raise LocalizedMeshingError unless the boundary edges of the faces are the edges of the
-    curve. Boundary edges on the faces of the box are left out if the surface may end there
-    (`walls`)."""
+    curve.
+
+    walls: the lower and upper corners (3,) of the box if the surface may end on the faces of the
+        box as well; else None."""
     edges = boundary_edges(faces)
     count = max(int(faces.max()) + 1, len(curve.points))
     if walls is not None:  # the surface ends there as well

@@ -45,18 +45,18 @@ _CORNERS = np.array(list(itertools.product((0.0, 1.0), repeat=3)))
 
 @dataclass(frozen=True)
 class RefinementBalls:
-    """Balls in which cells are subdivided once more.
+    """Balls of equal radius; cells that meet one of them are halved once more.
 
     points: (n, 3) their centers.
-    radius: of all balls.
+    radius: the radius of every ball.
     """
 
     points: FloatArray
     radius: float
 
     def meet(self, centers: FloatArray, radii: FloatArray | float) -> BoolArray:
-        """(k,) whether the balls with these centers (k, 3) and radii (k,), or one radius, meet any
-        of the balls."""
+        """(k,) whether each of the balls with centers `centers` (k, 3) and radii `radii` (k,) or a
+        common radius meets any of these balls."""
         if not len(centers):
             return np.zeros(0, np.bool_)
         import scipy.spatial  # imported here: it takes half a second
@@ -68,7 +68,7 @@ class RefinementBalls:
 
 @dataclass(frozen=True)
 class BoundaryCurve:
-    """The curve at which a level set ends.
+    """The curve at which a level set ends: points that edges connect to closed loops.
 
     points: (n, 3).
     edges: (n, 2) indices of the two points of each edge, in the direction in which the curve runs.
@@ -80,8 +80,8 @@ class BoundaryCurve:
     @classmethod
     def of(cls, loops: tuple[FloatArray, ...], longest: float) -> BoundaryCurve:
         """The curve that consists of closed loops (k, 3). Its points are first the vertices of the
-        loops, in their order; then those that divide edges longer than `longest` into equal
-        parts."""
+        loops, in their order; then the points that divide edges longer than the length `longest`
+        into equal parts."""
         points = [*loops]
         inner_points: list[FloatArray] = []
         edges: list[tuple[int, int]] = []
@@ -99,8 +99,8 @@ class BoundaryCurve:
         return cls(np.concatenate([*points, *inner_points, np.zeros((0, 3))]), pairs)
 
     def split(self, which: BoolArray) -> BoundaryCurve:
-        """The curve, with those edges halved that the mask `which` (k,) selects. Their midpoints
-        are additional points, after all others."""
+        """The curve with those edges halved that the mask `which` (k,) selects. Their midpoints
+        become additional points, after all existing ones."""
         a, b = self.edges[which].T
         middle = len(self.points) + np.arange(len(a))
         points = np.concatenate([self.points, 0.5 * (self.points[a] + self.points[b])])
@@ -108,8 +108,8 @@ class BoundaryCurve:
         return BoundaryCurve(points, np.concatenate([self.edges[~which], halves]))
 
     def split_near(self, places: RefinementBalls, longest: float) -> BoundaryCurve:
-        """The curve, with edges that meet the balls `places` halved until they are no longer than
-        `longest`."""
+        """The curve with its edges halved, again and again, as long as they meet one of the balls
+        `places` and are longer than `longest`."""
         curve = self
         while True:
             ends = curve.points[curve.edges]
@@ -122,11 +122,11 @@ class BoundaryCurve:
 
 @dataclass(frozen=True)
 class TetrahedronPoints:
-    """The points of a triangulation, with the function's samples.
+    """The points of a Delaunay triangulation, with samples of the function f - level at them.
 
-    points: (n, 3), those of the boundary curve first.
-    is_on_level: (n,) whether points are on the level; those of the curve count as on it.
-    samples: of f - level at all points; 0 at those of the curve.
+    points: (n, 3); the points of the boundary curve come first.
+    is_on_level: (n,) whether points are on the level set; points of the curve count as on it.
+    samples: of f - level at all points; 0 at the points of the curve.
     """
 
     points: FloatArray
@@ -137,8 +137,8 @@ class TetrahedronPoints:
 def box_cells(
     lower: FloatArray, upper: FloatArray, spacing: float, exact: bool
 ) -> tuple[BoxCells, int]:
-    """Cells that fill a box, and how many times they are to be halved until they are no larger than
-    `spacing`.
+    """A few cells that fill a box, from which octrees start; and how many times they are to be
+    halved until they are no larger than `spacing`.
 
     exact: whether the cells fill the box exactly; otherwise they are cubes, which fill a box that
         may be larger.
@@ -167,15 +167,17 @@ def sample_delaunay_points(
     seed: int,
     finer: tuple[RefinementBalls, ...] = (),
 ) -> TetrahedronPoints:
-    """The points of the tetrahedra, with samples of the function. The module's docstring says how
-    they are chosen.
+    """Choose the points of a Delaunay triangulation around a level set, and sample the function at
+    them. They are the corners and centers of the cells of an octree around the level set, moved
+    onto the level set if they are near it, and the points of the boundary curve.
 
     root: cells that fill the box, and how many times they are to be halved.
     boundary: the curve at which the level set ends.
-    walls: the lower and upper corners of a box; points on its faces stay on them. None if there is
-        none.
+    walls: the lower and upper corners (3,) of the box, if points on its faces have to stay on them;
+        else None.
     seed: of the random moves of points.
-    finer: balls; cells of the octree are halved again, once for each entry that they meet.
+    finer: sets of balls; cells of the octree are halved again, once for each set that has a ball
+        which meets them.
 
     Raises:
         MemoryError: there are more than four million cells.
@@ -208,10 +210,10 @@ def sample_delaunay_points(
 def _subdivided_cells(
     function: LevelFunction, leaves: BoxCells, finer: tuple[RefinementBalls, ...]
 ) -> list[BoxCells]:
-    """The cells that leaves of the octree are split into, smallest first. A leaf is split once,
-    into octants, if it meets a ball of the first entry of `finer`; the octants again if they meet
-    one of the second; and so on. Cells that are proved empty are left out, and so are leaves that
-    are not split."""
+    """The cells into which leaves of the octree are split, grouped by size, smallest first. A leaf
+    is split into octants if it meets a ball of the first entry of `finer`; all cells so far are
+    split again if they meet a ball of the second entry; and so on. Cells that are proved to be free
+    of the level set are left out, and so are leaves that are not split."""
     pool = [leaves]
     for balls in finer:
         octants: list[BoxCells] = []
@@ -250,8 +252,9 @@ def _corners_and_centers(
 
 
 def _is_far(points: FloatArray, free: FloatArray, boundary: BoundaryCurve) -> BoolArray:
-    """(n,) whether points (n, 3) are far enough from the curve: farther than `free` (n,), and
-    outside of the balls that have the curve's edges as diameters."""
+    """(n,) whether points (n, 3) are far enough from the boundary curve: farther than the lengths
+    `free` (n,), and outside of the balls, enlarged by a tenth, that have the curve's edges as
+    diameters."""
     if not len(boundary.edges):
         return np.ones(len(points), np.bool_)
     import scipy.spatial  # imported here: it takes half a second
@@ -278,8 +281,8 @@ def _is_far(points: FloatArray, free: FloatArray, boundary: BoundaryCurve) -> Bo
 
 
 def _off_walls(points: FloatArray, walls: tuple[FloatArray, FloatArray]) -> FloatArray:
-    """(n, 3) for each point and axis, 0 if the point is on a face of the box across that axis, so
-    that a move along the axis would take it off the face; else 1.
+    """(n, 3) factors for moves of points (n, 3) that keep points on the faces of a box: 0 for a
+    point and an axis if the point lies on a face of the box at right angles to the axis, else 1.
 
     walls: the lower and upper corners (3,) of the box.
     """
@@ -299,14 +302,15 @@ def _move_onto_level(
 ) -> tuple[FloatArray, LevelSamples, BoolArray]:
     """Move points that are near the level set onto it.
 
-    size: (n,) of the cells at the points.
+    size: (n,) the edge of the smallest cell at each point.
     free: (n,) the smallest permitted distances from the boundary curve.
     samples: of the function at the points.
-    walls: a box; points on its faces stay on them. None if there is none.
+    walls: the lower and upper corners (3,) of the box, if points on its faces have to stay on them;
+        else None.
 
-    Returns the points (n, 3); their samples; and a mask (n,) of those that are on the level. Points
-    stay where they are if Newton's method does not converge, or would move them far or too near to
-    the curve.
+    Returns the points (n, 3); their samples; and a mask (n,) of the points that are on the level
+    set. A point stays where it is if Newton's method does not converge, or would move it by more
+    than 0.45 cells or too near to the curve.
     """
     near = np.flatnonzero(samples.distance < _SNAP_DISTANCE * size)
     moved = newton_to_level(function, points[near], samples.select(near), 0.25 * size[near], walls)
@@ -325,21 +329,22 @@ def newton_to_level(
     function: LevelFunction,
     points: FloatArray,
     samples: LevelSamples,
-    longest: FloatArray,
+    max_step: FloatArray,
     walls: tuple[FloatArray, FloatArray] | None,
     steps: int = 5,
 ) -> FloatArray:
-    """Points (n, 3), moved towards the level by steps of Newton's method along the gradient.
+    """Move points (n, 3) towards the level set by steps of Newton's method along the gradient;
+    returns the moved points (n, 3).
 
     samples: of the function at the points.
-    longest: (n,) the largest length of each step.
+    max_step: (n,) the largest length of each step.
     walls: the lower and upper corners of a box; points on its faces stay on them, and no point
         leaves it. None if there is none.
     steps: the largest number of steps.
 
-    A point is no longer moved after a step so short that the next step, of the order of its square,
-    would be lost in rounding. It is not moved either where there is no finite step, as beside a
-    pole.
+    A point stops after a step so short that the next step, of the order of the square of this one,
+    would be lost in rounding. A point for which the step is not finite, as beside a pole, is not
+    moved.
     """
     x, rows = points.copy(), np.arange(len(points))
     for k in range(steps):
@@ -351,9 +356,9 @@ def newton_to_level(
             length = row_norms(move)
         lost = ~np.isfinite(length)
         move[lost], length[lost] = 0.0, 0.0
-        moved = current + move * np.minimum(1, longest[rows] / np.maximum(length, 1e-300))[:, None]
+        moved = current + move * np.minimum(1, max_step[rows] / np.maximum(length, 1e-300))[:, None]
         x[rows] = moved if walls is None else np.clip(moved, *walls)
-        rows = rows[length > _CONVERGED * longest[rows]]
+        rows = rows[length > _CONVERGED * max_step[rows]]
         if k == steps - 1 or not len(rows):
             break
         samples = function.sample(x[rows])
@@ -361,25 +366,26 @@ def newton_to_level(
 
 
 def to_multiple_roots(
-    function: LevelFunction, points: FloatArray, samples: LevelSamples, longest: FloatArray
+    function: LevelFunction, points: FloatArray, samples: LevelSamples, max_step: FloatArray
 ) -> FloatArray:
-    """Points (n, 3), moved towards a level set on which f - level has a multiple root: f - level =
-    u^m with m > 1 for some function u. There Newton's steps converge only linearly, each being 1 -
-    1/m times the one before. So two of Newton's steps are computed, and the points are moved to the
-    limit of the geometric series that they begin. This is done a few times.
+    """Move points (n, 3) towards a level set on which f - level has a multiple root, that is, f -
+    level = u^m near it for some function u and some m > 1. There Newton's steps converge only
+    linearly: each step is 1 - 1/m times the step before. So two of Newton's steps are computed, and
+    the points are moved to the limit of the geometric series that begins with these two. This is
+    done four times. Returns the moved points (n, 3).
 
     samples: of the function at the points.
-    longest: (n,) the largest length of each of Newton's steps.
+    max_step: (n,) the largest length of each of Newton's steps.
     """
     x = points
     for k in range(_SERIES_STEPS):
-        first = newton_to_level(
-            function, x, samples if k == 0 else function.sample(x), longest, None, steps=1
+        once = newton_to_level(
+            function, x, samples if k == 0 else function.sample(x), max_step, None, steps=1
         )
-        second = newton_to_level(function, first, function.sample(first), longest, None, steps=1)
-        before, after = row_norms(first - x), row_norms(second - first)
-        ratio = after / np.maximum(before, 1e-300)
+        twice = newton_to_level(function, once, function.sample(once), max_step, None, steps=1)
+        first_length, second_length = row_norms(once - x), row_norms(twice - once)
+        ratio = second_length / np.maximum(first_length, 1e-300)
         is_slow = (ratio > _RATE_RANGE[0]) & (ratio < _RATE_RANGE[1])
         factor = np.where(is_slow, 1 / (1 - np.minimum(ratio, _RATE_RANGE[1])), 1.0)
-        x = first + factor[:, None] * (second - first)
+        x = once + factor[:, None] * (twice - once)
     return x

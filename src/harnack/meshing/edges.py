@@ -1,5 +1,5 @@
-"""Edges of triangles and tetrahedra, found by integer keys; products and norms of rows; normals of
-triangles, and distances from them.
+"""Edges of triangles and tetrahedra, identified by integer keys; products and norms of rows;
+normals of triangles, and distances from triangles.
 
 `row_dots` and `row_norms` are here because numpy's own sums along an axis of length three are slow.
 """
@@ -51,16 +51,17 @@ IntArray = npt.NDArray[np.int64]
 
 
 def distance_from_triangles(point: FloatArray, corner: FloatArray) -> float:
-    """An upper bound of the distance of a point (3,) from the nearest of triangles (k, 3, 3), equal
-    to it but for rounding; infinity if there are no triangles."""
+    """The distance of a point (3,) from the nearest of triangles (k, 3, 3), rounded up; infinity if
+    there are no triangles."""
     return float(distances_from_triangles(point, corner).min(initial=np.inf))
 
 
 def distances_from_triangles(points: FloatArray, corner: FloatArray) -> FloatArray:
-    """(k,) an upper bound of the distance of each of k points (k, 3), or of a single point (3,),
-    from the triangle (k, 3, 3) of the same index; it is equal to the distance but for rounding. It
-    is the smallest distance from the triangle's edges, and from its plane if the projection of the
-    point is in the triangle."""
+    """(k,) the distances of points (k, 3), each from the triangle with the same index in `corner`
+    (k, 3, 3); or the distances of a single point (3,) from all triangles. They are upper bounds
+    that differ from the distances only by rounding. A distance is the smallest distance of the
+    point from the triangle's edges and, if the projection of the point lies in the triangle, from
+    its plane."""
     distance = np.full(len(corner), np.inf)
     for k in range(3):
         start, edge = corner[:, k], corner[:, k - 1] - corner[:, k]
@@ -103,7 +104,8 @@ class Edges:
         return cls(np.stack(np.divmod(keys, max(count, 1)), axis=1), index, uses, order)
 
     def paired_half_edges(self) -> IntArray:
-        """(j, 2) for each edge that occurs exactly twice, the indices of the two pairs."""
+        """(j, 2) for each edge that occurs exactly twice, the indices of the two pairs that are
+        this edge."""
         return self.pairs_by_edge[np.repeat(self.multiplicity == 2, self.multiplicity)].reshape(
             -1, 2
         )
@@ -117,14 +119,15 @@ def edge_keys(pairs: IntArray, count: int) -> IntArray:
 
 
 def half_edges(faces: IntArray) -> IntArray:
-    """(3m, 2) the directed edges of faces (m, 3): first all edges from corner 0 to corner 1, then
-    those from 1 to 2, then those from 2 to 0."""
+    """(3m, 2) the directed edges of faces (m, 3), by the indices of their ends: first the edges of
+    all faces from corner 0 to corner 1, then all from 1 to 2, then all from 2 to 0. So row k m + i
+    is edge k of face i."""
     return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
 
 
 def boundary_edges(faces: IntArray) -> IntArray:
-    """(k, 2) the edges that have a single face, among faces (m, 3); each in the direction of its
-    face."""
+    """(k, 2) the edges at which faces (m, 3) have a boundary: only a single face has such an edge.
+    Each is given by the indices of its ends, in the direction in which its face runs it."""
     pairs = half_edges(faces)
     edges = Edges.of(pairs)
     return pairs[edges.multiplicity[edges.edge_of_pair] == 1]

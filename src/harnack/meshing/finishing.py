@@ -1,4 +1,5 @@
-"""The last steps of meshing: thickening, simplification, and facts for the meshes' metadata."""
+"""The last steps of meshing: thickening of open surfaces, simplification, and conversion to
+trimesh, with facts about the mesh in its metadata."""
 
 from __future__ import annotations
 
@@ -46,17 +47,17 @@ _MIN_SIDE_DISTANCE = 0.98
 def thicken(
     surface: TriangleMesh, normals: FloatArray, thickness: float, tolerance: float
 ) -> tuple[TriangleMesh, dict[str, Any]]:
-    """A closed part of a given thickness around a surface, and facts about it. The fact
-    `thickened_by` is "offset" or "hulls of balls".
+    """Make a closed part of a given thickness around an open surface. Returns the part, and facts
+    about it as a dictionary, whose entry `thickened_by` is "offset" or "hulls of balls".
 
     Let t be the thickness, and let the surface's reach be the largest distance up to which points
     have a single closest point on it. If the reach is larger than t/2, the part consists of the
     surface moved by t/2 to both sides along its normals, and of walls along its boundary, straight
-    between the sides, so that the boundary stays where it is. To second order its volume is area
-    times t, plus K t^2/12 of that, with the Gaussian curvature K. If triangles turn over in this
-    way, or come nearer to the surface than t/2, or pass through each other, the part is instead the
-    union of the convex hulls of three balls around the corners of each triangle: all points within
-    t/2 of the surface, with a round boundary.
+    between the sides, so that the boundary stays where it is. To second order in t, its volume is
+    area * t * (1 + K t^2/12), with the Gaussian curvature K. If triangles turn over in this way, or
+    come nearer to the surface than t/2, or pass through each other, the part is instead a union
+    over all triangles, each contributing the convex hull of three balls of radius t/2 around its
+    corners: all points within t/2 of the surface, with a round boundary.
 
     normals: (n, 3) unit normals at the vertices, on the side from which faces run
         counter-clockwise.
@@ -112,13 +113,13 @@ def _normal_cosines(surface: TriangleMesh, normals: FloatArray) -> FloatArray:
 
 
 def _why_too_thick(surface: TriangleMesh, normals: FloatArray, thickness: float) -> str | None:
-    """Why half of the thickness is larger than the surface's reach, in words; None if nothing shows
-    that. The reach is the largest distance up to which points have a single closest point on the
-    surface.
+    """The reason, in words, why half of the thickness is larger than the surface's reach; None if
+    there is no sign of that. The reach is the largest distance up to which points have a single
+    closest point on the surface.
 
-    It is shown by triangles that turn over when their vertices are moved along their normals to a
-    side, or by points of a side that are nearer to the surface than they should be: near a vertex
-    that is not joined by an edge to the one that the point was moved from.
+    There are two signs: triangles turn over when their vertices are moved along the normals by half
+    of the thickness; or a moved vertex comes nearer than that to another vertex to which no edge
+    joins it.
     """
     import scipy.spatial  # imported here: it takes half a second
 
@@ -147,7 +148,8 @@ def _why_too_thick(surface: TriangleMesh, normals: FloatArray, thickness: float)
 
 
 def _hull_union(surface: TriangleMesh, radius: float, tolerance: float, why: str) -> TriangleMesh:
-    """The union of the convex hulls of three balls around the corners of each triangle.
+    """The union over all triangles of the convex hulls of three balls around the triangle's
+    corners.
 
     Balls are polyhedra with their corners on the sphere, so that the union lies inside of that for
     exact balls: by at most the larger of `tolerance` and a tenth of the radius, unless that would
@@ -199,9 +201,9 @@ def check_options(spacing: Any, thickness: Any, seed: Any, most: Any) -> None:
 
 def vertex_normals(function: LevelFunction, surface: TriangleMesh) -> FloatArray:
     """(n, 3) unit normals at the vertices of a surface. They point along the gradient of the field.
-    Where the field has no gradient, as at a curve at which the surface ends, or where the gradient
-    is far from the direction of the faces, they are the mean of the normals of the faces there,
-    weighted by area."""
+    At a vertex where the field has no gradient, as at a curve at which the surface ends, or where
+    the gradient is far from the direction of the faces, the normal is the mean of the normals of
+    the faces there, weighted by area."""
     corner = surface.vertices[surface.faces]
     normal = area_normals(corner)
     mean = np.zeros_like(surface.vertices)
@@ -222,12 +224,13 @@ def vertex_normals(function: LevelFunction, surface: TriangleMesh) -> FloatArray
 def simplify_mesh(
     surface: TriangleMesh, tolerance: float, check: Callable[[TriangleMesh], None]
 ) -> tuple[TriangleMesh, dict[str, Any]]:
-    """A closed surface with fewer triangles, or the same surface if that fails; and facts about it.
+    """Make a closed surface with fewer triangles. Returns the surface, or the same surface if that
+    fails, and facts about it as a dictionary.
 
-    manifold3d simplifies the surface, which keeps some of its vertices and moves the surface by
-    less than a fraction of the tolerance; half of the tolerance is for all other errors. Triangles
-    that then pass through each other are mended. If mending or the check fails, a smaller fraction
-    is tried.
+    The library manifold3d simplifies the surface: it keeps some of the vertices and moves the
+    surface by less than a fraction of the tolerance; half of the tolerance is left for all other
+    errors. If triangles then pass through each other, vertices near them are moved. If they still
+    do, or the check fails, a smaller fraction is tried.
 
     check: raises MeshingError if a surface, none of whose triangles pass through each other, fails
         its checks.

@@ -1,10 +1,11 @@
-"""Harmonic hole fillings. They lie on surfaces on which the winding number of a mesh is 1/2, and
-fill all holes at once.
+"""Harmonic hole fillings: they lie on the surface on which the winding number of a mesh is 1/2
+modulo 1, and fill all holes of the mesh at once.
 
 Let w be the winding number. Its level 1/2, modulo 1, is the level 2 pi of the solid angle of the
-boundary edges (`geometry.chains`): a smooth surface that ends at these edges. It is meshed so that
-it has these very edges, and joined to the mesh by the indices of their vertices. It connects the
-boundary loops of one gap, whereas `hole_filling` closes each loop by itself.
+boundary edges (`geometry.chains`): a smooth surface that ends at these edges. The surface is meshed
+so that the mesh has exactly these boundary edges, and both meshes are joined at the common
+vertices. A harmonic filling connects all boundary loops of a gap, whereas `hole_filling` closes
+each loop by itself.
 """
 
 from __future__ import annotations
@@ -60,7 +61,8 @@ _CELLS_ACROSS = 24
 # How often edges of holes that are missing among those of the tetrahedra are halved; and the
 # largest number of pieces, in all and for each edge: so many arise where edges lie on each other.
 _MAX_HALVINGS, _MAX_PIECES, _MAX_PIECES_PER_EDGE = 12, 20_000, 64
-# How often patches that intersect the mesh are computed again, with smaller cells.
+# How often patches (the pieces of a filling) that intersect the mesh are computed again, with
+# smaller cells.
 _MAX_MESH_RETRIES = 1
 # How far the winding number may be from 1/2, modulo 1, at vertices of patches.
 _MAX_WINDING_ERROR = 1e-6
@@ -107,10 +109,10 @@ class HarmonicFilling:
 
 
 def harmonic_patches(
-    vertices: FloatArray, faces: IntArray, edges: IntArray, asked: HoleFillingOptions
+    vertices: FloatArray, faces: IntArray, edges: IntArray, options: HoleFillingOptions
 ) -> HarmonicFilling:
     """Fill the holes of a mesh by harmonic fillings that end at its boundary edges. If that fails,
-    holes of three edges are filled by triangles, and the others by harmonic fillings.
+    holes of three edges are filled by triangles, and all other holes by harmonic fillings.
 
     vertices: (n, 3) of the mesh.
     faces: (m, 3) of the mesh.
@@ -120,16 +122,16 @@ def harmonic_patches(
         MeshingError: fillings could not be computed, or intersect the mesh or each other.
     """
     try:
-        return _fill_all_holes(vertices, faces, edges, asked)
+        return _fill_all_holes(vertices, faces, edges, options)
     except MeshingError as error:
         missing = triangle_fills(vertices, faces, edges)
         if not len(missing):
             raise
         first = error
-    asked.report(f"once more, with triangles in {len(missing):,} holes of three edges")
+    options.report(f"once more, with triangles in {len(missing):,} holes of three edges")
     together = np.concatenate([faces, missing])
     try:
-        filling = _fill_all_holes(vertices, together, checked_boundary_edges(together), asked)
+        filling = _fill_all_holes(vertices, together, checked_boundary_edges(together), options)
     except MeshingError as error:
         raise MeshingError(
             f"{first}; and with triangles in {len(missing):,} holes of three edges: {error}"
@@ -141,13 +143,13 @@ def harmonic_patches(
 def _fill_all_holes(
     vertices: FloatArray, faces: IntArray, edges: IntArray, options: HoleFillingOptions
 ) -> HarmonicFilling:
-    """The harmonic filling of all holes: patches that end at the boundary edges (k, 2). Where a
-    check fails, they are computed again with smaller cells there.
+    """The harmonic filling of all holes: faces that end at the boundary edges `edges` (k, 2) of the
+    mesh. If a check fails in known places, the filling is computed again with smaller cells there.
 
     faces: (m, 3) of the mesh.
 
     Raises:
-        MeshingError: as `harmonic_patches`.
+        MeshingError: the filling could not be computed, or intersects the mesh or itself.
     """
     if not len(edges):
         return HarmonicFilling(vertices[:0], faces[:0], True, 0.0, 0)
@@ -190,11 +192,13 @@ def _fill_all_holes(
 
 
 class _MeshIntersectionError(LocalizedMeshingError):
-    """Patches intersect the mesh."""
+    """A harmonic filling intersects the mesh; `locations` holds the centers of its faces that
+    do."""
 
 
 def checked_boundary_edges(faces: IntArray) -> IntArray:
-    """(k, 2) the edges that have a single face, in the direction of that face.
+    """(k, 2) the boundary edges of faces (m, 3), which have a single face each; in the direction in
+    which this face runs them.
 
     Raises:
         MeshError: an edge has more than two faces, or two that run it in the same direction.
@@ -222,8 +226,8 @@ def checked_boundary_edges(faces: IntArray) -> IntArray:
 
 
 def triangle_fills(vertices: FloatArray, faces: IntArray, edges: IntArray) -> IntArray:
-    """(k, 3) triangles that fill holes of three edges; those that would intersect other triangles
-    are left out.
+    """(k, 3) triangles that fill those holes of a mesh that have three edges. Triangles that would
+    intersect other triangles are left out.
 
     vertices, faces: of the mesh.
     edges: (n, 2) its boundary edges, in the direction of the faces.
@@ -260,21 +264,24 @@ def _mesh_patches(
     is_last: bool,
     report: Callable[[str], None],
 ) -> HarmonicFilling:
-    """The level set of the function that ends at the boundary edges (k, 2) of the mesh, as a
-    filling.
+    """The level set of the function, meshed so that it ends at the boundary edges `edges` (k, 2) of
+    the mesh; as a filling.
 
-    The edges are edges of Delaunay's tetrahedra; those that are missing there are halved first, and
-    their midpoints are removed from the patches afterwards.
+    The level set is meshed in a Delaunay tetrahedralization that contains all boundary edges. Edges
+    that are missing in it are halved first, and their midpoints are removed from the filling
+    afterwards.
 
     vertices: (n, 3) of the mesh.
-    spacing: the size of cells; they are halved in each entry of `finer` that they meet.
+    spacing: the size of cells, a length.
+    finer: sets of balls; cells are halved once for each set that has a ball which meets them.
     tolerance: a length.
     seed: of the random moves of points.
-    is_last: whether this is the last attempt, in which patches are accepted that cannot be refined.
+    is_last: whether this is the last attempt; then a filling that cannot be refined to the
+        tolerance is accepted.
 
     Raises:
-        MeshingError: no patch ends at the edges, or a check of `mesh` fails; a TriangleLimitError
-            if edges are cut into too many pieces.
+        MeshingError: no filling ends at the edges, or a check of the mesh fails; a
+            TriangleLimitError if edges are cut into too many pieces.
     """
     rim, rim_edges = np.unique(edges, return_inverse=True)
     boundary = BoundaryCurve(vertices[rim], rim_edges.reshape(-1, 2))
@@ -338,11 +345,11 @@ def _refine_patches(
     tolerance: float,
     report: Callable[[str], None],
 ) -> tuple[FloatArray, IntArray]:
-    """The vertices and faces of patches, refined to the tolerance. Three ways are tried, and the
-    first whose result does not pass through itself is taken: smoothing, refining and improving;
+    """Refine a filling to the tolerance; returns its vertices and faces. Three ways are tried, and
+    the first result that does not pass through itself is taken: smoothing, refining and improving;
     smoothing before and after refining; refining alone.
 
-    x: (n, 3) the vertices of the patches.
+    x, faces: (n, 3), (m, 3) the filling before refinement.
     tolerance: a length.
 
     Raises:
@@ -374,21 +381,21 @@ def _refine_patches(
 
 
 def _new_nonmanifold_vertices(before: IntArray, after: IntArray) -> IntArray:
-    """The vertices at which faces are a manifold before, but not after. Vertices in which holes
-    touch are no manifold before either."""
+    """Indices of the vertices at which the faces `before` are a manifold, but the faces `after` are
+    not. (Where holes touch in a vertex, the faces are no manifold in the first place.)"""
     return np.setdiff1d(nonmanifold_vertices(after), nonmanifold_vertices(before))
 
 
 def _collapse_midpoint(x: FloatArray, faces: IntArray, middle: int, ends: list[int]) -> IntArray:
-    """The faces after the vertex `middle`, which halves a boundary edge, was merged with one end of
-    that edge. Of the two ends the one is taken for which fewer faces intersect or, if the numbers
-    are equal, the one for which the faces around the vertex are turned less.
+    """Merge the vertex `middle`, which halves a boundary edge, with one end of that edge; returns
+    the new faces. It is the end for which fewer faces intersect afterwards or, if the numbers are
+    equal, the end for which the faces around the vertex turn less.
 
     x: (n, 3) the vertices.
     ends: the two vertices at the ends of the edge.
 
     Raises:
-        LocalizedMeshingError: merging with either end would join other faces than those at the
+        LocalizedMeshingError: merging with either end would also join faces that are not at the
             edge.
     """
     in_star = (faces == middle).any(axis=1)
@@ -400,8 +407,8 @@ def _collapse_midpoint(x: FloatArray, faces: IntArray, middle: int, ends: list[i
             continue
         moved = np.where(star == middle, end, star)
         is_kept = ~(star == end).any(axis=1)
-        one, other = _unit_normals(x[star[is_kept]]), _unit_normals(x[moved[is_kept]])
-        cosine = float((one * other).sum(axis=1).min(initial=1.0))
+        before, after = _unit_normals(x[star[is_kept]]), _unit_normals(x[moved[is_kept]])
+        cosine = float((before * after).sum(axis=1).min(initial=1.0))
         new_faces = np.concatenate([others, moved[is_kept]])
         is_moved = np.arange(len(new_faces)) >= len(others)
         candidates.append((len(intersecting_faces(x, new_faces, is_moved)), -cosine, new_faces))
@@ -411,7 +418,7 @@ def _collapse_midpoint(x: FloatArray, faces: IntArray, middle: int, ends: list[i
             "subdivide the mesh there, or choose a smaller `cell_size`",
             x[[middle]],
         )
-    return min(candidates, key=lambda one: one[:2])[2]
+    return min(candidates, key=lambda candidate: candidate[:2])[2]
 
 
 def _unit_normals(corners: FloatArray) -> FloatArray:
@@ -421,9 +428,9 @@ def _unit_normals(corners: FloatArray) -> FloatArray:
 
 
 def _check_boundary(x: FloatArray, faces: IntArray, boundary: BoundaryCurve) -> None:
-    """Raise LocalizedMeshingError unless the boundary edges of the patches are those of `boundary`,
-    run in the same direction. The patches are turned over afterwards, so that they run each edge
-    against the mesh's faces."""
+    """Raise LocalizedMeshingError unless the boundary edges of a filling are the edges of the curve
+    `boundary`, run in the same direction. (The filling is turned over afterwards, so that it runs
+    each edge opposite to the face of the mesh.)"""
     directed = {(int(a), int(b)) for a, b in half_edges(faces)}
     open_edges = {(a, b) for a, b in directed if (b, a) not in directed}
     unmatched = open_edges ^ {(int(a), int(b)) for a, b in boundary.edges}
@@ -441,12 +448,12 @@ def _check_filled_mesh(
     patches: HarmonicFilling,
     report: Callable[[str], None],
 ) -> None:
-    """Check the mesh together with its patches: it is a manifold; at the patches' vertices the
-    winding number of the mesh is 1/2 modulo 1; and the patches intersect neither the mesh nor each
-    other.
+    """Check a mesh together with its filling `patches`: it is a manifold; at the filling's vertices
+    the winding number of the mesh is 1/2 modulo 1; and the filling intersects neither the mesh nor
+    itself.
 
     Raises:
-        LocalizedMeshingError: a check fails; a _MeshIntersectionError if patches intersect the
+        LocalizedMeshingError: a check fails; a _MeshIntersectionError if the filling intersects the
             mesh.
     """
     report("checking the patches")

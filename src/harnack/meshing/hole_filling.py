@@ -1,17 +1,20 @@
-"""Fills the holes of a mesh smoothly. Each hole is bounded by a loop of boundary edges.
+"""Fills the holes of a mesh smoothly. Each hole is bounded by a loop of boundary edges (edges with
+a single face).
 
 A filling begins as a triangulation of its loop: the one that has the smallest dihedral angles, also
 with the faces around the loop (Liepa, Filling Holes in Meshes, 2003); or, for long loops, the one
 with the smallest area (Barequet and Sharir 1995). The two may differ: the smallest area may cut
 through a tube where the smallest angles go around it. Edges are split and flipped until triangles
 are as large as those around the hole. Then the filling is faired, so that it bends as little as
-possible: the sum of squared Laplacians of positions, over the new vertices and those of the loop,
-is minimized, while all vertices of the mesh stay (Botsch and Kobbelt 2004). So the filling
-continues the surface around it, tangents included. The weights of the Laplacians are computed from
-the filling before this step. Repeated, with long edges split in between, fairing converges to
-surfaces whose mean curvature is harmonic, such as spheres and cylinders.
+possible: the sum of squared Laplacians of positions, over the new vertices and the vertices of the
+    loop, is minimized, while all vertices of the mesh stay (Botsch and Kobbelt 2004). So the
+    filling continues the surface around it, tangents included. The weights of the Laplacians are
+    computed from the filling before this step. If the step is repeated, with long edges split in
+    between, it converges to surfaces whose mean curvature is harmonic, such as spheres and
+    cylinders.
 
-Nothing is proved about such fillings. `fill_holes` checks them and returns those that pass.
+Nothing is proved about such fillings. `fill_holes` checks the fillings and returns the ones that
+pass the checks.
 """
 
 from __future__ import annotations
@@ -74,7 +77,8 @@ class HoleFilling:
     faces: (p, 3) the faces of the fillings. Indices below the number of the mesh's vertices stand
         for vertices of the mesh, the following ones for new vertices.
     unfilled_loops: the loops whose fillings failed, each an array of indices of vertices.
-    reason: why these failed, in words, with the number of loops for each reason.
+    reason: why the fillings of these loops failed, in words, with the number of loops for each
+        reason.
     """
 
     vertices: FloatArray
@@ -90,11 +94,13 @@ def fill_holes(
 
     A filling is accepted if its triangles have positive area and intersect no other triangle, and
     if the mesh's winding number at its vertices and at the centers of its faces is near 1/2 modulo
-    1. The latter fails if a loop does not bound a hole by itself: two loops bound one gap, or
-    another component stands in the hole. Loops that fail are tried again with the triangulation of
-    smallest area, then without fairing.
+    1. The winding number is not near 1/2 if a loop does not bound a hole by itself: two loops bound
+    one gap, or another component stands in the hole. Loops whose fillings are not accepted are
+    tried again: with the triangulation of smallest area, then without fairing.
 
-    winding: returns the winding number (k,) of the mesh at points (k, 3).
+    vertices, faces: (n, 3), (m, 3) the mesh.
+    loops: the indices of the vertices of each loop (`hole_loops`).
+    winding: returns the winding numbers (k,) of the mesh at points (k, 3).
     """
     x, together = vertices, faces
     pending: list[IntArray] = loops
@@ -113,8 +119,8 @@ def fill_holes(
 
 
 def _drop_unused(x: FloatArray, faces: IntArray, input_count: int) -> tuple[FloatArray, IntArray]:
-    """The vertices (n, 3) and faces, without vertices that no face uses. The first `input_count`
-    vertices, those of the mesh, are kept in any case."""
+    """Remove the vertices that no face uses; returns vertices and faces. The first `input_count`
+    vertices, which belong to the input mesh, are kept in any case."""
     used = np.zeros(len(x), np.bool_)
     used[:input_count] = True
     used[faces] = True
@@ -129,12 +135,13 @@ def _failure_reasons(
     input_count: int,
     winding: Winding,
 ) -> dict[int, str]:
-    """The reasons why patches fail, by the indices of their loops.
+    """The reasons, in words, why patches (fillings of single loops) are not accepted; a dictionary
+    whose keys are the indices of their loops.
 
-    x: (n, 3) all vertices; the first `input_count` are those of the mesh.
+    x: (n, 3) all vertices; the first `input_count` are the vertices of the mesh.
     faces: (m, 3) of the mesh.
     new: (p, 3) the faces of all patches.
-    owner: (p,) the index of the loop whose patch each of these belongs to.
+    owner: (p,) for each face of a patch, the index of the loop that the patch fills.
     winding: the winding number of the mesh at points (k, 3).
     """
     reasons: dict[int, str] = {}
@@ -160,11 +167,15 @@ def _failure_reasons(
 
 
 def hole_loops(vertices: FloatArray, faces: IntArray, edges: IntArray) -> list[IntArray]:
-    """The loops that boundary edges (k, 2) form, each an array of indices of vertices without
-    repetition. Edges and loops run in the direction of the faces at the edges.
+    """The closed loops that boundary edges form, each an array of indices of vertices without
+    repetition.
 
-    If several holes meet at a vertex, a loop goes on with the edge that bounds the same gap between
-    the faces around the vertex, as seen along the normal there.
+    vertices, faces: (n, 3), (m, 3) the mesh.
+    edges: (k, 2) its boundary edges, in the direction in which the faces run them; loops have this
+        direction too.
+
+    If several holes meet at a vertex, a loop goes on with the other edge of the same gap between
+    the faces around the vertex.
     """
     leaving: defaultdict[int, list[int]] = defaultdict(list)
     arriving: defaultdict[int, list[int]] = defaultdict(list)
@@ -201,13 +212,14 @@ def hole_loops(vertices: FloatArray, faces: IntArray, edges: IntArray) -> list[I
 def _match_loop_edges(
     x: FloatArray, v: int, normal: FloatArray, starts: list[int], ends: list[int]
 ) -> list[int]:
-    """The vertices with which loops go on at the vertex `v`, one for each vertex in `starts`.
-    Coming from a start, it is the next end counter-clockwise, seen from where the normal points:
-    faces are to the left of their edges, and holes to the right.
+    """Find the vertices with which loops go on at the vertex `v`, at which several holes meet.
+    Returns one of `ends` for each vertex in `starts`. It is the next end counter-clockwise from the
+    start, around v and as seen from where the normal points: faces are to the left of their edges,
+    and holes to the right.
 
     normal: (3,) of the surface at v, of any length.
-    starts, ends: the vertices from which boundary edges lead to v, and those to which they lead
-        from v.
+    starts, ends: the vertices from which boundary edges lead to v, and the vertices to which
+        boundary edges lead from v.
     """
     axis = np.eye(3)[np.abs(normal).argmin()]
     unit_normal = normal / max(float(np.linalg.norm(normal)), 1e-300)
@@ -240,12 +252,14 @@ def _make_patches(
 ) -> tuple[FloatArray, IntArray, IntArray, dict[int, str]]:
     """Triangulate all loops, refine the triangulations, and fair them.
 
-    by_angles: whether loops are triangulated by angles.
-    fairings: how often patches are faired.
+    by_angles: whether loops are triangulated so that angles between neighboring triangles are
+        small; otherwise so that the area is small.
+    fairings: how often patches are faired, that is, their vertices are moved so that they bend
+        least.
 
-    Returns all vertices (n, 3), those of patches last; the faces (p, 3) of patches; (p,) the index
-    of the loop that each face belongs to; and, by the indices of their loops, the reasons why loops
-    have no patch.
+    Returns all vertices (n, 3), the new ones last; the faces (p, 3) of patches; (p,) for each face
+    the index of the loop that it helps to fill; and a dictionary from the indices of loops without
+    a patch to the reasons, in words.
     """
     third = _opposite_corners(faces, np.unique(np.concatenate(loops)), len(vertices))
     used_edges = {(min(edge), max(edge)) for edge in third}
@@ -277,8 +291,8 @@ def _make_patches(
 
 
 def _opposite_corners(faces: IntArray, rims: IntArray, count: int) -> dict[tuple[int, int], int]:
-    """The third corner of the face at each directed edge between two of the vertices `rims`; faces
-    run the edge in that direction.
+    """A dictionary from directed edges to the third corner of the face that runs the edge in this
+    direction; for edges between two of the vertices `rims`.
 
     count: the number of vertices of the mesh.
     """
@@ -292,8 +306,8 @@ def _opposite_corners(faces: IntArray, rims: IntArray, count: int) -> dict[tuple
 
 
 def _forbidden_diagonals(polygon: IntArray, used_edges: set[tuple[int, int]]) -> BoolArray:
-    """(n, n) for each pair of a polygon's vertices, by their positions in it, whether an edge joins
-    them already, so that no diagonal may. False for the polygon's own edges.
+    """(n, n) for each pair of positions in a polygon, whether an edge joins the two vertices
+    already, so that no diagonal may join them. False for the polygon's own edges.
 
     polygon: (n,) indices of vertices.
     used_edges: all edges, the lower index first.
@@ -322,13 +336,13 @@ def _min_area_triangulation(
     third: dict[tuple[int, int], int],
     used_edges: set[tuple[int, int]],
 ) -> IntArray | None:
-    """The triangulation (n - 2, 3) of a polygon with the smallest area; None if existing edges
-    exclude every triangulation. By dynamic programming: cost[i, k] is the smallest area for the
-    vertices from position i to position k.
+    """Triangulate a polygon with the smallest area. Returns the triangles (n - 2, 3); None if
+    existing edges exclude every triangulation. By dynamic programming: cost[i, k] is the smallest
+    area for the vertices from position i to position k.
 
     x: (m, 3) all vertices.
     polygon: (n,) indices of vertices.
-    third: unused; there for calls like those of `_min_dihedral_triangulation`.
+    third: unused; the parameters are those of `_min_dihedral_triangulation`.
     used_edges: edges that exist already; they are no diagonals.
     """
     n, corner = len(polygon), x[polygon]
@@ -375,9 +389,10 @@ def _min_dihedral_triangulation(
     third: dict[tuple[int, int], int],
     used_edges: set[tuple[int, int]],
 ) -> IntArray | None:
-    """The triangulation (n - 2, 3) of a polygon whose largest angle between the normals of
-    neighbors is smallest, faces around the polygon included; of equal ones that with the smallest
-    area (Liepa 2003). None if existing edges exclude every triangulation.
+    """Triangulate a polygon so that the largest angle between the normals of neighboring triangles,
+    also with the faces around the polygon, is as small as possible. Of triangulations with equal
+    angles, that of the smallest area is chosen (Liepa 2003). Returns the triangles (n - 2, 3); None
+    if existing edges exclude every triangulation.
 
     By dynamic programming over the vertices from position i to position k: turn[i, k] is minus the
     cosine of the largest angle, area[i, k] twice the area, and beside[i, k] the normal of the
@@ -385,7 +400,8 @@ def _min_dihedral_triangulation(
 
     x: (m, 3) all vertices.
     polygon: (n,) indices of vertices.
-    third: the third corner of the face at each directed edge (`_opposite_corners`).
+    third: from directed edges around the polygon to the third corners of their faces
+        (`_opposite_corners`).
     used_edges: edges that exist already; they are no diagonals.
     """
     n, corner = len(polygon), x[polygon]
@@ -436,14 +452,14 @@ def _normalized(vectors: FloatArray) -> FloatArray:
 def _refine_patches(
     vertices: FloatArray, faces: IntArray, new: IntArray, fixed_edges: IntArray
 ) -> tuple[FloatArray, IntArray]:
-    """Split and flip edges until the triangles of patches are about as large as those around them;
-    new vertices are moved to the middle of their neighbors.
+    """Split and flip edges of patches until the triangles are about as large as the faces around
+    the patch. New vertices are moved to the means of their neighbors.
 
     new: (p, 3) the faces of patches.
     fixed_edges: (t, 2) the existing edges of the mesh, which no flip may make again.
 
-    Returns all vertices (n, 4), new ones last, with the usual length of edges there in the last
-    column; and the faces of patches.
+    Returns all vertices (n, 4), new ones last; column 3 is the usual length of edges near the
+    vertex. Also the faces (q, 3) of patches.
     """
     input_count = len(vertices)
     x = np.column_stack([vertices, _mean_edge_lengths(vertices, faces, np.unique(new))])
@@ -457,8 +473,9 @@ def _refine_patches(
 
 
 def _split_long_edges(x: FloatArray, new: IntArray) -> tuple[FloatArray, IntArray]:
-    """Split inner edges of patches in the middle that are longer than `_LONG_RATIO` times the
-    mean of the usual lengths at their ends.
+    """Split those inner edges of patches at their midpoints that are longer than `_LONG_RATIO`
+    times the mean of the usual lengths at their ends. Returns the vertices (j, 4) and the faces of
+    patches.
 
     x: (n, 4) vertices, with the usual length of edges in the last column; new vertices get the mean
         of the values at both ends.
@@ -491,16 +508,17 @@ def _mean_edge_lengths(x: FloatArray, faces: IntArray, rims: IntArray) -> FloatA
 
 
 def _relax_new_vertices(x: FloatArray, new: IntArray, input_count: int) -> FloatArray:
-    """(n, 4) the rows of `x`, with those from `input_count` on replaced so that each is the mean of
-    its neighbors' rows in the graph of the patches' edges."""
+    """Move new vertices of patches to the means of their neighbors: rows from index `input_count`
+    of x (n, 4) are replaced so that each is, in the sense of least squares, the mean of the rows of
+    its neighbors along edges of patches. Returns the new array (n, 4)."""
     ends = Edges.of(half_edges(new)).vertices
     laplacian = _graph_laplacian(ends, np.ones(len(ends)), len(x))
     return _solve_least_squares(laplacian[input_count:], x, input_count)
 
 
 def _solve_least_squares(matrix: Any, x: FloatArray, input_count: int) -> FloatArray:
-    """`x` (n, d) with the rows from `input_count` on replaced so that the sum of squares of matrix
-    @ x is smallest.
+    """Replace the rows of x (n, d) from index `input_count` on so that the sum of squares of all
+    entries of matrix @ x is smallest. Returns the new array (n, d).
 
     matrix: (k, n) sparse.
     """
@@ -518,7 +536,9 @@ def _graph_laplacian(ends: IntArray, weight: FloatArray, count: int) -> Any:
     """The Laplacian (count, count) of a graph, as a sparse matrix: -weight for each edge, and at
     each vertex the sum of the weights of its edges.
 
-    ends: (k, 2) the vertices of each edge. weight: (k,). count: the number of vertices.
+    ends: (k, 2) the vertices of each edge.
+    weight: (k,) the weights of the edges.
+    count: the number of vertices.
     """
     import scipy.sparse  # imported here: it takes half a second
 
@@ -536,10 +556,10 @@ def _graph_laplacian(ends: IntArray, weight: FloatArray, count: int) -> Any:
 
 
 def _fair_patches(x: FloatArray, faces: IntArray, new: IntArray, input_count: int) -> FloatArray:
-    """(n, 3) the vertices, with those from `input_count` on moved so that the patches and the faces
-    around them bend least: the sum over vertices of the squared Laplacian of the position, times
-    the vertex's area, is smallest. Vertices of patches count in the sum, except those at edges that
-    remain open.
+    """Move the vertices from index `input_count` on so that the patches and the faces around them
+    bend least. Returns all vertices (n, 3). The sum over the vertices of patches of |Laplacian of
+    the position|^2, times the vertex's share of the area, is made as small as possible. Vertices at
+    edges that remain open do not count in the sum.
 
     faces: (m, 3) of the mesh.
     new: (p, 3) of patches.
@@ -568,9 +588,9 @@ def _fair_patches(x: FloatArray, faces: IntArray, new: IntArray, input_count: in
 
 
 def _flip_edges(x: FloatArray, new: IntArray, fixed_edges: IntArray) -> IntArray:
-    """The faces of patches (p, 3) with edges flipped so that the angles opposite to them become
-    small (Delaunay's criterion). An edge is flipped only if the new edge does not exist yet and no
-    triangle turns over.
+    """Flip edges of patches so that the angles opposite to edges become small (Delaunay's
+    criterion). Returns the new faces (p, 3). An edge is flipped only if the new edge does not exist
+    yet and no triangle turns over.
 
     The edge from a to b of the faces f, with the third corner c, and g, with the third corner d, is
     replaced by the edge from c to d. An edge is flipped if the sum of the cotangents of the angles
@@ -619,8 +639,8 @@ def _cotangents(a: FloatArray, b: FloatArray, apex: FloatArray) -> FloatArray:
 
 
 def _loop_of_faces(new: IntArray, loops: list[IntArray], count: int) -> IntArray:
-    """(p,) the index of the loop whose patch each face belongs to. The faces of a patch are joined
-    by edges, and one of them is at the first edge of the loop.
+    """(p,) for each face of a patch, the index of the loop that the patch fills. The faces of a
+    patch are connected by edges, and one face is at the first edge of the loop.
 
     count: the number of vertices.
     """

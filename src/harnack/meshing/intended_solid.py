@@ -2,8 +2,9 @@
 differs from it.
 
 A closed mesh need not be right: a filling may cut off half of a solid. So each result of `repair`
-is compared with the winding number w of the input, at points away from both surfaces: where w is
-clearly above 1/2 the result must have its inside, and where it is clearly below its outside.
+is compared with the winding number w of the input mesh, at points away from the surfaces of both.
+Points at which w is clearly above 1/2 have to be inside of the result, and points at which w is
+clearly below 1/2 have to be outside.
 """
 
 from __future__ import annotations
@@ -60,14 +61,14 @@ _OPEN_SHARE = 0.4
 
 @dataclass(frozen=True)
 class Difference:
-    """How the result of a repair differs from the input.
+    """How the closed surface that a repair returned differs from the input mesh.
 
     share: the fraction of the compared points that are on the wrong side of the surface.
     places: (k, 3) some of these points.
     missing: the number of points that should be inside, and are not.
     added: the number of points that should not be inside, and are.
-    volumes: of the surface, and of the input. None if they agree, or if the input is not a closed
-        mesh that winds around every point at most once."""
+    volumes: the volume of the surface, and the volume of the input. None if they agree, or if the
+        input is not a closed mesh that winds around every point at most once."""
 
     share: float
     places: FloatArray
@@ -103,7 +104,8 @@ class Difference:
 
 @dataclass(frozen=True)
 class IntendedSolid:
-    """A mesh whose corners are joined and that is not inside out.
+    """The solid that a damaged mesh is meant to bound: the mesh with equal corners joined and with
+    faces turned over so that it is not inside out.
 
     vertices, faces: (n, 3), (m, 3) the mesh.
     is_turned: (m,) the mask of the faces whose orientation was reversed.
@@ -133,7 +135,7 @@ class IntendedSolid:
         counter-clockwise.
 
         Raises:
-            MeshError: as `validate_mesh`.
+            MeshError: the vertices or faces are not valid (`validate_mesh`).
         """
         x, faces = validate_mesh(
             np.asarray(mesh.vertices), np.asarray(mesh.faces), allow_zero_area=True
@@ -168,7 +170,7 @@ class IntendedSolid:
 
     @functools.cached_property
     def field(self) -> WindingNumber | None:
-        """The winding number of the mesh; None if all faces cancel each other."""
+        """The winding number of the mesh, as a field; None if all faces cancel each other."""
         return _winding_number(self.vertices, self.oriented)
 
     def winding(self, points: FloatArray) -> FloatArray:
@@ -202,7 +204,7 @@ class IntendedSolid:
         return points, self.winding(points)
 
     def check_encloses(self) -> None:
-        """Raise if the mesh is an open sheet.
+        """Raise an error if the mesh is an open sheet, which bounds no solid.
 
         At points spread over the faces it is tested whether the winding number on either side is at
         least 1/2. The mesh is an open sheet if that fails on more than 40 % of its area.
@@ -225,10 +227,12 @@ class IntendedSolid:
             )
 
     def difference(self, surface: TriangleMesh, away: float) -> Difference | None:
-        """The difference of a closed surface from the input, or None if there is none.
+        """How a closed surface, the result of a repair, differs from this solid; None if no
+        difference is found.
 
-        It is measured at points that are farther than `away` (a length) from both, and at points
-        next to closed parts that are farther than `away` from the surface."""
+        It is measured at points that are farther than `away` (a length) from the surface and from
+        the input mesh; and at points next to closed parts of the input that are farther than `away`
+        from the surface."""
         points, w = self.samples
         corner = surface.vertices[surface.faces]
         near_surface = _near(corner, self.size, np.random.default_rng(1))
@@ -276,17 +280,19 @@ def _on_other_side(
     triangles: FloatArray,
     away: float,
 ) -> tuple[int, int, FloatArray]:
-    """Count points on the wrong side of the result of a repair.
+    """Count the points that lie on the wrong side of the result of a repair.
 
     w: the winding numbers (n,) of the input at `points` (n, 3).
     field: the winding number of the result.
-    triangles: (m, 3, 3). Points within `away` of them are no evidence, as stated below.
+    triangles: (m, 3, 3) the triangles that points have to be away from.
+    away: a length; if only points within this distance of the triangles are on the wrong side, the
+        result counts as right.
 
     Returns:
-        The number of points outside of the result whose winding numbers are clearly above 1/2; the
-        number of points inside whose winding numbers are clearly below; and, among a selection of
-        all these points, those (k, 3) farther than `away` from the triangles. If there are none of
-        the last, both numbers are 0.
+        The number of points outside of the result with w clearly above 1/2; the number of points
+        inside of it with w clearly below 1/2; and the points (k, 3), among at most 40 of all these,
+        that are farther than `away` from the triangles. If there are no such distant points, both
+        numbers are 0.
     """
     inside = _values(field, points) > 0.5
     missing, added = (~inside & (w > 0.5 + _CLEARANCE), inside & (w < 0.5 - _CLEARANCE))
@@ -299,7 +305,8 @@ def _on_other_side(
 
 
 def _winding_number(x: FloatArray, faces: IntArray) -> WindingNumber | None:
-    """The winding number of a mesh, or None if all faces cancel or have no area."""
+    """The winding number of a mesh with vertices x (n, 3) and faces (m, 3), as a field; None if all
+    faces cancel each other or have no area."""
     try:
         return WindingNumber(*without_zero_area_faces(x, faces))
     except MeshError:  # all faces cancel, or have no area
@@ -314,7 +321,8 @@ def _values(field: WindingNumber | None, points: FloatArray) -> FloatArray:
 
 
 def _turned(faces: IntArray, is_turned: BoolArray) -> IntArray:
-    """Faces (m, 3), with the orientation reversed where the mask (m,) is set."""
+    """Reverse the orientation of those faces (m, 3) for which the mask (m,) is set; returns all
+    faces."""
     return np.where(is_turned[:, None], faces[:, ::-1], faces)
 
 
@@ -351,9 +359,10 @@ def _inside_out(x: FloatArray, faces: IntArray, parts: list[IntArray]) -> BoolAr
 
     parts: for each closed part, the indices of its faces.
 
-    A closed part is reversed together with the outermost part that contains it. The faces that
-    belong to no closed part are reversed with the largest closed part that contains them. If none
-    does, they are judged by themselves, and the closed parts inside them are reversed with them."""
+    A closed part is reversed together with the outermost closed part that contains it. The faces
+    that belong to no closed part are reversed together with the largest closed part that contains
+    them. If no closed part contains them, they are reversed if they wind clockwise
+    (`_winds_clockwise`), together with the closed parts inside of them."""
     is_inside_out, is_rest = np.zeros(len(faces), np.bool_), np.ones(len(faces), np.bool_)
     for rows in parts:
         is_rest[rows] = False
@@ -377,8 +386,9 @@ def _inside_out(x: FloatArray, faces: IntArray, parts: list[IntArray]) -> BoolAr
 
 
 def _lies_in(x: FloatArray, faces: IntArray, container: IntArray) -> bool:
-    """Whether the mesh `container` (k, 3) winds around the center of each of a selection of `faces`
-    (m, 3). Both index the vertices x."""
+    """Whether `faces` (m, 3) lie in the mesh with the faces `container` (k, 3): it winds around the
+    centers of about 16 of them. Both refer to the vertices x (n, 3). False if there are no
+    faces."""
     if not len(faces) or not len(container):
         return False
     centers = x[faces[:: max(1, len(faces) // _PART_SAMPLES)]].mean(axis=1)
@@ -386,10 +396,12 @@ def _lies_in(x: FloatArray, faces: IntArray, container: IntArray) -> bool:
 
 
 def _winds_clockwise(x: FloatArray, faces: IntArray) -> bool:
-    """Whether a mesh winds around more points clockwise than counter-clockwise, of points near it.
+    """Whether a mesh with vertices x (n, 3) winds clockwise: of random points near it, it winds
+    around more points clockwise than counter-clockwise.
 
-    Nearly all faces of an ordinary mesh look away from its middle. Then the signed volumes of the
-    tetrahedra between faces and middle decide, without winding numbers."""
+    If nearly all faces look away from the middle of the mesh, as in most meshes, it winds
+    counter-clockwise. That is decided by the signed volumes of the tetrahedra between the faces and
+    the middle, without winding numbers."""
     rng = np.random.default_rng(0)
     triangles = x[faces]
     size = float(np.ptp(triangles, axis=(0, 1)).max())

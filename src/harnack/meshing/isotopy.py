@@ -1,4 +1,5 @@
-"""How much of a mesh in tetrahedra is proved to have the topology of the level set.
+"""On how many tetrahedra a mesh made by marching tetrahedra is proved to have the topology of the
+level set.
 
 Let f be the function minus its level. Let F be the function that is linear on each tetrahedron and
 equals f at the corners; its zero set are the triangles of `marching_tetrahedra`. Let H_t = (1-t) F
@@ -73,13 +74,16 @@ _FAR_FROM_CURVE = 1.5
 
 @dataclass(frozen=True)
 class IsotopyCoverage:
-    """On which part of the tetrahedra the topology of a mesh is proved to be that of the level set.
+    """On which fraction of the tetrahedra the topology of a mesh is proved to be that of the level
+    set.
 
     Only tetrahedra count that may hold a point of the level set, or that hold a point of the mesh.
 
-    proved: the fraction of these on which (a), (b) or (c) is proved. If it is 1, the mesh and the
-        level set are isotopic.
-    proved_off_curve: the same fraction among those farther than 1.5 cells from the curve.
+    proved: the fraction of these tetrahedra on which condition (a), (b) or (c) of the module's
+        theorem is proved. If it is 1, the mesh and the level set are isotopic (one can be deformed
+        into the other).
+    proved_off_curve: the same fraction among the tetrahedra farther than 1.5 cells from the
+        boundary curve.
     count: the number of these tetrahedra. For fields that do not bound the change of their gradient
         only those that hold a point of the mesh are counted.
     unproved_off_curve: (k, 4) the corners of the tetrahedra farther than 1.5 cells from the curve
@@ -91,7 +95,8 @@ class IsotopyCoverage:
     unproved_off_curve: IntArray
 
     def shares(self) -> dict[str, float]:
-        """The two fractions, by the names that they have in the metadata of a mesh."""
+        """The fractions `proved` and `proved_off_curve`, by the names that they have in the
+        metadata of a mesh."""
         return {"isotopy": self.proved, "isotopy_far": self.proved_off_curve}
 
 
@@ -105,13 +110,15 @@ def isotopy_of(
     spacing: float,
     walls: Walls,
 ) -> IsotopyCoverage:
-    """On which tetrahedra the topology of the mesh is proved to be that of the level set.
+    """Find out on which tetrahedra the topology of a mesh is proved to be that of the level set.
 
-    points, tetrahedra: the points, and the indices (m, 4) of the corners of the tetrahedra.
+    points, tetrahedra: points with samples of the function, and for each tetrahedron the indices
+        (m, 4) of its corners among them.
 
     is_cut: (m,) whether a tetrahedron holds a point of the mesh.
     faces: (k, 3) the triangles of the mesh; its first vertices are the points of the tetrahedra.
-    boundary: the curve. spacing: the size of cells.
+    boundary: the curve at which the level set ends.
+    spacing: the size of cells, a length.
     walls: the lower and the upper corner (3,) of the box, on whose faces the surface may end;
         None if it does not end there.
     """
@@ -147,27 +154,29 @@ def isotopy_of(
 
 
 def _has_bounds(function: LevelFunction, corners: FloatArray) -> bool:
-    """Whether the field bounds the change of its gradient on any of a selection of tetrahedra
-    (n, 4, 3). If not, all cut tetrahedra stay unproved, and no others need to be examined."""
+    """Whether the field gives a finite bound of the change of its gradient on at least one of about
+    a hundred of the tetrahedra with corners (n, 4, 3). If it does not, nothing can be proved."""
     tried = corners[:: max(1, len(corners) // _MAX_TRIED)]
     center, radius = _balls(tried)
     return not len(tried) or bool((function.gradient_bounds(center, radius)[1] < _NO_BOUND).any())
 
 
 def _share(proved: BoolArray) -> float:
-    """The fraction of a mask that is set; 1 for an empty mask."""
+    """The fraction of True entries of a mask; 1 for an empty mask."""
     return float(proved.mean()) if len(proved) else 1.0
 
 
 def _balls(corners: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Balls around simplices (n, k, 3): centers (n, 3) and radii (n,)."""
+    """Balls that contain simplices with corners (n, k, 3). Returns the centers (n, 3), the means of
+    the corners, and the radii (n,)."""
     center = corners.mean(axis=1)
     return center, np.linalg.norm(corners - center[:, None], axis=2).max(axis=1)
 
 
 @dataclass(frozen=True)
 class _LinearGradients:
-    """Gradients of the linear interpolation F on tetrahedra.
+    """The gradients of F on tetrahedra. F is the function that is linear on each tetrahedron and
+    equals f - level at the corners.
 
     owner: (k,) the index of the tetrahedron that each gradient belongs to. A tetrahedron has one
         gradient, two or none.
@@ -184,14 +193,16 @@ def _linear_gradients(
     values: FloatArray,
     faces: IntArray,
 ) -> _LinearGradients:
-    """The gradients of F, which interpolates `values` (m, 4) linearly on tetrahedra.
+    """The gradients on m tetrahedra of F, the function that is linear on each tetrahedron and has
+    the values `values` (m, 4) at its corners.
 
     corners, index: (m, 4, 3), (m, 4) the corners of the tetrahedra and the indices of these points.
     faces: (j, 3) of the mesh.
 
     A tetrahedron without a volume has no gradient. If all four corners are on the level, F is 0
-    there. Then, if exactly two of its faces are in the mesh, it has two gradients: the normals of
-    these faces (see "Four corners on the level" above). Otherwise it has none."""
+    there. Then, if exactly two of its faces are in the mesh, F is changed a little inside of it, so
+    that it has two gradients, which are normals of these two faces (see "Four corners on the level"
+    in the module). Otherwise it has no gradient."""
     edges = corners[:, 1:] - corners[:, :1]
     size = np.linalg.norm(edges, axis=2).max(axis=1)
     has_volume = np.abs(np.linalg.det(edges)) > 1e-9 * size**3
@@ -210,17 +221,18 @@ def _linear_gradients(
     sign = np.sign(function.values(corners[rows].mean(axis=1)))
     has_two = in_mesh.sum(axis=1) == 2
     for k, triple in enumerate(triples):
-        those = np.flatnonzero(has_two & in_mesh[:, k])
-        a, b, c = (corners[rows[those], corner] for corner in triple)
+        chosen = np.flatnonzero(has_two & in_mesh[:, k])
+        a, b, c = (corners[rows[chosen], corner] for corner in triple)
         normal = np.cross(b - a, c - a)
-        inward = ((corners[rows[those], k] - a) * normal).sum(axis=1)
-        owners.append(rows[those])
-        slopes.append(normal * (np.sign(inward) * sign[those])[:, None])
+        inward = ((corners[rows[chosen], k] - a) * normal).sum(axis=1)
+        owners.append(rows[chosen])
+        slopes.append(normal * (np.sign(inward) * sign[chosen])[:, None])
     return _LinearGradients(np.concatenate(owners), np.concatenate(slopes))
 
 
 def _triple_keys(triples: IntArray, point_count: int) -> IntArray:
-    """One number for each triple (k, 3) of point indices, the same for any order of the three.
+    """(k,) an integer for each triple (k, 3) of point indices: the same for any order of the three
+    indices, and different for different triples.
 
     point_count: more than the largest index, and less than two million."""
     a, b, c = np.sort(triples, axis=1).T
@@ -235,13 +247,17 @@ def _proved_by_stars(
     slopes: _LinearGradients,
     rows: IntArray,
 ) -> BoolArray:
-    """(k,) whether (c) is proved for the tetrahedra with indices `rows` (k,).
+    """(k,) whether condition (c) of the module's theorem is proved for the tetrahedra with indices
+    `rows` (k,): each corner has a vector n with n . grad F > 0 and n . grad f > 0 on all tetrahedra
+    around the corner.
 
-    corners, index: (m, 4, 3), (m, 4) of all tetrahedra. slopes: the gradients of F on them.
+    corners, index: (m, 4, 3), (m, 4) the corners of all tetrahedra, and the indices of these
+        points.
+    slopes: the gradients of F on the tetrahedra.
 
-    For each corner, the vector n of (c) is computed as by a perceptron: it starts as the sum of all
-    unit gradients of F around the corner; then the gradients whose product with n is not positive
-    are added again, for a few rounds."""
+    For each corner, the vector n is computed as by a perceptron: it starts as the sum of all unit
+    gradients of F around the corner; then the gradients whose product with n is not positive are
+    added again, for a few rounds."""
     vertices = np.unique(index[rows])
     number = np.full(int(index.max(initial=0)) + 1, -1, np.int64)
     number[vertices] = np.arange(len(vertices))
@@ -271,10 +287,13 @@ def _proved_by_stars(
 
 
 def _proved_empty(function: LevelFunction, corners: FloatArray) -> BoolArray:
-    """(n,) whether (a) is proved on tetrahedra (n, 4, 3): f has no zero there.
+    """(n,) whether condition (a) of the module's theorem is proved on tetrahedra with corners (n,
+    4, 3) that the mesh does not meet: f - level has no zero there, and neither has its linear
+    interpolation F.
 
-    They are halved a few times for that. F has no zero there either, and f has no net crossing of a
-    level on their edges, so both lie between the same two levels, which is (a)."""
+    Tetrahedra are halved up to five times, until a ball around each piece is proved to hold no zero
+    of f - level. The mesh is the zero set of F, so F has no zero there. As f does not cross a level
+    on the edges either, both functions have the same sign."""
     owner, pieces = np.arange(len(corners)), corners
     for _ in range(_HALVINGS + 1):
         center, radius = _balls(pieces)
@@ -295,11 +314,15 @@ def _proved_regular(
     slope: FloatArray,
     free: FloatArray,
 ) -> BoolArray:
-    """(n,) whether (a) or (b) is proved on all of simplices (n, k, 3), by halving them.
+    """(n,) whether condition (a) or (b) of the module's theorem is proved on all of each simplex
+    with corners (n, k, 3): f and F have no zero there, or grad f . grad F > 0. Simplices are halved
+    up to five times for that.
 
-    start: (n,) the values of F at the first corners.
-    slope: (n, 3) grad F, or in (c) the vector n.
-    free: (3,) 1 for coordinates in which points may move, 0 for those that a wall fixes."""
+    start: (n,) the values of F at the first corners of the simplices.
+    slope: (n, 3) grad F on each simplex; for condition (c), the vector n of the theorem, and
+        `start` is 0.
+    free: (3,) 1 for coordinates in which points may move, 0 for coordinates that a face of the box
+        fixes."""
     owner, first = np.arange(len(corners)), corners[:, 0]
     pieces, proved = corners, np.ones(len(corners), np.bool_)
     half_period = np.inf if function.period is None else 0.499 * function.period
@@ -354,13 +377,14 @@ def _regular_on_walls(
     rows: BoolArray,
     walls: tuple[FloatArray, FloatArray],
 ) -> BoolArray:
-    """(n,) whether (b) is proved for the projections onto the walls of the box.
+    """(n,) whether, on each tetrahedron, grad f . grad F > 0 is also proved for the projections of
+    the gradients onto the faces of the box (walls) in which it has corners.
 
     rows: (n,) the mask of the tetrahedra whose faces, edges and corners in walls are tested.
     walls: the lower and the upper corner (3,) of the box.
 
-    Tetrahedra that are not in `rows` count as proved if they have no corner on a wall, else as not
-    proved."""
+    Tetrahedra outside of the mask `rows` count as proved if they have no corner on a wall, else as
+    not proved."""
     tolerance = 1e-9 * (walls[1] - walls[0])
     on = np.stack([np.abs(corners - wall) <= tolerance for wall in walls], axis=-1)  # (n, 4, 3, 2)
     proved = rows | ~on.any(axis=(1, 2, 3))
@@ -389,7 +413,7 @@ def _regular_on_walls(
 
 def _distances(points: FloatArray, boundary: BoundaryCurve) -> FloatArray:
     """(n,) distances of points (n, 3) from the curve, measured to nine points of each of its edges.
-    So they are too large by at most half of its longest edge."""
+    The distances are too large by at most a sixteenth of the longest edge."""
     import scipy.spatial  # imported here: it takes half a second
 
     searching: Any = scipy.spatial

@@ -1,8 +1,8 @@
 """The boundary of the solid of a closed mesh that intersects itself.
 
-The faces of the mesh are cut along each other, and the pieces that bound the solid are joined. The
-winding numbers on both sides of a piece tell whether it bounds the solid, the set of points around
-which the mesh winds at least once.
+The solid is the set of points around which the mesh winds at least once. The faces of the mesh are
+cut along each other. The winding numbers on both sides of a piece tell whether it bounds the solid,
+and the pieces that do are joined.
 
 Where two faces meet, the vertices of pieces of one face differ by rounding from those of the other
 face, and a piece may have vertices in the middle of an edge of another piece. So vertices are
@@ -48,11 +48,11 @@ def passes_itself(surface: TriangleMesh, number: IntArray) -> bool:
     surface: none of its triangles pass through each other's inside.
     number: (m,) the number of the connected component that each face belongs to.
 
-    Proof. Where one sheet passes through another, each is cut in two, and the winding numbers on
-    both sides of one of the two parts are larger by one than those of the other part. So the
-    winding numbers beside pieces of faces that touch others are not the same all over a connected
-    component. Where no sheet passes through the surface they are the same: they change at no other
-    place."""
+    Proof. Suppose that one sheet of the surface passes through another. Then each sheet is cut in
+    two parts, and the winding numbers on the two sides of one part are larger by one than on the
+    two sides of the other part. So the winding numbers beside pieces of touching faces are not the
+    same all over a connected component. If no sheet passes through another, they are the same all
+    over it, since they change at no other place."""
     pairs, _ = touching_pairs(surface.vertices, surface.faces)
     if not len(pairs):
         return False
@@ -65,11 +65,13 @@ def passes_itself(surface: TriangleMesh, number: IntArray) -> bool:
 def boundary_of_solid(vertices: FloatArray, faces: IntArray) -> TriangleMesh:
     """The boundary of the set of points around which a closed mesh winds at least once.
 
-    The mesh may wind around other points clockwise. Vertices of the mesh that are left are
-    unchanged, bit by bit. Where the boundary touches itself, each sheet has vertices of its own.
+    vertices, faces: (n, 3), (m, 3) the mesh, which may wind around some points clockwise.
+
+    Vertices of the mesh that the boundary has too are unchanged, bit by bit. Where the boundary
+    touches itself, each sheet has vertices of its own.
 
     Raises:
-        MeshingError: there are no such points, or the pieces do not fit together.
+        MeshingError: the mesh winds around no point, or the pieces do not fit together.
     """
     x, proper_faces = without_zero_area_faces(vertices, faces)
     cut = _Cut.of(x, proper_faces, np.arange(len(proper_faces)), closed=faces)
@@ -97,13 +99,15 @@ class _Cut:
     Lengths are scaled so that coordinates are at most about one: center + size * x is the original
     position of x.
 
-    rays: a tree of the faces that were cut. unit: (n, 3) the vertices of the mesh.
-    faces: (j, 3) the faces that were cut. pieces: (k, 3, 3).
+    tree: of the faces that were cut.
+    unit: (n, 3) the vertices of the mesh, scaled.
+    faces: (j, 3) the faces that were cut.
+    pieces: (k, 3, 3) the triangles into which they were cut.
     owner: (k,) the face of the mesh that each piece is a part of.
     front, back: (k,) the winding numbers on the two sides of each piece.
-    is_thick: (k,) whether a piece is thick enough for these numbers to be right."""
+    is_thick: (k,) whether a piece is thick enough for its winding numbers to be right."""
 
-    rays: TriangleTree
+    tree: TriangleTree
     unit: FloatArray
     faces: IntArray
     center: FloatArray
@@ -120,30 +124,30 @@ class _Cut:
     ) -> _Cut:
         """Cut the faces `rows` (indices) of a mesh along each other.
 
-        closed: all faces of the mesh, including those without an area, if `faces` lacks these;
-            winding numbers are counted with it."""
+        closed: all faces of the mesh, including faces without an area, with which winding numbers
+            are computed. None if `faces` has all of them."""
         corner = vertices[faces]
         low, high = corner.min(axis=(0, 1)), corner.max(axis=(0, 1))
         size = float(2.0 ** np.ceil(np.log2(0.5 * float((high - low).max()))))
         center = 0.5 * (low + high)
         scaled = (vertices - center) / size
-        rays = _rays(scaled, faces[rows])
-        pieces, owner = split_intersecting_faces(rays, scaled, faces[rows], covered_whole=True)
-        closed_rays = _rays(scaled, faces if closed is None else closed)
-        front, back = windings_of_sides(closed_rays, pieces)
+        tree = _tree_of_faces(scaled, faces[rows])
+        pieces, owner = split_intersecting_faces(tree, scaled, faces[rows], cuts_coplanar=True)
+        closed_tree = _tree_of_faces(scaled, faces if closed is None else closed)
+        front, back = windings_of_sides(closed_tree, pieces)
         edges = pieces - np.roll(pieces, 1, axis=1)
         longest = np.linalg.norm(edges, axis=2).max(axis=1)
         is_thick = np.linalg.norm(area_normals(pieces), axis=1) > _THIN * longest
         return cls(
-            rays, scaled, faces[rows], center, size, pieces, rows[owner], front, back, is_thick
+            tree, scaled, faces[rows], center, size, pieces, rows[owner], front, back, is_thick
         )
 
     def is_there_before(self) -> BoolArray:
-        """(k,) which pieces lie on a face with a lower index than their own, in the same plane. Of
-        several pieces at one place only that of the lowest face is needed. All faces have to be
-        cut."""
+        """(k,) whether each piece lies on another face, in the same plane, whose index is lower
+        than that of the piece's own face. Of several pieces at one place only the piece of the face
+        with the lowest index is needed. It is right only if all faces of the mesh were cut."""
         is_repeated = np.zeros(len(self.pieces), np.bool_)
-        covered, covering = overlapping_faces(self.rays, self.unit, self.faces)
+        covered, covering = overlapping_faces(self.tree, self.unit, self.faces)
         covered, covering = covered[covering < covered], covering[covering < covered]
         order = np.argsort(self.owner, kind="stable")
         start, end = (
@@ -162,10 +166,10 @@ class _Cut:
         return is_repeated
 
 
-def _rays(scaled: FloatArray, faces: IntArray) -> TriangleTree:
+def _tree_of_faces(scaled: FloatArray, faces: IntArray) -> TriangleTree:
     """A tree of the faces (m, 3) between the vertices `scaled` (n, 3), in double precision."""
-    tree = build_balanced_tree(scaled[faces].mean(axis=1), leaf_size=_LEAF_SIZE)
-    return TriangleTree.of(choose_backend("double"), tree, triangle_records(scaled, faces))
+    hierarchy = build_balanced_tree(scaled[faces].mean(axis=1), leaf_size=_LEAF_SIZE)
+    return TriangleTree.of(choose_backend("double"), hierarchy, triangle_records(scaled, faces))
 
 
 # Pieces joined.
@@ -176,11 +180,11 @@ def _cut_at_corners(x: FloatArray, faces: IntArray) -> IntArray:
 
     x: (n, 3) the vertices.
 
-    An edge for which that fails is cut at an end of another such edge that lies on it; of several,
-    at the one nearest to its middle. Returns the faces.
+    An edge that is run more often in one direction is cut at an end of another such edge, if one
+    lies on it; of several, at the end nearest to its middle. Returns the new faces (k, 3).
 
     Raises:
-        MeshingError: the pieces do not fit together.
+        MeshingError: edges remain that are run more often in one direction than in the other.
     """
     edges, _ = singular_edges(faces)
     for _ in range(_MAX_ROUNDS):
@@ -209,11 +213,12 @@ def _cut_at_corners(x: FloatArray, faces: IntArray) -> IntArray:
 
 
 def _corners_on(x: FloatArray, edges: IntArray) -> tuple[IntArray, BoolArray]:
-    """For each of the edges (k, 2), the end of another edge that lies on it, if there is one; of
-    several, the one nearest to its middle.
+    """For each of the edges (k, 2), find an end of another edge that lies on it; of several, the
+    end nearest to its middle. x: (n, 3) the vertices.
 
     Returns:
-        The vertices (k,), 0 where there is none; and the mask (k,) of edges that have one.
+        The indices (k,) of these vertices, 0 for an edge without one; and a mask (k,) of the edges
+        that have one.
     """
     import scipy.spatial  # imported here: it takes half a second
 
@@ -242,8 +247,11 @@ def _corners_on(x: FloatArray, edges: IntArray) -> tuple[IntArray, BoolArray]:
 def neighbors(x: FloatArray, faces: IntArray) -> IntArray:
     """(k, 2) pairs of `half_edges` at which two faces belong together.
 
-    At an edge of two faces these are the two. At an edge of more faces, they are those that have
-    material between them (`_wedges`). x: (n, 3) the vertices."""
+    At an edge of two faces, these two belong together. At an edge of more faces, two faces belong
+    together if they have material between them (`_wedges`). A row holds indices into
+    `half_edges(faces)`.
+
+    x: (n, 3) the vertices."""
     pairs, m = half_edges(faces), len(faces)
     edges = Edges.of(pairs)
     beside = [edges.paired_half_edges()]
@@ -259,13 +267,14 @@ def neighbors(x: FloatArray, faces: IntArray) -> IntArray:
 def _wedges(ends: FloatArray, third: FloatArray, is_along: BoolArray) -> IntArray:
     """Pairs (k, 2) of faces around an edge that have material between them.
 
-    ends: (2, 3) the ends of the edge. third: (n, 3) the third corners of its faces.
+    ends: (2, 3) the ends of the edge.
+    third: (n, 3) the third corners of its faces.
     is_along: (n,) whether a face runs the edge from the first end to the second.
 
     Faces are visited counter-clockwise, as seen against the direction of the edge. Material begins
     behind a face that runs the edge backwards, since the front of the face looks back, and ends at
-    the next face that runs it forwards. Of faces in the same direction, those at which material
-    ends come first."""
+    the next face that runs it forwards. Of faces in the same direction, the faces at which material
+    ends come first. Returns indices of the n faces."""
     direction = ends[1] - ends[0]
     offsets = third - ends[0]
     offsets -= np.outer(offsets @ direction / (direction @ direction), direction)
@@ -287,8 +296,8 @@ def _wedges(ends: FloatArray, third: FloatArray, is_along: BoolArray) -> IntArra
 
 
 def _apart_at_contacts(x: FloatArray, faces: IntArray) -> tuple[FloatArray, IntArray]:
-    """Give each sheet vertices of its own where sheets of a closed surface touch. Returns the
-    vertices and the faces.
+    """Give each sheet vertices of its own where sheets of a closed surface touch. x, faces: (n, 3),
+    (m, 3) the surface. Returns the new vertices and faces.
 
     At each vertex, corners of faces that are connected by edges form a fan, and each fan gets a
     vertex."""

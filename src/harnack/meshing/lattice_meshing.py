@@ -1,9 +1,11 @@
-"""Triangles of a real-valued level set in the tetrahedra of a lattice, and checks of them.
+"""Meshes of level sets of real-valued functions (without a period), made in the tetrahedra of a
+lattice, and checks of these meshes.
 
 Points of the lattice near the level set are moved onto it and become vertices, which removes most
-slivers (Labelle and Shewchuk 2007). Where parts of the surface then touch in a vertex or an edge,
-points are moved back until they do not. With none moved the surface is a manifold: every
-tetrahedron is cut by one triangle or quadrilateral, which the signs at its corners determine.
+slivers (Labelle and Shewchuk 2007). If parts of the surface then touch in a vertex or an edge,
+points are moved back until no parts touch. If no point is moved onto the level set, the surface is
+a manifold: every tetrahedron is cut by at most one triangle or quadrilateral, which the signs at
+its corners determine.
 """
 
 from __future__ import annotations
@@ -93,8 +95,8 @@ class MissedPartsError(MeshingError):
     """A level set has parts between the points of a lattice, which the mesh therefore misses.
 
     places: (k, 3) points on the level set, in the longest missed part.
-    thickness: (k,) thicknesses of the part there, multiples of 2^-7 cells; 0 where it is thinner,
-        inf where it is thicker than a cell.
+    thickness: (k,) thicknesses of the part at these points, lengths: 2^-7, 2^-6, ..., 1 cells; 0 if
+        the part is thinner, inf if it is thicker than a cell.
     size: the size of a cell, a length."""
 
     def __init__(
@@ -104,11 +106,12 @@ class MissedPartsError(MeshingError):
         self.places, self.thickness, self.size = places, thickness, size
 
     def may_be_fixed_by(self, smaller: float) -> bool:
-        """Whether smaller cells may find the part. smaller: their size, as a fraction of `size`.
+        """Whether smaller cells may find the missed part. smaller: the size of the smaller cells,
+        as a fraction of `size`.
 
-        They would not if they also missed a part that is at least two of them long and thinner than
-        a quarter of one. Such a part is beside a cusp or the tip of a cone, and no size of cells
-        resolves it."""
+        They cannot if they too would miss a part that is at least two of the smaller cells long and
+        thinner than a quarter of such a cell. Such a part is beside a cusp or the tip of a cone,
+        and no size of cells resolves it."""
         thin_places = self.places[self.thickness < _HOPELESS_THICKNESS * smaller * self.size]
         part = _longest_part(thin_places, _CLUSTER_DISTANCE * self.size)
         length = float(np.ptp(part, axis=0).max()) if len(part) else 0.0
@@ -125,14 +128,14 @@ def check_no_missed_parts(
     box: tuple[FloatArray, FloatArray],
     elsewhere: Clearance | None = None,
 ) -> None:
-    """Raise if the mesh of a level set misses parts that are at least two cells long: thin walls,
-    sharp edges, islands.
+    """Raise an error if the mesh of a level set misses parts of it that are at least two cells
+    long: thin walls, sharp edges, islands.
 
-    points, samples: points (n, 3) of a lattice, and the function there.
-    is_beside: (n,) which points are corners of tetrahedra that the mesh cuts.
+    points, samples: points (n, 3) of a lattice, and samples of the function at them.
+    is_beside: (n,) whether each point is a corner of a tetrahedron that the mesh cuts.
     surface: the vertices and faces of the mesh.
-    size: of a cell, a length.
-    box: the lower and the upper corner of the box in which the level set counts.
+    size: the size of a cell, a length.
+    box: the lower and the upper corner (3,) of the box in which the level set counts.
     elsewhere: the radius of a ball around each point within which the level set does not count.
 
     The signs at the points of a lattice do not show a wall between two points. Newton's method,
@@ -187,7 +190,8 @@ def check_no_missed_parts(
 
 
 def _thickness(function: LevelFunction, x: FloatArray, size: float) -> FloatArray:
-    """(k,) the thickness of the part at points x (k, 3) on the level set.
+    """(k,) the thickness, a length, of the part of the solid or of the gap at points x (k, 3) on
+    the level set.
 
     It is the distance to the next change of sign along the gradient or against it, the smaller of
     both, among distances 2^-7, 2^-6, ..., 1 times `size`. It is 0 where the sign is the same on
@@ -228,8 +232,9 @@ def _check_off_level_around(function: LevelFunction, points: FloatArray, radius:
 
 
 def _check_passes_level(function: LevelFunction, points: FloatArray, size: float) -> None:
-    """Raise if the function touches its level at most of `points` (n, 3), which are near the level
-    set, and does not pass it. A square does so, and no cells show it by signs.
+    """Raise UnrefinableError if the function only touches its level, without changing sign, at more
+    than half of `points` (n, 3), which are near the level set. A square does so, and signs at the
+    corners of cells never show it.
 
     The function is examined along a line through each point, in the direction of its gradient
     beside the point (at the point it may be 0), up to a hundredth of a cell of size `size` away.
@@ -270,7 +275,8 @@ def _check_passes_level(function: LevelFunction, points: FloatArray, size: float
 
 
 def _longest_part(x: FloatArray, max_gap: float) -> FloatArray:
-    """The points of the part with the longest bounding box, of points x (n, 3).
+    """Group points x (n, 3) into connected parts, and return the points (k, 3) of the part with the
+    longest bounding box.
 
     Two points belong to one part if a chain of points with gaps of at most `max_gap` connects them.
     """
@@ -287,8 +293,8 @@ def _longest_part(x: FloatArray, max_gap: float) -> FloatArray:
 def check_estimated_triangles(
     function: LevelFunction, vertices: FloatArray, faces: IntArray, tolerance: float
 ) -> None:
-    """Raise if refinement to the tolerance would make more triangles than the function allows, by
-    an estimate.
+    """Raise an error if refining the mesh to the tolerance would, by an estimate, make more
+    triangles than `function.most_faces`.
 
     The distance of the midpoints of a triangle's edges from the surface falls with the triangle's
     area. So a triangle with a distance of k tolerances is refined to about k triangles. A selection
@@ -297,7 +303,7 @@ def check_estimated_triangles(
     Raises:
         MeshingError: the gradient is 0 at the midpoint of an edge.
         TriangleLimitError: the estimate exceeds the limit. The message says which tolerance would
-            do.
+            be possible.
     """
     sampled = faces[:: max(1, len(faces) // 20_000)]
     if not len(sampled):
@@ -337,7 +343,8 @@ class TriangleMesh:
     """A triangle mesh.
 
     vertices: (n, 3).
-    faces: (m, 3) the vertices of each face, counter-clockwise as seen from where f is larger."""
+    faces: (m, 3) the indices of the vertices of each face, counter-clockwise as seen from the
+        outside, where the meshed function is larger."""
 
     vertices: FloatArray
     faces: IntArray
@@ -357,9 +364,11 @@ class TriangleMesh:
 
 @dataclass(frozen=True)
 class IrrelevantRegion:
-    """A region in which a surface need not be meshed, because other operands remove it.
+    """A region of space in which a surface need not be meshed, because it will be cut away by the
+    other solids with which the meshed solid is intersected.
 
-    clearance: from points (k, 3) to the radii of balls around them that lie in the region.
+    clearance: a function from points (k, 3) to radii (k,) of balls around them that lie in the
+        region; 0 for points outside of it.
     cached_cells: for each lattice, the indices of the cells that are not proved to lie in the
         region."""
 
@@ -370,10 +379,10 @@ class IrrelevantRegion:
 
     def relevant_cells(self, lattice: BccLattice, most: int) -> IntArray:
         """The indices (n, 3) of the cells that are not proved to lie in the region, and of cells
-        around them, in a border two cells wide. most: as for `BccLattice.nonempty_cells`.
+        around them, in a border two cells wide. most: the largest number of triangles.
 
         Raises:
-            MeshingError: there are more cells than `most` triangles take.
+            TriangleLimitError: there are more such cells than a mesh of `most` triangles may have.
         """
         key = (*lattice.lower.tolist(), *lattice.size.tolist(), *lattice.counts.tolist(), most)
         if key not in self.cached_cells:
@@ -393,10 +402,11 @@ def mesh_open_surface(
         from the level set.
 
     Returns:
-        The mesh; and on which part of the tetrahedra its topology is proved, before refinement.
+        The mesh; and on which part of the tetrahedra the topology of the mesh before refinement is
+        proved.
 
     Raises:
-        MeshingError: no cell is cut, or there are too many cells.
+        MeshingError: the level set does not meet the box, or there are too many cells.
         UnrefinableError: the function is not finite somewhere, or its level set is a volume.
     """
     walls = lattice.lower, lattice.upper
@@ -439,12 +449,15 @@ def mesh_closed_surface(
     are coarse and may touch in vertices: the caller cuts them away. The mesh has no faces if the
     function is negative nowhere.
 
-    tolerance: a length, as for `mesh_open_surface`.
-    as_cut: whether to leave the triangles as the cells cut them, which never pass through each
-        other, and to miss parts between lattice points. That is for functions with creases
-        everywhere, as distances from meshes, and for cells of about the tolerance.
-    elsewhere: a region in which the surface does not matter. Except for a few cells at the region's
-        border, the function counts as positive there, and coarse triangles close the surface.
+    tolerance: a length, the largest distance of the midpoints of edges and of the centers of faces
+        from the level set.
+    as_cut: whether to return the triangles as they were made in the cells, so that they never pass
+        through each other: they are not refined, and parts between lattice points are missed. This
+        is for functions with creases everywhere, such as distances from meshes, in cells of about
+        the tolerance.
+    elsewhere: a region in which the surface does not matter. In the region, except for a few cells
+        at its border, the function counts as positive, and coarse triangles close the surface
+        there.
 
     Raises:
         MeshingError: there are too many cells.
@@ -500,11 +513,11 @@ def mesh_closed_surface(
 def split_faces_off_level(
     function: LevelFunction, surface: TriangleMesh, farthest: float, times: int
 ) -> TriangleMesh:
-    """Cut faces whose center is farther than `farthest` (a length) from the level set, as across a
-    crease.
+    """Cut those faces into three whose center is farther than `farthest` (a length) from the level
+    set, as happens across a crease. Returns the new mesh.
 
-    Each is cut into three at its center, moved onto the level set; so are the new faces, up to
-    `times` times. All edges stay."""
+    The new vertex is the face's center, moved onto the level set. The new faces are examined in the
+    same way, so that a face is cut up to `times` times. All edges stay."""
     vertices, faces = surface.vertices, surface.faces
     pending = np.arange(len(faces))
     for _ in range(times):
@@ -556,12 +569,17 @@ def _check_nothing_missed(
     elsewhere: Clearance | None = None,
 ) -> None:
     # Tetrahedra with corners on both sides; those with corners on the level may have no face.
-    """Raise if parts of the level set are missed (see `check_no_missed_parts`).
+    """Raise MissedPartsError if the mesh misses parts of the level set that are at least two cells
+    long. The points from which they are searched are found here; `check_no_missed_parts` does the
+    search.
 
-    points, samples: of the lattice. corners: (m, 4) of all tetrahedra.
-    first: the mesh before refinement. faces: those of its faces that count.
+    points, samples: points (n, 3) of the lattice, and samples of the function at them.
+    corners: (m, 4) the corners of all tetrahedra.
+    first: the mesh before refinement.
+    faces: the faces of it that count.
     box: the lower and the upper corner of the box where the level set counts.
-    elsewhere: radii of balls in which it does not count."""
+    elsewhere: gives for points the radii of balls around them in which the level set does not
+        count; None if it counts everywhere."""
     signs = np.where(first.points.is_on_level, 0.0, np.sign(first.points.samples.value))[corners]
     is_beside = np.zeros(len(points), np.bool_)
     is_beside[corners[(signs.min(axis=1) < 0) & (signs.max(axis=1) > 0)]] = True
@@ -573,14 +591,16 @@ def _check_nothing_missed(
 def _refinable_points(
     lattice: BccLattice, does_matter: BoolArray | None
 ) -> Callable[[FloatArray], BoolArray]:
-    """A function from points (n, 3) to the mask (n,) of those where triangles may be refined.
+    """Make a function from points (n, 3) to a mask (n,): whether triangles may be refined at each
+    point.
 
     These points are farther than one and a half cells from the faces of the box, and neither in an
     irrelevant cell nor in a cell beside one. does_matter: the mask of the relevant cells, one entry
     for each cell of the lattice; None if all are relevant.
 
-    Triangles that end in the outermost cells are not refined: it would never end, as the edge that
-    they end with stays as it is. Their centers are in the outermost one and a half cells."""
+    Triangles that end in the outermost layer of cells are not refined: refinement would never end,
+    since the edges at their ends stay as they are. The centers of these triangles are less than one
+    and a half cells from the faces of the box."""
     lower, upper = lattice.lower + 1.5 * lattice.size, lattice.upper - 1.5 * lattice.size
     deep = None if does_matter is None else lattice.interior_cells(does_matter)
 
@@ -602,7 +622,8 @@ def _wall_faces(
     """Faces (m, 3) of tetrahedra that lie on the faces of the box and cover the negative part of
     it.
 
-    corners: (k, 4) of the tetrahedra. is_wall: (n,) the mask of the points on the faces of the box.
+    corners: (k, 4) the indices of the corners of each tetrahedron.
+    is_wall: (n,) the mask of the points on the faces of the box.
 
     A tetrahedron has such a face if exactly three of its corners are on the box and the function is
     at most 0 at the fourth. The faces are counter-clockwise as seen from outside of the box."""
@@ -621,8 +642,8 @@ def _wall_faces(
 def _sample_lattice(
     function: LevelFunction, points: FloatArray, lattice: BccLattice, is_irrelevant: BoolArray
 ) -> LevelSamples:
-    """The function at points (n, 3) of a lattice; a large positive value where `is_irrelevant` (n,)
-    is set.
+    """Samples of the function at points (n, 3) of a lattice. Points in the mask `is_irrelevant`
+    (n,) get a large positive value instead.
 
     Raises:
         UnrefinableError: the function is not finite at a point, or equals its level nearly
@@ -648,8 +669,8 @@ def _sample_lattice(
 def _check_is_continuous(
     function: LevelFunction, vertices: FloatArray, faces: IntArray, lattice: BccLattice
 ) -> None:
-    """Raise if many vertices are far from the level set. The signs change at all vertices, so the
-    function jumps at these, and refinement would never end."""
+    """Raise UnrefinableError if many vertices are far from the level set. The function changes its
+    sign at every vertex, so it jumps at these, and refinement would never end."""
     x = vertices[np.unique(faces)]
     is_far = function.sample(x).distance > _JUMP_DISTANCE * float(lattice.size.max())
     if is_far.sum() > _MAX_JUMP_SHARE * len(x):
@@ -665,8 +686,9 @@ def _check_is_continuous(
 def _check_off_level_at_most_points(
     function: LevelFunction, points: FloatArray, lattice: BccLattice
 ) -> None:
-    """Raise if the function equals its level, up to rounding, nearly everywhere, as x - x does. No
-    cells of such a function are proved empty, however small they are."""
+    """Raise UnrefinableError if the function equals its level, up to rounding, at more than three
+    quarters of the points (n, 3), as x - x does for level 0. No cells of such a function are proved
+    empty, however small they are."""
     if len(points) <= _MAX_FLAT_SHARE * 2 * math.prod(lattice.counts.tolist()):
         return
     probes = points[:: -(-len(points) // _MOST_PROBES)]
@@ -685,10 +707,10 @@ class _InitialMesh:
 
     vertices, faces: (n, 3), (m, 3). The first vertices are the points of the tetrahedra; the others
         lie on edges that the level set crosses.
-    points: the points of the tetrahedra; those near the level set were moved onto it.
-    rows: (k,) the indices of the tetrahedra through whose inside the level set may pass.
-    crossed: (k,) whether it crosses an edge of each.
-    ends: (j, 2) the indices of the two end points of each edge that it crosses."""
+    points: the points of the tetrahedra; points near the level set were moved onto it.
+    rows: (k,) the indices of the tetrahedra that the level set may pass through.
+    crossed: (k,) for each of these tetrahedra, whether the level set crosses one of its edges.
+    ends: (j, 2) the indices of the two end points of each edge that the level set crosses."""
 
     vertices: FloatArray
     faces: IntArray
@@ -698,7 +720,8 @@ class _InitialMesh:
     ends: IntArray
 
     def is_cut(self, corners: IntArray) -> BoolArray:
-        """(m,) which of all tetrahedra, given by their corners (m, 4), hold a point of a face."""
+        """(m,) whether each of all tetrahedra, given by the indices of their corners (m, 4),
+        contains a point of a face of the mesh."""
         cut = _have_any(self.points.is_on_level, corners)
         cut[self.rows] |= self.crossed
         return cut
@@ -724,8 +747,9 @@ def _march(
     Where parts of the surface touch in a moved point, the point is moved back to its original
     position, until no parts touch.
 
-    points, samples: of the lattice. corners: (m, 4) of the tetrahedra.
-    is_fixed: (n,) the mask of the points that are not moved.
+    points, samples: points (n, 3) of the lattice, and samples of the function at them.
+    corners: (m, 4) the indices of the corners of each tetrahedron.
+    is_fixed: (n,) the mask of the points that must not be moved.
     is_wall: (n,) the mask of the points that count as on the level.
     walls: the lower and the upper corner of the box, on whose faces points stay; or None.
 
@@ -791,11 +815,13 @@ def _snap_points(
 ) -> tuple[FloatArray, LevelSamples, BoolArray]:
     """Move points near the level set onto it.
 
-    Points are moved if their estimated distance from it is less than a quarter of a cell, and if
-    `is_fixed` (n,) is not set there.
+    Points are moved if their estimated distance from the level set is less than a quarter of a cell
+    and they are not in the mask `is_fixed` (n,). A point whose move does not converge stays where
+    it is.
 
     Returns:
-        The points (n, 3); their samples; and the mask (n,) of those on the level.
+        The points (n, 3); samples of the function at them; and the mask (n,) of the points on the
+        level set.
     """
     size = float(lattice.size.min())
     near = np.flatnonzero((samples.distance < _SNAP_DISTANCE * size) & ~is_fixed)
@@ -815,8 +841,8 @@ def _snap_points(
 
 
 def _have_any(chosen: BoolArray, corners: IntArray) -> BoolArray:
-    """(m,) which tetrahedra, given by their corners (m, 4), have a chosen point. chosen: a mask of
-    points."""
+    """(m,) whether each tetrahedron, given by the indices of its corners (m, 4), has a corner in
+    the mask `chosen` (n,) of points."""
     has_chosen = np.zeros(len(corners), np.bool_)
     for column in corners.T:  # four times as fast as chosen[corners].any(axis=1)
         has_chosen |= chosen[column]
@@ -829,10 +855,12 @@ _ABOVE, _BELOW, _ON_LEVEL = 1, 5, 25
 
 
 def _may_be_cut(value: FloatArray, is_on: BoolArray, corners: IntArray) -> BoolArray:
-    """(m,) whether the level may pass through tetrahedra, given by their corners (m, 4): they have
-    corners on both sides of it, or at least three corners on it.
+    """(m,) whether the level set may pass through each tetrahedron, given by the indices of its
+    corners (m, 4): the tetrahedron has corners on both sides of the level set, or at least three
+    corners on it.
 
-    value: (n,) the function at the points. is_on: (n,) which points are on the level."""
+    value: (n,) the function at the points.
+    is_on: (n,) whether each point is on the level set."""
     code = np.where(is_on, _ON_LEVEL, np.where(value > 0, _ABOVE, _BELOW)).astype(np.uint8)
     code_sum = np.zeros(len(corners), np.uint8)
     for column in corners.T:

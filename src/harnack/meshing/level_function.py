@@ -1,4 +1,5 @@
-"""The function to be meshed, at many points at a time, and its proved bounds around them."""
+"""The function f - level whose level set is meshed: its values and gradients at many points at a
+time, and proved bounds of its change around them."""
 
 from __future__ import annotations
 
@@ -38,11 +39,12 @@ _PROOFS = choose_enclosures("curvature")
 class LevelSamples:
     """Values and gradients of a function at n points.
 
-    value: (n,) f - level; for an angle the value nearest to 0, in [-period/2, period/2].
+    value: (n,) f - level; for a field with a period, such as a solid angle, reduced by multiples of
+        the period to [-period/2, period/2].
     gradient: (n, 3).
     quarter_period_radius: (n,) a radius of a ball around each point. Within the ball, f is proved
-        to differ from its value at the point by less than a quarter of its period. 0 without a
-        period."""
+        to differ from its value at the point by less than a quarter of its period. 0 if the field
+        has no period."""
 
     value: FloatArray
     gradient: FloatArray
@@ -54,17 +56,17 @@ class LevelSamples:
 
     def replaced(self, rows: Any, others: LevelSamples) -> LevelSamples:
         """A copy in which the samples at points `rows` (indices or a mask) are `others`."""
-        value, gradient, reach = (
+        value, gradient, radius = (
             self.value.copy(),
             self.gradient.copy(),
             self.quarter_period_radius.copy(),
         )
-        value[rows], gradient[rows], reach[rows] = (
+        value[rows], gradient[rows], radius[rows] = (
             others.value,
             others.gradient,
             others.quarter_period_radius,
         )
-        return LevelSamples(value, gradient, reach)
+        return LevelSamples(value, gradient, radius)
 
     @property
     def distance(self) -> FloatArray:
@@ -74,7 +76,8 @@ class LevelSamples:
 
 
 class EvaluatorCache:
-    """Fields prepared for double precision, so that functions of the same field share them."""
+    """A store of fields that were prepared for double precision, so that several level functions of
+    the same field share one prepared field."""
 
     def __init__(self) -> None:
         self._made: dict[int, tuple[Field, Field]] = {}
@@ -88,12 +91,13 @@ class EvaluatorCache:
 
 @dataclass
 class LevelFunction:
-    """f - level of a field f, in double precision.
+    """The function f - level of a field f, evaluated in double precision at arrays of points.
 
-    most_faces: the largest allowed number of triangles of its mesh.
-    uploads: the prepared fields; several functions may share them.
-    secant_steps: where edges of cells meet the level set is found by this number of secant steps,
-        for functions that are nearly linear along edges, such as distances; 0 for a search.
+    most_faces: the largest allowed number of triangles of the level set's mesh.
+    uploads: the store of prepared fields; several functions may share it.
+    secant_steps: the number of secant steps that find the point at which an edge of a cell meets
+        the level set, for functions that are nearly linear along edges, such as distances. With 0
+        it is found by a search.
     evaluations: the number of points at which f has been evaluated."""
 
     field: Field
@@ -116,14 +120,15 @@ class LevelFunction:
         return self.field.period
 
     def relative_to_level(self, value: FloatArray) -> FloatArray:
-        """(n,) f - level for values (n,) of f; for an angle, that of the smallest magnitude."""
+        """(n,) f - level for values (n,) of f. If f has a period, a multiple of the period is added
+        so that the magnitude is smallest."""
         difference = value - self.level
         if self.period is None:
             return difference
         return difference - self.period * np.round(difference / self.period)
 
     def sample(self, points: FloatArray) -> LevelSamples:
-        """Values and gradients of the function at points (n, 3)."""
+        """Sample f - level, and its gradient, at points (n, 3)."""
         value, gradient, radius = self._in_batches(points, self._evaluated)
         return LevelSamples(self.relative_to_level(value), gradient, radius)
 
@@ -138,8 +143,8 @@ class LevelFunction:
         return self.relative_to_level(self._in_batches(points, value)[0])
 
     def is_on_level(self, points: FloatArray) -> BoolArray:
-        """(n,) whether f equals the level at points (n, 3), up to the bound of its error. That is a
-        rounding error, and for a sum a truncation error as well."""
+        """(n,) whether f equals the level at points (n, 3), up to the bound of the error of the
+        computed value (rounding, and for a truncated sum its truncation)."""
 
         def value_and_error(p: Vec3) -> tuple[Real, Real]:
             """The value of f at p, and the bound of its error."""
@@ -153,15 +158,17 @@ class LevelFunction:
     def gradient_bounds(
         self, points: FloatArray, radius: FloatArray
     ) -> tuple[LevelSamples, FloatArray]:
-        """Samples at points (n, 3), and bounds (n,) of how far the gradient changes nearby.
+        """Samples at points (n, 3), and bounds (n,) of |grad f(y) - grad f(x)| for all y within a
+        radius of each point x.
 
-        radius: (n,) the radius around each point within which the bound holds. Rounding is included
-            (`Field.gradient_change_bound`).
+        radius: (n,) this radius. The rounding error of the sampled gradient is included in the
+            bound.
 
         The samples have no `quarter_period_radius`: it is 0."""
 
         def compute(p: Vec3, r: Vec3) -> tuple[Real, Vec3, Real]:
-            """Value, gradient and bound of the gradient's change within r.x of p."""
+            """The value and the gradient of f at p, and the bound of the gradient's change within
+            the distance r.x of p."""
             sample = self._prepared.evaluate(p)
             change = self._prepared.gradient_change_bound(p, r.x) + sample.gradient_error
             return sample.value, sample.gradient, change
@@ -186,11 +193,10 @@ class LevelFunction:
         return self._in_batches(points, bound)[0]
 
     def _evaluated(self, p: Vec3) -> tuple[Real, Vec3, Real]:
-        """The value, the gradient and the `LevelSamples.quarter_period_radius` of f at points.
+        """The value and the gradient of f at points p, and a radius of a ball around each point.
 
-        For an angle, the radius is a length within which the bounds of the sample prove that f
-        changes by less than a quarter of the period, rounding errors included. It is 0 for other
-        fields."""
+        If f has a period, f is proved to change by less than a quarter of the period within this
+        radius, rounding errors included. Otherwise the radius is 0."""
         if self.period is None:
             with share_samples(), without_alternatives():
                 sample = self._prepared.evaluate(p)
@@ -213,7 +219,7 @@ class LevelFunction:
     def _in_batches(
         self, points: FloatArray, kernel: Callable[[Vec3], tuple[Any, ...]]
     ) -> tuple[FloatArray, ...]:
-        """The results of a kernel at points (n, 3), computed batch by batch; counted as
-        evaluations."""
+        """Compute the results of a kernel at points (n, 3), batch by batch, and count the points as
+        evaluations. Returns an array with n rows for each result."""
         self.evaluations += len(points)
         return map_batches(self._backend, kernel, points, at_once=1 << 18)

@@ -1,4 +1,5 @@
-"""Parts of a level set that are missing from its mesh by signs: walls and gaps thinner than a cell.
+"""Parts of a level set that are missing from a mesh that was made from signs of the function: walls
+and gaps thinner than a cell.
 
 The signs at the points of a lattice do not show a wall or a gap between two points.
 `points_off_level` checks that all points of the mesh are near the level set. Here the converse is
@@ -59,7 +60,7 @@ _THIN = 0.25
 
 @dataclass(frozen=True)
 class PointsOnLevel:
-    """Some points on a level set.
+    """Some points on a level set, known without a mesh of it.
 
     points: (k, 3).
     normals: (k, 3) unit normals there, towards where the function is positive."""
@@ -69,8 +70,9 @@ class PointsOnLevel:
 
     @classmethod
     def of(cls, function: SignFunction, tolerance: float) -> PointsOnLevel:
-        """Points on the level set that are known without a mesh of it: see the text above. There
-        are none for other fields.
+        """Find points on the level set without a mesh of it: on the triangles of a field that is
+        given by a mesh, beside the points of a cloud, or along rays out of blobs. For all other
+        fields there are none.
 
         tolerance: a length. The sign of a cloud's field is evaluated at least this far from its
             points."""
@@ -119,8 +121,8 @@ class PointsOnLevel:
         jumps &= (np.minimum(np.abs(ahead), np.abs(behind)) > _MIN_JUMP) & (area[rows] > 0)
         return cls(points[jumps], np.where(ahead > 0, 1.0, -1.0)[jumps, None] * normal[jumps])
 
-    def some(self, rows: Any) -> PointsOnLevel:
-        """The selected points. rows: their indices, or a mask."""
+    def select(self, rows: Any) -> PointsOnLevel:
+        """The selected points, with their normals. rows: their indices, or a mask."""
         return PointsOnLevel(self.points[rows], self.normals[rows])
 
     def within(self, lower: FloatArray, upper: FloatArray, volume: Volume | None) -> PointsOnLevel:
@@ -128,22 +130,24 @@ class PointsOnLevel:
         is_in = ((self.points > lower) & (self.points < upper)).all(axis=1)
         if volume is not None:
             is_in &= volume.contains_points(self.points)
-        return self.some(is_in)
+        return self.select(is_in)
 
 
 @dataclass(frozen=True)
 class LostParts:
-    """Points of the level set that are farther from a mesh than they should be.
+    """Points of a level set that are farther from its mesh than the tolerance: signs of parts that
+    the mesh has lost.
 
-    far: the number of points farther than `tolerance`. looked_at: the number of all points.
+    far: the number of points that are farther from the mesh than `tolerance`.
+    looked_at: the number of all points that were tested.
+    tolerance: a length.
     beyond: the number of points that are also farther than half a cell.
-    within: no point is farther than this from a corner or a center of a triangle; inf if there are
-        no triangles.
+    within: an upper bound of the distance of all points from the mesh; inf if it has no triangles.
     missing, filled: (k, 3), (j, 3) some of the far points: on parts that the mesh misses, and in
         gaps that it fills.
-    others: (i, 3) far points for which neither is known.
-    thickness: the median thickness of these parts and gaps; inf if they are wider than cells, or
-        not known.
+    others: (i, 3) more far points, of which it is not known which of the two is the case.
+    thickness: the median thickness of these parts and gaps, a length; inf if they are wider than
+        cells, or if no thickness is known.
     spacing: the size of cells.
     advice: what to do, in words."""
 
@@ -171,12 +175,14 @@ class LostParts:
         """Find the parts of a level set that a mesh has lost.
 
         known: points on the level set, near which the mesh should be.
-        surface: the mesh. spacing: the size of its cells."""
+        surface: the mesh.
+        tolerance: the largest distance that is no sign of a lost part.
+        spacing: the size of the mesh's cells, a length."""
         corner = surface.vertices[surface.faces]
-        distant = known.some(_are_farther(known.points, corner, tolerance))
+        distant = known.select(_are_farther(known.points, corner, tolerance))
         beyond = _are_farther(distant.points, corner, max(tolerance, _ALLOWED_CELLS * spacing))
         within = _bound_of_distances(distant.points, corner) if len(distant.points) else tolerance
-        shown = distant.some(_spread(len(distant.points), _MAX_MEASURED))
+        shown = distant.select(_spread(len(distant.points), _MAX_MEASURED))
         thickness, is_inside = _thicknesses(function, shown, spacing)
         is_thin = np.isfinite(thickness)
         thickness = thickness[is_thin]
@@ -196,7 +202,9 @@ class LostParts:
 
     @property
     def matter(self) -> bool:
-        """Whether more points are off the mesh than creases and corners cause for any mesh."""
+        """Whether the result matters: more than 1 % of the points are far from the mesh, or any
+        point is farther than half a cell. Creases and corners alone put a few points of any mesh
+        off."""
         return self.beyond > 0 or self.far > _ALLOWED_SHARE * self.looked_at
 
     @property
@@ -206,8 +214,10 @@ class LostParts:
         return self.beyond + len(self.missing) + len(self.filled) > 0
 
     def are_mended_by(self, smaller: float) -> bool:
-        """Whether smaller cells may show the lost parts: not if most of these are thinner than a
-        quarter of such a cell. smaller: their size, as a fraction of `spacing`."""
+        """Whether smaller cells may show the lost parts. They may not if the median thickness of
+        these parts is less than a quarter of such a cell.
+
+        smaller: the size of the smaller cells, as a fraction of `spacing`."""
         return self.thickness >= _THIN * smaller * self.spacing
 
     def __str__(self) -> str:
@@ -238,7 +248,9 @@ def _advice(field: Field) -> str:
 
 
 def _by_area(area: FloatArray) -> IntArray:
-    """The indices (2000,) of triangles, each repeated in proportion to its area. area: (m,)."""
+    """The indices (2000,) of triangles, each repeated about in proportion to its area.
+
+    area: (m,) the areas of the triangles, in any unit."""
     cumulative: FloatArray = np.cumsum(area)
     targets: FloatArray = (np.arange(_MAX_POINTS) + 0.5) / _MAX_POINTS * cumulative[-1]
     return np.searchsorted(cumulative, targets)
@@ -252,7 +264,7 @@ def _spread(count: int, max_count: int) -> IntArray:
 def _thicknesses(
     function: SignFunction, points: PointsOnLevel, spacing: float
 ) -> tuple[FloatArray, BoolArray]:
-    """The thickness of the part or the gap at each of k points of the level set.
+    """The thickness, a length, of the part or the gap beside each of k points of the level set.
 
     From each point the sign of the function is followed along the normal and against it, at
     distances up to the size of a cell. The thickness is the distance to the next change of sign, on
@@ -279,8 +291,9 @@ def _thicknesses(
 
 
 def _bound_of_distances(points: FloatArray, triangles: FloatArray) -> float:
-    """A bound of the distances of points (n, 3) from triangles (m, 3, 3): the largest distance from
-    the nearest corner or center. inf if there are no triangles."""
+    """An upper bound of the distances of points (n, 3) from triangles (m, 3, 3): the largest
+    distance of a point from the nearest corner or center of a triangle. It is inf if there are no
+    triangles."""
     import scipy.spatial  # imported here: it takes half a second
 
     searching: Any = scipy.spatial
@@ -296,9 +309,9 @@ def _are_farther(points: FloatArray, corner: FloatArray, distance: float) -> Boo
 
     corner: (m, 3, 3) the corners of the triangles.
 
-    A triangle within the distance has its center within the sum of the distance and the triangle's
-    radius around its center. Triangles whose radii differ by less than a factor of 2 are searched
-    together, with the larger radius."""
+    If a triangle comes within `distance` of a point, its center is within `distance` plus r of the
+    point, where r is the largest distance of the triangle's corners from its center. Triangles
+    whose r differ by less than a factor of 2 are searched together, with the larger r."""
     import scipy.spatial  # imported here: it takes half a second
 
     searching: Any = scipy.spatial

@@ -1,17 +1,19 @@
 """Balanced trees: built by median splits, stored as records, traversed without a stack.
 
-- `BalancedTree`: which primitive lies in which leaf, from `build_balanced_tree`, in vectorized
-  NumPy.
+- `BalancedTree`: which primitive (point, segment or triangle) lies in which leaf.
+  `build_balanced_tree` computes it in vectorized NumPy.
 - `PackedTree`: nodes and primitives as records on a backend, from `pack_tree`.
 - `traverse`: visits nodes depth first, and enters or skips each subtree; `for_each_primitive`:
   visits the primitives of a leaf.
 
-The meaning of a node, and the decision to skip it, are up to the caller.
+Nodes hold numbers of the caller, such as a bounding box, and the caller decides which nodes a walk
+skips.
 
-Trees are balanced and complete: a level is a reshape of arrays, sums over nodes are sums along an
-axis, and a walk needs a link in each node and no stack. Nodes are records of eight-float packets,
-siblings side by side. If vertices move, the tree keeps its shape, and its bounds are computed from
-the new positions.
+All nodes of a level of the tree have the same number of children. So a level is a reshape of
+arrays, a sum over the children of each node is a sum along an axis, and each node needs only a link
+to where the walk goes on, no stack. Nodes are records of eight-float packets, siblings side by
+side. If vertices move, the tree keeps its shape, and its bounds are computed from the new
+positions.
 """
 
 from __future__ import annotations
@@ -40,16 +42,18 @@ _MAX_LOOPED_ROW = 48
 
 @dataclass(frozen=True)
 class BalancedTree:
-    """A balanced tree: primitives in leaves, and complete levels of nodes above them.
+    """A balanced tree: primitives (points, segments or triangles) in leaves, and levels of nodes
+    above the leaves.
 
-    Every leaf holds w or w - 1 primitives, where w is the number of its slots, and every level of
-    nodes is complete. So a level is a reshape of arrays, and a sum over the children of each node
-    is a sum along an axis.
+    Every leaf has w slots and holds w or w - 1 primitives. All nodes of a level have the same
+    number of children, in order, so the level above is a reshape of arrays, and a sum over the
+    children of each node is a sum along an axis.
 
     leaf_slots: (leaves, w) the index of the primitive in each slot; NO_PRIMITIVE in an empty slot,
         which can only be the last of a leaf.
     arities: the number of children of the nodes of each level, from the parents of leaves to the
-        root."""
+        root.
+    """
 
     leaf_slots: IntArray
     arities: tuple[int, ...]
@@ -73,7 +77,7 @@ class BalancedTree:
         return sum(self.counts)
 
     def node_links(self) -> tuple[tuple[IntArray, ...], tuple[IntArray, ...], tuple[IntArray, ...]]:
-        """The links with which a walk visits all nodes depth first, without a stack.
+        """The links between nodes with which a walk visits all nodes depth first, without a stack.
 
         Returns:
             Three tuples of arrays, one array for each level of the tree, leaves first: the index of
@@ -81,9 +85,9 @@ class BalancedTree:
             subtree has been visited, `node_count` for the last one.
 
         The children of a node have consecutive indices; after them come the descendants of the
-        first child, then those of the second, and so on. So siblings, which are mostly visited
-        together, lie side by side in memory. For a leaf the first child is 0, the index of the
-        root, which stands for none.
+        first child, then the descendants of the second, and so on. So siblings, which are mostly
+        visited together, lie side by side in memory. A leaf has no children: the index of its first
+        child is given as 0, which is the index of the root.
         """
         below = [0]  # the number of nodes below a node, for each level
         for arity in self.arities:
@@ -115,15 +119,15 @@ def build_balanced_tree(points: FloatArray, *, leaf_size: int = 8, arity: int = 
     side of each node's box.
 
     leaf_size: the largest number of points of a leaf.
-    arity: the number of children of a node, 2 or 4 (two splits at once); with 4 the root may have
-        2.
+    arity: the number of children of a node, 2 or 4 (two splits at once). With 4, the root has 2
+        children if the number of splits is odd.
 
-    The time is O(n log n): each of log2(n / leaf_size) levels of splits is one partial sort. Nodes
-    that fit into the cache are split down to their leaves, one after the other. Threads would not
-    make it faster.
+    The time is O(n log n): each of log2(n / leaf_size) levels of splits is one partial sort. Once
+    nodes are small enough for the processor's cache, each batch of nodes is split down to its
+    leaves before the next batch. Threads would not make it faster.
 
     Raises:
-        ValueError: another arity.
+        ValueError: the arity is neither 2 nor 4.
     """
     if arity not in (2, 4):
         raise ValueError(f"arity must be 2 or 4, not {arity}")
@@ -148,14 +152,15 @@ def build_balanced_tree(points: FloatArray, *, leaf_size: int = 8, arity: int = 
 
 
 def _split(rows: IntArray, positions: FloatArray) -> tuple[IntArray, FloatArray]:
-    """Halve nodes along the longest axis of their points' boxes.
+    """Split each node into two halves of its points, at the median along the longest side of the
+    points' bounding box.
 
     rows: (k, w) the indices of the points of each node, one node per row.
     positions: (3, k, w) the coordinates of these points.
 
     The last slot of a row may be empty: its index is NO_PRIMITIVE and its position NaN, which sorts
-    behind all numbers. If each row holds w or w - 1 points, each new row holds ceil(w/2) points or
-    one less.
+    behind all numbers. Each row holds w or w - 1 points; each half holds ceil(w/2) points or one
+    less.
 
     Returns:
         The indices (2k, ceil(w/2)) and the positions (3, 2k, ceil(w/2)) of the points of the
@@ -213,13 +218,14 @@ _MAX_NODES = 2**24
 
 @dataclass(frozen=True)
 class PackedTree:
-    """A tree on a backend: records of its nodes and of its primitives.
+    """A tree uploaded to a backend, for walks in Dr.Jit: records (rows of numbers) of its nodes and
+    of its primitives (points, segments or triangles).
 
     Siblings lie side by side (`BalancedTree.node_links`), and primitives leaf by leaf.
 
     node_heads: eight numbers for each node: six of the caller; the index of the node at which the
-        walk goes on if it skips the node's subtree; and the index of the leaf or, for an inner
-        node, minus the index of its first child.
+        walk goes on if it skips the node's subtree; and for a leaf its index among leaves, or for
+        an inner node minus the index of its first child.
     node_payloads: further numbers of the caller for each node, or None. They are stored separately
         because a walk reads many heads in a row and few payloads.
     node_count: the number of nodes.
@@ -248,11 +254,13 @@ class PackedTree:
 def pack_tree(
     backend: Backend, tree: BalancedTree, levels: Sequence[FloatArray], primitives: FloatArray
 ) -> PackedTree:
-    """Upload a tree as records.
+    """Upload a tree to a backend, for `traverse`.
 
     levels: for each level of the tree, leaves first, the numbers (k, c) of its nodes, c >= 6. The
-        first six of each are read at every visit of the node, the others only on demand.
-    primitives: (leaves, leaf_size, j) the numbers of the primitives, by slots.
+        first six numbers of a node are read at every visit of the node, the further numbers only on
+        demand.
+    primitives: (leaves, leaf_size, j) the numbers of the primitive in each slot
+        (`BalancedTree.values_in_slots`).
 
     Raises:
         ValueError: there are more nodes than single precision can count.
@@ -308,10 +316,11 @@ PrimitiveBody: TypeAlias = "Callable[[list[Real], Mask, LoopValues], LoopValues]
 
 
 def traverse(tree: PackedTree, visit: Visit, state: LoopValues, active: Mask = True) -> LoopValues:
-    """Visit nodes depth first, from the root on, and return the final state.
+    """Visit the nodes of a tree depth first, from the root on, and return the final state. Each
+    lane (entry of Dr.Jit's arrays, such as a ray) walks by itself.
 
-    visit: takes a node and the state. It returns whether to visit the node's children (otherwise
-        its subtree is skipped) and the new state.
+    visit: takes a `VisitedNode` and the state. It returns a mask, whether to visit the node's
+        children (otherwise its subtree is skipped), and the new state.
     state: a tuple of arrays, which `visit` updates.
     active: the lanes that walk at all.
 
@@ -337,13 +346,16 @@ def traverse(tree: PackedTree, visit: Visit, state: LoopValues, active: Mask = T
 def for_each_primitive(
     node: VisitedNode, active: Mask, body: PrimitiveBody, state: LoopValues
 ) -> LoopValues:
-    """Update the state by `body` for each primitive of a leaf, on active lanes, and return it.
+    """Update a state by each primitive of the leaf `node`, and return the final state.
 
-    body: takes the record of a primitive, the mask of active lanes and the state; returns the
+    active: the lanes whose node is a leaf and whose state is to be updated.
+    body: takes the record of a primitive, the mask of active lanes and the state; returns the new
         state.
+    state: a tuple of arrays.
 
-    It costs nothing where all lanes of a packet are inactive. Empty slots are visited as well: the
-    caller of `pack_tree` has filled them with numbers that have no effect."""
+    A packet of lanes that are all inactive costs nothing. Empty slots are visited as well: the
+    caller of `pack_tree` has filled them with numbers that have no effect.
+    """
     tree = node.tree
     index = tree.backend.UInt32
 
@@ -351,6 +363,7 @@ def for_each_primitive(
         return active & (slot < tree.leaf_size)
 
     def step(slot: Any, *state: Any) -> LoopValues:
+        """Call `body` for the primitive in a slot, and go on to the next slot."""
         return slot + 1, *body(tree.primitive(node.leaf, slot, active), active, state)
 
     return dr.while_loop((index(0), *state), is_running, step, label="leaf")[1:]

@@ -62,13 +62,13 @@ class BoxTree:
     def next_box(
         self, o: Vec3, d: Vec3, after: tuple[Real, Any], start: Real, end: Real, active: Mask
     ) -> tuple[Real, Real, Any]:
-        """The next box that each ray o + t d, |d| = 1, enters after `after` = (t, number).
+        """The next box that each ray o + t d, |d| = 1, enters after the pair `after` = (t, number).
 
-        A ray enters a box at t = max(t of the first point of the ray in the box, start), and boxes
-        are ordered by (t, number). Boxes that a ray has left before `start` are not entered.
-        Starting with after = (t, NO_BOX), t < start, repeated calls visit every box that the ray
-        meets for start <= t <= end exactly once. Boxes are enlarged a little, so that rounding
-        never skips a box that the ray meets.
+        A ray that has not left a box before t = start enters it at max(t of its first point in the
+        box, start). Boxes are ordered by this t, and at the same t by number. Repeated calls, the
+        first with after = (t, NO_BOX) for any t < start, visit every box that the ray meets for
+        start <= t <= end exactly once. Boxes are enlarged a little, so that rounding never skips a
+        box that the ray meets.
 
         Returns:
             The t where the ray enters the box, the t where it leaves it, and the number of the box
@@ -76,41 +76,45 @@ class BoxTree:
         """
         real, index = self.tree.backend.Float, self.tree.backend.UInt32
         t_after, n_after = real(after[0]), index(after[1])
-        span = self._slab_test(o, d)
+        span = self._make_slab_test(o, d)
 
         def visit(node: VisitedNode, state: LoopValues) -> tuple[Mask, LoopValues]:
             """Enter a node if the ray meets its box before the best box so far."""
             near, far = span(node.head)
-            open_ = (near <= far) & (far >= start) & (near <= fmin(state[0], end))
-            return open_, for_each_primitive(node, open_ & node.is_leaf, nearer, state)
+            is_met = (near <= far) & (far >= start) & (near <= fmin(state[0], end))
+            return is_met, for_each_primitive(node, is_met & node.is_leaf, nearer, state)
 
         def nearer(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
             """Take the box of a record if it comes after `after` and before the best so far."""
             best, leave, number = state
             near, far = span(row)
             t, n = fmax(near, start), index(fmax(row[_BOX_NUMBER_COLUMN], real(0)))
-            later = (t > t_after) | ((t == t_after) & (n > n_after))
-            first = (t < best) | ((t == best) & (n < number))
+            is_after = (t > t_after) | ((t == t_after) & (n > n_after))
+            is_before_best = (t < best) | ((t == best) & (n < number))
             entered = (near <= far) & (far >= start) & (t <= end) & (row[_BOX_NUMBER_COLUMN] >= 0)
-            chosen = active & entered & later & first
+            chosen = active & entered & is_after & is_before_best
             return (
                 dr.select(chosen, t, best),
                 dr.select(chosen, far, leave),
                 dr.select(chosen, n, number),
             )
 
-        begun = (real(dr.inf), real(dr.inf), index(NO_BOX))
-        near, far, number = traverse(self.tree, visit, begun, active)
+        initial = (real(dr.inf), real(dr.inf), index(NO_BOX))
+        near, far, number = traverse(self.tree, visit, initial, active)
         return near, far, number
 
-    def _slab_test(self, o: Vec3, d: Vec3) -> Any:
-        """Make a function that computes at which t rays o + t d enter and leave a box.
+    def _make_slab_test(self, o: Vec3, d: Vec3) -> Any:
+        """Make a function that computes where rays o + t d enter and leave a box.
 
-        The function takes six numbers, the lower and the upper corner. It returns t slightly too
-        small and slightly too large, which covers rounding. Each plane of the box is moved outwards
-        by 16 roundings of the size of coordinates, and t is widened by 8 roundings of itself. The
-        quotient (x - o)/d has three roundings, and that of x - o is at most half a unit of the last
-        place of coordinates. The ray misses the box if the first t is larger than the second."""
+        The function takes the six numbers of the box, lower corner first, and returns two t. The
+        ray misses the box if the first is larger than the second. The first is rounded down and the
+        second up, so that rounding never loses a hit.
+
+        Rounding. With u the machine epsilon and S = 1 + the largest coordinate of o in magnitude,
+        each plane of the box, at the coordinate x, is moved outwards by 16 u S. That exceeds the
+        error of x - o. Each t is moved by 8 u |t|, which exceeds the error of the three operations
+        in (x - o)/d.
+        """
         backend = self.tree.backend
         vector = backend.Array3f
         # Never zero: 1e-18 of the boxes' size is far below their padding.
@@ -136,10 +140,11 @@ _ROUNDING_EPSILONS = 16.0
 
 @dataclass(frozen=True)
 class ClosestTriangle:
-    """The triangle nearest to points x, among the triangles that a query considers.
+    """For each lane, the triangle nearest to its point x, among the triangles that a query
+    considers.
 
-    squared_distance: of the triangle from x; inf where there is no triangle.
-    triangle: its index; NO_TRIANGLE where there is none.
+    squared_distance: of the triangle from x; inf if there is no triangle.
+    triangle: its index; NO_TRIANGLE if there is none.
     offset: (3,) the vector from x to the nearest point of the triangle.
     normal: (3,) a normal of the triangle by the right-hand rule, of any length; zero for a triangle
         of zero area.
@@ -152,18 +157,19 @@ class ClosestTriangle:
     is_inner: Mask
 
 
-def distance_lower_bound(rays: TriangleTree, x: Vec3) -> Real:
-    """A proved lower bound of the distance from x to the triangles, which is exact up to rounding.
-    Coordinates of triangles are at most about one.
+def distance_lower_bound(triangles: TriangleTree, x: Vec3) -> Real:
+    """A proved lower bound of the distance from x to the triangles, a length; it is exact up to
+    rounding. Coordinates of triangles are at most about one.
 
-    Proof. The distance from `ClosestPointOnTriangle` is off by a few machine epsilons of |x| + 1,
-    as is proved there. Boxes are skipped only if they are farther than the best distance so far by
-    that much. 16 epsilons of |x| + 1 are subtracted, several times the largest error that was found
-    with random needles and random triangles."""
-    real, vector = rays.tree.backend.Float, rays.tree.backend.Array3f
+    Proof. The distance computed by `ClosestPointOnTriangle` is off by a few machine epsilons of |x|
+    + 1, as is proved there. Boxes of the tree are skipped only if they are farther than the
+    smallest distance so far by that much. So 16 epsilons of |x| + 1 are subtracted. That is several
+    times the largest error that was observed for random needles and random triangles.
+    """
+    real, vector = triangles.tree.backend.Float, triangles.tree.backend.Array3f
     x = vector(x)
-    pad = _pad(rays, x)
-    inside = _distance_test(rays, x, pad)
+    pad = _pad(triangles, x)
+    inside = _distance_test(triangles, x, pad)
 
     def visit(node: VisitedNode, state: LoopValues) -> tuple[Mask, LoopValues]:
         """Enter a node if its box is nearer than the best distance so far."""
@@ -175,15 +181,16 @@ def distance_lower_bound(rays: TriangleTree, x: Vec3) -> Real:
         square = ClosestPointOnTriangle.of(row, x).squared_distance
         return (dr.select(active, fmin(square, state[0]), state[0]),)
 
-    start = (initial_squared_distance(rays, x),)
-    return fmax(dr.sqrt(traverse(rays.tree, visit, start)[0]) - pad, real(0))
+    start = (initial_squared_distance(triangles, x),)
+    return fmax(dr.sqrt(traverse(triangles.tree, visit, start)[0]) - pad, real(0))
 
 
-def initial_squared_distance(rays: TriangleTree, x: Vec3) -> Real:
-    """An upper bound of the squared distance from x to the triangles, with which a walk can skip
-    most boxes from its start. It is the squared distance to a vertex in a nearby leaf, rounded up.
+def initial_squared_distance(triangles: TriangleTree, x: Vec3) -> Real:
+    """An upper bound of the squared distance from x to the triangles. A search that starts with it
+    skips most boxes at once. It is the squared distance to a corner of a triangle in a nearby leaf,
+    rounded up.
     """
-    square, pad = squared_distance_in_nearby_leaf(rays.tree, x, 0), _pad(rays, x)
+    square, pad = squared_distance_in_nearby_leaf(triangles.tree, x, 0), _pad(triangles, x)
     return square + 2 * pad * (dr.sqrt(square) + pad)
 
 
@@ -199,12 +206,13 @@ def squared_distance_in_nearby_leaf(tree: PackedTree, x: Vec3, column: int) -> R
     x = vector(x)
 
     def body(i: Any, end: Any, best: Real, first: Any, after: Any, nearest_leaf: Any) -> LoopValues:
-        """Look at node i among its siblings, the last of which is followed by node `end`. After the
-        last, go down to the first child of the sibling with the nearest center.
+        """Compare the center of node i's box with the nearest center among its siblings so far. The
+        node after the last sibling is `end`. After the last sibling, go down to the first child of
+        the sibling with the nearest center.
 
-        best: the smallest squared distance of a sibling's center. nearest_leaf: the leaf of that
-            sibling, NO_TRIANGLE for an inner node. first, after: its first child, and the node
-            after its subtree."""
+        best: the smallest squared distance of a sibling's center so far.
+        nearest_leaf: the leaf of that sibling, NO_TRIANGLE for an inner node.
+        first, after: the first child of that sibling, and the node after its subtree."""
         head = tree.head(i)
         middle = 0.5 * (vector(*head[:3]) + vector(*head[3:6]))
         square = dr.squared_norm(middle - x)
@@ -231,7 +239,7 @@ def squared_distance_in_nearby_leaf(tree: PackedTree, x: Vec3, column: int) -> R
     leaf = dr.while_loop(start, is_running, body, label="to a leaf")[5]
 
     def add(slot: Any, square: Real) -> LoopValues:
-        """Take the point in a slot of the leaf into account."""
+        """Update the smallest squared distance by that of the point in a slot of the leaf."""
         row = tree.primitive(leaf, slot, backend.Bool(True))
         point = vector(*row[column : column + 3])
         return slot + 1, fmin(square, dr.squared_norm(point - x))
@@ -244,17 +252,20 @@ def squared_distance_in_nearby_leaf(tree: PackedTree, x: Vec3, column: int) -> R
 
 
 def next_closest_triangle(
-    rays: TriangleTree, x: Vec3, after: tuple[Real, Any], limit: Real, active: Mask
+    triangles: TriangleTree, x: Vec3, after: tuple[Real, Any], limit: Real, active: Mask
 ) -> ClosestTriangle:
-    """The next triangle after `after` that is nearer to x than `limit`, a squared distance.
+    """The triangle that comes next after the pair `after` and is nearer to x than `limit`, a
+    squared distance.
 
-    Triangles are ordered by (squared distance, number), and `after` is such a pair. Starting with
-    (-1, NO_TRIANGLE), repeated calls visit each triangle once."""
-    backend = rays.tree.backend
+    Triangles are ordered by squared distance from x, and at equal distances by number; `after` is a
+    squared distance and a number. Repeated calls, the first with (-1, NO_TRIANGLE), return each
+    triangle within the limit once. If there is no further triangle, the result's `triangle` is
+    NO_TRIANGLE."""
+    backend = triangles.tree.backend
     real, index, vector = backend.Float, backend.UInt32, backend.Array3f
     x, limit = vector(x), real(limit)
     square_after, number_after = real(after[0]), index(after[1])
-    inside = _distance_test(rays, x, _pad(rays, x))
+    inside = _distance_test(triangles, x, _pad(triangles, x))
 
     def visit(node: VisitedNode, state: LoopValues) -> tuple[Mask, LoopValues]:
         """Enter a node if its box is nearer than the best triangle so far."""
@@ -266,9 +277,9 @@ def next_closest_triangle(
         best, number, offset, normal, is_inner = state
         point = ClosestPointOnTriangle.of(row, x)
         square, n = point.squared_distance, index(fmax(row[NUMBER_COLUMN], real(0)))
-        later = (square > square_after) | ((square == square_after) & (n > number_after))
-        first = (square < best) | ((square == best) & (n < number))
-        chosen = active & later & first & (row[NUMBER_COLUMN] >= 0)
+        is_after = (square > square_after) | ((square == square_after) & (n > number_after))
+        is_before_best = (square < best) | ((square == best) & (n < number))
+        chosen = active & is_after & is_before_best & (row[NUMBER_COLUMN] >= 0)
         return (
             dr.select(chosen, square, best),
             dr.select(chosen, n, number),
@@ -278,26 +289,27 @@ def next_closest_triangle(
         )
 
     start = (limit, index(NO_TRIANGLE), vector(0), vector(0), backend.Bool(False))
-    square, number, offset, normal, is_inner = traverse(rays.tree, visit, start, active)
+    square, number, offset, normal, is_inner = traverse(triangles.tree, visit, start, active)
     exists = number != NO_TRIANGLE
     return ClosestTriangle(dr.select(exists, square, dr.inf), number, offset, normal, is_inner)
 
 
 def _pad(triangles: TriangleTree, x: Vec3) -> Real:
-    """A bound of the rounding error of distances from x, a length: see `distance_lower_bound`."""
+    """A bound of the rounding error of computed distances from x to triangles: a length, 16 machine
+    epsilons of |x| + 1 (`distance_lower_bound`)."""
     return _ROUNDING_EPSILONS * triangles.tree.backend.machine_epsilon * (1 + dr.max(dr.abs(x)))
 
 
 def _distance_test(triangles: TriangleTree, x: Vec3, pad: Real) -> Any:
     """Make a function that tells whether a node's triangles may be within a distance of x.
 
-    The function takes a node and a squared distance, and returns a mask. It tests the distance from
-    the node's box and, if the tree has them, from its slab (`node_slabs`), both widened by the
-    length `pad`."""
+    The function takes a node and a squared distance, and returns a mask. It tests the distance of x
+    from the node's bounding box and, if the tree has slabs, from the node's slab (a flat cylinder
+    around its triangles, see `node_slabs`). Box and slab are enlarged by the length `pad`."""
     vector = triangles.tree.backend.Array3f
 
     def may_be_within(node: VisitedNode, square: Real) -> Mask:
-        """Whether the node's box and slab come within the distance whose square is given."""
+        """Whether the node's enlarged box and slab come within the distance sqrt(square) of x."""
         low, high = vector(*node.head[:3]) - pad, vector(*node.head[3:]) + pad
         gap = dr.select(x < low, low - x, dr.select(x > high, x - high, 0))
         is_box_near = dr.squared_norm(gap) <= square
@@ -317,26 +329,28 @@ def _distance_test(triangles: TriangleTree, x: Vec3, pad: Real) -> Any:
 
 @dataclass(frozen=True)
 class ClosestPointOnTriangle:
-    """The closest point to x of a record's triangle.
+    """The point of a triangle that is closest to a point x.
 
     squared_distance: from x.
     offset: (3,) from x to the point.
     is_inner: whether the point lies inside the triangle, not on its edges.
 
-    It is the closest point of the plane if that lies in the triangle, otherwise the closest point
-    of the edges. The closest point of the plane is computed along the longest edge e, from a and of
-    length L, and along the altitude h on it, made orthogonal to e twice.
+    It is the closest point of the triangle's plane if that point lies in the triangle, otherwise
+    the closest point of the edges. The closest point of the plane is computed as a + alpha e + s h:
+    a and L are the start and the length of the longest edge e, and h is the altitude on e, from
+    which the component along e is removed twice.
 
-    Proof that the distance is off by only a few epsilons of l = L + |x - a|, however thin the
-    triangle (a cross product's direction is off by epsilon L/|h|, which for a needle is an error of
-    any size): x - a minus its component along e, removed twice, is right up to epsilon l and
-    orthogonal to e up to epsilon^2 l, and so is h, whose direction within the plane normal to e is
-    off by d <= epsilon L/|h|. So the point a + alpha e + s h lies off the plane by at most s|h| d
-    <= epsilon L, and off the closest point within it by k <= epsilon l + min(d H, |h|), H the
-    distance from the plane. That lengthens H by at most k^2/(2H), where k >= epsilon l counts as
-    min(d H, |h|)^2/(2H) <= d |h|/2 <= epsilon L/2, and by k <= 3 epsilon l for H < epsilon l. If
-    the same k puts the point on the wrong side of an edge, the edges' distance or the plane's is
-    off by as much.
+    Proof that the distance is off by only a few machine epsilons of l = L + |x - a|, however thin
+    the triangle. (A normal from a cross product would be off by epsilon L/|h|, which is large for a
+    needle.) The vector x - a minus its component along e, removed twice, is right up to epsilon l
+    and orthogonal to e up to epsilon^2 l. The same holds for h, so its direction within the plane
+    normal to e is off by an angle d <= epsilon L/|h|. So the computed point, with 0 <= s <= 1, lies
+    off the plane by at most s |h| d <= epsilon L. Within the plane it is off the closest point by k
+    <= epsilon l + min(d H, |h|), with H the distance of x from the plane. An offset k lengthens H
+    by at most k^2/(2H). The part min(d H, |h|) of k contributes min(d H, |h|)^2/(2H) <= d |h|/2 <=
+    epsilon L/2. For H < epsilon l the distance grows by at most k <= 3 epsilon l. If the same k
+    puts the point on the wrong side of an edge, the distance from the edges is taken for the
+    distance from the plane or the reverse; the two differ by as little.
     """
 
     squared_distance: Real
@@ -360,8 +374,8 @@ class ClosestPointOnTriangle:
         by_qr = ~by_pr & (squares[1] > squares[0])
 
         def chosen(of_pq: Any, of_qr: Any, of_pr: Any) -> Any:
-            """The number or vector of the longest edge, of one for each of the edges pq, qr
-            and pr."""
+            """Select the number or vector of the longest edge, from the three that belong to the
+            edges pq, qr and pr."""
             return dr.select(by_pr, of_pr, dr.select(by_qr, of_qr, of_pq))
 
         a, e, inverse = chosen(p, q, p), chosen(pq, qr, pr), chosen(first, second, third)
@@ -376,8 +390,9 @@ class ClosestPointOnTriangle:
 
 
 def _project_on_edge(v: Vec3, e: Vec3, inverse: Real) -> tuple[Real, Vec3]:
-    """The coefficient t and the rest r of v = t e + r, where r is orthogonal to e. The rest is made
-    orthogonal twice, so that rounding does not matter even if e is short. inverse: 1/|e|^2."""
+    """Split v = t e + r, where r is orthogonal to e. Returns t and r. The component along e is
+    removed twice, so that r is orthogonal to e despite rounding, even if e is short. inverse:
+    1/|e|^2."""
     vector = cast("Any", type(v))
     t = dr.dot(v, e) * inverse
     rest = dr.fma(vector(-t), e, v)
@@ -392,7 +407,7 @@ def _closest_on_segment(a: Vec3, e: Vec3, inverse: Real) -> Vec3:
 
 
 def _shortest_vector(*vectors: Vec3) -> tuple[Real, Vec3]:
-    """The squared length of the shortest of some vectors, and this vector."""
+    """The squared length of the shortest of the vectors, and this vector."""
     best, *rest = vectors
     square = dr.squared_norm(best)
     for vector in rest:
@@ -408,15 +423,15 @@ def squared_distance_to_segment(a: Vec3, e: Vec3, inverse: Real) -> Real:
     return dr.squared_norm(_closest_on_segment(a, e, inverse))
 
 
-def jump_sum_within(rays: TriangleTree, x: Vec3, distance: Real, active: Mask = True) -> Real:
-    """The sum of the absolute values of the jumps of the winding number across the triangles that
-    are within `distance` of x."""
-    real, vector = rays.tree.backend.Float, rays.tree.backend.Array3f
+def jump_sum_within(triangles: TriangleTree, x: Vec3, distance: Real, active: Mask = True) -> Real:
+    """The sum of |jump| over all triangles within `distance` of x: the jump is the change of the
+    winding number across a triangle, which its record holds."""
+    real, vector = triangles.tree.backend.Float, triangles.tree.backend.Array3f
     x, distance = vector(x), real(distance)
-    reach, inside = distance * distance, _distance_test(rays, x, distance)
+    reach, inside = distance * distance, _distance_test(triangles, x, distance)
 
     def visit(node: VisitedNode, state: LoopValues) -> tuple[Mask, LoopValues]:
-        """Enter a node if its box comes within the distance."""
+        """Enter a node if its box comes within `distance` of x."""
         close = inside(node, reach)
         return close, for_each_primitive(node, close & node.is_leaf, add, state)
 
@@ -429,4 +444,4 @@ def jump_sum_within(rays: TriangleTree, x: Vec3, distance: Real, active: Mask = 
         )
         return (state[0] + dr.select(within, dr.abs(row[PARITY_COLUMN]), 0),)
 
-    return traverse(rays.tree, visit, (real(0),), active)[0]
+    return traverse(triangles.tree, visit, (real(0),), active)[0]

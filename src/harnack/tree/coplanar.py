@@ -1,8 +1,8 @@
 """Triangles that overlap in the same plane, as where parts of a mesh touch; and the borders of the
 overlaps.
 
-Neither of two such triangles passes through the other, so that no edge crosses a face; and yet the
-winding number beside one triangle changes where the other ends.
+Two such triangles do not pass through each other: no edge of either crosses the other. Yet the
+winding number beside one triangle changes along the border of the other.
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ __all__ = ["borders_of_overlaps", "overlapping_faces"]
 # A length in units of the mesh's size: a triangle lies in a plane if it is within this distance of
 # it, and two triangles overlap if they do so by more than this.
 _IN_PLANE = 1e-12
-# The size of the cells of R^4 by which planes are told apart: see `_candidates`.
+# The edge of the cells of R^4 by which planes are told apart: each plane is a point of R^4
+# (`_candidates`).
 _PLANE_CELL = 1e-6
 # The rounding of a normal, as a length at the corner of a triangle of size one.
 _NORMAL_ROUNDING = 1e-15
@@ -37,36 +38,37 @@ _HASH_FACTORS = np.array(
 
 
 def borders_of_overlaps(
-    rays: TriangleTree, vertices: FloatArray, faces: IntArray, *, at_every_edge: bool = False
+    tree: TriangleTree, vertices: FloatArray, faces: IntArray, *, at_every_edge: bool = False
 ) -> tuple[IntArray, FloatArray]:
-    """Faces that are partly covered by other faces in their plane, and where to cut them.
+    """The faces that are partly covered by other faces in their plane, and where to cut them so
+    that each piece is covered completely or not at all.
 
-    rays: a tree of the same faces, with coordinates of at most about 1.
-    at_every_edge: whether edges between the covering faces count as borders too. If not, edges
-        inside of a covered part are left out where the covering faces meet in edges that no further
-        face has: the face is equally covered on both sides of these.
+    tree: a tree of the same faces, with coordinates of at most about 1.
+    at_every_edge: whether to cut along all edges of the covering faces. If not, an edge is left out
+        if all faces at it cover the face and run it equally often in both directions: the face is
+        then equally covered on both sides of the edge.
 
     Returns:
         The indices of the covered faces (k,), repeated for each border edge; and knives (k, 3, 3):
         triangles that meet the plane of the face in an edge of the border of the covered part.
     """
-    covered, covering = overlapping_faces(rays, vertices, faces)
+    covered, covering = overlapping_faces(tree, vertices, faces)
     if not len(covered):
         return covered, np.zeros((0, 3, 3))
     edges, sign = _edges(faces[covering])
-    key, number = np.unique(edges, axis=0, return_inverse=True)
-    number = number.reshape(-1)
-    pairs = np.repeat(covered, 3) * len(key) + number
-    lines, line, count = np.unique(pairs, return_inverse=True, return_counts=True)
-    net = np.zeros(len(lines), np.int64)
-    np.add.at(net, line.reshape(-1), sign)
-    face, edge = np.divmod(lines, len(key))
-    ends, faces_at = np.unique(_edges(faces)[0], axis=0, return_counts=True)
+    unique_edges, edge_index = np.unique(edges, axis=0, return_inverse=True)
+    edge_index = edge_index.reshape(-1)
+    pairs = np.repeat(covered, 3) * len(unique_edges) + edge_index
+    pair_keys, pair_index, count = np.unique(pairs, return_inverse=True, return_counts=True)
+    net = np.zeros(len(pair_keys), np.int64)
+    np.add.at(net, pair_index.reshape(-1), sign)
+    face, edge = np.divmod(pair_keys, len(unique_edges))
+    ends, face_count = np.unique(_edges(faces)[0], axis=0, return_counts=True)
     width = len(vertices)
-    at = np.searchsorted(ends @ [width, 1], key[edge] @ [width, 1])
-    is_border = at_every_edge | (net != 0) | (count != faces_at[at])
+    row = np.searchsorted(ends @ [width, 1], unique_edges[edge] @ [width, 1])
+    is_border = at_every_edge | (net != 0) | (count != face_count[row])
     face, edge = face[is_border], edge[is_border]
-    p, q = np.moveaxis(vertices[key[edge]], 1, 0)
+    p, q = np.moveaxis(vertices[unique_edges[edge]], 1, 0)
     normal, _ = _normals(vertices[faces[face]])
     away = np.linalg.norm(q - p, axis=1, keepdims=True) * normal
     middle, side = 0.5 * (p + q), q - p
@@ -86,7 +88,7 @@ def _edges(faces: IntArray) -> tuple[IntArray, IntArray]:
 
 def _normals(corners: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Unit normals (m, 3) of triangles (m, 3, 3), 0 for triangles without a normal; and their
-    heights (m,) over their longest edges."""
+    heights (m,) above their longest edges."""
     u, v = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     normal = np.cross(u, v)
     area = np.sqrt(np.einsum("ni,ni->n", normal, normal))
@@ -100,14 +102,17 @@ def _candidates(corners: FloatArray, normals: FloatArray, heights: FloatArray) -
     """The indices (k,) of triangles in whose plane other triangles may lie. Of two triangles in one
     plane, the one with the smaller height is always among them.
 
-    corners: (m, 3, 3). normals: (m, 3) unit normals. heights: (m,) over the longest edges.
+    corners: (m, 3, 3) the corners of all triangles.
+    normals: (m, 3) their unit normals.
+    heights: (m,) their heights over their longest edges.
 
     A plane is a point of R^4: its unit normal and its distance from the origin. The normal is
     turned so that its first coordinate that is larger than 0.3 in magnitude is positive. For two
     triangles in one plane these points differ only by rounding and by the effect of moving corners
     by `_IN_PLANE`, divided by the smaller of the triangles' heights. R^4 is divided into cells. So
-    a triangle alone in its cell can share its plane with another one only if its point is that near
-    to a wall of the cell, or a coordinate of its normal that near to 0.3 in magnitude."""
+    a triangle that is alone in its cell shares its plane with another triangle only in two cases:
+    its point is nearer to a wall of the cell than this difference, or a coordinate of its normal is
+    nearer to 0.3 in magnitude than this difference."""
     excess = np.abs(normals) - 0.3
     first = np.take_along_axis(normals, (excess > 0).argmax(axis=1)[:, None], axis=1)
     normals = np.where(first < 0, -normals, normals)
@@ -124,13 +129,16 @@ def _candidates(corners: FloatArray, normals: FloatArray, heights: FloatArray) -
 
 
 def overlapping_faces(
-    rays: TriangleTree, vertices: FloatArray, faces: IntArray
+    tree: TriangleTree, vertices: FloatArray, faces: IntArray
 ) -> tuple[IntArray, IntArray]:
-    """Pairs of faces, (k,) and (k,), that overlap in a plane; each pair in both orders.
+    """All pairs of faces (m, 3) that lie in one plane and overlap. Returns the indices (k,) of the
+    first and (k,) of the second faces of the pairs; each pair occurs in both orders.
 
-    Each pair is found from its smaller face: for each face, the overlapping faces that are at least
-    as large are searched for, and there are few."""
-    backend = rays.tree.backend
+    tree: of the same faces, with coordinates of at most about 1.
+
+    The search begins at the smaller face of each pair: for each face it finds the overlapping faces
+    that are at least as large, and there are few of them."""
+    backend = tree.tree.backend
     corners = vertices[faces]
     normals, heights = _normals(corners)
     rows = _candidates(corners, normals, heights)
@@ -139,7 +147,7 @@ def overlapping_faces(
     while len(rows):
         ends = tuple(to_vector3(backend, corner) for corner in np.moveaxis(corners[rows], 1, 0))
         ids = upload_integers(backend, rows)
-        partners = _next_in_plane(rays, ends, ids, sizes, backend.Float(after))
+        partners = _next_in_plane(tree, ends, ids, sizes, backend.Float(after))
         number = to_numpy(partners).astype(np.int64)
         hit = number != NO_TRIANGLE
         rows, after = rows[hit], number[hit].astype(np.float64)
@@ -198,8 +206,9 @@ def _normal(corners: tuple[Vec3, ...]) -> Vec3:
 
 
 def _in_plane(ours: tuple[Vec3, ...], theirs: tuple[Vec3, ...]) -> Mask:
-    """Whether one of two triangles has all corners in the plane of the other. One of the two tests
-    is enough: the normal of a thin triangle may be only rounding."""
+    """Whether one of two triangles has all its corners in the plane of the other one, up to
+    `_IN_PLANE`. It is enough that this holds for one of the two planes, since the normal of a thin
+    triangle may be only rounding error."""
 
     def lies_in(corners: tuple[Vec3, ...], plane: tuple[Vec3, ...]) -> Mask:
         """Whether three corners lie in the plane of a triangle; False if that has no normal."""
@@ -211,14 +220,15 @@ def _in_plane(ours: tuple[Vec3, ...], theirs: tuple[Vec3, ...]) -> Mask:
 
 
 def _overlap(ours: tuple[Vec3, ...], theirs: tuple[Vec3, ...]) -> Mask:
-    """Whether two triangles in one plane overlap by more than `_IN_PLANE`: for no edge of either
-    does the whole other triangle lie on the outer side of the edge."""
+    """Whether two triangles in one plane overlap by more than the length `_IN_PLANE`. They do if no
+    edge of either triangle separates them, that is, has the whole other triangle on its outer side.
+    """
     overlaps: Mask = True
-    for one, other in ((ours, theirs), (theirs, ours)):
-        normal = _normal(one)
+    for first, second in ((ours, theirs), (theirs, ours)):
+        normal = _normal(first)
         for k in range(3):
-            p, q = one[k], one[(k + 1) % 3]
+            p, q = first[k], first[(k + 1) % 3]
             inward = dr.cross(normal, _unit(q - p))
-            offsets = [dr.dot(inward, x - p) for x in other]
+            offsets = [dr.dot(inward, x - p) for x in second]
             overlaps &= fmax(fmax(offsets[0], offsets[1]), offsets[2]) > _IN_PLANE
     return overlaps

@@ -1,16 +1,15 @@
-"""Cells of a box that are proved empty, and the others: octrees, uniform grids, and connected
-components of cells.
+"""Cells of a box that are proved to contain no point of a set, such as a level set, and the
+remaining cells: octrees, uniform grids, and connected components of cells.
 
 - `RefinedCells`, from `refine_cells` and `nonempty_cells`: a box split where it is not proved
   empty.
 - `EmptySpaceGrid`: equal cubes on a backend, and the length for which a ray stays in empty cubes.
 - `OccupancyGrid`: such a grid of the cells that may contain a set of points, computed by an octree.
-- `largest_connected_component`: the largest group of cells that cells proved empty separate from
-  the others.
+- `largest_connected_component`: the largest group of connected cells that are not proved empty.
 
-A component is a group of cells that are not proved empty, connected by faces, edges and corners. If
-a single group is chosen, the march treats the cells of all others as empty. A trial point in such a
-cell is not sampled, so that nothing else is hit.
+A component is a group of cells that are not proved empty and are connected by faces, edges and
+corners. If a single component is to be drawn, the cells of all other components count as empty:
+rays jump across them, so that nothing in them is hit.
 """
 
 from __future__ import annotations
@@ -50,7 +49,8 @@ __all__ = [
 ]
 
 Clearance: TypeAlias = Callable[[FloatArray], FloatArray]
-"""A function from points (n, 3) to lengths (n,): no point of a set is nearer than that to them."""
+"""A function from points (n, 3) to lengths (n,), which are proved lower bounds of the distances of
+the points from a set, such as a level set."""
 
 _OCTANTS = np.array(list(itertools.product((0.0, 1.0), repeat=3)))
 
@@ -80,12 +80,14 @@ class BoxCells:
         return self.corners.min(axis=0), self.corners.max(axis=0) + self.size
 
     def bounding_kdop(self, slack: float) -> ConvexHull:
-        """A polytope around all boxes, enlarged by `slack` (a length). Its 26 normals are the
-        directions from a cube's center to its faces, edges and corners (a k-DOP)."""
+        """A convex polytope that contains all boxes, enlarged by `slack` (a length). Its 26 face
+        normals are the directions from a cube's center to the cube's faces, edges and corners (a
+        k-DOP)."""
         return _kdop_of_boxes(self.centers, 0.5 * self.size + slack)
 
     def octants(self) -> BoxCells:
-        """The eight octants of each box: (8 n) boxes of half the size."""
+        """The 8 n boxes of half the size into which the n boxes are divided, the octants of each
+        box in a row."""
         half = 0.5 * self.size
         return BoxCells((self.corners[:, None] + _OCTANTS * half).reshape(-1, 3), half)
 
@@ -97,22 +99,23 @@ class BoxCells:
         """(n,) whether each box, enlarged on all sides by `margin` times its size, is proved to
         hold no point of a set.
 
-        clearance: a function that bounds distances from the set. The ball around the enlarged box
-            has to be smaller than the clearance of its center."""
+        clearance: gives proved lower bounds of the distances of points from the set. A box is
+            proved empty if the ball around the enlarged box is smaller than the clearance of its
+            center."""
         if not len(self.corners):
             return np.zeros(0, np.bool_)
         return clearance(self.centers) > self.half_diagonal * (1 + 2 * margin + 1e-9)
 
 
 def kdop_of_points(points: FloatArray, slack: float) -> ConvexHull:
-    """The 26-sided polytope (`BoxCells.bounding_kdop`) around points (n, 3), enlarged by
-    `slack`."""
+    """The smallest convex polytope with the 26 face normals of `BoxCells.bounding_kdop` that
+    contains points (n, 3), enlarged along the axes by `slack` (a length)."""
     return _kdop_of_boxes(points, np.full(3, slack))
 
 
 def merge_kdops(one: ConvexHull, other: ConvexHull) -> ConvexHull:
-    """The smallest 26-sided polytope (`BoxCells.bounding_kdop`) that contains two such
-    polytopes."""
+    """The smallest convex polytope with the 26 face normals of `BoxCells.bounding_kdop` that
+    contains two polytopes with these normals."""
     return ConvexHull(
         one.normals,
         np.maximum(one.offsets, other.offsets),
@@ -122,8 +125,8 @@ def merge_kdops(one: ConvexHull, other: ConvexHull) -> ConvexHull:
 
 
 def _kdop_of_boxes(centers: FloatArray, half: FloatArray) -> ConvexHull:
-    """The 26-sided polytope (`BoxCells.bounding_kdop`) around boxes with centers (n, 3) and half
-    edge lengths (3,)."""
+    """The smallest convex polytope with the 26 face normals of `BoxCells.bounding_kdop` that
+    contains boxes with centers (n, 3) and half edge lengths `half` (3,)."""
     normals = np.array([v for v in itertools.product((-1, 0, 1), repeat=3) if any(v)], float)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     offsets = (centers @ normals.T).max(axis=0) + np.abs(normals) @ half
@@ -132,7 +135,8 @@ def _kdop_of_boxes(centers: FloatArray, half: FloatArray) -> ConvexHull:
 
 @dataclass(frozen=True)
 class RefinedCells:
-    """Cells that fill a box.
+    """The leaves of octrees that fill a box: cells of the finest size, and larger cells that are
+    proved to contain no point of a set.
 
     occupied: the cells of the finest size that are not proved empty: they may contain points of the
         set.
@@ -149,11 +153,15 @@ def refine_cells(
     max_rounds: int,
     margin: float = 0.0,
 ) -> RefinedCells:
-    """Split `cells` into octants, and those that are not proved empty again and again.
+    """Split cells into octants, and split the octants that are not proved empty again, for several
+    rounds. Returns the cells of the last round that are not proved empty, and all cells proved
+    empty.
 
+    clearance: gives proved lower bounds of the distances of points from the set.
     max_cells_per_round: refinement stops before a round that would test more cells than this.
     max_rounds: the largest number of rounds; each halves the edges.
-    margin: as for `BoxCells.is_proved_empty`."""
+    margin: a cell counts as empty only if it is proved empty after it was enlarged on all sides by
+        this fraction of its size."""
     empty: list[BoxCells] = []
     for _ in range(max_rounds):
         if 8 * len(cells.corners) > max_cells_per_round:
@@ -168,11 +176,12 @@ def refine_cells(
 def nonempty_cells(
     lower: FloatArray, upper: FloatArray, clearance: Clearance, most: int, finest: int
 ) -> BoxCells:
-    """The smallest cells of the octree of a box that are not proved empty. There are no cells if
-    all of the box is proved empty.
+    """The leaves of the octree of a box that are not proved to be free of a set, of equal size.
+    There are none if all of the box is proved empty.
 
-    lower, upper: the corners of the box.
-    most: the largest number of cells tested in a round.
+    lower, upper: the corners (3,) of the box.
+    clearance: gives proved lower bounds of the distances of points from the set.
+    most: refinement stops before a round that would test more cells than this.
     finest: the largest number of rounds; each halves the edges."""
     root = BoxCells(np.array(lower)[None], np.array(upper) - np.array(lower))
     return refine_cells(root, clearance, most, finest).occupied
@@ -187,13 +196,13 @@ Layout = TypeVar("Layout", bound="GridData")
 
 @dataclass(frozen=True)
 class GridData:
-    """A grid of cells, some of them proved empty; in NumPy.
+    """A uniform grid of cubes, some of them proved to contain no point of a set; in NumPy.
 
-    origin: (3,) its lower corner, in numbers of single precision.
+    origin: (3,) the lower corner of the grid, in numbers of single precision.
     cell_size: the width of a cell (`round_to_short_float`).
     shape: the number of cells along x, y and z.
     empty_distance: (cells,), x fastest: for each cell the chessboard distance, in cells, to the
-        nearest occupied cell; 0 for an occupied cell."""
+        nearest cell that is not proved empty; 0 for such a cell itself."""
 
     origin: FloatArray
     cell_size: float
@@ -203,12 +212,16 @@ class GridData:
 
 @dataclass(frozen=True)
 class EmptySpaceGrid:
-    """A grid of cells, some of them proved empty; on a backend, with all numbers as kernel
-    parameters.
+    """A uniform grid of cubes, some of them proved to contain no point of a set, on a backend. All
+    numbers are parameters of kernels, so that kernels are compiled once for all grids.
 
     A point outside of the grid is treated like its nearest cell.
 
-    backend, origin, cell_size, shape, empty_distance: as in `GridData`, uploaded.
+    origin: (3,) the lower corner of the grid.
+    cell_size: the width of a cell.
+    shape: the number of cells along x, y and z.
+    empty_distance: for each cell, x fastest, the chessboard distance, in cells, to the nearest cell
+        that is not proved empty.
     margin: an empty cell enlarged on all sides by this number of cells is empty too.
     """
 
@@ -247,17 +260,18 @@ class EmptySpaceGrid:
     def empty_run(self, p: Vec3, d: Vec3, length: Real) -> Real:
         """A length s for which p + s d is proved to stay in empty cells; it may exceed `length`.
 
-        p, d: the start, and the direction. length: the length at which the search may stop.
+        p, d: the start and the direction of each ray.
+        length: the length at which the search may stop.
 
         Proof. All cells less than empty_distance cells away from a point's cell are empty, and so
-        are the margins around them. Together they form a cube, larger than these cells by the
-        margin. A step goes beyond the cells by at most the margin minus `_ROUNDING_SHARE`, so it
-        stays inside of the cube; the rest of the margin is for the rounding of positions. Steps end
-        where a cell is occupied."""
+        are the margins around them. These cells form a cube, and with their margins a cube larger
+        by the margin. A step leaves the cube of cells by at most the margin minus
+        `_ROUNDING_SHARE`, so it stays inside of the larger cube; the remaining `_ROUNDING_SHARE` is
+        for the rounding of positions. Steps end in the first cell that is not proved empty."""
 
         def extend(s: Real) -> tuple[Real, Mask]:
-            """From length s on, a longer length up to which the path stays in empty cells, and
-            whether the cell at s is empty; s itself if it is not."""
+            """A length, at least s, up to which the path from p + s d on stays in empty cells; and
+            a mask of whether the cell at p + s d is empty. If it is not, the length is s."""
             cell = self.cell(dr.fma(type(p)(s), d, p))
             free = cell.empty_distance
             return dr.select(
@@ -288,8 +302,8 @@ class EmptySpaceGrid:
         """A length, at most `end`, up to which rays o + t d, |d| = 1, stay in empty cells from `t`
         on.
 
-        It is `t` itself where coordinates are so large that rounding might move a point into
-        another cell: a point is off by at most four roundings of its largest coordinate."""
+        It is `t` itself if coordinates are so large that rounding might move a point too far
+        (`is_resolved`): a point is off by at most four roundings of its largest coordinate."""
         length = dr.select(self.is_resolved(o, end), end - t, 0)
         run = self.empty_run(dr.fma(type(o)(t), d, o), d, length)
         return dr.select(length > 0, fmin(t + run, end), t)
@@ -321,8 +335,8 @@ class GridCell:
         around: the cube consists of the cells less than `around` cells away from the point's cell,
             and of the margin around them.
 
-        A face of the cube where the grid ends does not count, since points outside of the grid are
-        treated like its nearest cell. So the length may be infinite."""
+        The path may leave the cube through a face on which the grid ends, since points outside of
+        the grid are treated like the nearest cell. So the length may be infinite."""
         length: Real = self.grid.backend.Float(dr.inf)
         margin = self.grid.margin - _ROUNDING_SHARE
         for k in range(3):
@@ -338,8 +352,9 @@ class GridCell:
 
 
 def distance_to_occupied(empty: BoolArray) -> IntArray:
-    """`GridData.empty_distance`, from a mask (nz, ny, nx) of the empty cells. If all are empty,
-    each is as far as the largest number of cells along an axis."""
+    """The array `GridData.empty_distance` (cells,), x fastest, from a mask (nz, ny, nx) of the
+    empty cells: the chessboard distance of each cell, in cells, from the nearest cell that is not
+    empty. If all cells are empty, it is the largest number of cells along an axis."""
     if empty.all():
         return np.full(empty.size, max(empty.shape), np.int64)
     from scipy import ndimage  # imported here: it takes a third of a second
@@ -362,8 +377,8 @@ _MARGIN, _ROUNDS = 1 / 16, 3
 
 @dataclass(frozen=True)
 class OccupancyGrid(GridData):
-    """A grid of the cells that may contain a point of a set. Empty cells, and the margins around
-    them (`EmptySpaceGrid`), contain no point of the set."""
+    """A uniform grid of cubes, some of which may contain points of a set. The empty cells, and
+    margins of 1/16 cell around them, contain no point of the set."""
 
     @classmethod
     def from_clearance(
@@ -372,11 +387,12 @@ class OccupancyGrid(GridData):
         """A grid over a box that holds the set, with about `across` cells along the box's longest
         side.
 
-        lower, upper: the corners (3,) of the box. clearance: bounds of the distance from the set.
+        lower, upper: the corners (3,) of the box.
+        clearance: gives proved lower bounds of the distances of points from the set.
 
-        There are no points of the set outside of the box, so an empty cell at the box's faces is
-        empty outwards as well. There are fewer cells if they would otherwise be smaller than the
-        spacing of numbers in single precision."""
+        There are no points of the set outside of the box, so an empty cell at a face of the box
+        stays empty if it is extended outwards. Cells are never smaller than the spacing of the
+        box's largest coordinate in single precision, so there may be fewer than `across`."""
         reach = np.abs([lower, upper]).max().astype(np.float32)
         cell = max(float((upper - lower).max()) / across, float(np.spacing(reach)))
         cell = round_to_short_float(cell)
@@ -409,7 +425,9 @@ class OccupancyGrid(GridData):
 
     def refined(self, clearance: Clearance) -> OccupancyGrid:
         """The same grid with more empty cells: a cell also counts as empty if its eight octants are
-        proved empty, with the same margin around the cell."""
+        all proved empty, each enlarged by the margin of the cell.
+
+        clearance: gives proved lower bounds of the distances of points from the set."""
         x, y, z = self.shape
         full = (self.empty_distance == 0).reshape(z, y, x)
         indices = np.argwhere(full)[:, ::-1]
@@ -429,29 +447,30 @@ _NEIGHBOR_STENCIL = np.ones((3, 3, 3), np.bool_)
 
 
 def largest_connected_component(cells: OccupancyGrid) -> OccupancyGrid:
-    """The grid in which only the largest group of connected cells is occupied.
+    """The grid in which only the largest group of connected cells counts as occupied, that is, as
+    not proved empty.
 
     The size of a group is the sum of its projections along the three axes. A projection counts the
     rows of cells along an axis that contain a cell of the group. Of equal groups, the first along
     z, y and x is chosen.
 
     The number of cells would be a worse measure of areas or volumes. It would be right only if each
-    piece of a surface were surrounded by as many occupied cells. But there are more around it where
-    the function vanishes to a higher order; and around the two sides of a plate thinner than a cell
-    there are no more than around a single side. Projections do not depend on that, except for the
-    cells at their outlines. There are several more of these where a function vanishes to a higher
-    order, so that with coarse cells a smaller component may be chosen.
+    piece of a surface were surrounded by as many occupied cells. But there are more occupied cells
+    around a piece on which the function vanishes to a higher order; and around the two sides of a
+    plate thinner than a cell there are no more than around a single side. Projections are
+    independent of the number of layers of cells, except at their outlines. Where a function
+    vanishes to a higher order, the outline is several cells wider, so that with coarse cells a
+    smaller component may be chosen.
 
     Proof that no component of the set is cut in two. All of the set lies in occupied cells, as
     closed cubes. A connected part of it cannot be covered by two unions of such cubes that are
     closed and have no point in common. Cubes have a point in common if they share at least a
     corner, that is, if they are neighbors. So the part lies in the cells of a single group.
 
-    Proof that rays may jump across the other groups, with the margin by which
-    `EmptySpaceGrid.empty_run` goes beyond the cells that it jumps across. A neighbor of a cell of
-    another group belongs to that group or was empty before, and the margin is less than a cell. So
-    the margin contains nothing of the chosen group. The margin of a cell that was empty before
-    contains nothing of the set at all."""
+    Proof that rays may jump across the other groups, and beyond their cells by the margin
+    (`EmptySpaceGrid.empty_run`). A neighbor of a cell of another group belongs to that group or was
+    empty before, and the margin is less than a cell. So the margin contains nothing of the chosen
+    group. The margin of a cell that was empty before contains nothing of the set at all."""
     x, y, z = cells.shape
     full = (cells.empty_distance == 0).reshape(z, y, x)
     if not full.any():

@@ -1,4 +1,5 @@
-"""Lists of nodes and primitives of a tree, a list for each lane, built and traversed in Dr.Jit.
+"""Lists of nodes and primitives of a tree, a list for each lane (an entry of Dr.Jit's arrays, such
+as a query point), built and traversed in Dr.Jit.
 
 - `LaneLists`: many lists of integers, one list after the other in memory.
 - `build_lists`: builds lists by a walk that runs twice, to count entries and to write them.
@@ -56,8 +57,8 @@ class LaneLists:
 
     @classmethod
     def concatenate(cls, backend: Backend, parts: list[LaneLists]) -> LaneLists:
-        """The lists of all parts together: the lanes of the first part, then those of the second,
-            ...
+        """The lists of all `parts` together: those of the lanes of the first part, then those of
+        the lanes of the second part, and so on.
 
         In each part, the first list must begin at entry 0 and each list where the one before ends.
 
@@ -73,7 +74,8 @@ class LaneLists:
         return cls(*(upload_integers(backend, part) for part in arrays))
 
     def subset(self, backend: Backend, lanes: IntArray) -> LaneLists:
-        """The lists of these lanes, by index; a lane may occur several times."""
+        """The lists of the lanes with indices `lanes` (k,), as k lists; a lane may occur several
+        times."""
         index = backend.UInt32
         uploaded = upload_integers(backend, lanes)
         first, count = (dr.gather(index, numbers, uploaded) for numbers in (self.first, self.count))
@@ -84,7 +86,7 @@ def build_lists(backend: Backend, walk: Callable[[WriteEntry | None], Any]) -> L
     """Build one list for each lane by running `walk` twice: to count the entries and to write them.
 
     walk: called with None, it returns the number of entries of each lane. Called with a
-        `WriteEntry`, it also writes each entry with it.
+        `WriteEntry`, a function that writes one entry, it also calls that function for each entry.
 
     Raises:
         ValueError: there are 2^31 entries or more.
@@ -97,25 +99,29 @@ def build_lists(backend: Backend, walk: Callable[[WriteEntry | None], Any]) -> L
         raise ValueError(_TOO_LONG)
     first, entries = upload_integers(backend, start[:-1]), dr.zeros(index, max(1, int(start[-1])))
 
-    def put(position: Any, entry: Any, active: Mask) -> None:
-        """Write an entry at a position of the list of each active lane."""
+    def write_entry(position: Any, entry: Any, active: Mask) -> None:
+        """The `WriteEntry` for `walk`: write an entry at a position of the list of each active
+        lane."""
         dr.scatter(entries, index(entry), first + position, active)
 
-    dr.eval(walk(put), entries)
+    dr.eval(walk(write_entry), entries)
     return LaneLists(first, count, entries)
 
 
 def traverse_subtrees(
     tree: PackedTree, lists: LaneLists, visit: Visit, state: LoopValues
 ) -> LoopValues:
-    """Walk over the subtrees of the nodes in each lane's list; return the final state.
+    """Visit the nodes of the subtrees below the listed nodes, depth first; return the final state.
+    Each lane walks through the nodes of its own list, one subtree after the other.
 
-    visit, state: as for `balanced_tree.traverse`."""
+    visit: takes a `VisitedNode` and the state; returns whether to visit the node's children, and
+        the new state.
+    state: a tuple of arrays."""
     index = tree.backend.UInt32
 
     def body(k: Any, i: Any, end: Any, *state: Any) -> LoopValues:
-        """Visit node i of the subtree of list entry k; the subtree ends at node `end`. Where i
-        equals `end`, the subtree of entry k begins."""
+        """Visit node i of the subtree of list entry k; `end` is the node after that subtree. If i
+        equals `end`, begin the subtree of entry k instead."""
         begins = i == end
         entry = dr.gather(index, lists.entries, lists.first + k, begins & (k < lists.count))
         i = dr.select(begins, entry, i)
@@ -145,6 +151,7 @@ def for_each_entry(
     index = backend.UInt32
 
     def step(k: Any, *state: Any) -> LoopValues:
+        """Call `body` for entry k of the lists, and go on to the next entry."""
         active = k < lists.count
         entry = dr.gather(index, lists.entries, lists.first + k, active)
         return k + 1, *body(entry, active, state)

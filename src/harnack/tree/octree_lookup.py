@@ -1,7 +1,7 @@
 """Lookup of the octree leaf that contains a point, on a backend.
 
-The builder of an octree lists its nodes level by level (`OctreeLookup.from_levels`). The caller
-keeps a record for each leaf; its contents are up to the caller.
+The builder of an octree lists its nodes depth by depth (`OctreeLookup.from_levels`). A lookup
+returns the index of a leaf; the caller keeps what belongs to the leaf, such as a local expansion.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ __all__ = ["BALL_MARGIN", "MAX_DEPTH", "OCTANT_DIRECTIONS", "OctreeLookup", "enc
 # The smallest cells have 2^-MAX_DEPTH of the width of the cube. A lookup begins in a uniform grid
 # whose cells have 2^-_TOP_DEPTH of it.
 MAX_DEPTH, _TOP_DEPTH = 10, 5
-# What is proved for all points of a cell should be proved in the ball around it, enlarged by this
-# factor, because rounding may move a point out of the cell. Rounding in single precision moves it
-# by less than 2^-20 of the cube's width; the enlarged balls of the smallest cells are larger by
-# 2^-19 of that width.
+# What is used for all points of a cell has to be proved in a ball: the ball around the cell,
+# enlarged by this factor, because rounding may move a point out of the cell. Rounding in single
+# precision moves it by less than 2^-20 of the cube's width; the enlarged balls of the smallest
+# cells are larger by 2^-19 of that width.
 BALL_MARGIN = 1.004
 # Vectors from the center of a cube to the centers of its octants, in quarters of the cube's width;
 # the z component changes fastest.
@@ -49,15 +49,16 @@ def encode_nodes(is_leaf: BoolArray, leaves: int, split: int) -> IntArray:
 
 @dataclass(frozen=True)
 class OctreeLookup:
-    """The octree of a cube, on a backend.
+    """The octree of a cube, on a backend, for `find_leaf`.
 
-    lower_corner: the lower corner of the cube.
+    lower_corner: (3,) the lower corner of the cube.
     cells_per_length: 2^MAX_DEPTH divided by the width of the cube.
-    top_grid: (8^_TOP_DEPTH,) the cells of a uniform grid, z fastest. Each holds the encoded node at
-        depth _TOP_DEPTH that the cell is, or the encoded leaf at a smaller depth that contains the
+    top_grid: (8^_TOP_DEPTH,) an encoded node for each cell of a uniform grid, z fastest. It is the
+        node of depth _TOP_DEPTH that fills the cell, or a leaf of smaller depth that contains the
         cell.
-    encoded_nodes: all nodes except the root, encoded: the index of the first of eight consecutive
-        children (z fastest), or -1 - k for leaf k."""
+    encoded_nodes: all nodes except the root, encoded: an inner node as the index of the first of
+        its eight consecutive children (z fastest), leaf k as -1 - k.
+    """
 
     backend: Backend
     lower_corner: Vec3
@@ -90,8 +91,8 @@ class OctreeLookup:
         return 4 * (nodes + 8**_TOP_DEPTH)
 
     def find_leaf(self, x: Vec3) -> tuple[Any, Mask]:
-        """The index of the leaf that contains x, and a mask of whether x lies in the cube. Where it
-        does not, the leaf at the lower corner is returned."""
+        """The index of the leaf that contains x, and a mask of whether x lies in the octree's cube.
+        For points outside of the cube, the index is that of the leaf at the lower corner."""
         index, integer = self.backend.UInt32, self.backend.Int32
         position = (x - self.lower_corner) * self.cells_per_length
         inside = dr.all((position >= 0) & (position < float(2**MAX_DEPTH)))
@@ -115,7 +116,10 @@ class OctreeLookup:
 
 
 def _build_top_grid(encoded_root: int, nodes: IntArray) -> IntArray:
-    """`OctreeLookup.top_grid`, flattened. encoded_root: the root, encoded as by `encode_nodes`.
+    """The array `OctreeLookup.top_grid` (8^_TOP_DEPTH,): for each cell of a uniform grid, z
+    fastest, the encoded node that the cell is, or the encoded leaf that contains the cell.
+
+    encoded_root: the root, encoded as by `encode_nodes`.
     nodes: all other nodes, encoded."""
     grid = np.full((1, 1, 1), encoded_root, np.int64)
     for _ in range(_TOP_DEPTH):

@@ -2,8 +2,8 @@
 them.
 
 The set of points whose winding number is above 1/2, for a closed mesh that crosses itself, is
-bounded by parts of the mesh's triangles. If each triangle is cut along the others, every piece is
-inside of the set or on its boundary as a whole.
+bounded by parts of the mesh's triangles. If each triangle is cut along all other triangles, every
+piece lies as a whole either on the boundary of the set, or off it.
 """
 
 from __future__ import annotations
@@ -33,29 +33,30 @@ _CENTROID = (1 / 3, 1 / 3, 1 / 3)
 
 
 def split_intersecting_faces(
-    rays: TriangleTree, vertices: FloatArray, faces: IntArray, *, covered_whole: bool = False
+    tree: TriangleTree, vertices: FloatArray, faces: IntArray, *, cuts_coplanar: bool = False
 ) -> tuple[FloatArray, IntArray]:
-    """Cut faces (m, 3) into triangles, none of which passes through another or is partly covered by
-    another.
+    """Cut faces (m, 3) into triangles, none of which passes through another, nor is partly covered
+    by faces in its plane.
 
-    rays: a tree of the same faces, with coordinates of at most about 1.
-    covered_whole: whether faces are also cut where others in their plane meet, so that each of
-        these covers all of a piece or nothing of it.
+    tree: of the same faces, with coordinates of at most about 1.
+    cuts_coplanar: whether to cut a face also along edges inside of the part of it that other faces
+        in its plane cover. Then each face in the plane of a piece covers either the whole piece or
+        no part of it.
 
     Returns:
         The pieces (k, 3, 3), which have the orientation of their faces and fill them; and the index
         (k,) of the face that each is a piece of.
 
     Where two triangles intersect in a segment, each end of the segment lies on an edge of one of
-    them. So every edge is traced as a ray. If it crosses a triangle T, the faces at the edge are
-    cut by the plane of T, and T by their planes, but only where the cut meets the other triangle.
-    An edge that meets another edge, up to rounding, counts as meeting all faces at that edge. Faces
-    in the same plane are cut along the borders of the faces that cover them. Superfluous cuts are
-    harmless.
+    them. So every edge is traced as a ray. If the edge crosses a triangle T, each face at the edge
+    is cut by the plane of T, if that cut meets T; and T is cut by the plane of each face at the
+    edge, if that cut meets the face. An edge that meets another edge, up to rounding, counts as
+    meeting all faces at that edge. Faces in the same plane are cut along the borders of the faces
+    that cover them. Superfluous cuts are harmless.
     """
     corners = vertices[faces]
-    cut, by = _crossing_faces(rays, vertices, faces)
-    covered, borders = borders_of_overlaps(rays, vertices, faces, at_every_edge=covered_whole)
+    cut, by = _crossing_faces(tree, vertices, faces)
+    covered, borders = borders_of_overlaps(tree, vertices, faces, at_every_edge=cuts_coplanar)
     if not len(cut) + len(covered):
         return corners, np.arange(len(faces))
     cut, knives = np.concatenate([cut, covered]), np.concatenate([corners[by], borders])
@@ -71,38 +72,41 @@ def split_intersecting_faces(
 
 
 def separates_levels(
-    rays: TriangleTree, pieces: FloatArray, levels: tuple[float, ...]
+    tree: TriangleTree, pieces: FloatArray, levels: tuple[float, ...]
 ) -> BoolArray:
-    """(k,) whether one of the levels lies strictly between the winding numbers on the two sides of
-    a triangle of `pieces` (k, 3, 3)."""
-    low, high = winding_numbers_of_sides(rays, pieces)
+    """(k,) for each triangle of `pieces` (k, 3, 3), whether any of the levels lies strictly between
+    the winding numbers of the mesh in `tree` on the triangle's two sides."""
+    low, high = winding_numbers_of_sides(tree, pieces)
     return np.any([(low < level) & (level < high) for level in levels], axis=0)
 
 
 def winding_numbers_of_sides(
-    rays: TriangleTree, pieces: FloatArray, barycentric: tuple[float, float, float] = _CENTROID
+    tree: TriangleTree, pieces: FloatArray, barycentric: tuple[float, float, float] = _CENTROID
 ) -> tuple[FloatArray, FloatArray]:
-    """The winding numbers on the two sides of triangles: the smaller ones (k,) and the larger ones
-        (k,).
+    """The winding numbers of the mesh in `tree` on the two sides of the triangles `pieces` (k, 3,
+    3). Returns the smaller (k,) and the larger (k,) of both numbers.
 
     barycentric: the barycentric coordinates of the point of the triangle at which they are
         computed; by default its center."""
-    front, back = windings_of_sides(rays, pieces, barycentric)
+    front, back = windings_of_sides(tree, pieces, barycentric)
     return np.minimum(front, back), np.maximum(front, back)
 
 
 def windings_of_sides(
-    rays: TriangleTree, pieces: FloatArray, shares: tuple[float, float, float] = _CENTROID
+    tree: TriangleTree, pieces: FloatArray, shares: tuple[float, float, float] = _CENTROID
 ) -> tuple[FloatArray, FloatArray]:
-    """The winding numbers (k,) in front of triangles `pieces` (k, 3, 3) and those (k,) behind them.
+    """The winding numbers of the mesh in `tree` in front of triangles `pieces` (k, 3, 3) and behind
+    them. Returns two arrays (k,).
 
-    The front is the side from which the corners run counter-clockwise. shares: the barycentric
-    coordinates of the point of the triangle; by default its center.
+    The front is the side from which the corners of a triangle run counter-clockwise.
 
-    For each triangle, a ray along its normal counts the crossings ahead of a point a little in
-    front of the triangle, and those ahead of a point a little behind it. So coincident triangles
-    are passed all at once."""
-    backend = rays.tree.backend
+    shares: the barycentric coordinates of the point of each triangle at which they are computed; by
+        default its center.
+
+    For each triangle, a ray along its normal counts the signed crossings ahead of a point a little
+    in front of the triangle, and ahead of a point a little behind it. Triangles that coincide with
+    it lie between these two points, so all of them count."""
+    backend = tree.tree.backend
     a, b, c = np.moveaxis(pieces, 1, 0)
     normal = np.cross(b - a, c - a)
     length = np.linalg.norm(normal, axis=1, keepdims=True)
@@ -110,7 +114,7 @@ def windings_of_sides(
     points = shares[0] * a + shares[1] * b + shares[2] * c
     frame = RayFrame.along(backend, to_vector3(backend, points), to_vector3(backend, normal))
     front, back = (
-        to_numpy(rays.signed_crossings_ahead(frame, backend.Float(dr.opaque(backend.Float, t))))
+        to_numpy(tree.signed_crossings_ahead(frame, backend.Float(dr.opaque(backend.Float, t))))
         for t in (_COINCIDENT, -_COINCIDENT)
     )
     return front, back
@@ -141,7 +145,8 @@ def _crossing_faces(
 
 
 def _ranks_in_groups(count: IntArray) -> IntArray:
-    """The numbers 0, 1, ..., n - 1 for each of the counts n, concatenated."""
+    """For each of the counts n in turn, the numbers 0, 1, ..., n - 1, all concatenated. Counts (2,
+    3) give (0, 1, 0, 1, 2)."""
     first = np.cumsum(count) - count
     return cast("IntArray", np.arange(int(count.sum())) - np.repeat(first, count))
 
@@ -183,10 +188,12 @@ def _next_foreign_crossing(
     tree: TriangleTree, corner: list[Any], frame: RayFrame, ends: tuple[Any, Any], end: Any,
     after: tuple[Any, Any],
 ) -> tuple[Any, Any]:  # fmt: skip
-    """The next crossing of each ray with a face that has neither of two vertices as a corner.
+    """The next crossing of each ray with a face of which neither of two vertices is a corner.
 
-    corner: three arrays, the vertices of all faces. ends: the two vertices, for each ray.
-    end: the largest t. after: (t, number), the crossing behind which the search begins.
+    corner: three index arrays, the first, second and third vertices of all faces.
+    ends: the two vertices, two index arrays with an entry for each ray.
+    end: the largest t.
+    after: (t, number of a face), the crossing behind which the search begins.
 
     Returns t and the number of the face; NO_TRIANGLE if there is none."""
     index = tree.tree.backend.UInt32
@@ -210,13 +217,14 @@ def _next_foreign_crossing(
 def _cut_up(pieces: FloatArray, rows: IntArray, knives: FloatArray) -> tuple[FloatArray, IntArray]:
     """Cut triangles by the planes of other triangles, the knives.
 
-    pieces: (n, 3, 3) the triangles. knives: (k, 3, 3).
+    pieces: (n, 3, 3) the triangles that are cut.
+    knives: (k, 3, 3) the triangles whose planes cut them.
     rows: (k,) the index of the triangle that each knife cuts. A knife cuts only where its triangle,
         not only its plane, meets the piece.
 
-    In each round every piece is cut by one of the knives that meet it, the one in the middle of its
-    list, and the new pieces share the other knives of the list: so the number of knives of a piece
-    falls by about half.
+    In each round every piece is cut by one of the knives that meet it: the knife in the middle of
+    the piece's list. The remaining knives of the list are passed on to the new pieces that they
+    meet. So the number of knives of a piece falls by about half in each round.
 
     Returns:
         The pieces (j, 3, 3), and the index (j,) of the triangle that each is a piece of.
@@ -253,8 +261,8 @@ def _pieces_at_plane(pieces: FloatArray, heights: FloatArray) -> FloatArray:
 
     heights: (k, 3) the signed distances of the corners from the plane.
 
-    Returns (3 k, 3, 3): first the single triangle of each, then the first of the two, then the
-    second."""
+    Returns (3 k, 3, 3): first the k single triangles; then, of the two triangles on the other side,
+    the k first ones and the k second ones."""
     # The corner that is alone on its side comes first; a corner in the plane belongs to the side of
     # another corner.
     signs = np.where(heights > 0, 1, -1)
@@ -270,8 +278,8 @@ def _pieces_at_plane(pieces: FloatArray, heights: FloatArray) -> FloatArray:
 
 
 def _heights(pieces: FloatArray, knives: FloatArray) -> FloatArray:
-    """(k, 3) the signed distances of the corners of triangles from the planes of knives, both (k,
-    3, 3)."""
+    """(k, 3) the signed distances of the corners of the triangles `pieces` from the planes of the
+    triangles `knives` with the same index; both are (k, 3, 3)."""
     a, b, c = np.moveaxis(knives, 1, 0)
     normal = np.cross(b - a, c - a)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
@@ -282,7 +290,8 @@ def _cut_meets_triangle(pieces: FloatArray, heights: FloatArray, knives: FloatAr
     """(k,) whether the segment in which the plane of a knife cuts a triangle meets the knife's
     triangle.
 
-    pieces, knives: (k, 3, 3). heights: (k, 3) of the corners of pieces above the planes.
+    pieces, knives: (k, 3, 3) the triangles that are cut, and the triangles whose planes cut them.
+    heights: (k, 3) the signed distances of the corners of pieces from the planes.
 
     The segment is clipped by the three edges of the knife: low and high are the ends of what is
     left, as fractions of the segment."""

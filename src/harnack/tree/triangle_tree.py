@@ -46,10 +46,12 @@ NO_TRIANGLE = 0xFFFFFFFF
 
 
 def triangle_records(vertices: FloatArray, faces: IntArray) -> FloatArray:
-    """Records (m, 14) of the triangles `faces` (m, 3).
+    """The records (m, 14) of the triangles `faces` (m, 3): the rows of numbers from which a tree
+    and its rays know each triangle.
 
-    Each has the corners (9 numbers), ordered by the indices of their vertices; +1, or -1 if that
-    order reverses the face; the index of the face; and 1/length^2 of the edges 01, 12 and 02."""
+    A record has the corners (9 numbers), ordered by the indices of their vertices; +1, or -1 if
+    that order reverses the face; the index of the face; and 1/length^2 of the edges between corners
+    0 and 1, 1 and 2, and 0 and 2 (0 for an edge without a length)."""
     order = np.argsort(faces, axis=1, kind="stable")
     corners = vertices[np.take_along_axis(faces, order, axis=1)]
     even = np.isin(order @ np.array([9, 3, 1]), (5, 15, 19))  # 012, 120, 201 in base three
@@ -91,18 +93,19 @@ def node_boxes(tree: BalancedTree, low: FloatArray, high: FloatArray) -> list[Fl
 def node_slabs(
     tree: BalancedTree, corners: FloatArray, boxes: list[FloatArray]
 ) -> list[FloatArray]:
-    """Slabs around the triangles of the nodes of a tree. Returns an array (k, 6) for each level of
-    the tree, leaves first.
+    """A slab for each node of a tree: a flat cylinder that contains the node's triangles. Returns
+    an array (k, 6) for each level of the tree, leaves first.
 
-    corners: (n, 3, 3) of the triangles. boxes: from `node_boxes`.
+    corners: (n, 3, 3) the corners of the triangles.
+    boxes: the bounding boxes of the nodes (`node_boxes`).
 
     A slab has six numbers: a unit normal n, an offset, half a thickness and a radius. With c the
     center of the node's box, each point of its triangles is c + h n + r, where r is orthogonal to
     n, |h - offset| <= half the thickness and |r| <= radius.
 
-    A piece of a smooth surface is much thinner than its box, which matters for points far away:
-    with boxes alone, a walk visits the whole cap of the surface that bulges by less than the width
-    of a box."""
+    A piece of a smooth surface is much thinner than its bounding box. With boxes alone, a search
+    for the triangle nearest to a far point would visit the whole cap of the surface whose depth is
+    less than the width of a box."""
     points = tree.values_in_slots(corners, np.nan).reshape(len(tree.leaf_slots), -1, 3)
     edges = corners - corners[:, :1]
     normals = tree.values_in_slots(np.cross(edges[:, 1], edges[:, 2])).sum(axis=1)
@@ -122,8 +125,8 @@ def node_slabs(
 
 @dataclass(frozen=True)
 class RayFrame:
-    """Coordinates along and across rays o + t d. The unit vectors u, v and d are orthogonal and
-    right-handed."""
+    """Orthonormal coordinates of rays o + t d, one frame for each ray: u and v across the ray, and
+    t along it. The unit vectors u, v and d are orthogonal and right-handed."""
 
     o: Vec3
     u: Vec3
@@ -139,12 +142,12 @@ class RayFrame:
         return cls(o, u, v, d)
 
     def transverse(self, p: Vec3) -> tuple[Real, Real]:
-        """The coordinates (u, v) of p in the plane normal to the rays, relative to the ray."""
+        """The coordinates (u, v) of p in the plane across the ray; the ray itself is at (0, 0)."""
         a = p - self.o
         return _flush_tiny(dr.dot(a, self.u)), _flush_tiny(dr.dot(a, self.v))
 
     def depth(self, p: Vec3) -> Real:
-        """The t of the point of the ray that is nearest to p."""
+        """The t of the point o + t d of the ray that is nearest to p."""
         return dr.dot(p - self.o, self.d)
 
     def component(self, a: Vec3) -> Real:
@@ -154,20 +157,22 @@ class RayFrame:
 
 @dataclass(frozen=True)
 class VerticalRayFrame:
-    """The frame of rays from points o along the z axis. It takes no computation."""
+    """The coordinates of rays from points o along the z axis, with the methods of `RayFrame` but
+    almost no computation."""
 
     o: Vec3
 
     def transverse(self, p: Vec3) -> tuple[Real, Real]:
-        """As `RayFrame.transverse`."""
+        """The coordinates (x, y) of p relative to the ray: the x and the y axis take the place of u
+        and v."""
         return _flush_tiny(p.x - self.o.x), _flush_tiny(p.y - self.o.y)
 
     def depth(self, p: Vec3) -> Real:
-        """As `RayFrame.depth`."""
+        """The t of the point o + t (0, 0, 1) of the ray that is nearest to p."""
         return p.z - self.o.z
 
     def component(self, a: Vec3) -> Real:
-        """As `RayFrame.component`."""
+        """The component of a vector along the z axis."""
         return a.z
 
 
@@ -179,17 +184,20 @@ def _flush_tiny(coordinate: Real) -> Real:
 
 
 def edge_function(a: tuple[Real, Real], b: tuple[Real, Real]) -> Real:
-    """Twice the signed area of the triangle (0, a, b). Its sign says on which side of the edge ab
-    the ray passes.
+    """Twice the signed area of the triangle with the corners (0, 0), a and b. Its sign says on
+    which side of the edge from a to b the ray passes.
 
-    a, b: coordinates across the ray. The result is the same, to the last bit, for every triangle at
-        the edge, if a and b come in the same order."""
+    a, b: the coordinates (u, v) of the edge's ends across the ray, which is at (0, 0).
+
+    For all triangles at the edge the result has the same bits, if a and b come in the same
+    order."""
     return dr.fma(a[0], b[1], -(a[1] * b[0]))
 
 
 @dataclass(frozen=True)
 class TriangleTree:
-    """A tree of bounding boxes over triangles, which finds their crossings with rays."""
+    """A tree of bounding boxes over triangles, with methods that find the crossings of the
+    triangles with rays. Coordinates of triangles are at most about 1."""
 
     tree: PackedTree
 
@@ -199,9 +207,10 @@ class TriangleTree:
     ) -> TriangleTree:
         """Build the tree.
 
+        tree: which triangle lies in which leaf.
         records: of the triangles, from `triangle_records`.
-        slabs: whether nodes have slabs (`node_slabs`) besides boxes, for closest points from far
-            away."""
+        slabs: whether nodes have slabs (flat cylinders around their triangles, see `node_slabs`)
+            besides boxes. They make searches for the closest triangle of a far point faster."""
         corners = records[:, :9].reshape(-1, 3, 3)
         levels = node_boxes(tree, corners.min(axis=1), corners.max(axis=1))
         if slabs:
@@ -217,10 +226,12 @@ class TriangleTree:
         active: Mask,
         reach: float = 0.0,
     ) -> tuple[Real, Any, Real, Vec3]:
-        """The next crossing of a ray after `after`, with t <= t_max.
+        """The first crossing of a ray with a triangle that comes after the pair `after` and has t
+        <= t_max.
 
-        after: (t, number). Crossings are ordered by t, and those at the same t by the number of the
-            triangle.
+        after: (t, number of a triangle). Crossings are ordered by t, and at the same t by the
+            number of the triangle. With the number NO_TRIANGLE, all crossings at exactly this t are
+            skipped.
         reach: a length. If it is more than 0, a triangle counts as crossed too if its border is
             within this distance of the ray; but not if its border is that close to an end of the
             ray, t = 0 or t_max.
@@ -237,13 +248,13 @@ class TriangleTree:
             self.tree.backend.Array3f,
         )
         t_after, n_after = real(after[0]), index(after[1])
-        inside = self._slab_test(frame, reach)
+        may_meet_box = self._make_box_test(frame, reach)
 
         def visit(node: VisitedNode, state: LoopValues) -> tuple[Mask, LoopValues]:
             """Enter a node if the ray comes near its box before the best crossing so far."""
             limit = fmin(state[0], t_max)
-            open_ = inside(node, t_after, limit)
-            return open_, for_each_primitive(node, open_ & node.is_leaf, nearer, state)
+            is_met = may_meet_box(node, t_after, limit)
+            return is_met, for_each_primitive(node, is_met & node.is_leaf, nearer, state)
 
         def nearer(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
             """Take the crossing with a record's triangle if it is after `after` and before the best
@@ -251,13 +262,13 @@ class TriangleTree:
             best, number, sign, normal = state
             t, new_sign = signed_crossing(row, frame)
             n = index(fmax(row[NUMBER_COLUMN], real(0)))
-            later = (t > t_after) | ((t == t_after) & (n > n_after) & (n_after != NO_TRIANGLE))
-            first = (t < best) | ((t == best) & (n < number))
+            is_after = (t > t_after) | ((t == t_after) & (n > n_after) & (n_after != NO_TRIANGLE))
+            is_before_best = (t < best) | ((t == best) & (n < number))
             passed = new_sign != 0
             if reach > 0:
                 within = (t > 2 * reach) & (t < t_max - 2 * reach)
                 passed |= within & _is_beside(row, frame, reach)
-            chosen = active & passed & later & first & (t <= t_max)
+            chosen = active & passed & is_after & is_before_best & (t <= t_max)
             return (
                 dr.select(chosen, t, best),
                 dr.select(chosen, n, number),
@@ -270,13 +281,14 @@ class TriangleTree:
         return best, number, sign, normal * dr.rsqrt(fmax(dr.squared_norm(normal), real(1e-37)))
 
     def signed_crossings_ahead(self, frame: RayFrame, t_min: Real, active: Mask = True) -> Real:
-        """The sum of the signs of all crossings of a ray with t > t_min (`signed_crossing`)."""
-        real, inside = self.tree.backend.Float, self._slab_test(frame)
+        """The sum of the signs of all crossings of a ray with triangles at t > t_min. The sign of a
+        crossing is 1 if the triangle's normal points along the ray, else -1."""
+        real, may_meet_box = self.tree.backend.Float, self._make_box_test(frame)
 
         def visit(node: VisitedNode, state: LoopValues) -> tuple[Mask, LoopValues]:
             """Enter a node if the ray comes near its box ahead of t_min."""
-            open_ = inside(node, real(t_min), real(dr.inf))
-            return open_, for_each_primitive(node, open_ & node.is_leaf, add, state)
+            is_met = may_meet_box(node, real(t_min), real(dr.inf))
+            return is_met, for_each_primitive(node, is_met & node.is_leaf, add, state)
 
         def add(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
             """Add the sign of the crossing with a record's triangle, if it is ahead of t_min."""
@@ -288,24 +300,25 @@ class TriangleTree:
     def signed_crossings_between(
         self, frame: RayFrame, end: Real, unit: Real, active: Mask
     ) -> tuple[Real, Mask]:
-        """The sum of the signs of all crossings with 0 < t < end, and a mask of the rays for which
-        that sum is certain.
+        """The sum of the signs of all crossings of a ray with triangles at 0 < t < end, and a mask
+        of the rays for which rounding cannot change the sum. The sign of a crossing is 1 if the
+        triangle's normal points along the ray, else -1.
 
         unit: the rounding error of a coordinate.
 
-        A computed t belongs to a point of the triangle within a few units of the ray. So the error
-        of t is that distance divided by the cosine of the angle between ray and normal. If t may
-        therefore lie on either side of an end of the interval, the sum is not certain."""
-        real, inside = self.tree.backend.Float, self._slab_test(frame)
+        The computed t belongs to a point of the triangle within a few units of the ray. So t is off
+        by at most a few units divided by the cosine of the angle between ray and normal. If t is
+        that close to 0 or to `end`, the sum is not certain."""
+        real, may_meet_box = self.tree.backend.Float, self._make_box_test(frame)
 
         def visit(node: VisitedNode, state: LoopValues) -> tuple[Mask, LoopValues]:
             """Enter a node if the ray comes near its box between 0 and `end`."""
-            open_ = inside(node, real(0), real(end))
-            return open_, for_each_primitive(node, open_ & node.is_leaf, add, state)
+            is_met = may_meet_box(node, real(0), real(end))
+            return is_met, for_each_primitive(node, is_met & node.is_leaf, add, state)
 
         def add(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
             """Add the sign of the crossing with a record's triangle, if it is between 0 and `end`;
-            and clear the mask of certain sums if rounding may have decided that."""
+            and clear the lane's mask if rounding may have decided whether it is."""
             total, sure = state
             t, sign = signed_crossing(row, frame)
             normal = normal_of(row, self.tree.backend.Array3f)
@@ -322,10 +335,11 @@ class TriangleTree:
         return total, sure
 
     def signed_crossings_vertical(self, x: Vec3, way: Real, active: Mask = True) -> Real:
-        """The sum of the signs of all crossings of rays from x along the z axis.
+        """The sum of the signs of all crossings of rays from x along the z axis with triangles. The
+        sign of a crossing is 1 if the triangle's normal has a positive z component, else -1, for
+        both directions of the ray.
 
-        way: 1 for rays upwards, -1 for rays downwards. In both cases the signs are those for the
-            upward direction.
+        way: 1 for rays upwards, -1 for rays downwards.
 
         Testing boxes costs less than for other directions."""
         real = self.tree.backend.Float
@@ -336,11 +350,11 @@ class TriangleTree:
         def visit(node: VisitedNode, state: LoopValues) -> tuple[Mask, LoopValues]:
             """Enter a node if its box, slightly enlarged, meets the vertical ray."""
             x0, y0, z0, x1, y1, z1 = node.head
-            open_ = (
+            is_met = (
                 (high_x >= x0) & (low_x <= x1) & (high_y >= y0) & (low_y <= y1)
                 & (height - pad <= dr.select(up, z1, -z0))
             )  # fmt: skip
-            return open_, for_each_primitive(node, open_ & node.is_leaf, add, state)
+            return is_met, for_each_primitive(node, is_met & node.is_leaf, add, state)
 
         def add(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
             """Add the sign of the crossing with a record's triangle, if it is ahead."""
@@ -349,12 +363,13 @@ class TriangleTree:
 
         return traverse(self.tree, visit, (real(0),), active)[0]
 
-    def _slab_test(self, frame: RayFrame, reach: float = 0.0) -> Any:
+    def _make_box_test(self, frame: RayFrame, reach: float = 0.0) -> Any:
         """Make a function that tells whether rays come near a node's box.
 
-        The function takes a node and two t. It returns a mask: whether the ray comes within `reach`
-        (a length) of the box between these t. Rounding may turn a no into a yes, never a yes into a
-        no."""
+        The function takes a node, t_min and t_max. It returns a mask: whether the ray comes within
+        `reach` (a length) of the node's box at some t between these two. Rounding may turn a no
+        into a yes, never a yes into a no: boxes and t are widened by `pad`, a bound of the rounding
+        error, since |d| = 1 makes t a length."""
         backend = self.tree.backend
         vector = backend.Array3f
         d = frame.d
@@ -366,7 +381,8 @@ class TriangleTree:
         pad = 16 * backend.machine_epsilon * (1 + size) + reach
 
         def may_meet(node: VisitedNode, t_min: Real, t_max: Real) -> Mask:
-            """Whether a ray comes near the node's box for t between t_min and t_max."""
+            """Whether the ray comes within `reach` of the node's box, up to rounding, for a t
+            between t_min and t_max."""
             low, high = vector(*node.head[:3]) - pad, vector(*node.head[3:]) + pad
             a, b = (low - o) * inverse, (high - o) * inverse
             near = fmax(fmax(fmin(a.x, b.x), fmin(a.y, b.y)), fmin(a.z, b.z))
@@ -383,7 +399,8 @@ def corners_of(row: list[Real], vector: Any) -> tuple[Vec3, Vec3, Vec3]:
 
 
 def normal_of(row: list[Real], vector: Any) -> Vec3:
-    """A normal of the triangle of a record by the right-hand rule, of any length.
+    """A normal of the triangle of a record, in the direction of its face's right-hand rule; its
+    length is twice the area.
 
     vector: the type of the normal."""
     p, q, r = corners_of(row, vector)
@@ -391,17 +408,18 @@ def normal_of(row: list[Real], vector: Any) -> Vec3:
 
 
 def signed_crossing(row: list[Real], frame: RayFrame | VerticalRayFrame) -> tuple[Real, Real]:
-    """The t and the sign of the crossing of a ray with the triangle of a record. The sign is 0 if
-    there is none.
+    """The t and the sign of the crossing of a ray with the triangle of a record. The sign is 1 if
+    the triangle's normal points along the ray, -1 if it points back, and 0 if the ray does not
+    cross the triangle.
 
     In the plane across the ray, with coordinates (u, v), the sign is the winding number of the
     triangle about the ray. It is a sum over the edges of the triangle: +1 for each that crosses the
     half-line v = 0, u > 0 upwards, and -1 for each that crosses it downwards. Upwards means from v
     <= 0 to v > 0, which v alone decides; whether u > 0 at the crossing is the sign of
-    `edge_function`. Both are the same for all triangles around a vertex or an edge. So a rounding
-    error that adds a crossing to one of them takes it from its neighbor: the sum over a closed
-    surface is right whatever the rounding did, and rays through edges and vertices need no special
-    case.
+    `edge_function`. Both decisions are the same for all triangles at an edge or a vertex. So a
+    rounding error that adds a crossing to one triangle takes it from its neighbor. The sum over a
+    closed surface is right whatever the rounding was, and rays through edges and vertices need no
+    special case.
 
     t is the depth of a point of the triangle within a few roundings of coordinates of the ray,
     however thin the triangle is (`_crossing_depth`)."""
@@ -411,19 +429,19 @@ def signed_crossing(row: list[Real], frame: RayFrame | VerticalRayFrame) -> tupl
     ab, bc, ac = edge_function(a, b), edge_function(b, c), edge_function(a, c)
     up_a, up_b, up_c = a[1] > 0, b[1] > 0, c[1] > 0
 
-    def upwards(from_up: Mask, to_up: Mask, left: Real) -> Real:
+    def edge_sign(from_up: Mask, to_up: Mask, left: Real) -> Real:
         """How an edge crosses the half-line v = 0, u > 0: 1 upwards, -1 downwards, 0 if it does
         not.
 
-        from_up, to_up: whether v > 0 at the ends of the edge. left: the `edge_function` of its
-            ends."""
+        from_up, to_up: whether v > 0 at the ends of the edge.
+        left: the `edge_function` of its ends."""
         one = type(left)(1)
         return dr.select(~from_up & to_up & (left > 0), one, 0) - dr.select(
             from_up & ~to_up & (left < 0), one, 0
         )
 
     sign = row[PARITY_COLUMN] * (
-        upwards(up_a, up_b, ab) + upwards(up_b, up_c, bc) - upwards(up_a, up_c, ac)
+        edge_sign(up_a, up_b, ab) + edge_sign(up_b, up_c, bc) - edge_sign(up_a, up_c, ac)
     )
     a, b, c = (*a, frame.depth(p)), (*b, frame.depth(q)), (*c, frame.depth(r))
     close = _EDGE_ROUNDINGS * float(dr.epsilon(frame.o)) * (1 + dr.max(dr.abs(frame.o)))
@@ -431,8 +449,8 @@ def signed_crossing(row: list[Real], frame: RayFrame | VerticalRayFrame) -> tupl
 
 
 def _is_beside(row: list[Real], frame: RayFrame, reach: float) -> Mask:
-    """Whether the line of a ray comes within `reach` of the border of a record's triangle. (Terms
-    that `signed_crossing` computes as well are computed once.)"""
+    """Whether the line of a ray comes within `reach` (a length) of an edge of a record's triangle.
+    (Dr.Jit computes terms that `signed_crossing` has as well only once.)"""
     p, q, r = corners_of(row, type(frame.o))
     a, b, c = frame.transverse(p), frame.transverse(q), frame.transverse(r)
     is_near: Mask = False
@@ -457,38 +475,39 @@ def _crossing_depth(
     areas: the `edge_function` of the edges ab, bc and ac of the corners a, b and c.
     close: the distance from an edge within which the ray passes through the edge.
 
-    The barycentric weight of a corner is an area divided by that of the triangle. Where the
-    triangle is thin, it is only rounding error. So t is found along the longest edge, on which
-    coordinates are accurate. Let w be the weight of the corner off the longest edge, s' the
-    coordinate along that edge, from 0 to 1, of this corner, and s + w s' that of the ray, with 0 <=
-    s <= 1 - w. First, w is clamped to the range for which there is such an s; then s is computed
-    from w. A wrong w moves the point only across the longest edge, by no more than the rounding of
-    an area over the edge's length.
+    The barycentric weight of a corner is an area divided by the triangle's area, which for a thin
+    triangle is only rounding error. So t is computed along the longest edge, on which coordinates
+    are accurate. Let w be the weight of the corner opposite to the longest edge. Measure positions
+    along that edge from 0 at its start to 1 at its end, and let s' be the position of the opposite
+    corner. Then the ray's position is s + w s' with 0 <= s <= 1 - w. First, w is clamped to the
+    range for which there is such an s; then s is computed from w. A wrong w moves the point only
+    across the longest edge, by no more than the rounding of an area over the edge's length.
 
-    If the ray is within `close` of an edge or a vertex, it passes through all triangles there at
-    the depth of that edge or vertex, the same bits for all: the jumps of the winding number
-    across them are at exactly the same t."""
+    If the ray is within `close` of an edge or a vertex, t is the depth of that edge or vertex. It
+    has the same bits for all triangles there, so that the ray crosses all of them at exactly the
+    same t."""
     (a, b, c), (ab, bc, ac) = corners, areas
     squares = _square(a, b), _square(b, c), _square(a, c)
     is_first = (squares[0] >= squares[1]) & (squares[0] >= squares[2])
     is_last = squares[2] > squares[1]
 
-    def of_longest(first: Real, second: Real, last: Real) -> Real:
-        """The number of the longest edge, of one number for each of the edges ab, bc and ac."""
+    def select_longest(first: Real, second: Real, last: Real) -> Real:
+        """Select the number that belongs to the longest edge, from the three of the edges ab, bc
+        and ac."""
         return dr.select(is_first, first, dr.select(is_last, last, second))
 
     start, end, apex = (
-        tuple(of_longest(*numbers) for numbers in zip(*choice, strict=True))
+        tuple(select_longest(*numbers) for numbers in zip(*choice, strict=True))
         for choice in ((a, b, a), (b, c, c), (c, a, b))
     )
     e = end[0] - start[0], end[1] - start[1]
-    share = dr.rcp(of_longest(*squares))
+    share = dr.rcp(select_longest(*squares))
     along = -dr.fma(start[0], e[0], start[1] * e[1]) * share
     aside = dr.fma(apex[0] - start[0], e[0], (apex[1] - start[1]) * e[1]) * share
     zero = type(ab)(0)
     along, aside = clamp(along, zero, 1), clamp(aside, zero, 1)
     max_w = fmin((1 - along) / (1 - aside), fmin(along / aside, type(ab)(1)))
-    w = clamp(of_longest(ab, bc, -ac) / (bc - ac + ab), zero, max_w)
+    w = clamp(select_longest(ab, bc, -ac) / (bc - ac + ab), zero, max_w)
     s = clamp(dr.fma(-w, aside, along), zero, 1 - w)
     t = dr.fma(s, end[2] - start[2], dr.fma(w, apex[2] - start[2], start[2]))
     near = close * close
