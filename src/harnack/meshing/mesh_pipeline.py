@@ -781,7 +781,7 @@ def _unlimited_box(field: Field, volume: Volume | None) -> _MeshingBox:
     if bounds is None or not np.isfinite(bounds).all():
         raise MeshingError(
             f"the solid on this side of the level of {type(field).__name__} reaches to infinity: "
-            "choose the other side, or give a clip with bounds, such as a box (harnack.Box)"
+            "choose the other side, or give a clip with bounds, such as a box"
         )
     return _MeshingBox(*bounds, True)
 
@@ -802,7 +802,7 @@ def _box(field: Field, levels: tuple[float, ...], volume: Volume | None) -> _Mes
     if volume is None and extent is None:
         raise MeshingError(
             f"{type(field).__name__} does not say where its level {level:g} ends: give a "
-            "clip, such as a box (harnack.Box)"
+            "clip, such as a box"
         )
     if isinstance(field, SolidAngle):
         return _around_curve(field, extent, volume)

@@ -90,7 +90,8 @@ def animate(
     path: .gif (Pillow) or .mp4 (PyAV: `pip install harnack[film]`).
     frames: the number of pictures.
     fps: pictures a second. In a GIF each picture lasts a whole number of hundredths of a second.
-    orbit: degrees that the camera goes around its target during the film.
+    orbit: degrees that the camera goes around its target during the film; None is 360 if nothing
+        else moves, else 0.
     camera: as `render` takes it. Properties that it does not set (target, distance, angle of view)
         are the same for all pictures, and such that everything is always in view.
     client, checkpoint: as `render` takes them. Workers draw whole pictures; a film with more
@@ -106,7 +107,11 @@ def animate(
     count = check_integer("frames", arguments.pop("frames"))
     if not 1 <= count <= _MAX_FRAMES:
         raise ValueError(f"frames must be from 1 to {_MAX_FRAMES:,}, not {count}")
-    fps, orbit = (as_finite(arguments.pop(name), name) for name in ("fps", "orbit"))
+    fps, orbit = as_finite(arguments.pop("fps"), "fps"), arguments.pop("orbit")
+    if orbit is None:
+        is_moving = any(map(_is_function_of_s, (surfaces, *arguments.values())))
+        orbit = 0.0 if is_moving else 360.0
+    orbit = as_finite(orbit, "orbit")
     if not 0 < fps <= 240:
         raise ValueError(f"fps must be more than 0 and at most 240, not {fps}")
     for name, value in arguments.items():

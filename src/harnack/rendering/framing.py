@@ -83,7 +83,7 @@ class UnboundedSurfaceError(ValueError):
         hint = (
             "" if bounded_level is None else f", or choose another level, such as {bounded_level:g}"
         )
-        super().__init__(f"{reason}: give it a clip, such as a ball (harnack.Ball){hint}")
+        super().__init__(f"{reason}: give it a clip, such as a ball{hint}")
         self.reason = reason
         self.bounded_level = bounded_level
 

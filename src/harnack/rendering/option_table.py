@@ -212,7 +212,7 @@ OPTIONS: tuple[Option, ...] = (
     Option("fps", "film", frozenset(("animate",)), "pictures a second (24)", "N",
            text.parse_positive, default=24.0, in_files=False),
     Option("orbit", "film", frozenset(("animate",)), "degrees that the camera goes around the "
-           "surface", "DEGREES", text.parse_number, default=0.0, in_files=False),
+           "surface (360 if nothing else moves)", "DEGREES", text.parse_number, in_files=False),
     Option("title", "live", LIVE, "title of the page", "TEXT", str, default="", in_files=False),
     Option("host", "server", frozenset(("view",)), "address to serve at; any but this machine's "
            "own is open to the network, and the page's address then has a token (127.0.0.1)",
