@@ -1,4 +1,4 @@
-"""One file that opens in any browser, and traces surfaces there."""
+"""Writes one HTML file, a page, that opens in any browser and traces surfaces there."""
 
 from __future__ import annotations
 
@@ -123,13 +123,14 @@ def page(
 
 
 def check_title(title: Any) -> None:
-    """Raise TypeError for a title that is no text."""
+    """Raise `TypeError` if the title is not a string."""
     if not isinstance(title, str):
         raise TypeError(f"title must be text, not {title!r:.60}")
 
 
 def still_png(live: LiveScene) -> str:
-    """A picture of the initial state, as base64 of a PNG file."""
+    """A picture of the initial state, as base64 text of a PNG file. A page shows it where the
+    browser cannot trace."""
     camera = Camera(**live.pose)
     still: Any = live.render_still(
         live.initial_controls, show=live.show, size=_STILL_SIZE, camera=camera
@@ -138,11 +139,12 @@ def still_png(live: LiveScene) -> str:
 
 
 def _places(live: LiveScene) -> dict[str, list[float]]:
-    """The places of the sliders that a page holds: those of their steps, and of sliders without a
-    step as many as make no large file, where what is drawn changes much from place to place.
+    """The slider values for which a page stores states, a list for each slider by name. A slider
+    with a step has all its values; a slider without a step has evenly spaced values, fewer if the
+    states are large (see `_TARGET_BYTES`).
 
     Raises:
-        ValueError: there are too many combinations of places.
+        ValueError: there are more than `_MOST_CHOICES` combinations of slider values.
     """
     sliders = live.content.sliders
     count = max(2, min(_MAX_SLIDER_VALUES, int(_CHOICES ** (1 / max(1, len(sliders))))))
@@ -166,19 +168,23 @@ def _places(live: LiveScene) -> dict[str, list[float]]:
 
 
 def _framing_values(places: Mapping[str, list[float]]) -> Mapping[str, list[float]]:
-    """The places that are framed: all, or of many places every other place and the last one."""
+    """The slider values by which the picture is framed. places: the values of each slider in the
+    page. They are returned unchanged if they have at most `_FRAMED` combinations; otherwise every
+    other value and the last one of each slider."""
     if math.prod(map(len, places.values())) <= _FRAMED:
         return places
     return {name: sorted({*values[::2], values[-1]}) for name, values in places.items()}
 
 
 def _slider_combinations(places: Mapping[str, list[float]]) -> list[dict[str, float]]:
-    """One place of each slider, in all combinations, the last slider's going fastest."""
+    """All combinations of the values of the sliders, each as a value by slider name. The last
+    slider changes fastest."""
     return [dict(zip(places, place, strict=True)) for place in itertools.product(*places.values())]
 
 
 def _slider_state(live: LiveScene, values: Mapping[str, float]) -> JsonDict:
-    """The delta from the initial state to the state at a place of the sliders."""
+    """The state at the given slider values, as its difference from the initial state, in JSON
+    data."""
     with slider_values_in_errors(values):
         state = live.state(ControlState(values))
     return encode_arrays(state_delta(live.initial_state, state, checks=False))
@@ -186,7 +192,13 @@ def _slider_state(live: LiveScene, values: Mapping[str, float]) -> JsonDict:
 
 @dataclass(frozen=True)
 class PageJob:
-    """The job of computing the states of a page: the arguments of `page`, and Mitsuba's variant."""
+    """The arguments of `page` in a form that can be sent to workers, which compute the states of
+    the page.
+
+    surfaces: the content of the page, as `page` takes it.
+    settings: the options of `page` by name, sliders included.
+    variant: the Mitsuba variant of this process, which workers are to use too.
+    """
 
     surfaces: Any
     settings: Mapping[str, Any]
@@ -194,35 +206,36 @@ class PageJob:
 
     @functools.cached_property
     def unframed(self) -> LiveScene:
-        """The live scene of the arguments, framed for the start values of its sliders."""
+        """The live scene of the arguments, framed for the start values of its sliders alone."""
         set_variant(self.variant)
         return LiveScene.of(self.surfaces, dict(self.settings))
 
     @functools.cached_property
     def places(self) -> dict[str, list[float]]:
-        """The slider values that the page holds, by slider."""
+        """The slider values for which the page stores states, by slider name."""
         return _places(self.unframed)
 
     @functools.cached_property
     def live(self) -> LiveScene:
-        """The live scene, framed for all slider values that the page holds."""
+        """The live scene, framed for all slider values that the page stores."""
         return self.unframed.framed(_slider_combinations(_framing_values(self.places)))
 
     @functools.cached_property
     def digest(self) -> str:
-        """A digest of the initial state, to which the deltas of the other states are relative."""
+        """A hash of the initial state, as text. Differences of other states can be applied only to
+        the same initial state."""
         return hashlib.blake2b(
             json.dumps(encode_arrays(self.live.initial_state)).encode()
         ).hexdigest()
 
     def state(self, values: Mapping[str, float], digest: str) -> TaskResult:
-        """The delta of a state, for a combination of slider values, relative to the initial state;
-        as text in bytes.
+        """The difference of the state at the given slider values from the initial state, as
+        {"text": bytes of JSON in an array of uint8}.
 
-        digest: of the initial state that is in the page.
+        digest: the hash of the page's initial state, in the process that writes the page.
 
         Raises:
-            RuntimeError: the initial state of this process is another one.
+            RuntimeError: this process computes an initial state with another hash.
         """
         if self.digest != digest:
             raise RuntimeError(
@@ -234,7 +247,11 @@ class PageJob:
 
 
 def _slider_states(job: PageJob, workers: Executor, advance: Any) -> JsonDict:
-    """The places of the sliders, and the delta of the state at each combination of them."""
+    """{"places": the values of each slider, "frames": the difference from the initial state for
+    each combination of them}, in the order of `_slider_combinations`.
+
+    workers: run the tasks. advance: called with the finished fraction of the work after each task.
+    """
     frames: list[JsonDict] = []
     tasks = [(values, job.digest) for values in _slider_combinations(job.places)]
     for result in workers.run_tasks(job, "state", tasks):
@@ -244,14 +261,20 @@ def _slider_states(job: PageJob, workers: Executor, advance: Any) -> JsonDict:
 
 
 def script(*names: str) -> str:
-    """The JavaScript modules of this folder, joined into one script."""
+    """The named JavaScript modules of this folder, joined into one script without imports and
+    exports."""
     parts = [resource(name) for name in names]
     text = "\n".join(re.sub(r"^import .*?;\n", "", part, flags=re.M | re.S) for part in parts)
     return re.sub(r"^export ", "", text, flags=re.M)
 
 
 def document(scene: Mapping[str, Any], still: str, link: str = "frames") -> str:
-    """The HTML of a page. link: "frames", or "server" if Python answers it."""
+    """The text of an HTML page.
+
+    scene: the data of `LiveScene.scene`. still: base64 text of a PNG file.
+    link: where the page gets other states from: "frames" for states stored in it, or "server" for
+        Python's answers.
+    """
     passes = json.dumps(resource("passes.wgsl"))
     return _PAGE.substitute(
         title=html.escape(scene["title"]),
@@ -265,7 +288,7 @@ def document(scene: Mapping[str, Any], still: str, link: str = "frames") -> str:
 
 
 def resource(name: str) -> str:
-    """The text of a file of this folder."""
+    """The text of a file of this folder, such as a JavaScript module."""
     return resources.files("harnack.live").joinpath(name).read_text(encoding="utf-8")
 
 
