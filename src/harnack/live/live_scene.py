@@ -189,8 +189,8 @@ class LiveScene:
 
     def framed(self, places: Iterable[Mapping[str, float]]) -> LiveScene:
         """This scene with a placement and a camera such that the surfaces stay in the picture for
-        all combinations of slider values in `places` (each a mapping from slider names to values). A
-        scene without sliders, or whose camera has a box, is returned unchanged.
+        all slider values in `places`, each a mapping from slider names to values. A scene without
+        sliders, or whose camera has a box, is returned unchanged.
 
         Slider values for which nothing can be drawn are left out here: drawing them reports the
         error.

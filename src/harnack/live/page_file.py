@@ -66,35 +66,37 @@ def page(
 ) -> None:
     """Write one HTML file in which surfaces turn under mouse, touch and keys.
 
-        hk.page(field, "surface.html")
-        hk.page(field, "levels.html", level=hk.Slider(1, 12))
-        hk.page(lambda w: hk.fields.Morph(a, b, w=w), "morph.html", w=hk.Slider(0, 1))
+            hk.page(field, "surface.html")
+            hk.page(field, "levels.html", level=hk.Slider(1, 12))
+            hk.page(lambda w: hk.fields.Morph(a, b, w=w), "morph.html", w=hk.Slider(0, 1))
 
-    It opens in any browser with WebGPU, without Python and without a network; some want it from
-    https or 127.0.0.1. Where there is none it shows a still picture and says why. The kernel that
-    Dr.Jit records for each surface is in it, translated to WGSL: the same proofs on another GPU.
-    Rounding is not proved there, so that 2,048 rays with Dr.Jit's answers are in the file, too.
-    They are traced first, and if the visitor's device does not agree, nothing of what it says is
-    drawn.
+    The file opens in any browser with WebGPU, without Python and without a network; some browsers
+    offer WebGPU only to pages from https or 127.0.0.1. A browser without WebGPU shows a still
+    picture and says why. The file holds the kernel that Dr.Jit records for each surface, translated
+    to WGSL, so that the visitor's GPU takes the same proved steps. As rounding on that GPU is not
+    proved, the file also holds 2,048 rays for each surface with Dr.Jit's results. The browser
+    traces these rays first, and draws nothing that its GPU computes if the results do not agree.
 
-    surfaces: a field, a `Surface`, or a list of them, as `render` draws them in its studio; or a
-        function of sliders that gives them.
-    path: ends in .html. title: of the page; by default the field's own text.
-    options, keywords: as `render` takes them in its studio: level, clip, tolerance, material,
-        camera, up, boundary_radius, ..., and backdrop="light" or "dark"; those of still pictures
-        alone are refused. A `Slider` may stand in the place of a number, and functions of sliders,
-        by the names of their arguments, in the place of anything. What is drawn at each place of a
-        slider is in the file: of one without a step 33, of two 17 each, and fewer where they would
-        take more than 4 MB (9, of several 5 each, at least). A page with sliders of more than 8 MB
-        is written with a warning.
-    client, checkpoint: as `render` takes them, for the places of sliders.
+    surfaces: a field, a `Surface`, or a list of them, as for `render`; or a function of sliders
+        that returns them.
+    path: the file to write; it must end in .html or .htm. title: of the page; by default the
+        field's own text.
+    options, keywords: options of `render` and of traces: level, clip, tolerance, material, camera,
+        up, boundary_radius, ..., and backdrop="light" or "dark". Options for still pictures alone
+        are refused. The value of an option that is a number may be a `Slider`. Any other value may
+        be a function whose arguments are named like sliders. The file stores a state for every
+        combination of slider values. A slider without a step has 33 values, two such sliders have
+        17 each, and fewer if the states would take more than 4 MB (at least 9 for one slider, 5
+        each for several). A page with sliders of more than 8 MB is written with a warning.
+    client, checkpoint: a Dask client (or its address) that computes the states, and a folder in
+        which finished states are kept, as for `render`.
 
     Raises:
         ValueError: a path that does not end in .html; a surface without bounds; a transparent
-            material; sliders with too many combinations of places; a place of the sliders at which
-            nothing can be drawn, with what is wrong there.
-        UntranslatableError: the kernel holds an operation that is not translated.
-        TypeError: what is no field; an unknown setting; a slider that nothing depends on.
+            material; sliders with too many combinations of values; slider values for which nothing
+            can be drawn (the message says why).
+        UntranslatableError: the kernel holds an operation that has no translation to WGSL.
+        TypeError: a surface that is no field; an unknown option; a slider that nothing depends on.
     """
     target = os.fspath(path)
     settings = with_flat_options({**keywords, "options": options})
