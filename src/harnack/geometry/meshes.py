@@ -70,15 +70,15 @@ def validate_mesh(
 
 
 def zero_area_faces(vertices: npt.ArrayLike, faces: npt.ArrayLike) -> IntArray:
-    """Indices (k,) of the faces that count as faces of zero area.
+    """The indices (k,) of the faces that count as faces of zero area.
 
     Twice the area of such a face is at most 8 units in the last place (2^-49) of the square of its
-    longest edge: its vertices lie on a line, or two of them are equal, up to the rounding of a
-    cross product. So it depends neither on the scale nor on the position of the mesh. Such a face
-    has no reliable normal.
+    longest edge: up to the rounding of a cross product, its vertices lie on a line or two of them
+    are equal. This depends neither on the scale nor on the position of the mesh. Such a face has no
+    reliable normal.
 
     Raises:
-        MeshError: as `validate_mesh`, but for zero area.
+        MeshError: the mesh is not valid, apart from faces of zero area (see `validate_mesh`).
     """
     return np.flatnonzero(_measure_faces(*_checked_arrays(vertices, faces))[0])
 
@@ -122,14 +122,15 @@ def solid_angles(corners: FloatArray, point: FloatArray) -> FloatArray:
 
 
 def _checked_arrays(vertices: Any, faces: Any) -> tuple[FloatArray, IntArray]:
-    """Fresh arrays of the right types and shapes, with finite vertices and indices in range."""
+    """Vertices as a new float64 array (n, 3) of finite numbers, and faces as a new int64 array (m,
+    3) of valid indices. Raises `MeshError`."""
     x = _as_vertices(vertices)
     triangles = _as_faces(faces, len(x))
     return x, triangles
 
 
 def _as_vertices(vertices: Any) -> FloatArray:
-    """A new float64 array (n, 3) of finite vertices. Raises MeshError."""
+    """Vertices as a new float64 array (n, 3) of finite numbers. Raises `MeshError`."""
     array = _as_array(vertices, "the vertices", "every vertex needs three coordinates")
     if array.size == 0:
         raise MeshError("there are no vertices: give an array (n, 3)")
@@ -146,7 +147,8 @@ def _as_vertices(vertices: Any) -> FloatArray:
 
 
 def _as_faces(faces: Any, count: int) -> IntArray:
-    """A new int64 array (m, 3) of indices of `count` vertices. Raises MeshError."""
+    """Faces as a new int64 array (m, 3) of indices below `count`, the number of vertices. Raises
+    `MeshError`."""
     array = _as_array(faces, "the faces", "every face needs three indices; triangulate polygons")
     if array.size == 0:
         raise MeshError("there are no faces: give an array (m, 3) of vertex indices")
@@ -167,7 +169,7 @@ def _as_faces(faces: Any, count: int) -> IntArray:
 
 
 def _check_range(faces: npt.NDArray[Any], count: int) -> None:
-    """Raise a MeshError for a face with an index outside of [0, count)."""
+    """Raise `MeshError` if a face (m, 3) has an index outside of [0, count)."""
     if int(faces.min()) >= 0 and int(faces.max()) < count:
         return
     outside = (faces < 0) | (faces >= count)
@@ -185,8 +187,8 @@ def _check_range(faces: npt.NDArray[Any], count: int) -> None:
 
 
 def _as_array(values: Any, name: str, ragged: str) -> npt.NDArray[Any]:
-    """The values as a NumPy array of numbers. ragged: the end of the message for rows of different
-    lengths. Raises MeshError."""
+    """The values as a NumPy array, which is no array of objects. name: what they are, for messages.
+    ragged: the end of the message for rows of different lengths. Raises `MeshError`."""
     try:
         array = np.asarray(values)
     except (ValueError, OverflowError):
@@ -197,7 +199,8 @@ def _as_array(values: Any, name: str, ragged: str) -> npt.NDArray[Any]:
 
 
 def _measure_faces(x: FloatArray, faces: IntArray) -> tuple[BoolArray, FloatArray]:
-    """Whether each face counts as flat, and its longest edge in the maximum norm: (m,) each.
+    """For each face (m, 3) of vertices x (n, 3): whether it counts as a face of zero area, (m,),
+    and the largest difference of two of its vertices in any coordinate, (m,).
 
     Edges are scaled before they are multiplied, so that nothing overflows or underflows.
     """

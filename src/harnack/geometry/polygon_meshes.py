@@ -44,12 +44,12 @@ _MAX_EXAMINED_FACES = 20_000
 
 @dataclass(frozen=True, eq=False)
 class PolygonFaces:
-    """Faces with any number of corners, in flat arrays.
+    """Polygonal faces with any number of corners and loops, in flat arrays.
 
     vertices: (n, 3).
-    corners: (k,) vertex indices, loop after loop.
-    sizes: (l,) the number of corners of each loop.
-    face_of_loop: (l,) ascending; every face has a loop.
+    corners: (k,) the vertex index of each corner, loop after loop.
+    loop_sizes: (l,) the number of corners of each loop.
+    face_of_loop: (l,) the face of each loop, ascending; every face has at least one loop.
     """
 
     vertices: FloatArray
@@ -283,7 +283,8 @@ def _check_edges(mesh: PolygonFaces) -> None:
 
 
 def _first_repeated_key(keys: IntArray) -> int | None:
-    """The index of the first key that occurs earlier in the array; None if all keys differ."""
+    """The smallest index of a key that also occurs earlier in the array; None if all keys
+    differ."""
     _, first = np.unique(keys, return_index=True)
     if len(first) == len(keys):
         return None
@@ -398,8 +399,12 @@ def _smoothed(points: FloatArray, edges: IntArray, times: int) -> FloatArray:
 def _clusters(
     vertices: FloatArray, faces: IntArray, count: int, iterations: int, seed: int
 ) -> IntArray:
-    """The cluster (m,) of each triangle, by Lloyd's algorithm in six dimensions
-    (`cluster_into_polygons`)."""
+    """The cluster (m,) of each triangle of a mesh. Triangles are points (centroid, weight * unit
+    normal) in six dimensions, weighted by area, and are clustered by Lloyd's algorithm.
+
+    count: the number of clusters; some may become empty. iterations: the number of Lloyd's steps.
+        seed: of the random initial centers.
+    """
     import scipy.spatial  # imported here: it takes half a second, and few programs need it
 
     spatial: Any = scipy.spatial

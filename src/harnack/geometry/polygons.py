@@ -49,11 +49,12 @@ def cancel_opposite_edges(loops: Loops) -> Loops:
 
 
 def remaining_edges(loops: Loops) -> tuple[FloatArray, FloatArray]:
-    """Starts and ends (k, 3) of the edges of closed loops that remain after
-    `cancel_opposite_edges`, each edge once.
+    """The starts and ends (k, 3) of the edges of closed loops that remain after opposite edges were
+    cancelled, each edge once.
 
-    Around an edge that is run n times net, the solid angle changes by 4 pi n: unless n = 0 it takes
-    every value modulo 4 pi next to each of its points, so that every level set ends there.
+    Around an edge that is run n times net (once in each direction counts 0), the solid angle
+    changes by 4 pi n. Unless n = 0 it takes every value modulo 4 pi next to each point of the edge,
+    so that every level set ends there.
     """
     if not loops:
         return np.zeros((0, 3)), np.zeros((0, 3))
@@ -63,8 +64,8 @@ def remaining_edges(loops: Loops) -> tuple[FloatArray, FloatArray]:
 
 
 def _welded_edges(loops: Loops, points: FloatArray) -> tuple[IntArray, IntArray]:
-    """The begin and the end (m,) of all edges of the loops, as indices of `points`, which are the
-    vertices of all loops. Points at the same position have the same index."""
+    """The first and the last point (m,) of all edges of the loops, as indices of `points` (m, 3),
+    the vertices of all loops. Points at the same position have the same index."""
     index = weld_vertices(points)
     parts = np.split(index, np.cumsum([len(loop) for loop in loops])[:-1])
     return index, np.concatenate([np.roll(part, -1) for part in parts])
@@ -156,10 +157,9 @@ def _fans(polygons: IntArray) -> IntArray:
 
 
 def _fan_is_invalid(vertices: FloatArray, polygons: IntArray) -> BoolArray:
-    """(m,) whether a triangle of the fan around the first corner is reversed or flat.
-
-    Polygons of zero area count as convex.
-    """
+    """For each of m polygons with k corners (indices (m, k) of `vertices`), whether a triangle of
+    the fan around its first corner is reversed or flat, as an array (m,). Polygons of zero area
+    count as convex."""
     points = vertices[polygons]
     diagonals = points[:, 1:] - points[:, :1]
     areas = np.cross(diagonals[:, :-1], diagonals[:, 1:])
@@ -201,10 +201,9 @@ def _clip_ears(polygon: IntArray, projection: FloatArray) -> IntArray:
 
 
 def _perturb_straight_corners(projection: FloatArray) -> FloatArray:
-    """The polygon (k, 2), with corners in the middle of straight edges moved by a tiny amount.
-
-    Such a corner is then not an ear, which would be a triangle of zero area.
-    """
+    """The polygon (k, 2) with each corner in the middle of a straight edge moved inwards by a tiny
+    amount. Ear clipping then does not cut off such a corner, which would give a triangle of zero
+    area."""
     arriving, leaving = (
         projection - np.roll(projection, 1, axis=0),
         np.roll(projection, -1, axis=0) - projection,

@@ -159,7 +159,7 @@ class TangentVoronoi:
 
 
 def _below(count: Any) -> Callable[..., Mask]:
-    """A loop condition: whether the first number of the state is below `count`."""
+    """The condition of a Dr.Jit loop: whether the first entry of its state is below `count`."""
 
     def is_active(i: Any, *_: Any) -> Mask:
         return i < count
@@ -168,7 +168,8 @@ def _below(count: Any) -> Callable[..., Mask]:
 
 
 def _line_in_disc(backend: Backend, q: tuple[Real, Real], b: Real) -> _BisectorLine:
-    """The line q . y = b as a `_BisectorLine`, relative to the unit disc."""
+    """The line q.y = b in the plane, with its normal scaled to unit length, as a `_BisectorLine`.
+    If it misses the unit disc, its normal becomes 0."""
     length = dr.sqrt(dr.square(q[0]) + dr.square(q[1]))
     crosses = length > b
     inverse = dr.select(crosses, dr.rcp(length), 0)
@@ -182,12 +183,12 @@ def _clip_bisectors(
     bisector: Any,
     line_count: Any,
 ) -> list[tuple[Real, Real, Mask]]:
-    """For each of `own_lines`, the interval (lower, upper) of positions along it that all other
-    lines leave, empty if lower >= upper; and whether another neighbor lies to the left of its
-    neighbor.
+    """For each line of `own_lines`: the interval (lower, upper) of positions along it that lie in
+    the cell, that is in the unit disc and not beyond another line (empty if lower >= upper); and
+    whether some other neighbor lies to the left of the line's neighbor.
 
-    indices: the indices of `own_lines`.
-    bisector: gives the line of an index, in lanes of a mask.
+    indices: the index of each of `own_lines` among all lines.
+    bisector: bisector(i, mask) returns line i, in lanes of the mask.
     line_count: the number of all lines.
     """
     initial: list[Any] = []
