@@ -164,7 +164,8 @@ def orthonormal_basis(d: Vec3) -> tuple[Vec3, Vec3]:
 
 def orthonormal_basis_rows(d: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Two arrays u and v (n, 3) of unit vectors for an array d (n, 3) of unit vectors: (u, v, d) is
-    orthonormal and right-handed in each row. As `orthonormal_basis`, for NumPy arrays."""
+    orthonormal and right-handed in each row. The same formula as `orthonormal_basis`, for NumPy
+    arrays."""
     x, y, z = d.T
     sign = np.copysign(1.0, z)
     a = -1.0 / (sign + z)

@@ -130,28 +130,29 @@ def as_unit_normals(normals: Any, count: int) -> FloatArray:
 def estimate_areas(
     points: npt.ArrayLike, normals: npt.ArrayLike, neighbors: int = 20
 ) -> FloatArray:
-    """The area (n,) that each point of a cloud stands for: the area of its Voronoi cell in the
-    tangent plane.
+    """Estimate the area (n,) that each point of a cloud represents: the area of its Voronoi cell
+    (the points of space that are nearer to it than to any other point) in its tangent plane.
 
     Barill et al. 2018, section 3.1, project the nearest neighbors to the tangent plane and take the
     area of the point's Voronoi cell among them. Here the point's Voronoi cell in space is
-    intersected with the tangent plane instead. For points in a plane this is the same; but a point
-    on the other side of a thin wall does not shrink the cell, since its bisecting plane is parallel
-    to the tangent plane. Points at the same position share a cell.
+    intersected with the tangent plane instead. For points in a plane this is the same. But here a
+    point on the other side of a thin wall does not shrink the cell, since its bisecting plane is
+    parallel to the tangent plane. Points at the same position share a cell.
 
     Let R be the distance of the farthest neighbor that is used. All other points can cut the cell
-    only at distances above R/2: so within the disc of radius R/2 the cell is exact, and it is cut
-    off there. At the boundary of an open surface a cell may be unbounded: if all neighbors lie on
-    one side of a line through the point, their mirror images bound the cell too, so that it extends
-    as far outwards as inwards.
+    only at distances above R/2. So within the disc of radius R/2 the cell is exact, and it is cut
+    off at this radius. At the boundary of an open surface a cell may be unbounded: if all neighbors
+    lie on one side of a line through the point, their mirror images bound the cell too, so that it
+    extends as far outwards as inwards. The radius is also limited to three times the median of its
+    neighbors' radii, so that an isolated point gets no more area than its neighbors.
 
-    Outliers: a cell is also cut off at three times the median of these radii of its neighbors, so
-    that a point far from the others gets no more area than they have.
-
-    neighbors: the number of neighbors; more cost time, fewer cut large cells of uneven samples.
+    points, normals: (n, 3) each.
+    neighbors: the number of neighbors that are used; more take more time, fewer cut off large cells
+        of uneven samples.
 
     Raises:
-        CloudError: as `validate_cloud`; all points are at one position; fewer than 3 neighbors.
+        CloudError: points or normals are not valid (see `validate_cloud`); all points are at one
+            position; fewer than 3 neighbors.
     """
     x = as_cloud_points(points)
     n = as_unit_normals(normals, len(x))

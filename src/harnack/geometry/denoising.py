@@ -113,17 +113,17 @@ def outlier_indices(points: FloatArray, tree: Any) -> IntArray:
 
 
 def estimate_noise(points: FloatArray, normals: FloatArray | None, tree: Any) -> NoiseEstimate:
-    """Estimate the noise and the spacing of a cloud.
+    """Estimate the noise and the spacing of a cloud of points (n, 3). tree: the search tree of
+    these points.
 
-    Each of up to 1000 probe points has neighbors, and each neighbor j predicts the height t_j of
-    the surface above the probe (module docstring). The noise is the median, over probes, of the
-    standard deviation of t_j. Without normals, deviations from the plane that fits the neighbors
-    best are used, so that curvature counts as noise.
+    Each of up to 1000 probe points has neighbors. A neighbor j at p_j with the normal n_j predicts
+    that the surface is at the height t_j = (n + n_j)/2 . (p_j - x) above a probe x with the normal
+    n. The noise is the median, over the probes, of the standard deviation of t_j. If `normals` is
+    None, deviations from the plane that best fits the neighbors are used instead, so that curvature
+    counts as noise.
 
     The number of neighbors grows from 16 to 1024, until the farthest is (in the median) 4.5
-    standard deviations away: fewer reach no farther than the noise, and show no surface.
-
-    tree: of these points.
+    standard deviations away: fewer neighbors reach no farther than the noise, and show no surface.
     """
     rng = np.random.default_rng(0)
     probes = np.sort(rng.choice(len(points), min(len(points), _PROBES), replace=False))

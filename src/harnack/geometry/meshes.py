@@ -86,7 +86,8 @@ def zero_area_faces(vertices: npt.ArrayLike, faces: npt.ArrayLike) -> IntArray:
 def without_zero_area_faces(
     vertices: npt.ArrayLike, faces: npt.ArrayLike
 ) -> tuple[FloatArray, IntArray]:
-    """The mesh without the faces of `zero_area_faces`, as `validate_mesh` returns it.
+    """The mesh without its faces of zero area (see `zero_area_faces`): vertices (n, 3) float64 and
+    faces (k, 3) int64, copies that cannot be written to.
 
     All vertices stay, so indices keep their meaning. A face of zero area adds nothing to a winding
     number. If it filled a gap of zero width (a vertex in the middle of its neighbor's edge), the
@@ -94,7 +95,8 @@ def without_zero_area_faces(
     and only make distances to boundary edges smaller than need be.
 
     Raises:
-        MeshError: as `validate_mesh`; no face has an area.
+        MeshError: the mesh is not valid, apart from faces of zero area (see `validate_mesh`); or no
+            face has an area.
     """
     x, triangles = _checked_arrays(vertices, faces)
     is_flat, longest = _measure_faces(x, triangles)
@@ -227,7 +229,7 @@ def _check_size(longest: FloatArray) -> None:
 
 
 def _zero_area_message(x: FloatArray, faces: IntArray, flat: IntArray) -> str:
-    """The text of an error message about faces of zero area, whose indices are `flat`."""
+    """The text of an error message about faces of zero area. flat: the indices of these faces."""
     a, b, c = (x[k] for k in faces[flat[0]])
     corners = ", ".join(format_vector(corner) for corner in (a, b, c))
     repeated = bool((a == b).all() or (b == c).all() or (c == a).all())

@@ -89,16 +89,19 @@ class TangentVoronoi:
         self, points: FloatArray, normals: FloatArray, nearest: npt.NDArray[Any],
         radii: FloatArray, *, mirrored: bool,
     ) -> tuple[FloatArray, BoolArray]:  # fmt: skip
-        """The areas (m,) of cells in units of the squared radii, and a mask (m,) of the points all
-        of whose neighbors lie on one side.
+        """The areas (m,) of the cells of m points, in units of their squared radii; and a mask (m,)
+        of the points whose neighbors all lie on one side of a line through the point.
 
-        mirrored: whether the mirror images of the neighbors count as well.
+        points, normals: (m, 3) the points, and the unit normals of their tangent planes.
+        nearest: (m, k) indices of the neighbors among `positions`.
+        radii: (m,) the radius at which each cell is cut off.
+        mirrored: whether the mirror images of the neighbors at the point count as neighbors too.
 
-        Each neighbor has a bisector line, at distance h_j from the center of the cell. The other
-        lines and the circle leave an interval of line j: an edge of the cell. The cell is star
-        shaped, so its area is the sum of the triangles between these edges and the center, and of
-        circular sectors in the remaining directions. All neighbors lie on one side if one of them
-        has no other neighbor to its left.
+        Each neighbor j has a bisector line in the tangent plane, at the distance h_j from the
+        center of the cell. The other lines and the circle leave an interval of line j: an edge of
+        the cell. The cell is star shaped, so its area is the sum of the triangles between these
+        edges and the center, and of circular sectors in the remaining directions. All neighbors lie
+        on one side if one of them has no other neighbor to its left.
         """
         backend, index = self.backend, self.backend.UInt32
         u, v = (upload_vectors(backend, axis) for axis in orthonormal_basis_rows(normals))

@@ -77,7 +77,8 @@ class Welded:
     def _from_index(
         cls, index: IntArray, vertices: FloatArray, faces: IntArray, rounded: int
     ) -> Welded:
-        """The mesh with vertex k replaced by vertex index[k]. rounded: see `Welded`."""
+        """The mesh in which vertex k is replaced by vertex index[k]. rounded: the number of
+        positions that were joined although rounding separates them."""
         net = net_faces(index[faces])
         return cls(index, net, *singular_edges(net.faces, net.multiplicity), rounded)
 

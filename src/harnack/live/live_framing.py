@@ -81,9 +81,9 @@ def extreme_points(points: FloatArray) -> FloatArray:
 def _orbit(camera: Camera, placement: Placement, points: FloatArray) -> dict[str, Any]:
     """A camera that turns about a target, as data for camera.js (see `Framing.camera`).
 
-    The position and direction are those that `camera` has for the points (n, 3) after placement.
-    The target is the point of the line of sight that is as far from the camera as the middle of the
-    points' box, measured along the line of sight.
+    It stands where `camera` stands when it frames the points (n, 3) after placement, and looks in
+    the same direction. The target is the point of the line of sight that is as far from the camera
+    as the middle of the points' box, measured along the line of sight.
     """
     on_stage = placement.apply(points)
     pose = camera.pose(on_stage, _SIZE, placement.apply)

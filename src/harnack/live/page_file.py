@@ -66,9 +66,9 @@ def page(
 ) -> None:
     """Write one HTML file in which surfaces turn under mouse, touch and keys.
 
-            hk.page(field, "surface.html")
-            hk.page(field, "levels.html", level=hk.Slider(1, 12))
-            hk.page(lambda w: hk.fields.Morph(a, b, w=w), "morph.html", w=hk.Slider(0, 1))
+        hk.page(field, "surface.html")
+        hk.page(field, "levels.html", level=hk.Slider(1, 12))
+        hk.page(lambda w: hk.fields.Morph(a, b, w=w), "morph.html", w=hk.Slider(0, 1))
 
     The file opens in any browser with WebGPU, without Python and without a network; some browsers
     offer WebGPU only to pages from https or 127.0.0.1. A browser without WebGPU shows a still

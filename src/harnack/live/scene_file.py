@@ -155,8 +155,8 @@ class SceneFile:
 def read_scene(path: str | os.PathLike[str]) -> SceneFile:
     """Read a scene file, which `write_scene` or a view has written.
 
-            scene = hk.read_scene("mine.json")
-            hk.render(scene.surfaces, "mine.png", **scene.settings)
+        scene = hk.read_scene("mine.json")
+        hk.render(scene.surfaces, "mine.png", **scene.settings)
 
     Names of files in it are relative to the scene file's folder.
 
@@ -195,7 +195,7 @@ def write_scene(
 ) -> None:
     """Write surfaces, and the options by which they are drawn, to a scene file.
 
-            hk.write_scene("mine.json", hk.SolidAngle(curve), level=2.0, material="gold")
+        hk.write_scene("mine.json", hk.SolidAngle(curve), level=2.0, material="gold")
 
     path: the file to write; it must end in .json.
     surfaces, settings: surfaces and options as `harnack.render` and `page` take them, `options`
@@ -580,12 +580,12 @@ def _surface_of(
             raise SceneFileError(f"{where} has no field")
         for name in data:
             _check_name(name, _SURFACE_KEYS, "keyword of a surface")
-        text = data.pop("field")
-        field = _source_of(text, where, find)
+        field_entry = data.pop("field")
+        field = _source_of(field_entry, where, find)
         if field is not None:
-            sources.append((field, text))
+            sources.append((field, field_entry))
         else:
-            field = _field_of(text, f"{where}: field", find)
+            field = _field_of(field_entry, f"{where}: field", find)
         keywords = _settings_of(data, SURFACE_OPTIONS)
         return Surface(field, **keywords) if keywords else field
     except SceneFileError:

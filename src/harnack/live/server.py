@@ -96,9 +96,9 @@ def view(
     """Show surfaces live in the browser: a person can turn them, move sliders and drag their
     curves.
 
-            hk.view(hk.SolidAngle(vertices))
-            hk.view(lambda l, m: hk.SphericalHarmonic(int(l), int(min(l, m))), level=0.1,
-                    l=hk.Slider(1, 8, 5, step=1), m=hk.Slider(0, 8, 3, step=1))
+        hk.view(hk.SolidAngle(vertices))
+        hk.view(lambda l, m: hk.SphericalHarmonic(int(l), int(min(l, m))), level=0.1,
+                l=hk.Slider(1, 8, 5, step=1), m=hk.Slider(0, 8, 3, step=1))
 
     The visitor's browser traces all rays by the kernels that Dr.Jit recorded, as in a page of
     `page`. Python prepares what has changed and sends it. Moving a point or a slider compiles no

@@ -26,9 +26,9 @@ class Widget(anywidget.AnyWidget):
     """A live surface in a notebook. Its attributes change when a person moves something, and
     setting an attribute moves it in the picture.
 
-            view = hk.view(field, level=hk.Slider(1, 12))
-            view.observe(lambda change: print(change.new["level"]), names="sliders")
-            view.sliders = {"level": 6.0}
+        view = hk.view(field, level=hk.Slider(1, 12))
+        view.observe(lambda change: print(change.new["level"]), names="sliders")
+        view.sliders = {"level": 6.0}
 
     camera: {"position": (3,), "target": (3,), "fov": degrees} in the surfaces' coordinates, of a
         picture of 4 : 3.
