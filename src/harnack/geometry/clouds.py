@@ -279,20 +279,20 @@ def estimate_normals(points: npt.ArrayLike, neighbors: int | None = None) -> Flo
     chosen such that the component's extreme points in 26 directions face outward, summed over the
     directions; for a closed surface this is right, however unevenly it is sampled.
 
-    neighbors: the number of neighbors. None chooses: 16; for noisy points up to 64, so that the
-        planes through them are known to a few degrees; and if that is not enough, 64 neighbors
-        among a random subset of the points (with a fixed seed), as sparse as the noise requires.
+    neighbors: the number of neighbors to which planes are fitted. None chooses 16; for noisy points
+        up to 64, so that the planes are known to a few degrees; and if that is not enough, 64
+        neighbors among a random subset of the points (with a fixed seed), as sparse as the noise
+        requires.
 
     As each component faces outward by itself, the inner wall of a hollow body does not face its
     cavity. The side that an open surface faces is a convention; for a flat surface it is the
     positive side of the axis nearest to its normal. If details are smaller than neighborhoods,
-    normals may have the wrong sign: look at the result.
-
-    Points at the same position get the same normal.
+    normals may have the wrong sign: look at the result. Points at the same position get the same
+    normal.
 
     Raises:
-        CloudError: as `validate_cloud` for points; fewer than 4 positions; neighborhoods on a line,
-            which have no plane; fewer than 3 neighbors.
+        CloudError: points are no finite numbers (n, 3) or have coordinates above 1e100; fewer than
+            4 positions; neighborhoods on a line, which have no plane; fewer than 3 neighbors.
     """
     x = as_cloud_points(points)
     if neighbors is not None:

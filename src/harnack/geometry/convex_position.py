@@ -75,7 +75,8 @@ def _edge_lengths(x: FloatArray) -> FloatArray:
 
 
 def _is_flat(x: FloatArray) -> bool:
-    """Whether the vertices x (n, 3) lie within PLANE_TOLERANCE of a common plane."""
+    """Whether the vertices x (n, 3) of a polygon of size 1 lie within PLANE_TOLERANCE of a common
+    plane."""
     axes: FloatArray = np.linalg.svd(x - x.mean(axis=0), full_matrices=False)[2]
     return bool(np.ptp(x @ axes[2]) <= PLANE_TOLERANCE)
 
@@ -300,8 +301,9 @@ def _support(x: FloatArray, normals: FloatArray) -> FloatArray:
 
 
 def _hull_normals(x: FloatArray) -> tuple[FloatArray, bool]:
-    """Unit outward normals (m, 3) of half-spaces that bound the hull of x (n, 3), and whether x is
-    flat or straight. x is centered and of size 1."""
+    """Unit outward normals (m, 3) of half-spaces whose intersection, with suitable offsets, is the
+    hull of points x (n, 3); and whether the points are flat or on a line. x is centered and of size
+    1."""
     axes: FloatArray = np.linalg.svd(x - x.mean(axis=0), full_matrices=len(x) < 3)[2]
     coordinates: FloatArray = np.einsum("ij,kj->ik", x, axes)
     thickness: FloatArray = np.ptp(coordinates, axis=0)

@@ -109,8 +109,8 @@ class Circle:
         return np.array(self.center) - half_size, np.array(self.center) + half_size
 
     def polygon(self, sides: int, *, circumscribed: bool = False) -> FloatArray:
-        """(sides, 3) corners of the regular polygon inscribed in the circle, or circumscribed about
-        it."""
+        """The corners (sides, 3) of a regular polygon with this many sides that is inscribed in the
+        circle or, if `circumscribed`, drawn about it."""
         if sides < 3:
             raise ValueError(f"a polygon needs at least three sides, not {sides}")
         radius = self.radius / math.cos(math.pi / sides) if circumscribed else self.radius
@@ -123,7 +123,7 @@ class Circle:
 
 
 def _numbers(values: Any, name: str, shape: tuple[int, ...]) -> FloatArray:
-    """The values of a circle's attribute as a float64 array of this shape.
+    """The value of a circle's attribute `name` as a float64 array of this shape.
 
     Raises:
         ValueError: another shape, or a number that is not finite.
@@ -350,7 +350,8 @@ def _too_many(name: str, count: int) -> str:
 
 
 def edge_endpoints(loops: Loops) -> tuple[FloatArray, FloatArray]:
-    """Start and end points of all edges, (m, 3) each, loop by loop in order."""
+    """The start points and the end points of all edges of closed loops, (m, 3) each, loop by
+    loop."""
     return np.concatenate(loops), np.concatenate([np.roll(v, -1, axis=0) for v in loops])
 
 

@@ -175,7 +175,7 @@ def _segments_touch(
 
 
 def _distances(p: FloatArray, a: FloatArray, b: FloatArray) -> FloatArray:
-    """The distances (k,) of points p from the segments from a to b, (k, 2) each."""
+    """The distances (k,) of points p from the segments from a to b; p, a and b are (k, 2)."""
     edge = b - a
     t = ((p - a) * edge).sum(axis=1) / (edge * edge).sum(axis=1)
     return np.linalg.norm(p - a - np.clip(t, 0, 1)[:, None] * edge, axis=1)

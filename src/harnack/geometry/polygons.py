@@ -151,7 +151,8 @@ def _group_by_size(sizes: IntArray) -> list[IntArray]:
 
 
 def _fans(polygons: IntArray) -> IntArray:
-    """The triangles (m (k - 2), 3) of polygons (m, k): the fan of each around its first corner."""
+    """The triangles (m (k - 2), 3) of m polygons with k corners each, (m, k): each polygon is
+    divided by the diagonals from its first corner."""
     first = np.broadcast_to(polygons[:, :1], polygons[:, 2:].shape)
     return np.stack([first, polygons[:, 1:-1], polygons[:, 2:]], axis=2).reshape(-1, 3)
 
@@ -170,8 +171,9 @@ def _fan_is_invalid(vertices: FloatArray, polygons: IntArray) -> BoolArray:
 
 
 def _projections(vertices: FloatArray, polygons: IntArray) -> FloatArray:
-    """Plane coordinates (m, k, 2) of polygons (m, k), projected along their mean normals; the
-    polygons run counter-clockwise."""
+    """Plane coordinates (m, k, 2) of m polygons with k corners (indices (m, k) of `vertices`), each
+    projected along its mean normal. In the plane the polygons run counter-clockwise and have a size
+    of about 1."""
     offsets = vertices[polygons]
     offsets = offsets - offsets[:, :1]
     normal = np.cross(offsets[:, :-1], offsets[:, 1:]).sum(axis=1)
@@ -185,7 +187,9 @@ def _projections(vertices: FloatArray, polygons: IntArray) -> FloatArray:
 
 
 def _clip_ears(polygon: IntArray, projection: FloatArray) -> IntArray:
-    """The triangles of a polygon (k,) whose projection (k, 2) is not convex."""
+    """The triangles (k - 2, 3) of a polygon (k,), by cutting off ears (triangles at convex
+    corners). projection: (k, 2) the polygon in the plane. A polygon that crosses itself may give
+    another number of triangles."""
     import mapbox_earcut  # imported here, since most files do not need it
 
     ears = np.zeros((0, 3), dtype=np.int64)

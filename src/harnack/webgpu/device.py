@@ -199,7 +199,7 @@ _CHECKED_LANES = 4096
 
 
 class DeviceMismatchError(RuntimeError):
-    """The results of a device differ from Dr.Jit's."""
+    """The results of a device disagree with Dr.Jit's results for a sample of the lanes."""
 
 
 def evaluate_on_device(
