@@ -3,8 +3,8 @@
 import harnack as hk
 hits = hk.trace(hk.SolidAngle(vertices), origins, directions)
 
-The names at the top are imported when they are first used, as `__init__.pyi` lists them, and so are
-the namespaces, modules with everything else: unused names take no time to start.
+The names that `__init__.pyi` lists, and the namespaces (modules that hold all further names), are
+imported when they are first used, so that `import harnack` is fast.
 """
 
 from __future__ import annotations
@@ -31,6 +31,8 @@ __all__ = [  # pyright: ignore[reportUnsupportedDunderAll]
 
 
 def __getattr__(name: str) -> Any:
+    """Python calls this for an attribute of the package that is not imported yet: import it, or
+    raise `AttributeError` with a hint."""
     if name in _NAMESPACES:
         return import_module(f"{__name__}.{name}")
     if name in __all__:
@@ -47,7 +49,7 @@ def __dir__() -> list[str]:
 
 
 def _namespace_of(name: str) -> str | None:
-    """The namespace that has a public name; None if there is none."""
+    """The name of the namespace that has the public name `name`; None if there is none."""
     if name.startswith("_"):
         return None
     for namespace in _NAMESPACES:

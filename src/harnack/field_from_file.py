@@ -1,4 +1,5 @@
-"""Fields of surface files: the kind of field, the axis that is up, and how to draw it."""
+"""Makes a field from a surface file. The file decides the kind of field, the axis that points up,
+and how it is drawn by default."""
 
 from __future__ import annotations
 
@@ -45,9 +46,10 @@ _LOOP_FILES = (".obj", ".ply", ".loops")
 class FieldFromFile:
     """The field of a file.
 
-    summary: the decisions made and their reasons, in a line.
-    show, material: how it is drawn by default. Surfaces of meshes and clouds are shaded, with a
-        single ray a pixel, as their rays cost many times the rays of a curve's surface.
+    field: the field, in coordinates in which z points up.
+    summary: the decisions made and their reasons, on one line.
+    show, material: how `render` draws it by default. Surfaces of meshes and clouds are "shaded"
+        with a single ray per pixel, as each ray costs many times a ray of a curve's surface.
     """
 
     field: Field
@@ -65,20 +67,23 @@ def field_from_file(
     smoothing: float | Literal["auto"] | None = None,
     up: Axis | None = None,
 ) -> FieldFromFile:
-    """The field of a surface file: of a mesh a `WindingNumber`, of a cloud with normals a
-    `DipolePotential`, of closed curves a `SolidAngle`, of polygons, on request, a `PolygonMesh`, of
-    metaballs and molecules `Blobs`.
+    """Make a field from a surface file. A mesh becomes a `WindingNumber`, a cloud of points with
+    normals a `DipolePotential`, and closed curves a `SolidAngle`. Polygons become a `PolygonMesh`
+    (on request), and metaballs and molecules become `Blobs`.
 
-    read_as: "winding", "dipole", "loops" or "polygons", instead of the decision of `read_geometry`.
-    take_boundary: whether to take the curves that bound the faces, instead of the faces.
-    normals: "estimate" estimates the normals of a point cloud, and replaces normals of the file.
-    smoothing: for clouds with noise, a length in the file's unit or "auto", as for
-        `DipolePotential`.
-    up: the file's axis that is turned to z. By default y for glTF, whose standard says so, and for
-        meshes and clouds of .obj files, most of which have y up; else z.
+    path: the file.
+    read_as: "winding", "dipole", "loops" or "polygons" replaces the decision of `read_geometry`
+        about what the file holds.
+    take_boundary: whether to use the curves that bound the faces instead of the faces.
+    normals: "estimate" estimates the normals of a point cloud, and ignores normals of the file.
+    smoothing: for noisy point clouds, the length over which noise is evened out, in the file's
+        unit; "auto" measures the noise (see `DipolePotential`).
+    up: the axis of the file that is turned to z. By default y for glTF, whose standard says so, and
+        for meshes and clouds of .obj files, most of which have y up; z for all other files.
 
     Raises:
-        FileFormatError: as `read_geometry`; a point cloud without normals.
+        FileFormatError: the file cannot be read by `read_geometry`; or a point cloud has no
+            normals.
         ValueError: settings that contradict each other or the file, or that no field accepts.
     """
     path = Path(path)
@@ -112,7 +117,8 @@ def field_from_file(
 
 
 def _default_up_axis(path: Path, *, is_curve: bool) -> tuple[Axis, str]:
-    """The axis that is up in files of this kind, and why."""
+    """The axis that points up in files with this path's suffix, and the reason in words. is_curve:
+    whether the file holds curves."""
     kind = path.suffix.lower()
     if kind in _Y_UP_FORMATS:
         return "y", "the standard of the format"
@@ -122,6 +128,8 @@ def _default_up_axis(path: Path, *, is_curve: bool) -> tuple[Axis, str]:
 
 
 def _read(path: Path, read_as: ReadAs | None, boundary: bool) -> LoadedGeometry:
+    """The geometry of a file: of type `read_as` if it is given, or the curves that bound its faces
+    if `boundary` is True."""
     if boundary and path.suffix.lower() in _LOOP_FILES:
         loops = tuple(read_loops(path, boundary=True))
         noun = "loop" if len(loops) == 1 else "loops"
@@ -136,6 +144,14 @@ def _field(
     smoothing: float | Literal["auto"],
     rotation: FloatArray,
 ) -> Field:
+    """The field of some geometry, turned by the matrix `rotation` (3, 3).
+
+    normals: "estimate" to estimate the normals of a point cloud, otherwise None.
+    smoothing: the smoothing of a point cloud, a length or "auto".
+
+    Raises:
+        ValueError: a point cloud without normals, or data that the field does not accept.
+    """
     if isinstance(surface, LoadedMesh):
         return WindingNumber(surface.vertices @ rotation.T, surface.faces)
     if isinstance(surface, LoadedCurves):

@@ -1,4 +1,5 @@
-"""Data in and out: outlines of SVG files and of text, files and arrays of other libraries."""
+"""Namespace of input and output: outlines from SVG files and text, and files and arrays of other
+libraries."""
 
 from __future__ import annotations
 

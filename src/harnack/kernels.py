@@ -1,4 +1,5 @@
-"""Kernels of blobs: functions of the distance from a point, whose sums are surfaces (`Blobs`)."""
+"""Kernels of blobs: functions of the distance from a point. The level sets of their sums are
+surfaces (`Blobs`)."""
 
 from __future__ import annotations
 

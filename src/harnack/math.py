@@ -1,5 +1,6 @@
-"""Functions of formulas: sin, sqrt, norm and others, of numbers, of arrays and of coordinates with
-proved ranges. A formula in Python, for `harnack.expression`, uses these in place of NumPy's."""
+"""Functions for formulas: sin, sqrt, norm and others. They take numbers, arrays, and coordinates
+with proved ranges. A Python function that is passed to `harnack.expression` uses them in place of
+NumPy's."""
 
 from __future__ import annotations
 

@@ -28,6 +28,8 @@ def did_you_mean(misspelled: object, candidates: Iterable[str]) -> str:
 
 
 def _likeness(a: str, b: str) -> float:
+    """The similarity of two strings: difflib's ratio (0 to 1) and a bonus for each letter of their
+    common prefix."""
     alike = (x == y for x, y in zip(a, b, strict=False))
     prefix = sum(itertools.takewhile(bool, alike))
     return difflib.SequenceMatcher(None, a, b).ratio() + _COMMON_PREFIX_BONUS * prefix

@@ -1,4 +1,5 @@
-"""Checks of parts to be printed: problems that a slicer would have, and the thickness of walls."""
+"""Namespace of checks before 3D printing: problems that a slicer would report, and the thickness of
+walls."""
 
 from __future__ import annotations
 

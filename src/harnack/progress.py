@@ -37,14 +37,15 @@ def teller(progress: Callable[[str], None] | None) -> Callable[[str], None]:
 
 @contextmanager
 def progress_bar(name: str, progress: bool | Advance) -> Generator[Advance]:
-    """Context manager that shows the progress of `name` on stderr. It yields a function, to be
-    called with each fraction (of 1 in all) that has been finished.
+    """Context manager that shows on stderr how much of the task `name` is finished. It yields a
+    function, to be called with each fraction of the task that has been finished; all fractions add
+    up to 1.
 
-    progress: whether to show it; or a function that is called instead, and may raise an exception
-        to stop the task.
+    progress: whether to show the progress; or a function that receives the fractions instead. It
+        may raise an exception to stop the task.
 
-    It is a bar in a terminal, and lines of text in notebooks and log files: in a notebook a bar
-    would need ipywidgets, and control codes of terminals are shown as they are.
+    A terminal shows a bar. Notebooks and log files get lines of text, because a bar in a notebook
+    would need ipywidgets, and log files would contain a terminal's control codes.
 
     Raises:
         TypeError: progress is neither a bool nor a function.
@@ -66,7 +67,12 @@ def progress_bar(name: str, progress: bool | Advance) -> Generator[Advance]:
 
 
 class _TextProgress:
-    """Prints a line of text now and then."""
+    """Prints a line of text about the progress of a task every few seconds. name: of the task.
+
+    _done: the fraction that is finished.
+    _cached_fraction: the fraction that was finished within the first half second, for example
+        because stored results were found. It does not count for the estimate of the remaining time.
+    """
 
     def __init__(self, name: str) -> None:
         self._name = name
@@ -75,6 +81,8 @@ class _TextProgress:
         self._start = self._last = time.monotonic()
 
     def __call__(self, part: float) -> None:
+        """Note that the fraction `part` was finished, and print a line if the last one is several
+        seconds old."""
         self._done += part
         now = time.monotonic()
         if now - self._start < _INSTANT_SECONDS:  # parts that are there already

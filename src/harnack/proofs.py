@@ -1,4 +1,5 @@
-"""What a field of one's own promises, and the enclosures that prove steps from promises."""
+"""Namespace for fields of one's own: promises (proved bounds of f near a point), and the enclosures
+(intervals that provably contain f along a ray) that follow from promises."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""Dr.Jit backends and precisions, and the check that the loaded LLVM is one that works. No
-mathematics.
+"""Dr.Jit backends and precisions, arrays, loops and tables on them, and a check that Dr.Jit has
+loaded a usable LLVM. It contains no mathematics of fields.
 
-Importing this package decides which LLVM Dr.Jit loads (see `harnack.backend.llvm`), so it has to
-come before any other import of drjit: `harnack/__init__.py` imports it first.
+Importing this package decides which LLVM Dr.Jit loads (see `harnack.backend.llvm`). So it must come
+before any other import of drjit: `harnack/__init__.py` imports it first.
 """
 
 from __future__ import annotations

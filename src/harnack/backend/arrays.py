@@ -35,10 +35,12 @@ _ALIGNMENT = 64  # bytes: the widest vectors of any processor
 
 @dataclass(frozen=True)
 class Backend:
-    """The Dr.Jit types of one backend and precision. All of them carry derivatives.
+    """The Dr.Jit array types of one backend and precision. All of them carry derivatives.
 
     name: "llvm" (CPU), "cuda" (NVIDIA GPU) or "metal" (Apple GPU, single precision only).
     precision: "single" or "double", the precision of Float and of the vectors' components.
+    Float, UInt32, Int32, Bool: array types with one entry per lane.
+    Array2f, Array3f, Array4f, ArrayXf: vector types with 2, 3, 4 and any number of Floats.
     """
 
     name: BackendName
@@ -68,14 +70,16 @@ class Backend:
 
 @functools.cache
 def _make_backend(name: BackendName, precision: Precision) -> Backend:
-    """The backend with this name and precision; made once, after a check of LLVM or Metal."""
+    """The `Backend` with this name and precision. LLVM or Metal is checked when its `Backend` is
+    first made; later calls return the same object."""
     if name == "llvm":
         ensure_llvm()
     module = importlib.import_module(f"drjit.{name}.ad")
     suffix = "64" if precision == "double" else ""
 
     def real(stem: str) -> Any:
-        """The floating-point type with this name, in the right precision."""
+        """The Dr.Jit type of this name in the right precision: Float becomes Float64 for double
+        precision."""
         return getattr(module, stem + suffix)
 
     backend = Backend(
@@ -99,9 +103,9 @@ def _check_ieee_arithmetic(backend: Backend) -> None:
     """Check that a device computes as IEEE 754 prescribes.
 
     Metal's compiler may by default assume that no number is infinite or NaN, and may round
-    differently; the proofs rely on both. So a few operations are run on the device and compared
-    with NumPy. The device may flush subnormal numbers to zero: no operation of the comparison leads
-    to them.
+    differently; the proofs need both infinities and NaN and the right rounding. So a few operations
+    are run on the device and compared with NumPy. The device may flush subnormal numbers (those
+    below about 1e-38) to zero: no operation of the comparison has such a result.
 
     Raises:
         RuntimeError: a result differs from NumPy's.
@@ -130,15 +134,15 @@ def _check_ieee_arithmetic(backend: Backend) -> None:
 
 
 def choose_backend(precision: Precision = "single") -> Backend:
-    """The backend to compute on: CUDA if there is a usable device, Metal for single precision if
-    there is one, else LLVM.
+    """The backend to compute on: CUDA if there is a usable device; else, for single precision,
+    Metal if there is a usable device; else LLVM.
 
-    The environment variable HARNACK_BACKEND ("llvm", "cuda" or "metal") forces one. Metal has no
-    double precision, which stays on LLVM.
+    The environment variable HARNACK_BACKEND ("llvm", "cuda" or "metal") forces one of them. Metal
+    has no double precision; with "metal", double precision uses LLVM.
 
     Raises:
         ValueError: unknown precision, or unknown name in HARNACK_BACKEND.
-        LLVMNotFoundError: LLVM is needed, and there is none that Dr.Jit can work with.
+        LLVMNotFoundError: LLVM is needed, and no LLVM that Dr.Jit can use is installed.
         RuntimeError: CUDA or Metal is forced and no device is usable, or Metal computes
             incorrectly.
     """
@@ -164,10 +168,12 @@ def choose_backend(precision: Precision = "single") -> Backend:
 
 
 def precision_of_input(*arrays: Any) -> Precision:
-    """The precision in which to compute with array-likes: double if any of them is an array of
-    float64, or a list of such arrays, else single (float32, integers, lists of numbers)."""
+    """The precision in which to compute with arrays or lists: "double" if any of them is an array
+    of float64 or a list with such an array, otherwise "single" (float32, integers, lists of
+    numbers)."""
 
     def is_double(array: Any) -> bool:
+        """Whether an array, or an entry of nested lists, has the type float64."""
         if isinstance(array, list | tuple):
             return any(map(is_double, cast("list[Any]", array)))
         dtype = getattr(array, "dtype", None)
@@ -181,9 +187,9 @@ def backend_of(array: Any) -> Backend:
     differentiation.
 
     Raises:
-        TypeError: not a Dr.Jit array; one of Dr.Jit's scalar mode, a tensor or the like; or not of
-            32- or 64-bit floats.
-        LLVMNotFoundError: it lives on an LLVM that Dr.Jit cannot work with.
+        TypeError: not a Dr.Jit array; an array of Dr.Jit's scalar mode, a matrix, tensor or the
+            like; or not of 32- or 64-bit floats.
+        LLVMNotFoundError: Dr.Jit has loaded an LLVM that it cannot use.
     """
     kind = _untyped_class(array)
     full_name = f"{kind.__module__}.{kind.__name__}"
@@ -208,7 +214,8 @@ def backend_of(array: Any) -> Backend:
 
 
 def _untyped_class(value: object) -> Any:
-    """The class of a value, for calls whose static types do not know Dr.Jit's classes."""
+    """The class of a value, typed as `Any`: static type checkers do not know the attributes of
+    Dr.Jit's classes."""
     return type(value)
 
 
@@ -227,14 +234,17 @@ _PRECISIONS: dict[Any, Precision] = {
 
 
 def to_vector3(backend: Backend, vectors: Any, name: str = "vectors") -> Vec3:
-    """Vectors as backend.Array3f, from an array-like of shape (n, 3) or a Dr.Jit 3-vector.
+    """Vectors as backend.Array3f, from an array or list of shape (n, 3) or from a Dr.Jit 3-vector.
 
-    Values of an array-like must be finite. A Dr.Jit vector is returned in the backend's precision.
-    Its values are not checked, as a check would evaluate it and end its recording.
+    The numbers of an array or list must be finite. A Dr.Jit vector is converted to the backend's
+    precision. Its numbers are not checked: reading them would evaluate the vector, and so split the
+    kernel that is being recorded.
+
+    name: what the vectors are, for messages.
 
     Raises:
         TypeError: not numbers; a Dr.Jit array that is no 3-vector or of another backend.
-        ValueError: wrong shape; NaN or infinite values. The message starts with `name`.
+        ValueError: wrong shape; NaN or infinite values.
     """
     if dr.is_array_v(_untyped_class(vectors)):
         _check_same_backend(backend, vectors, name)
@@ -245,11 +255,12 @@ def to_vector3(backend: Backend, vectors: Any, name: str = "vectors") -> Vec3:
 
 
 def as_finite_vectors(vectors: Any, name: str) -> FloatArray:
-    """An array-like of shape (n, 3) as a float64 array, all of it finite.
+    """Vectors as a float64 array (n, 3) of finite numbers. name: what the vectors are, for
+    messages.
 
     Raises:
         TypeError: not numbers.
-        ValueError: wrong shape; NaN or infinite values. The message starts with `name`.
+        ValueError: wrong shape; NaN or infinite values.
     """
     values = as_real_array(vectors, name, type_error=TypeError).astype(np.float64, copy=False)
     check_vectors(values, name)
@@ -260,22 +271,29 @@ def as_finite_vectors(vectors: Any, name: str) -> FloatArray:
 
 
 def upload_vectors(backend: Backend, rows: npt.NDArray[Any], name: str = "vectors") -> Vec3:
-    """An array (n, 3) as backend.Array3f, each column uploaded by `upload_floats`. Infinite values
-    and NaN are allowed."""
+    """Rows (n, 3) as backend.Array3f with n lanes, evaluated. Infinite values and NaN are allowed.
+
+    Raises:
+        ValueError: a number is too large for single precision. The message starts with `name`.
+    """
     return backend.Array3f(
         *(upload_floats(backend, column) for column in _cast(backend, rows, name).T)
     )
 
 
 def to_float(backend: Backend, values: Any, name: str = "values") -> Real:
-    """Numbers as backend.Float, from a number, an array-like of shape (n,) or a Dr.Jit array.
+    """Numbers as backend.Float, from a number, an array or list of shape (n,), or a Dr.Jit array.
 
     Infinite values are allowed (a ray may have no end), NaN is not. A single number becomes a
-    kernel parameter rather than a literal, so that another value does not compile another kernel.
+    kernel parameter, not a literal in the kernel's code, so that another number compiles no other
+    kernel. The numbers of a Dr.Jit array are not checked.
+
+    name: what the numbers are, for messages.
 
     Raises:
-        TypeError: not numbers; a Dr.Jit array that is no scalar array or of another backend.
-        ValueError: wrong shape; NaN. The message starts with `name`.
+        TypeError: not numbers; a Dr.Jit array that has more than one number per lane or is of
+            another backend.
+        ValueError: wrong shape; NaN.
     """
     if dr.is_array_v(_untyped_class(values)):
         _check_same_backend(backend, values, name)
@@ -286,16 +304,20 @@ def to_float(backend: Backend, values: Any, name: str = "values") -> Real:
     if numbers.ndim > 1:
         raise ValueError(f"{name} must be a number or have shape (n,), not {numbers.shape}")
     _check_rows(np.isnan(numbers), "NaN", name)
-    cast = _cast(backend, numbers, name)
-    if cast.ndim == 0:
-        return dr.opaque(backend.Float, float(cast))
-    return upload_floats(backend, cast)
+    rounded = _cast(backend, numbers, name)
+    if rounded.ndim == 0:
+        return dr.opaque(backend.Float, float(rounded))
+    return upload_floats(backend, rounded)
 
 
 def gather_vectors(backend: Backend, vectors: Vec3, index: Index) -> Vec3:
-    """Gather the vector at an index in each lane, in the backend's precision; the vectors may have
-    any precision. A component of width 1, which all lanes share, is not gathered: Dr.Jit would
-    write the derivatives of such a gather beyond the end of the array."""
+    """For each lane, the vector at an index, in the backend's precision.
+
+    vectors: a Dr.Jit 3-vector of any precision. index: an index for each lane.
+
+    A component of width 1, which all lanes share, is not gathered: Dr.Jit would write the
+    derivatives of such a gather beyond the end of the array.
+    """
     return backend.Array3f(
         *(
             component if dr.width(component) == 1 else dr.gather(backend.Float, component, index)
@@ -305,8 +327,8 @@ def gather_vectors(backend: Backend, vectors: Vec3, index: Index) -> Vec3:
 
 
 def as_kernel_parameters(array: Any) -> Any:
-    """The same array with literals turned into kernel parameters (`dr.make_opaque`), so that
-    another value uses the compiled kernel again. Derivatives are kept."""
+    """The array, with literals (constants in the kernel's code) turned into kernel parameters, so
+    that another value uses the same compiled kernel. Derivatives are kept."""
     kind = _untyped_class(array)
     if dr.depth_v(kind) > 1:
         return kind(*map(as_kernel_parameters, array))
@@ -318,7 +340,8 @@ def as_kernel_parameters(array: Any) -> Any:
 
 
 def _check_same_backend(backend: Backend, array: Any, name: str) -> None:
-    """Raise a TypeError for an array that does not live on the backend."""
+    """Raise `TypeError` for a Dr.Jit array that does not live on the backend. name: what it is, for
+    messages."""
     try:
         array_backend = backend_of(array)
     except TypeError as error:
@@ -330,8 +353,8 @@ def _check_same_backend(backend: Backend, array: Any, name: str) -> None:
 
 
 def _check_rows(is_bad: Any, kind: str, name: str) -> None:
-    """Raise a ValueError that names the first row where `is_bad` (n,) holds. kind: what is wrong
-    with it."""
+    """Raise `ValueError` if `is_bad` (n,) is True anywhere; the message names the first such row.
+    kind: what is wrong with the row. name: what the rows are."""
     indices = np.flatnonzero(is_bad)
     if indices.size:
         rest = f" and {indices.size - 1} more" if indices.size > 1 else ""
@@ -339,7 +362,8 @@ def _check_rows(is_bad: Any, kind: str, name: str) -> None:
 
 
 def _cast(backend: Backend, values: npt.NDArray[Any], name: str) -> npt.NDArray[Any]:
-    """The values in the backend's precision. Raises ValueError if a finite value overflows."""
+    """The numbers of an array in the backend's precision. Raises `ValueError` if a finite number
+    overflows."""
     if backend.precision == "double" or values.dtype == backend.dtype:
         return values
     with np.errstate(over="ignore"):
@@ -354,7 +378,9 @@ def _cast(backend: Backend, values: npt.NDArray[Any], name: str) -> npt.NDArray[
 
 
 def upload_floats(backend: Backend, values: npt.NDArray[Any]) -> Real:
-    """A copy of a one-dimensional NumPy array as an evaluated backend.Float in aligned memory."""
+    """A copy of a one-dimensional NumPy array as an evaluated backend.Float in aligned memory (see
+    `_aligned`). Raises `ValueError` for another shape, and for numbers too large for single
+    precision."""
     if values.ndim != 1:
         raise ValueError(f"expected a one-dimensional array, got shape {values.shape}")
     if values.size == 0:
@@ -364,16 +390,18 @@ def upload_floats(backend: Backend, values: npt.NDArray[Any]) -> Real:
 
 def upload_integers(backend: Backend, values: npt.NDArray[Any]) -> Index:
     """A copy of a one-dimensional NumPy array of integers >= 0 as an evaluated backend.UInt32 in
-    aligned memory."""
+    aligned memory (see `_aligned`)."""
     return backend.UInt32(_aligned(values, np.dtype(np.uint32)))
 
 
 def _aligned(values: npt.NDArray[Any], dtype: np.dtype[Any]) -> npt.NDArray[Any]:
-    """A copy that begins at a multiple of _ALIGNMENT bytes, with as many unused bytes after it.
+    """A copy of a one-dimensional array that begins at a multiple of _ALIGNMENT bytes, with at
+    least _ALIGNMENT unused bytes after it.
 
-    Dr.Jit maps a NumPy array in place. NumPy's memory is aligned to the vector width by chance
-    only. If it is not, packet gathers silently fall apart into scalar gathers; and since a kernel
-    depends on the alignment, the same work would compile another kernel.
+    Dr.Jit uses the memory of a NumPy array in place, and NumPy's memory is aligned to the
+    processor's vectors by chance only. Without alignment, Dr.Jit silently replaces packet gathers
+    (eight numbers at once) by slower single gathers; and since a kernel depends on the alignment,
+    the same work would compile another kernel.
     """
     size = values.size * dtype.itemsize
     memory = np.empty(size + 2 * _ALIGNMENT, np.uint8)
@@ -384,12 +412,12 @@ def _aligned(values: npt.NDArray[Any], dtype: np.dtype[Any]) -> npt.NDArray[Any]
 
 
 def to_numpy(array: Any) -> npt.NDArray[Any]:
-    """A Dr.Jit array of n lanes as NumPy: shape (n,), or (n, k) for vectors. Derivatives are cut.
-
-    Components of a single lane are repeated. The result is a copy.
+    """A Dr.Jit array of n lanes as a NumPy array of shape (n,), or (n, k) for vectors of k
+    components. Derivatives are dropped. A component with a single lane is repeated n times. The
+    result is a copy.
 
     Raises:
-        TypeError: not a Dr.Jit array, or one nested more deeply than a vector.
+        TypeError: not a Dr.Jit array, or an array of vectors of vectors.
     """
     kind = _untyped_class(array)
     if not dr.is_array_v(kind) or dr.depth_v(kind) > 2:

@@ -1,4 +1,4 @@
-"""The report of `harnack doctor`: versions, backend, LLVM, and what to do if something is amiss."""
+"""The report of `harnack doctor`: versions, the backend, LLVM, and what to do about problems."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ _KERNEL_SECONDS = 120
 
 @dataclass(frozen=True)
 class Finding:
-    """A line of the report.
+    """One line of the report.
 
-    subject: the thing that was examined.
-    detail: the result.
-    ok: False if harnack cannot work like this.
+    subject: what was examined.
+    detail: what was found.
+    ok: False if harnack cannot work because of it.
     advice: what to do about a problem; empty if there is none.
     """
 
@@ -41,7 +41,8 @@ class Finding:
 
 
 def diagnose() -> tuple[Finding, ...]:
-    """Examine this installation. It never raises: kernels are tried in separate processes."""
+    """Examine this installation, and return the lines of the report. It raises no error: kernels,
+    which might end the process, are tried in separate processes."""
     findings = [
         Finding("harnack", __version__),
         Finding("Python", f"{platform.python_version()} at {sys.executable}"),
@@ -59,7 +60,7 @@ def diagnose() -> tuple[Finding, ...]:
 
 
 def _package_finding(name: str) -> Finding:
-    """The version of a package."""
+    """The line about the version of a package."""
     try:
         return Finding(name, importlib.metadata.version(name))
     except importlib.metadata.PackageNotFoundError:
@@ -67,14 +68,16 @@ def _package_finding(name: str) -> Finding:
 
 
 def _device_finding(name: str, kind: Any) -> Finding:
-    """Whether Dr.Jit finds a device of this kind."""
+    """The line that says whether Dr.Jit finds a usable device. kind: Dr.Jit's constant for the
+    backend."""
     if dr.has_backend(kind):
         return Finding(name, "a usable device")
     return Finding(name, "no usable device (none is needed)")
 
 
 def _llvm_findings() -> list[Finding]:
-    """The LLVM that Dr.Jit loaded, then every LLVM on this machine, best first."""
+    """A line about the LLVM that Dr.Jit has loaded, then a line for each LLVM on this machine, best
+    first."""
     loaded = loaded_library()
     requested = os.environ.get(PATH_VARIABLE)
     source = f" ({PATH_VARIABLE})" if requested else ""
@@ -89,7 +92,7 @@ def _llvm_findings() -> list[Finding]:
 
 
 def _backend_finding() -> Finding:
-    """The backend that is chosen, or the reason why there is none."""
+    """The line about the backend that is chosen, or the reason why there is none."""
     forced = os.environ.get(BACKEND_VARIABLE)
     source = f", forced by {BACKEND_VARIABLE}" if forced else ""
     try:
@@ -103,8 +106,8 @@ def _backend_finding() -> Finding:
 
 
 def _kernel_finding(precision: str) -> Finding:
-    """Whether a small kernel runs. It runs in a separate process, since an unsuitable LLVM may end
-    the process that uses it."""
+    """The line that says whether a small kernel of this precision runs. It is tried in a separate
+    process, since an unsuitable LLVM may end the process that uses it."""
     subject = f"kernel, {precision} precision"
     code = f"import harnack.backend.doctor as d; d.try_kernel({precision!r})"
     try:
@@ -129,11 +132,11 @@ def _kernel_finding(precision: str) -> Finding:
 
 
 def try_kernel(precision: str) -> None:
-    """Compile and run a small kernel with the operations that the tracer uses, and check the
+    """Compile and run a small kernel with the operations that the tracer uses, and check its
     result.
 
     Raises:
-        RuntimeError: the kernel ran and its result is wrong.
+        RuntimeError: the result is wrong.
     """
     backend = choose_backend("double" if precision == "double" else "single")
     table = dr.arange(backend.Float, 8) + 1
@@ -141,9 +144,11 @@ def try_kernel(precision: str) -> None:
     x = dr.linspace(backend.Float, 0, 1, 64)
 
     def is_active(i: Index, total: Real) -> Mask:
+        """Whether the loop continues, for the index i of its next step."""
         return i < 8
 
     def add(i: Index, total: Real) -> tuple[Index, Real]:
+        """One step of the loop: add a term that is read from the table."""
         term = dr.gather(backend.Float, table, i)
         return i + 1, total + dr.minimum(term, 4) * dr.sqrt(x)
 
@@ -153,7 +158,7 @@ def try_kernel(precision: str) -> None:
 
 
 def print_report(console: Console) -> bool:
-    """Print the report; return True if harnack can work as it is."""
+    """Print the report. Returns True if harnack can work with this installation."""
     findings = diagnose()
     table = Table(show_header=False, box=None, pad_edge=False)
     table.add_column()

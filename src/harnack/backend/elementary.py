@@ -1,12 +1,12 @@
-"""Elementary functions of Dr.Jit arrays, where Dr.Jit's own are slow, inexact or overflow.
+"""Elementary functions of Dr.Jit arrays for which Dr.Jit's own are slow, inexact, or overflow.
 
-Minimum, maximum and clamp are one instruction each. `drjit.minimum` follows IEEE 754's
-NaN-propagating `minimum`, three instructions with AVX2 (and a crash with LLVM 15 and 16). A
-comparison and a select become a single `minps`. With a NaN in either place the *second* argument is
-returned: put the safe value there.
+Minimum, maximum and clamp take one instruction each (`minps` for a comparison and a select).
+`drjit.minimum` is slower: it follows IEEE 754's `minimum`, whose result is NaN if an argument is
+NaN. That takes three instructions with AVX2, and crashes with LLVM 15 and 16. Here, if either
+argument is NaN, the *second* argument is returned: pass the safe value there.
 
-`safe_norm` is right for vectors whose squares would overflow or vanish. `sincos` is as accurate on
-every backend as the promises of sums of waves assume.
+`safe_norm` is right for vectors whose squares would overflow or underflow. `sincos` has, on every
+backend, the accuracy that proved bounds of sums of waves assume.
 """
 
 from __future__ import annotations
@@ -46,10 +46,13 @@ _SCALING_EXPONENTS_SINGLE, _SCALING_EXPONENTS_DOUBLE = (
 
 
 def safe_norm(v: Vec3) -> Real:
-    """|v|, right for every vector of ordinary numbers; NaN if a component is NaN.
+    """The length |v| of a vector, also for vectors whose squares would underflow or overflow; NaN
+    if a component is NaN.
 
-    `drjit.norm` squares first: in single precision it is 0 for vectors shorter than 1e-19, such as
-    the gradient of a polynomial of degree 12 at a fiftieth of its size from a zero of that order.
+    `drjit.norm` squares the components first: in single precision it is 0 for vectors shorter than
+    1e-19. Such a vector is the gradient of a polynomial of degree 12 near a zero of order 12, at a
+    fiftieth of the polynomial's scale. Here very short and very long vectors are multiplied by a
+    power of 2 first.
     """
     largest = max_norm(v)
     real = cast("Any", type(largest))
@@ -61,7 +64,8 @@ def safe_norm(v: Vec3) -> Real:
 
 
 def safe_normalize(v: Vec3) -> Vec3:
-    """v/|v|, right for every vector whose largest component is a normal number."""
+    """The unit vector v / |v|, for every vector whose largest component is a normal floating-point
+    number, also if its square would underflow or overflow."""
     largest = dr.detach(max_norm(v))
     (low, _), (high, _) = _norm_scaling_exponents(largest)
     is_ordinary = (largest >= 2.0**low) & (largest <= 2.0**high)
@@ -70,12 +74,14 @@ def safe_normalize(v: Vec3) -> Vec3:
 
 
 def max_norm(v: Vec3) -> Real:
-    """The largest of |x|, |y| and |z|."""
+    """The largest of |x|, |y| and |z| of a vector."""
     return fmax(fmax(dr.abs(v.x), dr.abs(v.y)), dr.abs(v.z))
 
 
 def _norm_scaling_exponents(x: Real) -> tuple[tuple[int, int], tuple[int, int]]:
-    """The scaling exponents for the precision of x."""
+    """The exponents by which `safe_norm` scales vectors, for the precision of x: ((low, up), (high,
+    down)). Vectors shorter than 2^low are multiplied by 2^up, vectors longer than 2^high by
+    2^down."""
     return (
         _SCALING_EXPONENTS_DOUBLE
         if dr.type_v(type(x)) == dr.VarType.Float64
@@ -93,15 +99,18 @@ _COSINE = (2.443315711809948e-5, -1.388731625493765e-3, 4.166664568298827e-2)
 
 
 def sincos(x: Any) -> tuple[Any, Any]:
-    """sin x and cos x, each within 2u (u the unit roundoff) for |x| <= `max_sincos_argument`;
-    beyond it they are not numbers.
+    """sin x and cos x, each with an error of at most 2u (u is the unit roundoff of the precision).
+    If |x| is larger than `max_sincos_argument`, the results are NaN.
 
-    In single precision, they are computed here. Dr.Jit's own functions are one instruction on CUDA,
-    with an error of 2^-20.5 = 11u, and of 600u for an angle of 300 (PTX ISA, sin.approx); on LLVM
-    they lose accuracy above 8192: the error is 16u at 10^5, and no digit is right at 10^6. In
-    double precision, Dr.Jit's functions are accurate within 1.6u up to about 10^9, so only the
-    angles are reduced here: x - k pi/2 is rounded once, and once more for the second part of pi/2,
-    as products are fused.
+    Method: with k = x / (pi/2), rounded to an integer, the angle x - k pi/2 is small. Its sine and
+        cosine are exchanged and negated as k modulo 4 says.
+
+    In single precision, Dr.Jit's own functions are not accurate enough. On CUDA they are one
+    instruction, with an error of 2^-20.5 = 11u, and of 600u for an angle of 300 (PTX ISA,
+    sin.approx). On LLVM they lose accuracy above 8192: the error is 16u at 10^5, and no digit is
+    right at 10^6. So polynomials are used here. In double precision, Dr.Jit's functions are
+    accurate within 1.6u up to about 10^9, and are used for the reduced angle. The reduced angle is
+    rounded once for each part of pi/2, as the products are fused.
     """
     is_double = dr.type_v(type(x)) == dr.VarType.Float64
     k = dr.round(x * 0.6366197723675814)
@@ -118,28 +127,32 @@ def sincos(x: Any) -> tuple[Any, Any]:
     # k modulo 4 is 0, 1, 2, 3 for (s, c), (c, -s), (-s, -c), (-c, s).
     half = 0.5 * k
     floor = dr.floor(half)
-    is_odd, is_late = floor != half, dr.floor(0.5 * floor) != 0.5 * floor
-    s, c = dr.select(is_odd, cosine, sine), dr.select(is_odd, sine, cosine)
-    return dr.select(is_late, -s, s), dr.select(is_late ^ is_odd, -c, c)
+    is_odd, is_second_half = floor != half, dr.floor(0.5 * floor) != 0.5 * floor
+    swapped_sine, swapped_cosine = dr.select(is_odd, cosine, sine), dr.select(is_odd, sine, cosine)
+    return dr.select(is_second_half, -swapped_sine, swapped_sine), dr.select(
+        is_second_half ^ is_odd, -swapped_cosine, swapped_cosine
+    )
 
 
 def max_sincos_argument(real: Any) -> float:
-    """The largest angle whose sine is known in the precision of `real`. The rounding of such an
-    angle is up to 0.06 in single precision, and 0.01 in double precision."""
+    """The largest angle, in radians, for which `sincos` gives numbers in the precision of the type
+    `real`. The rounding of an angle of this size is up to 0.06 in single precision, and 0.01 in
+    double precision."""
     return 2.0**47 if dr.type_v(real) == dr.VarType.Float64 else 1e6
 
 
 def _polynomial(coefficients: tuple[float, ...], x: Any) -> Any:
-    """The polynomial with these coefficients, the highest power first, at x."""
-    total = coefficients[0]
+    """The value at x of the polynomial with these coefficients, the coefficient of the highest
+    power first."""
+    value = coefficients[0]
     for coefficient in coefficients[1:]:
-        total = dr.fma(total, x, coefficient)
-    return total
+        value = dr.fma(value, x, coefficient)
+    return value
 
 
 def orthonormal_basis(d: Vec3) -> tuple[Vec3, Vec3]:
-    """u and v with (u, v, d) orthonormal and right-handed, |d| = 1 (Duff et al. 2017, "Building an
-    Orthonormal Basis, Revisited")."""
+    """Two unit vectors u and v for each unit vector d such that (u, v, d) is orthonormal and
+    right-handed (Duff et al. 2017, "Building an Orthonormal Basis, Revisited")."""
     vector = cast("Any", type(d))
     sign = dr.select(d.z >= 0, type(d.z)(1), -1)
     a = -1 / (sign + d.z)
@@ -150,7 +163,9 @@ def orthonormal_basis(d: Vec3) -> tuple[Vec3, Vec3]:
 
 
 def orthonormal_basis_rows(d: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """`orthonormal_basis` of rows (n, 3) on the host."""
+    """Two arrays u and v (n, 3) of unit vectors for an array d (n, 3) of unit vectors: (u, v, d) is
+    orthonormal and right-handed in each row. The same formula as `orthonormal_basis`, for NumPy
+    arrays."""
     x, y, z = d.T
     sign = np.copysign(1.0, z)
     a = -1.0 / (sign + z)

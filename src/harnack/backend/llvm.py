@@ -1,8 +1,8 @@
-"""The choice of the LLVM on which the CPU backend runs, made before Dr.Jit can load a wrong one.
+"""Chooses the LLVM on which the CPU backend runs, before Dr.Jit can load an unsuitable one.
 
-Dr.Jit compiles CPU kernels with an LLVM library that it finds and loads while `import drjit` runs;
-`DRJIT_LIBLLVM_PATH` in the environment names one. It accepts nearly any version, but the version
-decides whether anything works. Tried with Dr.Jit 1.5.0 on x86-64 (loops, packet gathers, elementary
+Dr.Jit compiles CPU kernels with an LLVM library that it finds and loads during `import drjit`; the
+environment variable `DRJIT_LIBLLVM_PATH` names one. Dr.Jit accepts nearly any version, but many
+versions do not work. Tried with Dr.Jit 1.5.0 on x86-64 (loops, packet gathers, elementary
 functions, gradients, scatters, a Mitsuba render):
 
     up to 14   refused by Dr.Jit, which then has no CPU backend
@@ -11,8 +11,8 @@ functions, gradients, scatters, a Mitsuba render):
     20         not tried (no package at hand); its neighbors work
     21 to 23   work; 22 and 23 made the tracing kernels 10 to 15 % slower than 19
 
-So 17 is the minimum and 19 the preferred version; versions newer than those tried are the last
-choice.
+So 17 is the minimum and 19 the preferred version. A version newer than 23 is used only if there is
+no other.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ PATH_VARIABLE = "DRJIT_LIBLLVM_PATH"
 
 
 class LLVMNotFoundError(RuntimeError):
-    """No LLVM that Dr.Jit can work with; the message ends with the command that repairs it."""
+    """There is no LLVM that Dr.Jit can use. The message ends with a command that mends this."""
 
 
 @dataclass(frozen=True)
@@ -51,12 +51,13 @@ class LLVMLibrary:
 
     @property
     def rejection_reason(self) -> str | None:
-        """Why this library must not be used; None if it may be."""
+        """Why this library must not be used; None if it may be used."""
         return rejection_reason(self.major)
 
 
 def rejection_reason(major: int | None) -> str | None:
-    """Why LLVM of this major version must not be used; None if it may be."""
+    """Why an LLVM of this major version must not be used; None if it may be used. major: None if
+    the version is unknown."""
     if major is None:
         return "its version cannot be told"
     if major < 15:
@@ -67,11 +68,12 @@ def rejection_reason(major: int | None) -> str | None:
 
 
 def library_version(path: Path) -> int | None:
-    """Major version of the LLVM library at `path`, determined without loading it; None if unknown.
+    """The major version of the LLVM library at `path`, determined without loading it; None if
+    unknown.
 
-    The version is in the file name (libLLVM-15.so.1, libLLVM.so.19.1), in the name that the links
-    end at, in the library's own SONAME, or in a folder of the path (Homebrew:
-    Cellar/llvm/21.1.0/lib).
+    The version is looked for in the file name (libLLVM-15.so.1, libLLVM.so.19.1), in the name of
+    the file to which links lead, in the SONAME that the library stores, and in the folders of the
+    path (Homebrew: Cellar/llvm/21.1.0/lib).
     """
     real = Path(os.path.realpath(path))
     for name in (path.name, real.name):
@@ -89,7 +91,8 @@ def library_version(path: Path) -> int | None:
 
 
 def _version_from_soname(path: Path) -> int | None:
-    """Major version from the SONAME stored in the library's string table."""
+    """The major version in the SONAME (the name that a shared library stores for the linker); None
+    if there is none."""
     try:
         with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
             match = re.search(rb"\0libLLVM(?:-(\d+)[.\d]*\.so|\.so\.(\d+))[.\d]*\0", data)
@@ -99,7 +102,8 @@ def _version_from_soname(path: Path) -> int | None:
 
 
 def _search_folders() -> Iterator[Path]:
-    """Folders that may hold LLVM, the folders nearest to this Python first."""
+    """Yield the folders that may hold LLVM libraries on this platform, the folders of this Python
+    first."""
     yield Path(sys.prefix) / "lib" / "native"  # where `make setup` may have unpacked one
     yield Path(sys.prefix) / "lib"
     if "CONDA_PREFIX" in os.environ:
@@ -117,10 +121,8 @@ def _search_folders() -> Iterator[Path]:
 
 
 def find_libraries(folders: Iterable[Path] | None = None) -> tuple[LLVMLibrary, ...]:
-    """Every LLVM library in `folders` (default: wherever this platform keeps them), best first.
-
-    Each file is listed once, however many links lead to it. Nothing is loaded.
-    """
+    """All LLVM libraries in `folders` (by default, the folders where this platform keeps them),
+    best first. Each file is listed once, however many links lead to it. No library is loaded."""
     libraries: dict[str, LLVMLibrary] = {}
     for folder in _search_folders() if folders is None else folders:
         for pattern in ("libLLVM.so*", "libLLVM-*.so*", "libLLVM.dylib", "libLLVM-*.dylib"):
@@ -136,7 +138,8 @@ def find_libraries(folders: Iterable[Path] | None = None) -> tuple[LLVMLibrary, 
 
 
 def preference_key(major: int | None) -> tuple[bool, bool, bool, int]:
-    """Sort key of LLVM versions: the greatest is the one to use."""
+    """A key by which LLVM versions are sorted: the greatest key belongs to the version to use.
+    major: None if the version is unknown."""
     version = major or 0
     return (
         rejection_reason(major) is None,
@@ -147,17 +150,21 @@ def preference_key(major: int | None) -> tuple[bool, bool, bool, int]:
 
 
 def best_library() -> LLVMLibrary | None:
-    """The acceptable LLVM library on this machine that is used if nobody says otherwise."""
+    """The acceptable LLVM library on this machine that is used by default; None if there is
+    none."""
     return next((library for library in find_libraries() if library.rejection_reason is None), None)
 
 
 def import_drjit() -> None:
-    """Import Dr.Jit and have it load the best acceptable LLVM. Does not check the LLVM that was
-    loaded.
+    """Import Dr.Jit and have it load the best acceptable LLVM. The LLVM that it loads is not
+    checked here.
 
-    Dr.Jit loads LLVM while it is imported, so this has to come before any other `import drjit`. If
+    Dr.Jit loads LLVM while it is imported, so this must come before any other `import drjit`. If
     Dr.Jit was imported already, or the user set DRJIT_LIBLLVM_PATH, that choice stands, and
-    `ensure_llvm` checks it. The environment is left unchanged.
+    `ensure_llvm` checks it. The environment is unchanged afterwards.
+
+    Raises:
+        ImportError: Dr.Jit cannot be imported.
     """
     if "drjit" in sys.modules:
         return
@@ -178,7 +185,7 @@ def import_drjit() -> None:
 
 
 def loaded_library() -> LLVMLibrary | None:
-    """The LLVM that Dr.Jit runs on in this process; None if it has none."""
+    """The LLVM library that Dr.Jit has loaded in this process; None if it has loaded none."""
     major = _loaded_major()
     if major is None:
         return None
@@ -211,13 +218,13 @@ def _mapped_libraries() -> tuple[Path, ...]:
 
 
 def ensure_llvm() -> int:
-    """Return the major version of the LLVM that Dr.Jit runs on; raise if Dr.Jit cannot work with
-    it.
+    """Check the LLVM that Dr.Jit has loaded, and return its major version.
 
-    Call it before the first CPU kernel: with a wrong version the first kernel may end the process.
+    Call it before the first CPU kernel: with an unsuitable version the first kernel may end the
+    process.
 
     Raises:
-        LLVMNotFoundError: Dr.Jit has no LLVM, or one that it cannot work with.
+        LLVMNotFoundError: Dr.Jit has no LLVM, or one that it cannot use.
     """
     major = _loaded_major()
     if major is None:
@@ -231,7 +238,7 @@ def ensure_llvm() -> int:
 
 
 def _load_failure_message() -> str:
-    """The reason why Dr.Jit did not load LLVM, and advice."""
+    """The message of an error: why Dr.Jit has loaded no LLVM, and what to do."""
     requested = os.environ.get(PATH_VARIABLE)
     if requested:
         reason = rejection_reason(library_version(Path(requested)))
@@ -248,7 +255,8 @@ def _load_failure_message() -> str:
 
 
 def repair_advice() -> str:
-    """The one thing to do on this machine to get an acceptable LLVM."""
+    """What to do on this machine so that Dr.Jit loads an acceptable LLVM, as a sentence with a
+    command."""
     best = best_library()
     requested = os.environ.get(PATH_VARIABLE)
     if best is None or (requested and os.path.realpath(requested) == os.path.realpath(best.path)):

@@ -1,10 +1,12 @@
-"""Recorded loops whose state is a record with names, and work on only the lanes that need it.
+"""Recorded loops whose state is a record with named fields, and computations on only the lanes that
+need them.
 
-A recorded loop follows the rays of one packet until the last of them has ended, and masked lanes
-cost as much as the others. Where arrays may be evaluated, outside of any recording, there are two
-remedies: `compute_on_active` gathers the lanes of a mask into shorter arrays, and in
-`loop_with_queue` a lane that has finished a ray fetches the next ray. Both evaluate their results,
-and give each lane the result that it would have alone, in any order of lanes.
+A lane is one entry of Dr.Jit's arrays, here a ray; a packet is the group of lanes that a processor
+computes together. A recorded loop runs until the last ray of a packet has ended, and lanes whose
+ray has ended cost as much as all others. Outside of a recording, where arrays may be evaluated,
+there are two remedies: `compute_on_active` gathers the active lanes into shorter arrays, and in
+`loop_with_queue` a lane whose ray has ended takes the next ray. Both evaluate their results. The
+result of a ray does not depend on the other rays or on their order.
 """
 
 from __future__ import annotations
@@ -22,7 +24,7 @@ if TYPE_CHECKING:
 
 class LoopState(Protocol):
     """The state of a loop: a frozen dataclass whose fields are Dr.Jit arrays, further such
-    dataclasses, or None."""
+    dataclasses, or None. It is also called a record."""
 
     @property
     def active(self) -> Mask:
@@ -37,13 +39,17 @@ def loop_while_active(state: State, body: Callable[[State], State], label: str) 
     """Run `body` on the active lanes of the state until no lane is active, and return the final
     state.
 
+    body: returns the next state from a state. label: the name of the loop in Dr.Jit's output.
+
     Errors that the body raises while it is recorded are raised unchanged.
     """
 
     def is_active(*leaves: Any) -> Mask:
+        """The lanes on which the loop continues. leaves: the arrays of the state."""
         return rebuild_record(state, iter(leaves)).active
 
     def run_body(*leaves: Any) -> tuple[Any, ...]:
+        """The arrays of the next state, from the arrays of the state."""
         return tuple(array_leaves(body(rebuild_record(state, iter(leaves)))))
 
     try:
@@ -57,21 +63,28 @@ def update_where_active(
     active: Mask, change: Callable[[tuple[Any, ...]], tuple[Any, ...]], state: tuple[Any, ...],
     label: str,
 ) -> tuple[Any, ...]:  # fmt: skip
-    """Apply `change` to the state on active lanes. It runs in a loop of at most one iteration, so
-    that a packet without active lanes skips the work."""
+    """Apply `change` to the state on active lanes, and return the new state. `change` is the body
+    of a recorded loop of at most one iteration, so that a packet without active lanes skips the
+    work.
+
+    change: returns new arrays of the state from its arrays. label: the name of the loop.
+    """
     index = dr.uint32_array_t(active)
 
     def run_once(iteration: Any, *state: Any) -> tuple[Any, ...]:
+        """The body of the loop: count the iteration, and change the state."""
         return iteration + 1, *change(state)
 
     def is_first(iteration: Any, *_: Any) -> Mask:
+        """The lanes on which the loop runs its only iteration."""
         return active & (iteration < 1)
 
     return dr.while_loop((index(0), *state), is_first, run_once, label=label)[1:]
 
 
 def array_leaves(record: Any) -> Iterator[Any]:
-    """The arrays of a record and of its nested records, in order; None is left out."""
+    """Yield the arrays of a record (a dataclass) and of its nested records, in the order of the
+    fields. Fields that are None are left out."""
     for value in _entries(record):
         if dataclasses.is_dataclass(value):
             yield from array_leaves(value)
@@ -80,8 +93,8 @@ def array_leaves(record: Any) -> Iterator[Any]:
 
 
 def rebuild_record(like: Any, leaves: Iterator[Any]) -> Any:
-    """A record with the structure of `like`, whose arrays are the leaves, in the order of
-    `array_leaves`."""
+    """A record of the same type and structure as `like`, with other arrays. leaves: the arrays, in
+    the order of `array_leaves`."""
     values: list[Any] = []
     for value in _entries(like):
         if dataclasses.is_dataclass(value):
@@ -106,7 +119,7 @@ _LANES_PER_THREAD, _LANES_ON_GPU = 1024, 1 << 17
 
 
 def active_lanes(mask: Mask) -> tuple[Any, int]:
-    """Indices of the lanes where the mask is set, and their number.
+    """The indices of the lanes where the mask is set, as a Dr.Jit array, and their number.
 
     If there is only one such lane, its index is listed twice: Dr.Jit compiles separate kernels for
     arrays of length 1.
@@ -114,24 +127,25 @@ def active_lanes(mask: Mask) -> tuple[Any, int]:
     rows = dr.compress(mask)
     count = len(rows)
     if count == 1:
-        rows = _evaluate_unshared(lambda: dr.full(type(rows), int(rows[0]), 2))
+        rows = _evaluate_in_own_memory(lambda: dr.full(type(rows), int(rows[0]), 2))
     return rows, count
 
 
 def broadcast_copy(record: Lanes, width: int, index: Any) -> Lanes:
-    """An evaluated copy of a record in which every array has `width` lanes. index: the type of lane
-    indices."""
-    copies = _evaluate_unshared(
+    """An evaluated copy of a record in which every array has `width` lanes; an array of a single
+    lane is repeated. index: the Dr.Jit type of lane indices."""
+    copies = _evaluate_in_own_memory(
         lambda: [_broadcast(leaf, width, index) for leaf in array_leaves(record)]
     )
     return rebuild_record(record, iter(copies))
 
 
 def gather_record(record: Lanes, rows: Any) -> Lanes:
-    """The lanes of a record at the indices `rows`. A value that all lanes share stays an array of
-    width 1."""
+    """The record at the lanes `rows` (an array of indices). An array of width 1, which all lanes
+    share, stays as it is."""
 
     def gather(leaf: Any) -> Any:
+        """One array of the record at the lanes `rows`."""
         return leaf if dr.width(leaf) == 1 else dr.gather(type(leaf), leaf, rows)
 
     return rebuild_record(record, map(gather, array_leaves(record)))
@@ -140,11 +154,14 @@ def gather_record(record: Lanes, rows: Any) -> Lanes:
 def compute_on_active(
     mask: Mask, compute: Callable[[Lanes], Result], lanes: Lanes, inactive_result: Result
 ) -> Result:
-    """Run `compute` on the lanes where `mask` is set, and use `inactive_result` on all others.
+    """Run `compute` on the lanes where `mask` is set, and use `inactive_result` on all other lanes.
 
     The active lanes are gathered into shorter arrays, and the results are scattered back. Inputs
-    and outputs are evaluated, so that kernels do not depend on the number of active lanes.
+    and results are evaluated, so that kernels do not depend on the number of active lanes.
 
+    compute: returns a record from the record of lanes; each lane's result must not depend on other
+        lanes.
+    lanes: the record of inputs.
     inactive_result: a record with the structure of the result.
     """
     width = dr.width(mask)
@@ -166,16 +183,18 @@ def compute_on_active(
 def loop_with_queue(
     start: State, body: Callable[[State], State], result: Callable[[State], Result], label: str
 ) -> Result:
-    """Run `loop_while_active(start, body, label)` for every lane, and return `result` of the final
-    states, evaluated.
+    """Run `loop_while_active(start, body, label)`, and return `result` of the final states,
+    evaluated.
 
     Only a fixed number of lanes run at a time, far fewer than `start` has. A lane whose ray has
     ended stores its result and takes the next ray from a queue, so that no lane waits for the
     slowest ray of its packet.
 
-    body: the next state from the state of a lane. It may depend on the state of that lane only, and
-        use no other array that differs between lanes.
-    result: the result from the final state.
+    start: the initial states of all rays.
+    body: returns the next state of each lane from its state. It may depend on the state of that
+        lane only, and must use no other array that differs between lanes.
+    result: returns the result, a record, from a final state.
+    label: the name of the loop in Dr.Jit's output.
     """
     dr.eval(*array_leaves(start))
     width = max(dr.width(leaf) for leaf in array_leaves(start))
@@ -190,10 +209,10 @@ def loop_with_queue(
 
 @dataclass(frozen=True)
 class _QueueLane:
-    """A lane that follows rays from the queue.
+    """The state of the lanes that process the queue of rays.
 
-    queue_index: the position in the queue of the ray that it follows now.
-    state: the state of that ray.
+    queue_index: for each lane, the position in the queue of the ray that it follows now.
+    state: for each lane, the state of that ray.
     """
 
     queue_index: Any
@@ -209,31 +228,35 @@ def _run_queue(
     start: Any, body: Callable[[Any], Any], result: Callable[[Any], Any],
     rows: Any, total: int, results: list[Any], label: str,
 ) -> None:  # fmt: skip
-    """Run the loop of `loop_with_queue`.
+    """Run the loop of `loop_with_queue`, with the same start, body and result.
 
     rows: the indices in `start` of the rays in the queue.
     total: the number of these rays.
-    results: arrays into which the results are written, in place.
+    results: the arrays, one entry per ray, into which the results are written.
     """
     index = cast("Any", type(rows))
     count = dr.opaque(index, total)
     threads = dr.thread_count() if dr.backend_v(rows) == dr.JitBackend.LLVM else 0
     width = min(len(rows), _LANES_PER_THREAD * threads or _LANES_ON_GPU)
-    counter, first_indices = _evaluate_unshared(
+    counter, first_indices = _evaluate_in_own_memory(
         lambda: [dr.full(index, width, 1), dr.arange(index, width)]
     )
 
     def fetch_rays(queue_index: Any, mask: Mask) -> Any:
-        """The initial states of the rays at these positions of the queue, in lanes of the mask."""
+        """The initial states of the rays at the positions `queue_index` of the queue, for the lanes
+        of `mask`."""
         ids = dr.gather(index, rows, queue_index, mask)
 
         def gather(leaf: Any) -> Any:
+            """One array of the initial states, at these rays."""
             return leaf if dr.width(leaf) == 1 else dr.gather(type(leaf), leaf, ids, mask)
 
         return rebuild_record(start, map(gather, array_leaves(start)))
 
     def step_lanes(lane: _QueueLane) -> _QueueLane:
-        """Step all rays. Where a ray ends, store its result and begin the next ray of the queue."""
+        """Apply the body to the rays of all lanes. In each lane whose ray ends, store the result
+        and take the next ray of the queue. `counter` holds the position of the next ray that no
+        lane has taken."""
         new_state = body(lane.state)
         is_ended = lane.active & ~new_state.active
         ids = dr.gather(index, rows, lane.queue_index, is_ended)
@@ -261,16 +284,17 @@ def _run_queue(
 
 def _begin_new_scope(array: Any) -> None:
     """Begin a new Dr.Jit scope, as a recorded loop does. Dr.Jit merges equal expressions within a
-    scope only; without this call, the code that follows would compile to another kernel if the loop
-    was skipped."""
+    scope only. So without this call, the code that follows would compile to another kernel if the
+    loop was skipped. array: of the backend on which the scope begins."""
     dr.detail.new_scope(dr.backend_v(array))
 
 
-def _evaluate_unshared(compute: Callable[[], Any]) -> Any:
-    """Evaluate the arrays that `compute` returns, in memory that they share with no other array.
+def _evaluate_in_own_memory(compute: Callable[[], Any]) -> Any:
+    """Evaluate the arrays that `compute` returns, each in memory of its own.
 
-    Dr.Jit stores equal arrays once, and a kernel depends on which of its inputs are the same array:
-    an accidental match, such as two arrays of the same length, would compile another kernel.
+    Normally Dr.Jit stores equal arrays once, and a kernel depends on which of its inputs are the
+    same array. Two arrays that are equal by accident, such as index arrays of the same length,
+    would therefore compile another kernel.
     """
     with dr.scoped_set_flag(dr.JitFlag.ValueNumbering, False):
         arrays = compute()
@@ -279,6 +303,6 @@ def _evaluate_unshared(compute: Callable[[], Any]) -> Any:
 
 
 def _broadcast(leaf: Any, width: int, index: Any) -> Any:
-    """A copy of an array with `width` lanes: of each lane, or of the only one. index: the type of
-    lane indices."""
+    """A copy of an array with `width` lanes; an array of a single lane is repeated. index: the
+    Dr.Jit type of lane indices."""
     return dr.gather(type(leaf), leaf, dr.arange(index, width) * (dr.width(leaf) > 1))

@@ -1,8 +1,9 @@
-"""Tables of numbers on a backend, as records that a kernel reads in packets of eight.
+"""Tables of numbers on a backend. A kernel reads a row of a table (a record) in packets of eight
+numbers.
 
 A packet gather fetches eight numbers at once, which is several times faster than eight gathers, if
-the memory is aligned (`upload_floats` in `backend.arrays` says why that needs care). A loop over
-all records is recorded once, whatever their number: another table does not compile another kernel.
+the memory is aligned (see `backend.arrays`). A loop over all records is recorded once, whatever
+their number, so that another table compiles no other kernel.
 """
 
 from __future__ import annotations
@@ -29,13 +30,16 @@ RecordBody: TypeAlias = "Callable[[list[Real], LoopValues], LoopValues]"
 
 @dataclass(frozen=True)
 class RecordTable:
-    """A table on a backend, each row (record) padded with zeros to a multiple of eight numbers
+    """A table on a backend. Each row (record) is padded with zeros to a multiple of eight numbers
     (packets).
 
+    buffer: all numbers, row after row, with padding.
     packets_per_record: the number of packets of a record.
-    records_per_iteration: the number of records that an iteration of `for_each` reads.
-    iteration_count: the number of iterations of that loop.
-    first_record: the index, per lane, of the record to start at; None for the first of the table.
+    records_per_iteration: the number of records that one iteration of `for_each` reads.
+    iteration_count: the number of iterations of `for_each`, for each lane or the same for all
+        lanes.
+    first_record: the index, for each lane, of the record to start at; None to start at the first
+        record of the table.
     """
 
     backend: Backend
@@ -52,11 +56,11 @@ class RecordTable:
     ) -> RecordTable:  # fmt: skip
         """Upload a table (n, c), rounded to the backend's precision.
 
-        padding_row: (c,) a row without effect, repeated until `at_once` divides the number of rows.
-            Needed only if it does not.
-        at_once: the number of records that an iteration of `for_each` reads.
+        padding_row: (c,) a row without effect on the loop, appended until `at_once` divides the
+            number of rows; it may be None if `at_once` divides n.
+        at_once: the number of records that one iteration of `for_each` reads.
 
-        Rows are padded with zeros by Dr.Jit, on many threads and without another copy in NumPy.
+        Dr.Jit pads the rows with zeros, on many threads and without another copy in NumPy.
 
         Raises:
             ValueError: padding_row is needed and is None.
@@ -72,8 +76,8 @@ class RecordTable:
         rows, width = table.shape
         padded_width = -(-width // PACKET) * PACKET
         flat = upload_floats(backend, np.ascontiguousarray(table).ravel())
-        lane = dr.arange(backend.UInt32, rows * padded_width)
-        row, column = lane // padded_width, lane % padded_width
+        position = dr.arange(backend.UInt32, rows * padded_width)
+        row, column = position // padded_width, position % padded_width
         copy = dr.gather(backend.Float, flat, row * width + column, column < width)
         dr.eval(copy)
         return cls(
@@ -81,8 +85,8 @@ class RecordTable:
         )
 
     def view(self, first: Any, trips: Any) -> RecordTable:
-        """A view of the table that consists of `trips` consecutive records, from record `first` on.
-        Both numbers may differ between lanes. Only for tables with one record per iteration.
+        """The part of the table that consists of `trips` consecutive records, from record `first`
+        on. Both numbers may differ between lanes. The table must have one record per iteration.
 
         Raises:
             ValueError: an iteration reads several records.
@@ -94,7 +98,8 @@ class RecordTable:
         return replace(self, first_record=first, iteration_count=trips)
 
     def read_record(self, i: Any, active: Mask = True) -> list[Real]:
-        """The numbers of record i, padding included, fetched on active lanes only."""
+        """The numbers of record i, padding included, as a list of Dr.Jit arrays. i: an index for
+        each lane. active: the lanes that need the numbers; all others get zeros."""
         numbers: list[Real] = []
         i = i if self.first_record is None else i + self.first_record
         for k in range(self.packets_per_record):
@@ -106,9 +111,14 @@ class RecordTable:
     def for_each(
         self, body: RecordBody, state: LoopValues, label: str, active: Mask = True
     ) -> LoopValues:
-        """The state after `body` was applied to all records in turn, on active lanes only.
+        """Apply `body` to all records in turn, on active lanes only, and return the final state.
 
-        Inactive lanes cost nothing where all lanes of their packet are inactive.
+        body: returns the next state from the numbers of one record (a list of arrays) and the
+            state.
+        state: a tuple of arrays.
+        label: the name of the loop in Dr.Jit's output.
+
+        A packet of lanes skips the loop if all of its lanes are inactive.
         """
         iterations = (
             self.iteration_count if active is True else dr.select(active, self.iteration_count, 0)
@@ -121,6 +131,7 @@ class RecordTable:
             return i + 1, *state
 
         def is_active(i: Any, *_: Any) -> Mask:
+            """The lanes on which iteration i runs."""
             return i < iterations
 
         start = (self.backend.UInt32(0), *state)

@@ -1,16 +1,16 @@
-"""Conversions between Dr.Jit's tensors and vectors; functions for PyTorch and JAX.
+"""Converts between Dr.Jit's tensors and vectors, and wraps functions for PyTorch and JAX.
 
 Arrays of other frameworks reach Dr.Jit as tensors (n, 3) or (n,): `drjit.wrap` passes tensors to a
-function and expects tensors from it. This package computes with vectors instead, one lane for each
-row. All conversions pass derivatives on, in both directions.
+function and expects tensors from it. This package computes with vectors instead, with a lane for
+each row. All conversions pass derivatives on, in both directions.
 
 `wrap_for_jax` makes functions for JAX, for which Dr.Jit has no `wrap`. `wrap_for_torch` replaces
 `drjit.wrap` for PyTorch, which returns zeros for missing derivatives: here they raise an error, and
 the backward pass may be repeated. Neither framework is imported before it is used.
 
-Numbers that change from step to step of an optimization do not compile new kernels: literals with
-derivatives become kernel parameters, and curves whose vertices are Dr.Jit arrays do not choose
-proofs or hulls by their shape.
+Numbers that change from step to step of an optimization compile no new kernels: literals with
+derivatives become kernel parameters, and if the vertices of a curve are Dr.Jit arrays, neither its
+proofs nor its convex hull are chosen by its shape.
 """
 
 from __future__ import annotations
@@ -43,9 +43,11 @@ def tensor_to_vectors(
 ) -> Vec3:
     """The rows of a tensor (n, 3) as a 3-vector of n lanes.
 
+    name: what the tensor is, for messages. error: the class of errors about its shape.
+
     Raises:
         TypeError: not of 32- or 64-bit floats.
-        `error`: another shape. The message starts with `name`.
+        `error`: another shape.
     """
     check_vectors(tensor, name, error, transposed=TRANSPOSE_ADVICE)
     numbers = tensor_to_array(tensor, name)
@@ -57,8 +59,8 @@ def tensor_to_vectors(
 
 
 def tensor_to_array(tensor: Any, name: str = "values") -> Real:
-    """All numbers of a tensor, row by row. Raises TypeError if they are not 32- or 64-bit
-    floats."""
+    """All numbers of a tensor, row by row, as a Dr.Jit array. name: what the tensor is, for
+    messages. Raises `TypeError` if they are not 32- or 64-bit floats."""
     array = tensor.array
     try:
         return backend_of(array).Float(array)
@@ -67,16 +69,16 @@ def tensor_to_array(tensor: Any, name: str = "values") -> Real:
 
 
 def array_to_tensor(array: Any, shape: tuple[int, ...]) -> Any:
-    """A Dr.Jit array as a tensor of a shape, or a 3-vector as a tensor of shape (*shape, 3).
+    """A Dr.Jit array as a tensor of the given shape; a 3-vector as a tensor of shape (*shape, 3).
 
-    A value that all lanes share is repeated. Unsigned integers become signed, since PyTorch has no
-    unsigned ones.
+    A value that all lanes share is repeated. Unsigned integers become signed ones, since PyTorch
+    has no unsigned integers.
     """
     kind = cast("Any", type(array))
     count = math.prod(shape)
     if dr.width(array) == 1 and count > 1:
-        lane = dr.uint32_array_t(dr.array_t(kind))
-        array = dr.gather(kind, array, dr.zeros(lane, count))
+        index_type = dr.uint32_array_t(dr.array_t(kind))
+        array = dr.gather(kind, array, dr.zeros(index_type, count))
     if dr.depth_v(kind) > 1:
         array, shape = dr.ravel(array), (*shape, dr.size_v(kind))
     elif dr.is_unsigned_v(kind) and not dr.is_mask_v(kind):
@@ -85,11 +87,12 @@ def array_to_tensor(array: Any, shape: tuple[int, ...]) -> Any:
 
 
 def accepts_tensors(method: Method) -> Method:
-    """Extend a method of points: it also takes a tensor of points, and then returns tensors."""
+    """Decorator for a method of points: the method also takes a tensor of points, (..., 3), and
+    then returns a tensor."""
 
     @functools.wraps(method)
     def wrapper(self: Any, points: Any, **settings: Any) -> Any:
-        """The method for tensors and for all other points."""
+        """Call the method, with a tensor converted to vectors and the result converted back."""
         if not is_tensor(points):
             return method(self, points, **settings)
         *shape, _ = points.shape or (0,)
@@ -105,37 +108,41 @@ def accepts_tensors(method: Method) -> Method:
 
 
 def wrap_for_torch(function: Callable[..., Any]) -> Callable[..., Any]:
-    """A function of Dr.Jit tensors as one of PyTorch tensors, with derivatives.
+    """Turn a function of Dr.Jit tensors into a function of PyTorch tensors, with derivatives.
 
-    As `drjit.wrap(source="torch", target="drjit")`, but nothing is dropped silently: a result that
-    depends on the arguments only through quantities without a derivative, such as whether rays hit
-    (`hits.is_hit`), raises where its derivative is requested; and a second backward pass
+    It does what `drjit.wrap(source="torch", target="drjit")` does, but loses nothing silently. Some
+    results depend on the arguments only through quantities without a derivative, such as whether
+    rays hit (`hits.is_hit`): requesting their derivative raises an error. A second backward pass
     (`retain_graph=True`) is right, and calls `function` again.
 
-    function: must be pure. It is called with a Dr.Jit tensor for each PyTorch tensor among its
+    function: a pure function. It is called with a Dr.Jit tensor for each PyTorch tensor among its
         arguments, of the same shape and precision, and returns a Dr.Jit array or tensor, or several
         in a tuple, list or dictionary; 3-vectors become tensors (n, 3). All other arguments are
-        passed unchanged; tensors in lists and the like are not converted.
+        passed unchanged; tensors within lists and other containers are not converted.
 
-    Raises ImportError where PyTorch is not installed.
+    Raises ImportError if PyTorch is not installed.
     """
     torch: Any = importlib.import_module("torch")
 
     def run_function(arguments: list[Any], tensors: tuple[Any, ...]) -> tuple[list[Any], Any]:
-        """The inputs as Dr.Jit tensors with derivatives, and the result of `function`. arguments:
-        its arguments, with None in place of tensors."""
+        """Call `function`. Returns its tensor arguments as Dr.Jit tensors with derivatives, and its
+        result.
+
+        arguments: the arguments in order, with None in place of tensors. tensors: PyTorch tensors
+            for these places.
+        """
         inputs = [_differentiable_tensor(tensor.detach()) for tensor in tensors]
         remaining = iter(inputs)
         all_arguments = (next(remaining) if value is None else value for value in arguments)
         return inputs, function(*all_arguments)
 
     class Wrapped(torch.autograd.Function):
-        """The function, as PyTorch's automatic differentiation calls it."""
+        """The function in the form that PyTorch's automatic differentiation calls."""
 
         @staticmethod
         def forward(ctx: Any, arguments: list[Any], container: list[Any], *tensors: Any) -> Any:
-            """The results as PyTorch tensors; the function's own result is appended to
-            `container`."""
+            """The results as PyTorch tensors. The result of `function` itself, whose type (tuple,
+            list, ...) the caller needs, is appended to the list `container`."""
             inputs, outputs = run_function(arguments, tensors)
             container.append(outputs)
             ctx.save_for_backward(*tensors)
@@ -148,7 +155,8 @@ def wrap_for_torch(function: Callable[..., Any]) -> Callable[..., Any]:
         @staticmethod
         @torch.autograd.function.once_differentiable
         def backward(ctx: Any, *cotangents: Any) -> Any:
-            """Gradients with respect to the tensors, from those with respect to the results."""
+            """The gradients with respect to the arguments of `forward` (None for the first two).
+            cotangents: the gradients with respect to its results."""
             graph, ctx.graph = ctx.graph, None
             if graph is None:  # a repeated backward pass
                 inputs, outputs = run_function(ctx.arguments, ctx.saved_tensors)
@@ -163,6 +171,7 @@ def wrap_for_torch(function: Callable[..., Any]) -> Callable[..., Any]:
 
     @functools.wraps(function)
     def wrapped(*args: Any) -> Any:
+        """Call the function with PyTorch tensors."""
         tensors = [value for value in args if isinstance(value, torch.Tensor)]
         arguments = [None if isinstance(value, torch.Tensor) else value for value in args]
         container: list[Any] = []
@@ -172,15 +181,16 @@ def wrap_for_torch(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _results(outputs: Any) -> list[Any]:
-    """The results of a function, as a list."""
+    """The results of a function as a list, from a single result or a tuple, list or dictionary."""
     if isinstance(outputs, dict):
         return list(cast("dict[Any, Any]", outputs).values())
     return list(cast("list[Any]", outputs)) if isinstance(outputs, (tuple, list)) else [outputs]
 
 
 def _in_container(container: list[Any], results: Any) -> Any:
-    """The results in a container of the type of the function's result, which is the entry of
-    `container`."""
+    """Results in a container of the same type (and with the same keys) as the function's own
+    result. container: a list whose only entry is the function's own result. results: an
+    iterator."""
     outputs = container.pop()
     if isinstance(outputs, dict):
         return dict(zip(cast("dict[Any, Any]", outputs), results, strict=True))
@@ -188,14 +198,15 @@ def _in_container(container: list[Any], results: Any) -> Any:
 
 
 def _gradients(inputs: list[Any], outputs: list[Any], cotangents: list[Any]) -> list[Any]:
-    """The gradients, as tensors, with respect to the inputs that are floats.
+    """The gradients, as tensors, with respect to each input that holds floats.
 
+    inputs: tensors with derivatives enabled.
     outputs: the results of the function for these inputs.
-    cotangents: the gradients with respect to the outputs, None for none.
+    cotangents: the gradients with respect to the outputs; None for an output without a gradient.
 
     Raises:
-        NotImplementedError: a gradient is given for an output that depends on no input by a
-            derivative.
+        NotImplementedError: a nonzero gradient is given for an output that has no derivative with
+            respect to any input.
     """
     for output, cotangent in zip(outputs, cotangents, strict=True):
         if cotangent is None or not dr.is_float_v(output):
@@ -229,24 +240,21 @@ _TRACED_MESSAGE = (
 def wrap_for_jax(
     function: Callable[..., Any], *, result_like: Callable[..., Any] | None = None
 ) -> Callable[..., Any]:
-    """A function of Dr.Jit tensors as one of JAX arrays, with derivatives for `jax.grad`.
+    """Turn a function of Dr.Jit tensors into a function of JAX arrays, with derivatives for
+    `jax.grad`. Dr.Jit's own `drjit.wrap` does not support JAX.
 
-    The counterpart for JAX of `drjit.wrap(source="torch", target="drjit")`; Dr.Jit has none.
-
-    function: must be pure. It is called with a Dr.Jit tensor for each array or number among its
+    function: a pure function. It is called with a Dr.Jit tensor for each array or number among its
         arguments, of the shape and precision that it has in JAX, and returns Dr.Jit arrays or
         tensors, possibly in tuples, lists and dictionaries; 3-vectors become arrays (n, 3).
     result_like: only for use inside `jax.jit`: a JAX function of the same arguments whose result
-        has the shapes and types of `function`'s. Only these are used.
+        has the shapes and types of `function`'s result. Its values are not used.
 
-    A result that depends on the arguments only through quantities without a derivative, such as
-    whether rays hit (`hits.is_hit`), raises where its derivative is requested.
+    Some results depend on the arguments only through quantities without a derivative, such as
+    whether rays hit (`hits.is_hit`): requesting their derivative raises an error. Derivatives are
+    those of reverse mode (`jax.grad`, `jax.vjp`, `jax.jacrev`). A derivative calls `function` a
+    second time: JAX may keep the values of a forward pass, but it cannot keep Dr.Jit's graph.
 
-    Derivatives are those of reverse mode (`jax.grad`, `jax.vjp`, `jax.jacrev`). A derivative calls
-    `function` a second time: JAX may keep the values of a forward pass, but it cannot keep Dr.Jit's
-    graph.
-
-    Raises ImportError where JAX is not installed.
+    Raises ImportError if JAX is not installed.
     """
     jax: Any = importlib.import_module("jax")
     run = functools.partial(_run_for_jax, jax, function)
@@ -261,11 +269,12 @@ def wrap_for_jax(
         return _pure_callback(jax, run, jax.eval_shape(result_like, *args), *args)
 
     def forward(*args: Any) -> tuple[Any, Any]:
-        """The result, and the arguments, which `backward` needs."""
+        """The result, and the arguments, which JAX passes to `backward`."""
         return call(*args), args
 
     def backward(args: Any, cotangents: Any) -> Any:
-        """The gradients with respect to all arguments, from those with respect to the result."""
+        """The gradients with respect to all arguments. cotangents: the gradients with respect to
+        the result."""
         leaves: list[Any] = jax.tree.leaves(args)
         if _is_traced(jax, (args, cotangents)):
             shapes = [
@@ -290,21 +299,23 @@ def wrap_for_jax(
 
     @functools.wraps(function)
     def wrapped(*args: Any) -> Any:
+        """Call the function with arrays or numbers."""
         return differentiable(*jax.tree.map(jax.numpy.asarray, args))
 
     return wrapped
 
 
 def _run_for_jax(jax: Any, function: Callable[..., Any], *args: Any) -> Any:
-    """The result of `function` as JAX arrays. Derivatives are always enabled: hits are polished to
-    rounding where they are enabled, so that the result is the same with `jax.grad` and without."""
+    """Call `function` with JAX arrays, and return its result as JAX arrays. Derivatives are enabled
+    even if nobody asks for them, because hits are refined to rounding error only if they are; so
+    the result is the same with `jax.grad` and without."""
     outputs = function(*jax.tree.map(_differentiable_tensor, args))
     return jax.tree.map(_as_jax, outputs)
 
 
 def _pull_back(jax: Any, function: Callable[..., Any], args: Any, cotangents: Any) -> list[Any]:
-    """Gradients with respect to the arguments that are floats, from gradients with respect to the
-    result."""
+    """The gradients, as JAX arrays, with respect to each argument that holds floats. cotangents:
+    the gradients with respect to the result of `function`."""
     inputs = jax.tree.map(_differentiable_tensor, args)
     outputs = jax.tree.leaves(function(*inputs))
     gradients = _gradients(jax.tree.leaves(inputs), outputs, jax.tree.leaves(cotangents))
@@ -312,14 +323,17 @@ def _pull_back(jax: Any, function: Callable[..., Any], args: Any, cotangents: An
 
 
 def _is_traced(jax: Any, values: Any) -> bool:
-    """Whether JAX is transforming or compiling, so that values do not exist yet."""
+    """Whether a value is a placeholder without numbers, as JAX passes while it transforms or
+    compiles a function."""
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(values))
 
 
 def _pure_callback(jax: Any, compute: Callable[..., Any], shapes: Any, *args: Any) -> Any:
-    """The result of `compute`, called while a program that JAX has compiled runs."""
+    """The result of `compute`, which JAX calls while a compiled program runs. shapes: the shapes
+    and types of the result."""
 
     def compute_on_host(*values: Any) -> Any:
+        """The result of `compute` for NumPy arrays, as NumPy arrays."""
         # NumPy arrays, as a callback must not wait for work that JAX itself has to do.
         return jax.tree.map(np.asarray, compute(*jax.tree.map(np.asarray, values)))
 
@@ -327,17 +341,19 @@ def _pure_callback(jax: Any, compute: Callable[..., Any], shapes: Any, *args: An
 
 
 def _is_float(jax: Any, array: Any) -> bool:
-    """Whether JAX computes with floats for this array or number."""
+    """Whether an array or number holds floats for JAX."""
     return jax.numpy.issubdtype(jax.numpy.result_type(array), jax.numpy.floating)
 
 
 def _import_tensor(array: Any) -> Any:
-    """A Dr.Jit tensor of the same shape and precision, on the device where the array is."""
+    """A JAX, PyTorch or NumPy array as a Dr.Jit tensor of the same shape and precision, on the same
+    device."""
     return dr.detail.import_tensor(array, True)
 
 
 def _differentiable_tensor(array: Any) -> Any:
-    """A Dr.Jit tensor as `_import_tensor` gives it, with derivatives enabled if it holds floats."""
+    """An array of another framework as a Dr.Jit tensor, with derivatives enabled if it holds
+    floats."""
     tensor = _import_tensor(array)
     if dr.is_float_v(tensor):
         dr.enable_grad(tensor)
@@ -345,7 +361,8 @@ def _differentiable_tensor(array: Any) -> Any:
 
 
 def _as_tensor(value: Any) -> Any:
-    """A result of a function as a Dr.Jit tensor. Raises a TypeError for other values."""
+    """A result of a function, a Dr.Jit array or tensor, as a Dr.Jit tensor. Raises `TypeError` for
+    other values."""
     if not dr.is_array_v(cast("Any", type(value))):
         raise TypeError(
             "a function for JAX returns Dr.Jit arrays or tensors, in tuples, lists and "
@@ -355,5 +372,5 @@ def _as_tensor(value: Any) -> Any:
 
 
 def _as_jax(value: Any) -> Any:
-    """A result of a function as a JAX array, without derivatives."""
+    """A Dr.Jit array or tensor as a JAX array, without derivatives."""
     return dr.detach(_as_tensor(value)).jax()

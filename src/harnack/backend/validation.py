@@ -1,7 +1,7 @@
-"""Checks of the numbers that a caller passes, alone or in NumPy arrays.
+"""Checks of the numbers that a caller passes, single ones or in NumPy arrays.
 
-Checks of arrays raise the error class of the calling code, in the same wording everywhere. Limits
-that differ between curves, meshes and clouds are checked by their own modules.
+Checks of arrays raise the error class that the calling code names, with the same wording
+everywhere. Limits that differ between curves, meshes and clouds are checked by their own modules.
 """
 
 from __future__ import annotations
@@ -43,11 +43,18 @@ def as_real_array(
     ragged: str = "must be a rectangular array of numbers, not ragged",
     other: str = "must hold real numbers",
 ) -> npt.NDArray[Any]:
-    """The values as an array of integers or floats; it may be the same array, not a copy.
+    """The values as an array of integers or floats. An array of such numbers is returned itself,
+    not copied.
 
-    type_error: the class raised for values that are no real numbers, if it is not `error`.
+    name: what the values are, for messages.
+    error: the class of errors.
+    type_error: the class of errors about values that are no real numbers; None for `error`.
     ragged, other: the messages, after `name`, for rows of different lengths and for values that are
         not real numbers.
+
+    Raises:
+        NotImplementedError: the values carry derivatives, which would be lost.
+        error, type_error: the values are no rectangular array of real numbers.
     """
     check_no_derivatives(name, values)
     try:
@@ -67,8 +74,8 @@ def check_vectors(
     planar: str = "",
     transposed: str = "",
 ) -> None:
-    """Check that an array has shape (n, 3). planar, transposed: advice for shapes (n, 2) and (3,
-    n)."""
+    """Raise `error` unless an array has shape (n, 3). name: what it is, for messages. planar,
+    transposed: advice to append for the shapes (n, 2) and (3, n)."""
     if array.ndim == 2 and array.shape[1] == 3:
         return
     hint = ""
@@ -84,8 +91,8 @@ def check_vectors(
 def check_finite(
     rows: FloatArray, name: str, error: type[Exception], advice: str = "coordinates must be finite"
 ) -> None:
-    """Check that all numbers of an array (n, k) are finite. name: the name of a row, with {} for
-    its index."""
+    """Raise `error` unless all numbers of an array (n, k) are finite. name: what a row is, for the
+    message, with {} for its index. advice: the end of the message."""
     ids = np.flatnonzero(~np.isfinite(rows).all(axis=1))
     if ids.size:
         raise error(
@@ -95,26 +102,27 @@ def check_finite(
 
 
 def check_coordinate_size(x: FloatArray, error: type[Exception]) -> None:
-    """Check that no coordinate is larger than `MAX_COORDINATE`."""
+    """Raise `error` if a coordinate is larger than `MAX_COORDINATE`."""
     if (size := float(np.abs(x).max(initial=0.0))) > MAX_COORDINATE:
         raise error(f"coordinates up to {size:g} are too large: choose units nearer to 1")
 
 
 def format_vector(row: FloatArray) -> str:
-    """A vector as messages show it: (1, 2, 3)."""
+    """A vector as text for messages: "(1, 2, 3)"."""
     return "(" + ", ".join(f"{v:g}" for v in row) + ")"
 
 
 def others_suffix(count: int) -> str:
-    """The end of a message about the first of `count` entries: the number of other entries."""
+    """The end of a message about the first of `count` wrong entries: how many more there are."""
     return f" (and {count - 1:,} more)" if count > 1 else ""
 
 
 def check_no_derivatives(name: str, *values: Any) -> None:
-    """Check that no value carries derivatives, for code that would drop them.
+    """Check that no value carries derivatives, for code that would lose them.
 
     Raises:
-        NotImplementedError: a value does (`has_derivatives`). The message starts with `name`.
+        NotImplementedError: a value carries derivatives (see `has_derivatives`). The message starts
+            with `name`.
     """
     if has_derivatives(values):
         raise NotImplementedError(
@@ -126,11 +134,12 @@ def check_no_derivatives(name: str, *values: Any) -> None:
 
 
 def no_derivatives(function: Function) -> Function:
-    """Decorate a function that would drop derivatives: the decorated function refuses arguments
-    that carry them (`check_no_derivatives`)."""
+    """Decorator for a function that would lose derivatives: it refuses arguments that carry them,
+    by a `NotImplementedError` (see `check_no_derivatives`)."""
 
     @functools.wraps(function)
     def wrapper(*args: Any, **kwargs: Any) -> Any:
+        """Check all arguments, and call the function."""
         check_no_derivatives(function.__qualname__, args, kwargs)
         return function(*args, **kwargs)
 
@@ -139,8 +148,8 @@ def no_derivatives(function: Function) -> Function:
 
 def has_derivatives(value: Any) -> bool:
     """Whether a value is, or contains, a Dr.Jit or PyTorch array with derivatives enabled. The
-    search includes the entries of containers, the objects that functions refer to, and the
-    attributes of fields, of callables and of dataclasses."""
+    entries of containers, the objects that functions refer to, and the attributes of fields,
+    callables and dataclasses are searched too."""
     visited: set[int] = set()
     pending: list[Any] = [value]
     for node in pending:  # the list grows in this loop
@@ -161,9 +170,9 @@ def has_derivatives(value: Any) -> bool:
 
 
 def is_plain_data(value: Any) -> bool:
-    """Whether a value is plain data: Python's and NumPy's numbers, strings and arrays, in tuples,
-    dictionaries and dataclasses of this package. Plain data can never carry derivatives; Dr.Jit
-    arrays and functions can."""
+    """Whether a value consists of plain data only: Python's and NumPy's numbers, strings and
+    arrays, in tuples, dictionaries and dataclasses of this package. Plain data never carries
+    derivatives; Dr.Jit arrays and functions can."""
     pending: list[Any] = [value]
     for node in pending:  # the list grows in this loop
         kind = cast("Any", type(node))
@@ -181,8 +190,8 @@ def is_plain_data(value: Any) -> bool:
 
 
 def make_read_only(value: Any) -> None:
-    """Make the NumPy arrays in a value read-only: those in its tuples, lists, dictionaries and
-    dataclasses of this package."""
+    """Make all NumPy arrays in a value read-only, those in nested tuples, lists, dictionaries and
+    dataclasses of this package included."""
     if isinstance(value, np.ndarray):
         cast("npt.NDArray[Any]", value).setflags(write=False)
     elif isinstance(value, tuple | list):
@@ -203,7 +212,8 @@ _KNOWN_PACKAGES = frozenset(("harnack", "drjit", "numpy", "math"))
 
 
 def _contained_values(value: Any) -> list[Any]:
-    """The values that a value contains or refers to, as far as `has_derivatives` searches them."""
+    """The values that a value contains or refers to, in which `has_derivatives` searches
+    further."""
     if isinstance(value, _CONTAINER_TYPES):
         return [entry for entry in cast("Any", value) if type(entry) not in _PLAIN_TYPES]
     if isinstance(value, dict):
@@ -221,8 +231,7 @@ def _contained_values(value: Any) -> list[Any]:
 
 
 def format_short(value: Any) -> str:
-    """A short text for a value in a message: arrays by their shapes, long lists by their
-    lengths."""
+    """A short text for a value in a message: an array by its shape, a long list by its length."""
     if isinstance(value, float):  # of NumPy too
         return f"{value:.6g}"
     if isinstance(value, np.ndarray):
@@ -243,13 +252,14 @@ def format_short(value: Any) -> str:
 
 
 def is_same_or_equal(a: Any, b: Any) -> bool:
-    """Whether two values are the same object, or equal numbers, texts or tuples of these."""
+    """Whether two values are the same object, or equal numbers, strings or tuples of these."""
     plain = (int, float, str, tuple)
     return a is b or (isinstance(a, plain) and isinstance(b, plain) and bool(np.all(a == b)))
 
 
 def as_real(value: Any, name: str) -> float:
-    """A number of Python or NumPy as a float; infinities and NaN are allowed.
+    """A number of Python or NumPy as a float; infinities and NaN are allowed. name: what it is, for
+    messages.
 
     Raises:
         TypeError: it is not a number.
@@ -261,10 +271,11 @@ def as_real(value: Any, name: str) -> float:
 
 
 def as_positive(value: Any, name: str) -> float:
-    """A positive finite number as a float.
+    """A positive finite number as a float. name: what it is, for messages.
 
     Raises:
-        TypeError: it is not a number. ValueError: it is not positive and finite.
+        TypeError: it is not a number.
+        ValueError: it is not positive and finite.
     """
     number = as_real(value, name)
     if not 0.0 < number < math.inf:
@@ -273,10 +284,11 @@ def as_positive(value: Any, name: str) -> float:
 
 
 def as_finite(value: Any, name: str) -> float:
-    """A finite number as a float.
+    """A finite number as a float. name: what it is, for messages.
 
     Raises:
-        TypeError: it is not a number. ValueError: it is not finite.
+        TypeError: it is not a number.
+        ValueError: it is not finite.
     """
     number = as_real(value, name)
     if not math.isfinite(number):
@@ -285,7 +297,8 @@ def as_finite(value: Any, name: str) -> float:
 
 
 def as_integer_in_range(value: Any, name: str, minimum: int, maximum: int) -> int:
-    """An integer from `minimum` to `maximum`.
+    """A number as an int, if it is an integer from `minimum` to `maximum`. name: what it is, for
+    messages.
 
     Raises:
         ValueError: it is not an integer in that range.
@@ -301,10 +314,10 @@ def as_integer_in_range(value: Any, name: str, minimum: int, maximum: int) -> in
 
 
 def flag(value: Any, name: str) -> bool:
-    """True or False, of Python or NumPy.
+    """A bool of Python or NumPy as Python's bool. name: what it is, for messages.
 
     Raises:
-        TypeError: it is neither.
+        TypeError: it is not a bool.
     """
     if not isinstance(value, bool | np.bool_):
         raise TypeError(f"{name} must be True or False, not {format_short(value)}")
@@ -312,7 +325,7 @@ def flag(value: Any, name: str) -> bool:
 
 
 def integer(value: Any, name: str) -> int:
-    """An integer of any size.
+    """An integer of Python or NumPy as an int. name: what it is, for messages.
 
     Raises:
         TypeError: it is not an integer.
@@ -324,10 +337,11 @@ def integer(value: Any, name: str) -> int:
 
 
 def as_triple(value: Any, name: str, *, all_positive: bool = False) -> tuple[float, float, float]:
-    """Three finite numbers.
+    """Three finite numbers as a tuple of floats. name: what they are, for messages. all_positive:
+    whether they must be positive.
 
     Raises:
-        TypeError, ValueError: they are not.
+        TypeError, ValueError: they are not three such numbers.
     """
     try:
         entries = tuple(value)

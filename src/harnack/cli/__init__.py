@@ -1,4 +1,5 @@
-"""The command line: from arguments to calls, and from results to files."""
+"""The command line `harnack`: it turns arguments into calls of the library, and writes results to
+files."""
 
 from __future__ import annotations
 
@@ -13,7 +14,8 @@ __all__ = ["main"]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command; 0 on success, 1 for what went wrong, 2 for wrong usage, 130 for Ctrl-C."""
+    """Run a command with these arguments (by default those of the process), and return the exit
+    code: 0 for success, 1 for an error, 2 for wrong usage, 130 for Ctrl-C."""
     with track_interrupts() as interrupts, print_warnings():
         try:
             options = parse(arguments)

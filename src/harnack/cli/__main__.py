@@ -1,4 +1,4 @@
-"""`python -m harnack.cli`."""
+"""Runs the command line by `python -m harnack.cli`."""
 
 from __future__ import annotations
 

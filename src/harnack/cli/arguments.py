@@ -1,5 +1,5 @@
-"""The argument parser of the command `harnack`: commands, their options from the table of all
-options (`rendering.option_table`), and messages about wrong arguments."""
+"""The argument parser of the command `harnack`: its commands, their options (from the table of all
+options, `rendering.option_table`), and messages about wrong arguments."""
 
 from __future__ import annotations
 
@@ -32,7 +32,8 @@ CAMERA_OPTIONS = ("azimuth", "elevation", "fov", "zoom", "position", "target", "
 
 
 class _Parser(argparse.ArgumentParser):
-    """Says what is wrong in one line, and which option an unknown one may have meant."""
+    """An argument parser that reports an error on one line, and suggests an existing option for an
+    unknown one."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
@@ -40,15 +41,17 @@ class _Parser(argparse.ArgumentParser):
         self._negative_number_matcher = re.compile(r"-([\d.]|[xyz]$)")
 
     def error(self, message: str) -> NoReturn:
+        """Print an error message, and end the process with exit code 2."""
         self.exit(2, f"{printable(f'{self.prog}: error: {message}')} (see {self.prog} --help)\n")
 
     def options(self) -> list[str]:
-        """All options, as they are written."""
+        """The names of all options as they are written, such as "--level"."""
         return [name for action in self._actions for name in action.option_strings]
 
 
 def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
-    """The arguments of a command, by default of this process; `command` is its name.
+    """Parse the arguments of a command, by default those of this process. The result has an
+    attribute for each option, and the name of the command in `command`.
 
     Ends the process with exit code 2 for wrong usage.
     """
@@ -68,7 +71,7 @@ def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
 
 
 def parsers() -> tuple[_Parser, dict[str, _Parser]]:
-    """The parser of the whole command line, and the parsers of the commands by name."""
+    """The parser of the whole command line, and the parser of each command by name."""
     whole = _Parser(
         prog="harnack", description="Guaranteed ray tracing of harmonic and other surfaces."
     )
@@ -93,6 +96,7 @@ def parsers() -> tuple[_Parser, dict[str, _Parser]]:
 
 
 def _add_render(commands: Any) -> None:
+    """Add the command `render` to the parsers of commands."""
     parser = commands.add_parser(
         "render", help="draw one picture",
         description="Draw a gallery scene, the surface of a file, a formula, or a Mitsuba scene "
@@ -105,6 +109,7 @@ def _add_render(commands: Any) -> None:
 
 
 def _add_animate(commands: Any) -> None:
+    """Add the command `animate`, which makes a film, to the parsers of commands."""
     parser = commands.add_parser(
         "animate", help="a film around a surface",
         description="Draw a film in which the camera goes around a gallery scene, a formula or the "
@@ -116,6 +121,7 @@ def _add_animate(commands: Any) -> None:
 
 
 def _add_page(commands: Any) -> None:
+    """Add the command `page`, which writes an HTML file, to the parsers of commands."""
     parser = commands.add_parser(
         "page", help="one HTML file in which a surface turns",
         description="Write one HTML file that opens in any browser with WebGPU, without Python and "
@@ -127,6 +133,7 @@ def _add_page(commands: Any) -> None:
 
 
 def _add_view(commands: Any) -> None:
+    """Add the command `view`, which serves a page, to the parsers of commands."""
     parser = commands.add_parser(
         "view", help="a surface live in the browser: turned, its curve dragged, its level moved",
         description="Serve a page to the browser of this machine, until Ctrl-C. Python prepares "
@@ -139,6 +146,7 @@ def _add_view(commands: Any) -> None:
 
 
 def _add_mesh(commands: Any) -> None:
+    """Add the command `mesh` to the parsers of commands."""
     parser = commands.add_parser(
         "mesh", help="make triangles of a surface, or a closed part to print",
         description="Write the triangles of a gallery scene's surface, of a formula, or of the "
@@ -160,6 +168,7 @@ def _add_mesh(commands: Any) -> None:
 
 
 def _add_repair(commands: Any) -> None:
+    """Add the command `repair` to the parsers of commands."""
     parser = commands.add_parser(
         "repair", help="close a damaged mesh",
         description="Write a mesh with its holes filled; its triangles stay as they are. Where "
@@ -176,6 +185,8 @@ def _add_repair(commands: Any) -> None:
 
 
 def _add_check(commands: Any) -> None:
+    """Add the command `check`, which examines a mesh before printing, to the parsers of
+    commands."""
     parser = commands.add_parser(
         "check", help="say what a slicer would complain of",
         description="Say what is wrong with a mesh for printing, and where: open edges, edges of "
@@ -200,7 +211,9 @@ def _add_check(commands: Any) -> None:
 
 
 def _add_drawing(parser: Any, verb: str, output: str | None) -> None:
-    """The arguments of a command that draws."""
+    """Add the arguments that all commands that draw have: the source, the output, and the options
+    of the function `verb`, the camera and surface files. output: the help text of -o; None for no
+    such option."""
     _add_source(parser, output)
     _add_options(parser, verb)
     _add_camera(parser)
@@ -208,6 +221,8 @@ def _add_drawing(parser: Any, verb: str, output: str | None) -> None:
 
 
 def _add_source(parser: Any, output: str | None) -> None:
+    """Add the argument SOURCE, the option -o (unless its help text `output` is None), and the
+    option --parameter."""
     parser.add_argument(
         "source",
         metavar="SOURCE",
@@ -228,7 +243,12 @@ def _add_options(
     only: Sequence[str] | None = None,
     without: Sequence[str] = (),
 ) -> None:
-    """The options that a verb has in the table, in groups."""
+    """Add the options that the table of all options lists for a function, in groups.
+
+    verb: the name of the function, such as "render".
+    only: the names of the options to add; None for all.
+    without: names of options to leave out.
+    """
     groups: dict[str, Any] = {}
     for option in options_of(verb):
         if option.name in without or not option.is_on_command_line:
@@ -243,6 +263,8 @@ def _add_options(
 
 
 def _add_option(group: Any, option: Option, verb: str) -> None:
+    """Add an option of the table to a group of a parser. verb: the function that the command
+    calls."""
     if option.is_switch:
         group.add_argument(option.flag, action="store_true", default=None, help=option.help)
         return
@@ -256,6 +278,7 @@ def _add_option(group: Any, option: Option, verb: str) -> None:
 
 
 def _add_isolines_style(group: Any) -> None:
+    """Add the options for the width and the color of isolines."""
     group.add_argument(
         "--isolines-width", type=_argument(text.parse_positive), metavar="LENGTH",
         help="width of these lines, in the surface's coordinates (0.4 percent of its size)",
@@ -267,6 +290,7 @@ def _add_isolines_style(group: Any) -> None:
 
 
 def _add_camera(parser: Any) -> None:
+    """Add the options of the camera."""
     group = parser.add_argument_group("camera")
     helps: dict[str, tuple[Callable[[str], Any], str, str]] = {
         "azimuth": (text.parse_number, "DEGREES", "direction it looks from, around up (-50)"),
@@ -283,6 +307,7 @@ def _add_camera(parser: Any) -> None:
 
 
 def _add_sliders(parser: Any) -> None:
+    """Add the option --slider."""
     parser.add_argument(
         "--slider", type=_argument(_parse_slider), metavar="NAME=LOW:HIGH[:STEP]", action="append",
         default=[],
@@ -292,6 +317,7 @@ def _add_sliders(parser: Any) -> None:
 
 
 def _add_file_options(parser: Any) -> Any:
+    """Add the options for surface files, and return their group."""
     group = parser.add_argument_group("surface files")
     kinds = ("winding", "dipole", "loops", "polygons")
     group.add_argument(
@@ -317,13 +343,16 @@ def _add_file_options(parser: Any) -> Any:
 
 
 def _add_quiet(parser: Any) -> None:
+    """Add the option --quiet."""
     parser.add_argument("--quiet", action="store_true", help="show no progress")
 
 
 def _argument(parse_text: Callable[[str], Any]) -> Callable[[str], Any]:
-    """A parser of a text, with its own messages on the command line."""
+    """A function that parses an option's text by `parse_text`, and turns its errors into
+    argparse's, so that they are shown as errors of that option."""
 
     def parsed(value: str) -> Any:
+        """The parsed value of an option's text."""
         try:
             return parse_text(value)
         except (ValueError, TypeError) as wrong:
@@ -333,11 +362,12 @@ def _argument(parse_text: Callable[[str], Any]) -> Callable[[str], Any]:
 
 
 def _parse_smoothing(value: str) -> float | str:
+    """A length in text as a number; "auto" stays as it is."""
     return value if value == "auto" else text.parse_positive(value)
 
 
 def _parse_parameter(value: str) -> tuple[str, float]:
-    """ "a=0.5" as ("a", 0.5)."""
+    """A name and a number from text: "a=0.5" as ("a", 0.5)."""
     name, equals, number = value.partition("=")
     if not equals or not name.strip().isidentifier():
         raise ValueError(f"{text.quoted(value)}: write a name and a number as a=0.5")
@@ -345,9 +375,9 @@ def _parse_parameter(value: str) -> tuple[str, float]:
 
 
 def _parse_slider(value: str) -> tuple[str, Slider]:
-    """ "a=0:2:0.5" as ("a", Slider(0, 2, step=0.5))."""
-    name, _, rest = value.partition("=")
-    numbers = rest.split(":")
+    """A name and a slider from text: "a=0:2:0.5" as ("a", Slider(0, 2, step=0.5))."""
+    name, _, interval_text = value.partition("=")
+    numbers = interval_text.split(":")
     if not name.strip().isidentifier() or len(numbers) not in (2, 3):
         raise ValueError(
             f"{text.quoted(value)}: write a name and two ends as level=1:12, a step behind them as "

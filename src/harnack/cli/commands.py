@@ -1,4 +1,4 @@
-"""The commands of the command line."""
+"""The commands of the command line. Each takes the parsed arguments and returns the exit code."""
 
 from __future__ import annotations
 
@@ -40,6 +40,7 @@ _DEMO_SIZE = (480, 360)
 
 
 def _render(arguments: Any) -> int:
+    """Draw a picture of the source, and write it to a file."""
     path = source_path(arguments)
     target = check_picture_path(_output(arguments, path, ".png", "picture"))
     if is_mitsuba_scene(arguments, path):
@@ -52,7 +53,7 @@ def _render(arguments: Any) -> int:
 
 
 def _animate(arguments: Any) -> int:
-    """A film around a surface."""
+    """Write a film in which the camera goes around a surface."""
     path = source_path(arguments)
     target = check_film_path(_output(arguments, path, ".gif", "film"))
     if is_mitsuba_scene(arguments, path):
@@ -65,7 +66,7 @@ def _animate(arguments: Any) -> int:
 
 
 def _page(arguments: Any) -> int:
-    """A file to open in a browser."""
+    """Write an HTML file in which a surface turns."""
     path = source_path(arguments)
     target = _output(arguments, path, ".html", "page")
     surfaces, settings, _ = load_live_content("page", arguments, path)
@@ -75,28 +76,29 @@ def _page(arguments: Any) -> int:
 
 
 def _view(arguments: Any) -> int:
-    """A page that is served."""
+    """Serve a page to the browser until Ctrl-C is pressed."""
     surfaces, settings, sources = load_live_content("view", arguments, source_path(arguments))
     view(surfaces, sources=sources, open_browser=not arguments.no_browser, block=True, **settings)
     return 0
 
 
 def _output(arguments: Any, path: Path, suffix: str, kind: str) -> str:
-    """The file to write: the output of the arguments, or a file named like the source."""
+    """The path of the file to write: the argument -o or, without it, the name of the source with
+    `suffix`. path: of the source. kind: what is written, for messages."""
     if arguments.output == "":
         raise ValueError(f"-o is empty: name the {kind} to write, such as a{suffix}")
     return arguments.output or f"{path.stem or kind}{suffix}"
 
 
 def _mesh(arguments: Any) -> int:
-    """Triangles of a source's surface."""
+    """Write the triangles of the source's surface, and print facts about them."""
     path = source_path(arguments)
     target = check_mesh_path(_output(arguments, path, ".stl", "mesh"))
     surface = load_single_surface(arguments, path)
-    chosen = options_set("mesh", arguments)
+    given_options = options_set("mesh", arguments)
     settings = {
         name: value
-        for name, value in chosen.items()
+        for name, value in given_options.items()
         if name not in SHORTHAND or name == "tolerance"
     }
     if arguments.quiet:
@@ -124,7 +126,7 @@ def _mesh(arguments: Any) -> int:
 
 
 def _repair(arguments: Any) -> int:
-    """A closed mesh from a damaged mesh."""
+    """Close a damaged mesh, write it, and print what was changed."""
     import trimesh  # here: half a second that few need
 
     source = Path(arguments.mesh)
@@ -133,12 +135,14 @@ def _repair(arguments: Any) -> int:
     if not isinstance(loaded, LoadedMesh):
         raise ValueError(f"{source} holds no mesh to repair")
     print_line(f"{source}: {python_to_cli_terms(loaded.summary)}")
-    chosen = options_set("repair", arguments)
+    given_options = options_set("repair", arguments)
     # Files such as .stl list the corners of each face anew.
     used, faces = np.unique(weld_vertices(loaded.vertices)[loaded.faces], return_inverse=True)
     damaged = trimesh.Trimesh(loaded.vertices[used], faces.reshape(-1, 3), process=False)
     with Console().status("starting") as status:
-        repaired = repair(damaged, progress=None if arguments.quiet else status.update, **chosen)
+        repaired = repair(
+            damaged, progress=None if arguments.quiet else status.update, **given_options
+        )
     write_mesh(repaired, target)
     facts = repaired.metadata["harnack"]
     if facts["differs"] is not None:
@@ -153,7 +157,11 @@ def _repair(arguments: Any) -> int:
 
 
 def _repaired(facts: dict[str, Any], old: int, new: int) -> str:
-    """What `repair` kept, changed and added; and why not more was kept."""
+    """One line about a repair: what was kept, changed and added, and why not more was kept.
+
+    facts: the metadata that `harnack.repair` returns with a mesh.
+    old, new: the numbers of triangles before and after.
+    """
     parts = _counted(len(facts["parts"]), "part")
     if facts["dropped"]:
         parts += f", of which {facts['dropped']:,} dropped"
@@ -180,11 +188,12 @@ def _repaired(facts: dict[str, Any], old: int, new: int) -> str:
 
 
 def _counted(count: int, noun: str) -> str:
+    """A count and its noun, such as "1 hole" or "2 holes"."""
     return f"{count:,} {noun}" + ("" if count == 1 else "s")
 
 
 def _check(arguments: Any) -> int:
-    """What is wrong with a mesh for printing: 0 if nothing is."""
+    """Print the problems of a mesh for 3D printing. Returns 0 if there is none, else 1."""
     if arguments.colors is not None:
         if arguments.min_thickness is None:
             raise ValueError(
@@ -218,6 +227,7 @@ def _check(arguments: Any) -> int:
 
 
 def _gallery(arguments: Any) -> int:
+    """List the scenes of the gallery, or draw them into a folder."""
     console = Console()
     if arguments.list:
         width = max(map(len, SCENES)) + 2
@@ -249,7 +259,8 @@ def _gallery(arguments: Any) -> int:
 
 
 def _create_folder(name: str) -> Path:
-    """A folder to write to."""
+    """Create the folder to write to if it does not exist, and return its path. Raises `ValueError`
+    if that is impossible."""
     if not name:
         raise ValueError("-o is empty: name the folder to write to, such as out")
     folder = Path(name)
@@ -264,6 +275,7 @@ def _create_folder(name: str) -> Path:
 
 
 def _doctor(arguments: Any) -> int:
+    """Print a report about this installation. Returns 0 if harnack can work, else 1."""
     del arguments
     return 0 if doctor.print_report(Console()) else 1
 

@@ -1,4 +1,4 @@
-"""Writing triangle meshes: STL, PLY, OBJ, GLB and 3MF, by trimesh."""
+"""Writes triangle meshes to STL, PLY, OBJ, GLB and 3MF files, by trimesh."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ MESH_FILES = (".stl", ".ply", ".obj", ".glb", ".3mf")
 
 
 def check_mesh_path(path: str | os.PathLike[str]) -> Path:
-    """The path of a mesh to be written, with every check that is possible before the mesh is
-    computed.
+    """The path of a mesh file to be written. Everything that can be checked before the mesh is
+    computed is checked here.
 
     Raises:
-        ValueError: an extension that is none of a mesh.
-        ImportError: a format that needs packages which are not installed.
-        OSError: as `check_writable`.
+        ValueError: the extension is not that of a mesh format.
+        ImportError: the format needs packages that are not installed.
+        OSError: the file cannot be written there.
     """
     target = Path(path)
     if target.suffix.lower() not in MESH_FILES:
@@ -43,15 +43,14 @@ def check_mesh_path(path: str | os.PathLike[str]) -> Path:
 
 
 def write_mesh(mesh: trimesh.Trimesh, path: str | os.PathLike[str]) -> None:
-    """Write a mesh in the format that the name ends in; if that fails no file is left.
+    """Write a mesh in the format of the path's extension. If writing fails, no file is left.
 
-    Closed meshes are closed in the file as well: see `ClosedMesh`.
-
-    3MF has millimeters as its unit, which is written there; the other formats have none.
+    A closed mesh is still closed after rounding to the file's precision: see `ClosedMesh`. A 3MF
+    file says that its unit is the millimeter; the other formats have no unit.
 
     Raises:
-        ValueError, ImportError, OSError: as `check_mesh_path`.
-        MeshingError: as `ClosedMesh.export`.
+        ValueError, ImportError, OSError: the path is refused by `check_mesh_path`.
+        MeshingError: the mesh cannot be written as a closed one.
     """
     from harnack.meshing.closed_mesh import ClosedMesh
 

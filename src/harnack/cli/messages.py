@@ -1,6 +1,6 @@
-"""The messages of the command line: errors, names, and the handling of Ctrl-C while a command runs.
+"""Messages of the command line, and the handling of Ctrl-C while a command runs.
 
-Errors and names are printed on a single line, in the terms of the command line.
+Errors are printed on a single line, with options of the command line in place of Python's keywords.
 """
 
 from __future__ import annotations
@@ -29,13 +29,15 @@ _SAME = 1.0
 
 @dataclass
 class Interrupts:
-    """Whether Ctrl-C was pressed, and when (`time.monotonic`)."""
+    """Whether Ctrl-C was pressed, and when (in seconds of `time.monotonic`). It is the handler of
+    the signal."""
 
     pressed: bool = False
     when: float = -_SAME
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
-        """Raise KeyboardInterrupt, but not again while the first one is being answered."""
+        """Raise `KeyboardInterrupt`. A second signal within a second is ignored: a terminal and a
+        parent process may both pass on the same Ctrl-C."""
         del number, frame
         now = time.monotonic()
         if self.pressed and now - self.when < _SAME:
@@ -46,8 +48,8 @@ class Interrupts:
 
 @contextmanager
 def track_interrupts() -> Generator[Interrupts]:
-    """Context manager that records Ctrl-C within the block, where signals can be handled (the main
-    thread)."""
+    """Context manager that yields a record of whether Ctrl-C was pressed within it. Signals can be
+    handled in the main thread only; in other threads nothing is recorded."""
     interrupts = Interrupts()
     if threading.current_thread() is not threading.main_thread():
         yield interrupts
@@ -64,12 +66,14 @@ def track_interrupts() -> Generator[Interrupts]:
 
 @contextmanager
 def print_warnings() -> Generator[None]:
-    """Context manager that prints each warning of the block on a single line, in the terms of the
-    command line."""
+    """Context manager that prints each warning raised within it on a single line, in the terms of
+    the command line."""
     with warnings.catch_warnings():
         shown = warnings.showwarning
 
         def note(message: Any, category: type[Warning], *args: Any, **kwargs: Any) -> None:
+            """Print a warning that is meant for users; pass all other warnings to Python's own
+            function."""
             if issubclass(category, UserWarning | RuntimeWarning):
                 print(f"note: {python_to_cli_terms(str(message))}", file=sys.stderr)
             else:
@@ -95,16 +99,19 @@ _PARAMETER = re.compile(r'parameters=\{"(\w+)": 1\.0\}')
 
 
 def error_line(error: Exception) -> str:
-    """'error: ...' for an exception, printable and on one line."""
+    """The line that is printed for an exception: "error: ..." without line breaks and control
+    characters."""
     return printable(re.sub(r"\s*\n\s*", " ", f"error: {_explanation(error)}".strip()))
 
 
 def printable(text: str) -> str:
-    """Text on one line whose control characters, which terminals obey, are written as escapes."""
+    """The text with control characters, which a terminal would obey, written as escapes."""
     return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
 
 
 def _explanation(error: Exception) -> str:
+    """The message of an exception in the terms of the command line, with an option to try for the
+    most frequent errors."""
     if isinstance(error, UnboundedSurfaceError):
         if error.bounded_level is not None:
             return (
@@ -117,13 +124,15 @@ def _explanation(error: Exception) -> str:
 
 
 def python_to_cli_terms(text: str) -> str:
-    """A message of the library, with options of the command line in place of keywords of Python."""
+    """A message of the library with keywords of Python, such as `max_steps=`, replaced by options
+    of the command line, such as --max-steps."""
     text = _PARAMETER.sub(r"--parameter \1=1", text)
     return _KEYWORD.sub(_option, text)
 
 
 def _option(match: re.Match[str]) -> str:
-    """The option of the command line for a keyword; calls stay as they are."""
+    """The option of the command line that replaces a match of `_KEYWORD`. A call such as f(level=1)
+    stays as it is."""
     if match["call"]:
         return match["call"]
     name = match["name"] or match["first"] or match["quoted"] or match["alone"]
@@ -134,7 +143,7 @@ def _option(match: re.Match[str]) -> str:
 
 
 def level_text(level: float | None) -> str:
-    """A level as one writes it on the command line: "2pi", "0.5"."""
+    """A level as it is written on the command line, such as "2pi" or "0.5"."""
     ratio = (level or 0.0) / 3.141592653589793
     if ratio and abs(2 * ratio - round(2 * ratio)) < 1e-9:
         return f"{ratio:g}pi" if ratio != 1 else "pi"

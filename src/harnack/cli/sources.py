@@ -1,5 +1,5 @@
-"""What the SOURCE of a command is: a scene of the gallery, a file or a formula, with the options of
-the command line, as arguments of the verbs."""
+"""Loads the SOURCE of a command (a scene of the gallery, a file or a formula), and combines it with
+the options of the command line to arguments of `render`, `animate`, `mesh` and the like."""
 
 from __future__ import annotations
 
@@ -34,26 +34,32 @@ Content = tuple[Any, dict[str, Any], FieldSources]
 
 
 def options_set(verb: str, arguments: Any) -> dict[str, Any]:
-    """The options of a verb that are set on the command line, by their names in Python."""
+    """The options of a function that were given on the command line, by their names in Python.
+    verb: the name of the function, such as "render".
+
+    Raises:
+        ValueError: a style of isolines was given without isolines.
+    """
     values = {option.name: getattr(arguments, option.name, None) for option in options_of(verb)}
-    chosen = {name: value for name, value in values.items() if value is not None}
+    given_options = {name: value for name, value in values.items() if value is not None}
     style = {
         name: value
         for name in ("width", "color")
         if (value := getattr(arguments, f"isolines_{name}", None)) is not None
     }
-    if style and "isolines" not in chosen:
+    if style and "isolines" not in given_options:
         raise ValueError(f"--isolines-{next(iter(style))} without isolines: give --isolines too")
     if style:
-        chosen["isolines"] = replace(chosen["isolines"], **style)
-    return chosen
+        given_options["isolines"] = replace(given_options["isolines"], **style)
+    return given_options
 
 
 def source_path(arguments: Any) -> Path:
-    """The file of the source, or the name of a scene; of a formula, a name for its output.
+    """The source as a path: a file, the name of a scene, or "formula" for a formula. The output is
+    named after it.
 
     Raises:
-        ValueError: it is none of these.
+        ValueError: the source is none of these, or --parameter was given without a formula.
     """
     name = arguments.source
     if is_formula(name):
@@ -70,51 +76,65 @@ def source_path(arguments: Any) -> Path:
 
 
 def is_formula(name: str) -> bool:
-    """Whether a source is a formula."""
+    """Whether the source `name` is a formula."""
     is_file = Path(name).suffix.lower() in _SUFFIXES
     return name not in SCENES and not is_file and looks_like_formula(name)
 
 
 def is_mitsuba_scene(arguments: Any, path: Path) -> bool:
-    """Whether a source is the file of a Mitsuba scene."""
+    """Whether the source is the file of a Mitsuba scene (.xml)."""
     return arguments.source not in SCENES and path.suffix.lower() == ".xml"
 
 
 def load_mitsuba_scene(arguments: Any) -> tuple[str, dict[str, Any]]:
-    """A scene that has everything of its own, and the options of its picture."""
+    """The path of a Mitsuba scene, and the options of its picture.
+
+    Raises:
+        ValueError: an option was given that the scene sets in its own file, such as a material.
+    """
     _refuse_file_options(arguments)
-    chosen = options_set("render", arguments)
+    given_options = options_set("render", arguments)
     of_scene = (*SURFACE_OPTIONS, *TRACE_OPTIONS, *STUDIO_OPTIONS)
-    wrong = [f"--{name.replace('_', '-')}" for name in chosen if name in of_scene]
+    wrong = [f"--{name.replace('_', '-')}" for name in given_options if name in of_scene]
     wrong += [f"--{name}" for name in _camera_options(arguments)]
     if wrong:
         raise ValueError(f"{', '.join(wrong)}: a Mitsuba scene sets this in its own file")
-    return arguments.source, chosen
+    return arguments.source, given_options
 
 
 def load_content(
     verb: str, arguments: Any, path: Path, moved: Mapping[str, float] | None = None
 ) -> Content:
-    """The surfaces of a source, with the options of a command.
+    """The surfaces of the source, the options of the function `verb`, and the sources of the fields
+    for scene files.
 
-    moved: parameters of a formula besides those of the arguments.
+    path: the source as `source_path` returns it.
+    moved: numbers of names in a formula, besides those of --parameter.
     """
-    chosen = options_set(verb, arguments)
+    given_options = options_set(verb, arguments)
     if arguments.source in SCENES:
         _refuse_file_options(arguments)
-        return _of_scene(SCENES[arguments.source], arguments, chosen)
+        return _of_scene(SCENES[arguments.source], arguments, given_options)
     if is_formula(arguments.source):
         _refuse_file_options(arguments)
         camera = _camera(arguments, Camera())
-        return formula_field(arguments, moved), {**camera, **chosen}, ()
+        return formula_field(arguments, moved), {**camera, **given_options}, ()
     if path.suffix.lower() == ".json":
         _refuse_file_options(arguments)
-        return _of_scene_file(read_scene(path), arguments, chosen)
-    return _of_file(path, arguments, chosen)
+        return _of_scene_file(read_scene(path), arguments, given_options)
+    return _of_file(path, arguments, given_options)
 
 
 def load_live_content(verb: str, arguments: Any, path: Path) -> Content:
-    """The content of a page or a view, and its options, of which sliders may be values."""
+    """The content of a page or a view, its options, and the sources of its fields. Options that are
+    moved by sliders have sliders as values; a formula with sliders is a function of them.
+
+    verb: "page" or "view".
+    path: the source as `source_path` returns it.
+
+    Raises:
+        ValueError: the source is a Mitsuba scene, or a slider has no option or name to move.
+    """
     if is_mitsuba_scene(arguments, path):
         raise ValueError("a page needs a scene, a surface file or a formula, no Mitsuba scene")
     sliders = dict(arguments.slider)
@@ -143,6 +163,7 @@ def load_live_content(verb: str, arguments: Any, path: Path) -> Content:
     formula, fixed = arguments.source, dict(arguments.parameters)
 
     def field(**values: float) -> Field:
+        """The formula's field for these values of its sliders."""
         return expression(formula, parameters={**fixed, **values})
 
     kind = inspect.Parameter.KEYWORD_ONLY
@@ -153,8 +174,15 @@ def load_live_content(verb: str, arguments: Any, path: Path) -> Content:
 
 
 def load_single_surface(arguments: Any, path: Path) -> Field | Surface:
-    """The one surface of a source, for a mesh; with the options of surfaces that are set."""
-    chosen = {k: v for k, v in options_set("mesh", arguments).items() if k in SURFACE_OPTIONS}
+    """The only surface of the source, from which a mesh is made, with the options of surfaces that
+    were given.
+
+    Raises:
+        ValueError: the source has several surfaces, or an option does not apply to it.
+    """
+    surface_options = {
+        k: v for k, v in options_set("mesh", arguments).items() if k in SURFACE_OPTIONS
+    }
     if is_formula(arguments.source) or arguments.source in SCENES:
         _refuse_file_options(arguments)
         if arguments.up is not None:
@@ -176,70 +204,80 @@ def load_single_surface(arguments: Any, path: Path) -> Field | Surface:
         raise ValueError(
             f"scene {path} has {len(surfaces)} surfaces, and a mesh can be made of one only"
         )
-    return _replaced(surfaces[0], chosen)
+    return _replaced(surfaces[0], surface_options)
 
 
 def formula_field(arguments: Any, moved: Mapping[str, float] | None = None) -> Field:
-    """The field of a source that is a formula."""
+    """The field of the formula. moved: numbers of its names, besides those of --parameter."""
     return expression(arguments.source, parameters={**dict(arguments.parameters), **(moved or {})})
 
 
 def print_line(line: str) -> None:
-    """Print a line about what was read or done; names in it stand as they are."""
+    """Print a line about what was read or done, without rich's markup, so that names appear as they
+    are."""
     Console(highlight=False, soft_wrap=True, markup=False, emoji=False).print(printable(line))
 
 
-def _of_scene(scene: Scene, arguments: Any, chosen: dict[str, Any]) -> Content:
+def _of_scene(scene: Scene, arguments: Any, given_options: dict[str, Any]) -> Content:
+    """A scene of the gallery as surfaces, options and sources; the given options replace the
+    scene's."""
     surfaces = scene.surfaces()
-    of_surface, rest = _split(chosen, SURFACE_OPTIONS)
-    single = [name for name in ("level", "side") if name in of_surface]
-    if single and len(surfaces) != 1:
-        raise ValueError(f"scene {scene.name} has several surfaces; --{single[0]} does not apply")
+    of_surface, other_options = _split(given_options, SURFACE_OPTIONS)
+    single_surface_options = [name for name in ("level", "side") if name in of_surface]
+    if single_surface_options and len(surfaces) != 1:
+        raise ValueError(
+            f"scene {scene.name} has several surfaces; --{single_surface_options[0]} does not apply"
+        )
     sources = [
         (surface.field, {"scene": scene.name, "number": number})
         for number, surface in enumerate(surfaces)
     ]
-    of_trace, rest = _split(rest, TRACE_OPTIONS)
-    settings = {**scene.settings(len(surfaces)), **rest}
+    of_trace, other_options = _split(other_options, TRACE_OPTIONS)
+    settings = {**scene.settings(len(surfaces)), **other_options}
     settings["options"] = scene.options.replace(**of_trace)
     settings |= _camera(arguments, scene.camera)
     return [_replaced(surface, of_surface) for surface in surfaces], settings, sources
 
 
-def _of_scene_file(scene: SceneFile, arguments: Any, chosen: dict[str, Any]) -> Content:
+def _of_scene_file(scene: SceneFile, arguments: Any, given_options: dict[str, Any]) -> Content:
+    """A scene file's content as surfaces, options and sources; the given options replace the
+    file's."""
     settings = dict(scene.settings)
     settings |= _camera(arguments, settings.get("camera") or Camera())
-    if "level" in chosen and len(scene.surfaces) != 1:
+    if "level" in given_options and len(scene.surfaces) != 1:
         raise ValueError("a scene of several surfaces has their levels; --level does not apply")
-    of_surface, rest = _split(chosen, SURFACE_OPTIONS)
+    of_surface, other_options = _split(given_options, SURFACE_OPTIONS)
     surfaces = [
         _replaced(surface, of_surface) if isinstance(surface, Surface) else surface
         for surface in scene.surfaces
     ]
     if not all(isinstance(surface, Surface) for surface in surfaces):
         settings |= of_surface
-    return surfaces, {**settings, **rest}, scene.sources
+    return surfaces, {**settings, **other_options}, scene.sources
 
 
-def _of_file(path: Path, arguments: Any, chosen: dict[str, Any]) -> Content:
-    chosen = {name: value for name, value in chosen.items() if name != "up"}
+def _of_file(path: Path, arguments: Any, given_options: dict[str, Any]) -> Content:
+    """A surface file as a field, options and sources. What the file was taken for is printed."""
+    given_options = {name: value for name, value in given_options.items() if name != "up"}
     opened = field_from_file(path, **_file_options(arguments))
     print_line(f"{path}: {python_to_cli_terms(opened.summary)}")
     print_line(_described(opened.field))
     if getattr(arguments, "show", None) is None and opened.show != "path":
-        chosen["show"] = opened.show
+        given_options["show"] = opened.show
         print_line(f"drawn {opened.show}; --show path follows light paths, in minutes")
     source = {"file": str(path.resolve())}
     source |= {name: value for name, value in _file_options(arguments).items() if value}
-    settings = {"material": opened.material, **_camera(arguments, Camera()), **chosen}
+    settings = {"material": opened.material, **_camera(arguments, Camera()), **given_options}
     return opened.field, settings, [(opened.field, source)]
 
 
 def _file_options(arguments: Any) -> dict[str, Any]:
+    """The options for surface files, by name."""
     return {name: getattr(arguments, name) for name in FILE_OPTIONS}
 
 
 def _refuse_file_options(arguments: Any) -> None:
+    """Raise `ValueError` if an option for surface files was given (the source is none)."""
     for name in FILE_OPTIONS:
         if name != "up" and getattr(arguments, name):  # pictures have an axis that is up, too
             raise ValueError(
@@ -249,13 +287,15 @@ def _refuse_file_options(arguments: Any) -> None:
 
 
 def _split(values: Mapping[str, Any], names: Sequence[str]) -> tuple[dict[str, Any], ...]:
-    """The values of these names, and the others."""
-    inside = {name: value for name, value in values.items() if name in names}
-    return inside, {name: value for name, value in values.items() if name not in names}
+    """Two dictionaries: the values whose names are among `names`, and the values of all other
+    names."""
+    named = {name: value for name, value in values.items() if name in names}
+    return named, {name: value for name, value in values.items() if name not in names}
 
 
 def _replaced(surface: Field | Surface, keywords: Mapping[str, Any]) -> Field | Surface:
-    """A surface with other keywords. A level in place of a solid's is that of the level set."""
+    """The surface (or field) with these keywords of `Surface` changed. A new level of a solid that
+    lies between two levels turns it into a level set."""
     if not keywords:
         return surface
     if isinstance(surface, Field):
@@ -267,8 +307,13 @@ def _replaced(surface: Field | Surface, keywords: Mapping[str, Any]) -> Field | 
 
 
 def _unpacked(surfaces: Any, settings: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
-    """A single surface as its field, and its keywords beside the other options: a slider can then
-    be the value of a keyword."""
+    """A single surface as its field, with its keywords added to the options, so that a slider can
+    be the value of a keyword. Fields stay as they are.
+
+    Raises:
+        ValueError: there are several surfaces with keywords of their own, or a solid between two
+            levels.
+    """
     listed: list[Any] = [*surfaces] if isinstance(surfaces, list | tuple) else [surfaces]
     if not any(isinstance(surface, Surface) for surface in listed):
         return listed, settings
@@ -282,7 +327,8 @@ def _unpacked(surfaces: Any, settings: dict[str, Any]) -> tuple[Any, dict[str, A
 
 
 def _with_flat_options(settings: dict[str, Any], sliders: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings without `options` if a slider is the value of an option of traces."""
+    """The settings by name. If a slider moves an option of traces, the entry "options" (a
+    `TraceOptions`) is replaced by its tolerance and its number of steps."""
     options = settings.get("options")
     if not isinstance(options, TraceOptions) or not any(name in TRACE_OPTIONS for name in sliders):
         return settings
@@ -291,23 +337,26 @@ def _with_flat_options(settings: dict[str, Any], sliders: Mapping[str, Any]) -> 
 
 
 def _camera_options(arguments: Any) -> dict[str, Any]:
+    """The options of the camera that were given, by name."""
     values = {name: getattr(arguments, name, None) for name in CAMERA_OPTIONS}
     return {name: value for name, value in values.items() if value is not None}
 
 
 def _camera(arguments: Any, camera: Camera) -> dict[str, Any]:
-    """The camera, changed by the options that are set; empty if none is."""
-    chosen = _camera_options(arguments)
-    if not chosen:
+    """{"camera": `camera` changed by the given options}; empty if no option of the camera was
+    given."""
+    given_options = _camera_options(arguments)
+    if not given_options:
         return {}
-    if "position" in chosen:  # in place of where the camera stands by its angles
+    if "position" in given_options:  # in place of where the camera stands by its angles
         camera = replace(camera, azimuth=None, elevation=None, distance=None)
-    elif {"azimuth", "elevation", "distance"} & set(chosen):
+    elif {"azimuth", "elevation", "distance"} & set(given_options):
         camera = replace(camera, position=None)
-    return {"camera": replace(camera, **chosen)}
+    return {"camera": replace(camera, **given_options)}
 
 
 def _described(field: Field) -> str:
+    """One line about a field: the name of its class and the facts of its method `describe`."""
     facts = ", ".join(
         f"{key}: {f'{value:.6g}' if isinstance(value, float) else value}"
         for key, value in field.describe().items()

@@ -1,7 +1,9 @@
-"""Jobs split into tasks that run on the workers of a Dask cluster; results are kept in a folder.
+"""Runs jobs, split into tasks, on the workers of a Dask cluster, and keeps their results in a
+folder.
 
-`serialization` turns an object into bytes and computes a digest of its contents; `executor` runs
-tasks and keeps their results; `workers` checks that a cluster's workers can run them; `dask_arrays`
-evaluates fields at the points of Dask arrays, and `zarr_files` writes the results. Nothing here
-knows a field or a picture. Dask is imported only on demand: `pip install harnack[cluster]`.
+`serialization` turns an object into bytes and computes a hash of its contents. `executor` runs
+tasks and stores their results. `workers` checks that the workers of a cluster can run them.
+`dask_arrays` evaluates fields at the points of Dask arrays, and `zarr_files` writes the results.
+None of these modules depends on fields or pictures. Dask is imported only when it is used: `pip
+install harnack[cluster]`.
 """

@@ -1,5 +1,5 @@
-"""Functions of points and rays applied to Dask arrays, computed block by block when the result is
-needed."""
+"""Applies functions of points and rays to Dask arrays, block by block, when the result is
+computed."""
 
 from __future__ import annotations
 
@@ -23,14 +23,16 @@ def is_dask_array(value: Any) -> bool:
 
 
 def accepts_dask_arrays(*names: str) -> Callable[[Function], Function]:
-    """Return a decorator of a function or method of points or rays: if one of the named arguments
-    is a Dask array, the results are Dask arrays, whose blocks are the function's results for the
-    blocks of the arguments. Other arguments, such as a field, are sent to each worker once.
+    """A decorator for functions and methods of points or rays that lets them accept Dask arrays. If
+    one of the arguments `names` is a Dask array, the results are Dask arrays too, and each of their
+    blocks is the function's result for the same block of the arguments. All other arguments, such
+    as a field, are sent to each worker once.
 
     It must be the outermost decorator, since workers look the function up by its name.
     """
 
     def decorate(function: Function) -> Function:
+        """The function with support for Dask arrays."""
         signature = inspect.signature(function)
         variadic = next(
             (
@@ -43,13 +45,14 @@ def accepts_dask_arrays(*names: str) -> Callable[[Function], Function]:
 
         @functools.wraps(function)
         def wrapper(*positional: Any, **settings: Any) -> Any:
+            """Call `function` itself, or call it block by block if an argument is a Dask array."""
             if not any(map(is_dask_array, (*positional, *settings.values()))):
                 return function(*positional, **settings)
             arguments = signature.bind(*positional, **settings).arguments
             # The first argument, `self` of a method, is passed by position, all others by name.
-            first = arguments.pop(next(iter(signature.parameters)))
+            first_argument = arguments.pop(next(iter(signature.parameters)))
             named = {**arguments.pop(variadic, {}), **arguments}
-            return _map_blocks(functools.partial(wrapper, first), names, named)
+            return _map_blocks(functools.partial(wrapper, first_argument), names, named)
 
         return cast("Function", wrapper)
 
@@ -57,13 +60,14 @@ def accepts_dask_arrays(*names: str) -> Callable[[Function], Function]:
 
 
 def _map_blocks(call: Callable[..., Any], names: tuple[str, ...], arguments: dict[str, Any]) -> Any:
-    """Call a function block by block, without computing the blocks now.
+    """Apply a function to Dask arrays block by block, without computing anything yet.
 
     call: the function, which takes all arguments by name.
     names: the arguments that may be Dask arrays.
     arguments: the arguments by name; at least one is a Dask array.
 
-    Returns a Dask array, or for a dataclass as the result one with Dask arrays as its attributes.
+    Returns a Dask array or, if the function returns a dataclass, that dataclass with Dask arrays as
+    attributes.
 
     Raises:
         TypeError: another argument is a Dask array, or a Dask array does not hold real numbers.
@@ -112,13 +116,15 @@ def _map_blocks(call: Callable[..., Any], names: tuple[str, ...], arguments: dic
 def _align_blocks(
     dask_array: Any, dask_args: dict[str, Any], others: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Dask arrays that all have the same blocks of rows.
+    """The Dask arrays by name, all divided into the same blocks of rows.
 
-    dask_args: the Dask arrays by name; the blocks are those of the first.
-    others: arguments by name; arrays with as many rows become Dask arrays as well.
+    dask_args: the Dask arrays by name; the blocks are those of the first array.
+    others: further arguments by name; an array among them with as many rows becomes a Dask array
+        too.
 
     Raises:
-        ValueError: their lengths differ or are not known.
+        ValueError: the arrays have different or unknown lengths, or a shape other than (n, 3) or
+            (n,).
     """
     first_name, reference = next(iter(dask_args.items()))
     if reference.ndim == 0:
@@ -150,7 +156,11 @@ def _arrays_of(result: Any) -> dict[str, np.ndarray[Any, Any]]:
 
 
 def _run_block(packed: SerializedObject, blocks: dict[str, Any], start: int) -> dict[str, Any]:
-    """The results for one block of rows, which begins at row `start`."""
+    """Run on a worker: the result's arrays for one block of rows.
+
+    packed: the serialized function. blocks: the block of each Dask array by the argument's name.
+    start: the first row of the block, for messages.
+    """
     with exclusive_compute():
         try:
             return _arrays_of(packed.deserialize()(**blocks))

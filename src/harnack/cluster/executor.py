@@ -1,16 +1,15 @@
-"""Jobs as tasks that run in this process or on a Dask cluster; results may be kept in a checkpoint
+"""Runs jobs as tasks, in this process or on a Dask cluster. Results may be kept in a checkpoint
 folder.
 
-Each task is named by a hash of its contents, files and users' code included, without cached values
-(`serialization`, `users_code`). So a checkpoint folder needs no book-keeping: it can be used again
-after a crash, with other workers, or for a film with more frames. Finished tasks are not repeated,
-and files of other jobs are not touched.
+Each task is named by a hash of its contents, including files and users' code but not cached values
+(`serialization`, `users_code`). The name alone identifies a stored result. So a checkpoint folder
+can be used again after a crash, with other workers, or for a film with more frames: finished tasks
+are not repeated, and results of other jobs are left alone.
 
-There is a single path for all jobs. A picture is computed band by band in any case; only the place
-where a band is computed, this process or Dask's workers, differs (`shading`, `RenderExecutor`), so
-that the result is the same bit for bit. Steps that need the whole picture (hidden sky, outlines)
-run where the picture is put together. A surface is sent as a Dask task, and not as data in a
-worker's memory, which would be lost with the worker.
+All jobs take the same path. A picture is always computed band by band, in this process or on Dask's
+workers (`shading`, `RenderExecutor`), so that the result is the same bit for bit. Steps that need
+the whole picture (hidden sky, outlines) run in the process that assembles it. A job is sent as a
+Dask task, not as data in a worker's memory, because such data would be lost with the worker.
 """
 
 from __future__ import annotations
@@ -57,7 +56,7 @@ _POLL_SECONDS, _NO_WORKER_SECONDS = 0.005, 20.0
 
 @dataclass(frozen=True)
 class CheckpointFolder:
-    """A folder of the results of finished tasks, a file of arrays for each."""
+    """A folder that stores the results of finished tasks, one .npz file for each."""
 
     path: Path
 
@@ -66,7 +65,8 @@ class CheckpointFolder:
         """Open a folder; it is created if it does not exist.
 
         Raises:
-            OSError: it cannot be created, or no file can be created in it.
+            TypeError: `path` is not the path of a folder.
+            OSError: the folder cannot be created, or no file can be created in it.
         """
         try:
             folder = Path(path)
@@ -80,7 +80,7 @@ class CheckpointFolder:
         return cls(folder)
 
     def load(self, name: str) -> TaskResult | None:
-        """The result of the task with this name, None if it is not in the folder.
+        """The stored result of the task `name`; None if the folder has none.
 
         Raises:
             ValueError: the file is damaged.
@@ -97,37 +97,37 @@ class CheckpointFolder:
             ) from None
 
     def has(self, name: str) -> bool:
-        """Whether the result of the task with this name is in the folder."""
+        """Whether the folder has a result of the task `name`."""
         return self._file(name).exists()
 
     def save(self, name: str, arrays: TaskResult) -> None:
-        """Write the result of the task with this name."""
+        """Store the result of the task `name`."""
         with write_atomically(self._file(name)) as partial:
             np.savez(partial, allow_pickle=False, **arrays)
 
     def _file(self, name: str) -> Path:
-        """The file of the result of the task with this name."""
+        """The path of the file for the result of the task `name`."""
         return self.path / f"{name}.npz"
 
 
 @dataclass(frozen=True)
 class Executor:
-    """Runs the tasks of jobs (`open_executor`).
+    """Runs the tasks of jobs; `open_executor` makes it.
 
-    client: a Dask client, None for this process.
-    checkpoint: the folder in which results are kept, None for none.
-    chunks: the number of tasks that a job is split into, None for a number that suits the workers.
+    client: a Dask client whose workers run the tasks; None to run them in this process.
+    checkpoint: the folder that stores results; None for no folder.
+    chunks: the number of tasks that a job is split into; None for a number that suits the workers.
     """
 
     client: Any = None
     checkpoint: CheckpointFolder | None = None
     chunks: int | None = None
 
-    def split_range(self, count: int, most: int) -> list[tuple[int, int]]:
-        """Split range(count) into intervals (start, stop), each of at most `most` numbers. They are
-        shorter if that gives fewer tasks than `chunks` or, if `chunks` is None, than the threads of
-        the client need."""
-        size = max(1, min(most, count))
+    def split_range(self, count: int, max_size: int) -> list[tuple[int, int]]:
+        """Split range(count) into intervals (start, stop) of at most `max_size` numbers each. The
+        intervals are shorter if otherwise there were fewer tasks than `chunks` or, if `chunks` is
+        None, fewer than `_TASKS_PER_THREAD` for each thread of the client's workers."""
+        size = max(1, min(max_size, count))
         if self.chunks is not None:
             size = max(1, min(size, -(-count // self.chunks)))
         elif self.client is not None:
@@ -137,11 +137,13 @@ class Executor:
     def run_tasks(
         self, job: Any, step: str, parts: Sequence[tuple[Any, ...]]
     ) -> Iterator[TaskResult]:
-        """Call the method named `step` of a job with the arguments of each part, and yield the
-        results in the order of the parts.
+        """Call the method `step` of a job with the arguments of each part, and yield the results in
+        the order of the parts.
 
         job: an object that `SerializedObject.serialize` accepts. It is sent to each worker once,
-            and opened there once.
+            and deserialized there once.
+        step: the name of a method that returns arrays by name.
+        parts: a tuple of arguments for each task.
 
         Raises the errors of the method.
         """
@@ -165,7 +167,7 @@ class Executor:
                     self.checkpoint.save(name, arrays)
 
     def _max_pending(self) -> int:
-        """The largest number of tasks that may be submitted or waiting to be yielded."""
+        """The largest number of tasks that may be running or whose results wait to be yielded."""
         return 1 if self.client is None else _PENDING_PER_THREAD * self._threads()
 
     def _threads(self) -> int:
@@ -177,16 +179,17 @@ class Executor:
 def open_executor(
     client: Any = None, checkpoint: Any = None, chunks: int | None = None
 ) -> Generator[Executor]:
-    """Context manager that yields an Executor.
+    """Context manager that yields an `Executor`.
 
     client: a Dask client, the address of a scheduler, or None for this process.
-    checkpoint: the path of a folder in which results are kept, or None.
-    chunks: the number of tasks that a job is split into, or None for a number that suits the
-        workers.
+    checkpoint: the path of a folder that stores results, or None.
+    chunks: the number of tasks that a job is split into; None for a number that suits the workers.
 
     Raises:
-        ModuleNotFoundError, TypeError, OSError, RuntimeError: as `connect_client` and
-            `CheckpointFolder.open`.
+        ModuleNotFoundError: Dask or cloudpickle is not installed.
+        TypeError: client is neither a client nor an address, or checkpoint is no path.
+        OSError: no scheduler answers at the address, or the folder cannot be written.
+        RuntimeError: a worker cannot run the tasks.
     """
     folder = None
     if checkpoint is not None:
@@ -197,7 +200,11 @@ def open_executor(
 
 
 class _LocalTasks:
-    """Runs tasks in this process, one after the other."""
+    """Runs tasks in this process, one after the other.
+
+    do: the job's method. waiting: (name, arguments) of the tasks that were submitted and not run
+        yet.
+    """
 
     def __init__(self, packed: SerializedObject, step: str) -> None:
         self.do: TaskFunction = getattr(packed.deserialize(), step)
@@ -213,13 +220,19 @@ class _LocalTasks:
         return name, self.do(*part)
 
     def cancel(self) -> list[tuple[str, TaskResult]]:
-        """Return (name, result) of tasks that are finished but were not fetched: none."""
+        """The (name, result) of tasks that are finished but were not fetched: always none here."""
         return []
 
 
 class _DaskTasks:
-    """Runs tasks on the workers of a Dask cluster. Dask gives the tasks of a lost worker to
-    others."""
+    """Runs tasks on the workers of a Dask cluster. If a worker is lost, Dask runs its tasks on
+    another one.
+
+    completed: Dask's iterator of finished futures.
+    names: the task's name of each future that was not fetched yet.
+    checked_workers: addresses of the workers whose rounding was compared with this process.
+    packed: the future of the serialized job.
+    """
 
     def __init__(self, client: Any, packed: SerializedObject, step: str) -> None:
         distributed = import_optional("distributed", "client")
@@ -241,9 +254,8 @@ class _DaskTasks:
         self.completed.add(future)
 
     def next_completed(self) -> tuple[str, TaskResult]:
-        """Wait for a finished task, and return its name and its result.
-
-        Raises what the task raised.
+        """Wait for a finished task, and return its name and its result. An error of the task is
+        raised here.
 
         Raises:
             RuntimeError: several workers were lost while they ran the task, or the scheduler is
@@ -269,7 +281,8 @@ class _DaskTasks:
         return name, arrays
 
     def _wait(self) -> None:
-        """Wait until a task is finished. Warns if there is no worker to run a task."""
+        """Wait until a task is finished, and warn if there is no worker to run a task for a
+        while."""
         idle_since, has_warned = None, False
         next_check = time.monotonic() + 1
         while not self.completed.has_ready():
@@ -311,17 +324,19 @@ def _ordered_results(
     """Yield the results of tasks in their order, while several tasks run at the same time. A task
     that occurs several times is run once.
 
-    names: of the tasks; equal names are the same task.
-    arguments: of each task.
-    folder: where results are looked up and saved; None for no folder.
+    names: the name of each task; equal names are the same task.
+    arguments: the arguments of each task.
+    folder: the folder in which results are looked up and stored; None for no folder.
     runner: runs the tasks.
-    max_pending: gives the largest number of tasks that may be submitted or waiting to be yielded.
+    max_pending: returns the largest number of tasks that may be running or whose results wait to be
+        yielded.
     """
     results: dict[str, TaskResult] = {}
     pending: set[str] = set()
     remaining_uses, next_index = Counter(names), 0
 
     def submit(index: int) -> None:
+        """Start the task `index`."""
         runner.submit(names[index], arguments[index])
         pending.add(names[index])
 
@@ -354,14 +369,14 @@ def _ordered_results(
 
 
 def _unchanged(packed: SerializedObject) -> SerializedObject:
-    """The argument itself: the task that holds a serialized job on the cluster."""
+    """Return the argument. This is the Dask task whose result is the serialized job."""
     return packed
 
 
 def _run_task(
     packed: SerializedObject, step: str, arguments: tuple[Any, ...]
 ) -> tuple[TaskResult, str, str]:
-    """Run a task on this worker. Returns its result, the worker's address, and its
+    """Run one task on this worker. Returns its result, the worker's address, and the worker's
     `rounding_fingerprint`."""
     with exclusive_compute() as address:
         method: TaskFunction = getattr(packed.deserialize(), step)

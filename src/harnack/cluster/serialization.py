@@ -1,15 +1,16 @@
-"""Objects as bytes to be sent, and digests of their contents.
+"""Turns objects into bytes that can be sent to other processes, and computes hashes of their
+contents.
 
-Cached values are left out: they would be sent for nothing, and would make equal objects differ.
-The cached values are those of `functools.cached_property` and of a `TransientCache`, and private
-fields of dataclasses that are not compared.
+Cached values are left out: sending them would be useless, and they would give equal objects
+different hashes. Cached values are those of `functools.cached_property` and of a `TransientCache`,
+and private fields of dataclasses that are not compared.
 
 Functions and classes of Python and of installed packages are sent by name. Functions and classes of
-users are sent by value, with the attributes of users' modules that they use (`users_code.py`). The
-digest of such a function depends on what it does, but not on its line numbers, nor on the ids that
-cloudpickle generates for classes; so a program that is started again finds its earlier results. The
-ids are not sent either: with them, an object that is opened in the same process would replace the
-methods of its classes.
+users are sent by value, together with the attributes of users' modules that they use
+(`users_code.py`). The hash of such a function depends on what it does, but neither on its line
+numbers nor on the ids that cloudpickle generates for classes. So a program that is started again
+finds its stored results. These ids are not sent either: if they were, deserializing an object in
+the same process would replace the methods of its classes.
 """
 
 from __future__ import annotations
@@ -68,8 +69,10 @@ _MISSING_MESSAGE = (
 def import_optional(name: str, what: str) -> Any:
     """Import a module that the extra `cluster` installs.
 
+    what: the feature that needs it, for the message.
+
     Raises:
-        ModuleNotFoundError: it is not installed. The message says that `what` needs it.
+        ModuleNotFoundError: it is not installed.
     """
     try:
         return importlib.import_module(name)
@@ -79,13 +82,14 @@ def import_optional(name: str, what: str) -> Any:
 
 @functools.cache
 def package_versions() -> str:
-    """Versions of this library and of those on which the bits of its results depend."""
+    """The versions, as text, of this library and of the libraries on which the bits of its results
+    depend."""
     versions = (f"{name} {importlib.metadata.version(name)}" for name in _PACKAGES)
     return ", ".join((f"harnack {__version__}", *versions))
 
 
 class TransientCache(dict[Key, Value]):
-    """A cache that an object keeps for itself: a dictionary that is empty in copies and pickles of
+    """A dictionary in which an object caches computed values. It is empty in copies and pickles of
     the object."""
 
     def __reduce__(self) -> Any:
@@ -99,9 +103,10 @@ class SerializedObject:
     content_hash: 32 hexadecimal digits, equal for equal contents and equal versions of this
         library, of `package_versions` and of `others`.
     data: the pickle.
-    file_digests: (path, digest) of each file that the object names.
-    package_versions: the versions where it was pickled; `deserialize` refuses others.
-    others: (name, version) of other installed packages that it uses.
+    file_digests: (path, hash of the contents) of each file that the object names.
+    package_versions: the versions in the process that pickled the object; `deserialize` refuses
+        others.
+    others: (name, version) of the other installed packages that the object uses.
     """
 
     content_hash: str
@@ -112,23 +117,25 @@ class SerializedObject:
 
     @classmethod
     def serialize(cls, thing: Any, what: str) -> SerializedObject:
-        """Pickle an object.
+        """Pickle an object. what: what the object is, the first word of messages.
 
         Raises:
             ModuleNotFoundError: the extra `cluster` is not installed.
-            TypeError: the object cannot be pickled. The messages begin with `what`.
+            TypeError: the object cannot be pickled.
         """
         name, pickler = _hash_and_files(thing, what)
-        data = _pickle(_cacheless_pickler, thing, what).file.getvalue()
+        data = _pickle(_make_cacheless_pickler, thing, what).file.getvalue()
         files, others = sorted(pickler.files.items()), sorted(pickler.others.items())
         return cls(name, data, tuple(files), package_versions(), tuple(others))
 
     def deserialize(self) -> Any:
-        """The object. It is the same object as at the last call, as long as it is among the objects
-        opened last in this process, so that its prepared data is used again.
+        """Unpickle the object. The four objects that were deserialized last in this process are
+        kept, and the same object is returned for the same contents, so that what it has cached is
+        used again.
 
         Raises:
-            RuntimeError: it was pickled with other versions of packages than are installed here.
+            RuntimeError: the object was pickled with other versions of packages than are installed
+                here.
             ValueError: a file that it names has other contents here.
         """
         return _deserialize_cached(self)
@@ -139,7 +146,8 @@ class SerializedObject:
 
 @functools.lru_cache(maxsize=4)
 def _deserialize_cached(packed: SerializedObject) -> Any:
-    """`SerializedObject.deserialize`, which keeps the objects opened last."""
+    """Unpickle an object after checks of versions and files (see `SerializedObject.deserialize`);
+    the cache holds the four objects that were deserialized last."""
     sent = [
         packed.package_versions,
         *(f"{name} {version}" for name, version in packed.others),
@@ -164,28 +172,34 @@ def _deserialize_cached(packed: SerializedObject) -> Any:
 
 
 def content_hash(thing: Any, what: str) -> str:
-    """32 hexadecimal digits that depend on everything an object contains, on the contents of the
-    files that it names, and on `package_versions`.
+    """A hash of 32 hexadecimal digits that depends on everything an object contains, on the
+    contents of the files that it names, and on `package_versions`. what: what the object is, for
+    messages.
 
-    Each object is written out wherever it occurs, so that the digest does not depend on which of
-    several equal objects are the same object.
+    Equal parts of the object are written out at each place, so that the hash does not depend on
+    whether they are the same Python object.
 
     Raises:
-        ModuleNotFoundError, TypeError: as `SerializedObject.serialize`.
+        ModuleNotFoundError: the extra `cluster` is not installed.
+        TypeError: the object cannot be pickled.
     """
     return _hash_and_files(thing, what)[0]
 
 
-def _hash_and_files(value: Any, what: str, words: frozenset[str] = frozenset()) -> tuple[str, Any]:
-    """The content hash of an object, and the pickler that wrote it; this has noted the files and
-    packages that the object names.
+def _hash_and_files(
+    value: Any, what: str, identifiers: frozenset[str] = frozenset()
+) -> tuple[str, Any]:
+    """The content hash of a value, and the pickler that wrote it. The pickler has noted the hashes
+    of the files (`files`) and the versions of the packages (`others`) that the value uses.
 
-    words: names that occur in users' code, if some are known already.
+    what: what the value is, for messages.
+    identifiers: identifiers in users' code that are known already; they select the attributes of
+        users' modules that are written.
     """
     try:
-        pickler = _pickle(_hashing_pickler, value, what, words, fast=True)
+        pickler = _pickle(_make_hashing_pickler, value, what, identifiers, fast=True)
     except (RecursionError, TypeError, ValueError):  # an object that contains itself
-        pickler = _pickle(_hashing_pickler, value, what, words)
+        pickler = _pickle(_make_hashing_pickler, value, what, identifiers)
     data = (
         f"{package_versions()} {sorted(pickler.others.items())}".encode() + pickler.file.getvalue()
     )
@@ -193,24 +207,26 @@ def _hash_and_files(value: Any, what: str, words: frozenset[str] = frozenset()) 
 
 
 def _pickle(
-    make_class: Callable[[Any], Any], value: Any, what: str, words: frozenset[str] = frozenset(), *,
-    fast: bool = False,
+    make_class: Callable[[Any], Any], value: Any, what: str,
+    identifiers: frozenset[str] = frozenset(), *, fast: bool = False,
 ) -> Any:  # fmt: skip
-    """Write an object into the `file` of a new pickler, and return the pickler.
+    """Write a value into the attribute `file` of a new pickler, and return the pickler.
 
-    make_class: gives the class of the pickler, from cloudpickle's Pickler.
-    words: names that occur in users' code, if some are known already.
-    fast: whether to write equal objects out wherever they occur.
+    make_class: makes the class of the pickler from cloudpickle's class `Pickler`.
+    what: what the value is, for messages.
+    identifiers: identifiers in users' code that are known already.
+    fast: whether to write equal parts of the value at each place, without references between them.
 
-    Which attributes of modules are needed is known only after all code was written. So the object
-    is written again until no name is missing; this ends, since the code has finitely many names.
+    An attribute of a user's module is written if its name is an identifier in the users' code that
+    is written; all identifiers are known only at the end. So the value is written again until no
+    attribute is missing. This ends, since the code has finitely many identifiers.
 
     Raises:
-        TypeError: the object cannot be pickled.
+        TypeError: the value cannot be pickled.
     """
     cloudpickle = import_optional("cloudpickle", what)
     while True:
-        pickler = make_class(cloudpickle.Pickler)(what, words)
+        pickler = make_class(cloudpickle.Pickler)(what, identifiers)
         pickler.fast = fast
         try:
             pickler.dump(value)
@@ -219,15 +235,16 @@ def _pickle(
                 f"{what}: it cannot be sent to another process or written down ({error}); make it "
                 "of arrays, numbers and the classes of this library"
             ) from error
-        words = frozenset(pickler.words)
-        if all(len(attributes_named(*module)) == len(attributes_named(module[0], words))
+        identifiers = frozenset(pickler.words)
+        if all(len(attributes_named(*module)) == len(attributes_named(module[0], identifiers))
                for module in pickler.modules):  # fmt: skip
             return pickler
 
 
 def _by_value(definition: Any, reduce: Callable[[Any], Any]) -> Any:
-    """The result of cloudpickle's `reduce` for a function, class or type variable. If it is defined
-    in a module of a user, the result describes its contents, and not its name."""
+    """How to pickle a function, class or type variable: the result of cloudpickle's function
+    `reduce`. If the definition is in a user's module, this describes its contents; otherwise its
+    name."""
     module = sys.modules.get(str(getattr(definition, "__module__", None)))
     if module is None or not is_sent_itself(module):
         return reduce(definition)
@@ -243,7 +260,7 @@ def _by_value(definition: Any, reduce: Callable[[Any], Any]) -> Any:
 
 
 def _file_digest(name: str) -> str | None:
-    """A digest of the contents of a file; None if there is no such file."""
+    """A hash of the contents of a file; None if there is no such file."""
     try:
         if not Path(name).is_file():  # pipes never end
             return None
@@ -257,14 +274,15 @@ def _file_digest(name: str) -> str | None:
 
 
 def _cached_property(function: Callable[..., Any], name: str) -> functools.cached_property[Any]:
-    """A cached property of a class that is rebuilt from its pickle."""
+    """A cached property that pickle makes again from its function and its name."""
     cached = functools.cached_property(function)
     cached.__set_name__(object, name)
     return cached
 
 
 def _cached_function(function: Callable[..., Any], settings: dict[str, Any]) -> Any:
-    """A cached function that is rebuilt from its pickle, with an empty cache."""
+    """A function with an empty cache that pickle makes again. settings: arguments of
+    `functools.lru_cache`."""
     return functools.lru_cache(**settings)(function)
 
 
@@ -272,18 +290,23 @@ _CachedFunction = type(functools.cache(_cached_property))
 
 
 @functools.cache
-def _cacheless_pickler(base: Any) -> Callable[..., Any]:
-    """Return a class derived from cloudpickle's Pickler that leaves out cached values (module
-    docstring) and sends code of users by value.
+def _make_cacheless_pickler(base: Any) -> Callable[..., Any]:
+    """A subclass of cloudpickle's class Pickler (`base`) that leaves out cached values (see the
+    module's docstring) and pickles users' code by value.
 
-    Attributes of its objects:
-    words: names that occur in users' code.
-    modules: the users' modules that were met, with the words known at that time.
-    spaces: the namespaces in which functions look up names, by the id of the module's dictionary.
+    Attributes of its instances:
+
+    file: the buffer to which it writes.
+    what: what the pickled object is, for messages.
+    words: identifiers and strings that occur in the users' code pickled so far.
+    modules: for each user's module pickled so far, the module and the words known when it was
+        pickled, which decided which of its attributes were written.
+    spaces: the namespaces in which pickled functions look up global names, by the id of the
+        module's dictionary.
     """
 
-    class Lean(base):
-        """The pickler class."""
+    class CachelessPickler(base):
+        """The pickler class; `context` becomes its attribute `what`."""
 
         def __init__(self, context: str, words: frozenset[str]) -> None:
             self.file = io.BytesIO()
@@ -294,8 +317,9 @@ def _cacheless_pickler(base: Any) -> Callable[..., Any]:
             self.spaces: dict[int, Namespace] = {}
 
         def reducer_override(self, obj: Any) -> Any:
-            """The recipe by which an object is rebuilt (see `pickle.Pickler.reducer_override`),
-            without cached values."""
+            """How an object is rebuilt: a function, its arguments and a state without cached
+            values, as `pickle.Pickler.reducer_override` returns it; NotImplemented to pickle the
+            object as usual."""
             if isinstance(obj, ModuleType):
                 return self.of_module(obj)
             if isinstance(obj, functools.cached_property):  # which holds a lock in Python 3.11
@@ -319,8 +343,8 @@ def _cacheless_pickler(base: Any) -> Callable[..., Any]:
             return constructor, arguments, state, *rest[:3]
 
         def of_module(self, module: ModuleType) -> Any:
-            """The recipe of a module: its name or, for a user's module, its attributes that are
-            named by the words."""
+            """How a module is rebuilt: by its name; or, for a user's module, by those of its
+            attributes whose names are among the words."""
             if not is_sent_itself(module):
                 return importlib.import_module, (module.__name__,)
             words = frozenset(self.words)
@@ -330,8 +354,11 @@ def _cacheless_pickler(base: Any) -> Callable[..., Any]:
             return itself, (self.space(vars(module)),), (attributes, left_out), None, None, fill
 
         def of_function(self, function: FunctionType, reduced: Any) -> Any:
-            """The recipe of a function, whose words are noted. reduced: the recipe by
-            cloudpickle."""
+            """How a function is rebuilt, in the namespace of its module. Its identifiers and
+            strings are added to the words.
+
+            reduced: how cloudpickle rebuilds it.
+            """
             if not isinstance(reduced, tuple):
                 return reduced
             refuse_imports_within(function)
@@ -340,15 +367,17 @@ def _cacheless_pickler(base: Any) -> Callable[..., Any]:
             return function_in, (self.space(function.__globals__), code, closure), *rest
 
         def space(self, names: dict[str, Any]) -> Namespace:
-            """The namespace of a module's dictionary; one for each dictionary."""
+            """The namespace of a module's dictionary `names`; always the same object for the same
+            dictionary."""
             return self.spaces.setdefault(id(names), Namespace.of(names))
 
-    return Lean
+    return CachelessPickler
 
 
 def _without_generated_id(reduced: Any) -> Any:
-    """The recipe of a class without its generated id. By this id cloudpickle finds a class that it
-    rebuilt before, whose methods it would replace."""
+    """`reduced`, the way in which cloudpickle rebuilds a class, without the id that it generated.
+    By this id cloudpickle would find a class that it rebuilt before, and replace the methods of
+    that class."""
     if not isinstance(reduced, tuple):
         return reduced
     constructor, arguments, *rest = cast("tuple[Any, ...]", reduced)
@@ -360,12 +389,12 @@ def _without_generated_id(reduced: Any) -> Any:
 
 
 def _refuse_user_names(obj: Any) -> Any:
-    """The recipe of an object that stands for a name in a module of a user, such as a cached
-    function: its contents in place of its name. `NotImplemented` for all other objects, which are
+    """How to rebuild an object that pickle would describe only by its name in a user's module: a
+    cached function is rebuilt from its contents. NotImplemented for all other objects, which are
     pickled as usual.
 
     Raises:
-        TypeError: its contents cannot be determined.
+        TypeError: the contents cannot be determined.
     """
     module = sys.modules.get(str(getattr(obj, "__module__", None)))
     if module is None or not hasattr(obj, "__qualname__") or not is_sent_itself(module):
@@ -381,20 +410,22 @@ def _refuse_user_names(obj: Any) -> Any:
 
 
 @functools.cache
-def _hashing_pickler(base: Any) -> Callable[..., Any]:
-    """Return a pickler class whose output is only hashed. It leaves out whatever changes from run
-    to run (line numbers, generated ids, the order of sets), and adds a digest of each file that a
-    string or a path names.
+def _make_hashing_pickler(base: Any) -> Callable[..., Any]:
+    """A pickler class whose output is only hashed. It leaves out everything that changes from run
+    to run (line numbers, generated ids, the order of sets), and adds a hash of each file that a
+    string or a path names. base: cloudpickle's class Pickler.
 
-    Attributes of its objects:
-    files: the digest of each file, by its path.
+    Attributes of its instances besides those of `_make_cacheless_pickler`:
+
+    files: the hash of each file by its path.
     others: the versions of the installed packages that are used, by name.
-    begun: the functions, classes and modules that were begun, by id, with a number each.
+    begun: for each function, class and module whose writing has begun, by id: the object and its
+        number.
     """
-    base_pickler: Any = _cacheless_pickler(base)
+    base_pickler: Any = _make_cacheless_pickler(base)
 
-    class Naming(base_pickler):
-        """The pickler class."""
+    class HashingPickler(base_pickler):
+        """The pickler class; `context` becomes its attribute `what`."""
 
         def __init__(self, context: str, words: frozenset[str]) -> None:
             super().__init__(context, words)
@@ -403,6 +434,13 @@ def _hashing_pickler(base: Any) -> Callable[..., Any]:
             self.begun: dict[int, tuple[Any, int]] = {}
 
         def persistent_id(self, obj: Any) -> Any:
+            """Pickle calls this for each object: it returns a value to write in place of the
+            object, or None to pickle the object as usual.
+
+            A function, class or module whose writing has begun is replaced by its number, as it may
+            refer to itself. A set is replaced by the sorted hashes of its members, since its order
+            changes from run to run. The name of a file is replaced by a hash of the file.
+            """
             obj_type = cast("type[Any]", type(obj))
             if id(obj) in self.begun:  # classes, functions and modules may name themselves
                 return f"number {self.begun[id(obj)][1]}"
@@ -419,8 +457,8 @@ def _hashing_pickler(base: Any) -> Callable[..., Any]:
             return self.of_file(obj) if isinstance(obj, str | os.PathLike) else None
 
         def of_file(self, obj: Any) -> str | None:
-            """The text "file" and the digest, for a name or path of an existing file that is not
-            code; None for others. The digest is noted."""
+            """The text "file" and the hash of the contents, for a name or path of an existing file;
+            None for a file of code and for any other string. The hash is noted in `files`."""
             path = os.fsdecode(cast("str | os.PathLike[str]", obj))
             if path.endswith(_CODE_SUFFIXES) or (contents := _file_digest(path)) is None:
                 return None
@@ -428,8 +466,8 @@ def _hashing_pickler(base: Any) -> Callable[..., Any]:
             return f"file {contents}"
 
         def reducer_override(self, obj: Any) -> Any:
-            """The recipe of an object, of which only its content matters, as it is never
-            rebuilt."""
+            """A description of an object in the form of pickle's reduce values. It needs to
+            determine only the contents, as the object is never rebuilt from it."""
             if obj is tuple:  # all other recipes are written as tuples
                 return NotImplemented
             if isinstance(obj, CodeType):
@@ -456,8 +494,8 @@ def _hashing_pickler(base: Any) -> Callable[..., Any]:
             return constructor, arguments, state, *rest
 
         def note_origin(self, obj: Any) -> None:
-            """Note the version of the package, or the digest of the compiled file, that defines an
-            object."""
+            """Note, for the definition of an object, the version of its package (in `others`) or
+            the hash of its compiled file (in `files`)."""
             name = obj.__name__ if isinstance(obj, ModuleType) else getattr(obj, "__module__", None)
             if not isinstance(name, str):
                 return
@@ -471,7 +509,7 @@ def _hashing_pickler(base: Any) -> Callable[..., Any]:
             elif module is not None and (path := compiled_file(module)) is not None:
                 self.files[path] = str(_file_digest(path))
 
-    return Naming
+    return HashingPickler
 
 
 # Attributes whose values are names, and attributes that contain dictionaries of names.
@@ -480,8 +518,8 @@ _NAMESPACE_ATTRIBUTES = ("__globals__", "__kwdefaults__")
 
 
 def _with_encoded_keys(state: Any) -> Any:
-    """The state of an object, with the names of attributes as bytes: as strings, they would be
-    taken for names of files."""
+    """The state of an object with the names of attributes as bytes. As strings, they would be taken
+    for names of files."""
     if isinstance(state, tuple):
         return tuple(map(_with_encoded_keys, cast("tuple[Any, ...]", state)))
     if not isinstance(state, dict):
@@ -497,8 +535,8 @@ def _with_encoded_keys(state: Any) -> Any:
 
 
 def _encoded(names: Any) -> Any:
-    """A string as bytes; a dictionary as a list of pairs, with its strings as bytes; other values
-    unchanged."""
+    """A string as bytes; a dictionary as a list of pairs, with all of its strings as bytes; any
+    other value unchanged."""
     if isinstance(names, dict):
         mapping = cast("dict[Any, Any]", names)
         return [(_encoded(key), _encoded(value)) for key, value in mapping.items()]
@@ -518,8 +556,9 @@ def _is_generated_id(argument: Any) -> bool:
 
 @functools.lru_cache(maxsize=1024)
 def _transient_attributes(kind: type) -> dict[str, Any]:
-    """The attributes in which objects of a class store computed values, with the value that
-    replaces each in a pickle."""
+    """The attributes in which objects of the class `kind` cache computed values. The value of each
+    is what replaces it in a pickle: the default of a private dataclass field, or `_OMIT` to leave
+    it out."""
     replacements: dict[str, Any] = {
         name: _OMIT
         for definition in kind.__mro__

@@ -1,12 +1,12 @@
-"""Code of users: recognizing it, finding the attributes of users' modules that it uses, and sending
-such modules.
+"""Code of users: how it is recognized, which attributes of users' modules it uses, and how such
+modules are sent.
 
 Code of Python itself and of installed packages is sent by name. A user's module is sent by value,
-in its present state: a worker may lack it, or have imported it before it was changed, and a
-checkpoint folder must distinguish two states of it. The whole module would be too much, since
-modules also hold locks, clients and pictures. So only the attributes are sent whose names occur in
-the code that is sent. A module that was sent refuses all other attributes by name, so that nothing
-is missing silently.
+in its present state: a worker may lack the module, or may have imported it before it was changed,
+and a checkpoint folder must distinguish two states of it. But the whole module would be too much,
+since modules also hold locks, clients and pictures. So an attribute is sent only if its name occurs
+in the code that is sent. A sent module raises an error when any other attribute is used, so that
+nothing is missing silently.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ _LEFT_OUT = "__left_out__"
 
 
 class SentModule(ModuleType):
-    """A user's module with the attributes that were sent. It is not in sys.modules: a module that
-    is imported here under its name is another one."""
+    """A user's module, rebuilt on a worker with the attributes that were sent. It is not in
+    sys.modules, and is not the module that `import` finds there under its name."""
 
     def __getattr__(self, name: str) -> Any:
         # Not an AttributeError, which `hasattr` would take for "no such attribute".
@@ -55,16 +55,17 @@ class SentModule(ModuleType):
 
 @dataclass(frozen=True)
 class Namespace:
-    """The module in which functions look up names. When it is unpickled, it becomes a `SentModule`.
+    """The module in which pickled functions look up global names. Unpickling it gives a
+    `SentModule`.
 
-    known: the attributes that are sent in any case, whatever names the functions use.
+    known: the attributes that are sent whatever names the functions use, such as `__name__`.
     """
 
     known: Mapping[str, Any]
 
     @classmethod
     def of(cls, names: Mapping[str, Any]) -> Namespace:
-        """The namespace of a module, from its attributes by name."""
+        """The namespace of a module. names: the attributes of the module by name."""
         return cls({key: names[key] for key in _ALWAYS_SENT if key in names})
 
     def __reduce__(self) -> Any:
@@ -72,30 +73,34 @@ class Namespace:
 
 
 def sent_module(known: Mapping[str, Any]) -> SentModule:
-    """A module with only the attributes in `known`."""
+    """A new module that has only the attributes `known`."""
     module = SentModule(str(known.get("__name__", "")))
     vars(module).update(known)
     return module
 
 
 def itself(module: SentModule) -> SentModule:
-    """The module. So a namespace that functions share becomes the module that they name."""
+    """The module, unchanged. Pickle calls this to rebuild a module from a namespace, so that the
+    module is the one in which its functions look up names."""
     return module
 
 
 def fill(module: SentModule, contents: tuple[Mapping[str, Any], frozenset[str]]) -> None:
-    """Give a module its attributes, and the names of the attributes that are left out."""
+    """Set the attributes of a rebuilt module. contents: the attributes by name, and the names of
+    the attributes that were not sent."""
     attributes, left_out = contents
     vars(module).update(attributes, **{_LEFT_OUT: left_out - _NEVER_SENT})
 
 
 def function_in(module: SentModule, code: CodeType, closure: Any) -> FunctionType:
-    """A function that looks for names in a module."""
+    """A function of the given code and closure whose global names are those of a module."""
     return FunctionType(code, vars(module), None, None, closure)
 
 
 def attributes_named(module: ModuleType, words: frozenset[str] | set[str]) -> dict[str, Any]:
-    """The attributes of a module that code with these words may use, in the order of names."""
+    """The attributes of a module that code may use, sorted by name: those whose names are among
+    `words`, and all of them if `words` contains a function such as `vars`. words: identifiers and
+    strings in the code."""
     uses_all = bool(words & _ALL_ATTRIBUTES)
     return {
         name: value
@@ -105,7 +110,7 @@ def attributes_named(module: ModuleType, words: frozenset[str] | set[str]) -> di
 
 
 def codes_within(code: CodeType) -> Iterator[CodeType]:
-    """A code object, and the code objects of the functions and classes that it defines."""
+    """Yield a code object, and the code objects of all functions and classes that it defines."""
     yield code
     for constant in code.co_consts:
         if isinstance(constant, CodeType):
@@ -113,8 +118,8 @@ def codes_within(code: CodeType) -> Iterator[CodeType]:
 
 
 def words_of(function: FunctionType) -> set[str]:
-    """All names in the code of a function, and its string constants, which may be names of
-    attributes."""
+    """All names in the code of a function, and its string constants, as attributes may be looked up
+    by them."""
     return {
         word
         for code in codes_within(function.__code__)
@@ -132,8 +137,8 @@ def _strings_in(constants: Iterable[Any]) -> Iterator[str]:
 
 
 def refuse_imports_within(function: FunctionType) -> None:
-    """Refuse a function that imports users' modules when it is called: it cannot be determined
-    which modules these will be, and which of their attributes are used.
+    """Refuse a function that imports users' modules when it is called: it cannot be determined in
+    advance which modules these are, and which of their attributes are used.
 
     Raises:
         TypeError: the function imports such a module.
@@ -157,8 +162,8 @@ def refuse_imports_within(function: FunctionType) -> None:
 
 
 def _imports(code: CodeType) -> Iterator[tuple[int, str]]:
-    """The imports in a code object, as (level, name): the number of packages to go up (0 for an
-    absolute import), and the name relative to there."""
+    """Yield the imports in a code object as (level, name): the number of packages to go up (0 for
+    an absolute import), and the module's name relative to that package."""
     instructions = [
         instruction
         for instruction in dis.get_instructions(code)
@@ -170,8 +175,8 @@ def _imports(code: CodeType) -> Iterator[tuple[int, str]]:
 
 
 def _imported_module(statement: tuple[int, str], package: str) -> str:
-    """The full name of the module that an import statement (level, name) of a module in `package`
-    imports."""
+    """The full name of the module that an import imports. statement: the import as (level, name),
+    see `_imports`. package: the package of the module in which the import stands."""
     level, name = statement
     with suppress(ImportError):  # the function will raise this error itself
         return importlib.util.resolve_name("." * level + name, package)
@@ -179,7 +184,7 @@ def _imported_module(statement: tuple[int, str], package: str) -> str:
 
 
 def _is_user_root(root: str) -> bool:
-    """Whether a top-level module, imported or not, is a user's."""
+    """Whether the top-level module named `root`, imported or not, is a user's module."""
     module = sys.modules.get(root)
     if module is not None:
         return is_users(module)
@@ -193,7 +198,8 @@ def _is_user_root(root: str) -> bool:
 
 
 def is_users(module: ModuleType) -> bool:
-    """Whether a module is neither a part of Python nor of an installed package or this one."""
+    """Whether a module is a user's: not a part of Python, of an installed package or of this
+    library."""
     name = module.__name__
     root = name.partition(".")[0]
     if name == "__main__" or sys.modules.get(name) is not module:
@@ -207,7 +213,7 @@ def is_users(module: ModuleType) -> bool:
 
 
 def is_sent_itself(module: ModuleType) -> bool:
-    """Whether a module is a user's and not a compiled one."""
+    """Whether a module is sent by value: it is a user's module and not a compiled one."""
     location = _location_of(module)
     return is_users(module) and (
         location is None or location.endswith(_SOURCES) or not Path(location).suffix
@@ -215,13 +221,14 @@ def is_sent_itself(module: ModuleType) -> bool:
 
 
 def compiled_file(module: ModuleType) -> str | None:
-    """The file of a compiled module of a user; None for another module."""
+    """The path of a compiled module of a user; None for any other module."""
     path = _location_of(module)
     return path if path is not None and is_users(module) and not is_sent_itself(module) else None
 
 
 def _location_of(module: ModuleType) -> str | None:
-    """The file of a module; the folder of a package without a file; None if there is neither."""
+    """The file of a module, or the folder of a package without a file; None if the module has
+    neither."""
     attributes = vars(module)
     location = attributes.get("__file__") or next(iter(attributes.get("__path__", ())), None)
     return location if isinstance(location, str) else None
@@ -229,8 +236,8 @@ def _location_of(module: ModuleType) -> str | None:
 
 @functools.cache
 def _is_user_location(root: str, location: str) -> bool:
-    """Whether a file or folder of the top-level module `root` belongs neither to Python nor to an
-    installed package nor to this one."""
+    """Whether a file or folder belongs to a user, that is neither to Python nor to an installed
+    package nor to this library. root: the name of its top-level module."""
     if root == "harnack":
         return False
     path = Path(location).resolve()
@@ -245,8 +252,8 @@ def _is_user_location(root: str, location: str) -> bool:
 
 @functools.cache
 def installed_version(root: str) -> str | None:
-    """The version of the installed package that has a module; None for a part of Python, a user's
-    module, and one that is in no package."""
+    """The version of the installed package that has the top-level module `root`; None if no package
+    has it, as for Python's own and users' modules."""
     if root in sys.stdlib_module_names or root in ("__main__", "harnack") or _is_user_root(root):
         return None
     with suppress(importlib.metadata.PackageNotFoundError, ValueError):

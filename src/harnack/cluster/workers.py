@@ -1,4 +1,5 @@
-"""The workers of a Dask cluster, and checks that they can work before anything is sent to them."""
+"""Connects to a Dask cluster, and checks that its workers can run tasks before anything is sent to
+them."""
 
 from __future__ import annotations
 
@@ -25,11 +26,13 @@ _INSTALL = "install the same there as here, such as by pip install 'harnack[clus
 
 @contextmanager
 def connect_client(client: Any) -> Generator[Any]:
-    """Context manager that yields a Dask client whose workers have all been checked; None for None.
-    client: a Dask client, or the address of a scheduler; a client that was opened here is closed at
-    the end.
+    """Context manager that yields a Dask client whose workers have all been checked, or None if
+    `client` is None.
 
-    Workers that come later are checked when they get a task: by `exclusive_compute` and
+    client: a Dask client, the address of a scheduler, or None. A client that was opened from an
+        address is closed at the end.
+
+    Workers that join the cluster later are checked when they get a task: by `exclusive_compute` and
     `SerializedObject.deserialize`.
 
     Raises:
@@ -37,7 +40,7 @@ def connect_client(client: Any) -> Generator[Any]:
         TypeError: it is neither a client nor an address.
         OSError: there is no scheduler at the address.
         RuntimeError: a worker has no harnack, another version of it, or no LLVM that Dr.Jit can
-            work with. The message names it.
+            use. The message names the worker.
     """
     if client is None:
         yield None
@@ -69,8 +72,9 @@ def connect_client(client: Any) -> Generator[Any]:
 
 @contextmanager
 def exclusive_compute() -> Generator[str]:
-    """Context manager: within it no other task of this process computes, as Dr.Jit already uses all
-    threads of a worker. It yields the address of this Dask worker, "" if this process is not one.
+    """Context manager within which no other task of this process computes, as Dr.Jit already uses
+    all threads of a worker. It yields the address of this Dask worker, or "" if this process is no
+    worker.
 
     Raises:
         RuntimeError: Dr.Jit has no backend that it can use here.
@@ -91,7 +95,7 @@ def exclusive_compute() -> Generator[str]:
 
 
 def worker_threads(client: Any) -> dict[str, int]:
-    """The number of threads of each worker, by its address.
+    """The number of threads of each worker, by the worker's address.
 
     Raises:
         RuntimeError: the scheduler is gone.
@@ -135,7 +139,8 @@ def _check_workers(client: Any) -> None:
 
 
 def warn_rounding_differs(workers: Iterable[str]) -> None:
-    """Warn that the processors of workers, given by their addresses, round differently."""
+    """Warn that the processors of some workers round differently from this one. workers: their
+    addresses."""
     warnings.warn(
         f"the processors of {', '.join(sorted(workers))} round differently from this one: "
         "results are right, but not the same bit for bit as without them",
@@ -144,7 +149,9 @@ def warn_rounding_differs(workers: Iterable[str]) -> None:
 
 
 def _worker_state(dask_worker: Any = None) -> tuple[str, str]:
-    """Run on a worker: its `package_versions` and `rounding_fingerprint`.
+    """Run on a worker: return its `package_versions` and its `rounding_fingerprint`.
+
+    dask_worker: Dask passes the worker under this name.
 
     Raises:
         LLVMNotFoundError: Dr.Jit has no backend there.
@@ -156,25 +163,27 @@ def _worker_state(dask_worker: Any = None) -> tuple[str, str]:
 
 @functools.cache
 def adopt_worker_threads(has_nanny: bool, threads: int) -> None:
-    """Set Dr.Jit's number of threads to the number that Dask gave this worker.
+    """Set Dr.Jit's number of threads to the number that Dask gave this worker, if the process
+    belongs to this worker alone.
 
-    has_nanny: whether a nanny process watches over this process, which then belongs to the worker
-        alone.
+    has_nanny: whether Dask runs a supervising process (a nanny) for this worker; then the process
+        belongs to it alone.
     """
     if has_nanny:
         dr.set_thread_count(threads)
 
 
 def rounding_fingerprint() -> str:
-    """A digest of computed numbers on this machine, equal on machines where kernels give the same
-    bits."""
+    """The backend's name and a hash of numbers that kernels compute on this machine. It is equal on
+    machines whose kernels give the same bits."""
     name = choose_backend().name
     return f"{name} {_rounding(name)}"
 
 
 @functools.cache
 def _rounding(_name: str) -> str:
-    """The digest of `rounding_fingerprint`; the name of the backend is the key of the cache."""
+    """A hash of numbers that kernels of the chosen backend compute. _name: the backend's name, by
+    which the hash is cached."""
     x = dr.linspace(choose_backend().Float, 0.01, 40, 4096)
     s, c = dr.sincos(x)
     results = (dr.rcp(x), dr.rsqrt(x), s, c, dr.exp(-x), dr.log(x), dr.fma(s, c, x), dr.sqrt(x),

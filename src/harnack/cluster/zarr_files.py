@@ -1,4 +1,4 @@
-"""Dask arrays written to Zarr files, in which finished chunks stay."""
+"""Writes Dask arrays to Zarr files. Chunks that are already in the file are not computed again."""
 
 from __future__ import annotations
 
@@ -32,17 +32,19 @@ def to_zarr(
     A chunk of the file is a block of the array. Chunks of the same array that are already in the
     file are not computed again, so that an interrupted call can be continued.
 
-    array: a Dask array; it is recognized by its name, which Dask derives from its contents.
-    path: of a folder, by custom with the ending .zarr, that workers see under the same name.
+    array: a Dask array. Dask derives its name from its contents, and the file is recognized by this
+        name.
+    path: the folder to write, usually with the ending .zarr; workers must see it under the same
+        path.
     client: a `dask.distributed.Client` or the address of a scheduler; by default as Dask chooses.
-    progress: whether to show it, or a function that is called with each fraction (of 1 in all) that
-        is done.
+    progress: whether to show the progress; or a function that is called with each fraction of the
+        work that was finished (they add up to 1).
 
     Raises:
         ModuleNotFoundError: Dask or Zarr is not installed.
         TypeError: not a Dask array.
-        ValueError: there is another array at the path, or its blocks have unequal lengths.
-        OSError: the file cannot be written, or workers did not write it.
+        ValueError: there is another array at the path, or the blocks have unequal lengths.
+        OSError: the file cannot be written, or workers wrote to another file system.
     """
     zarr = import_optional("zarr", "to_zarr")
     dask = import_optional("dask", "to_zarr")
@@ -81,8 +83,8 @@ def to_zarr(
 
 
 def _compute_tasks(client: Any, tasks: list[Any]) -> Iterator[None]:
-    """Compute tasks: all at once on a client's cluster; one by one without a client. Yields after
-    each task."""
+    """Compute tasks, and yield after each finished one: all at once on the cluster of `client`, or
+    one after the other in this process if `client` is None."""
     if client is None:
         for task in tasks:
             task.compute()
@@ -100,7 +102,12 @@ def _compute_tasks(client: Any, tasks: list[Any]) -> Iterator[None]:
 
 
 def _open_or_create(zarr: Any, array: Any, target: Path) -> Any:
-    """The Zarr array of a Dask array, created if it does not exist."""
+    """Open the Zarr file of a Dask array, or create it if it does not exist.
+
+    Raises:
+        FileNotFoundError: the parent folder does not exist.
+        ValueError: the path holds something else.
+    """
     if not target.parent.is_dir():
         raise FileNotFoundError(f"cannot write {target}: create the folder {target.parent} first")
     chunks = tuple(max(1, lengths[0]) for lengths in array.chunks)
@@ -123,20 +130,21 @@ def _open_or_create(zarr: Any, array: Any, target: Path) -> Any:
 
 
 def _chunk_path(file: Any, target: Path, index: tuple[int, ...]) -> Path:
-    """The path of the file of a chunk. A chunk is written under another name first, and then
-    renamed."""
+    """The path of the file of a chunk. This file exists only if the chunk is complete: Zarr writes
+    it under another name first, and then renames it."""
     return target / file.metadata.encode_chunk_key(index)
 
 
 def _chunk_slices(array: Any, index: tuple[int, ...]) -> tuple[slice, ...]:
-    """The slices of an array that make up the chunk with this index."""
+    """The slices, one for each axis, that select the chunk with this index from the array."""
     starts = [sum(lengths[:k]) for lengths, k in zip(array.chunks, index, strict=True)]
     ends = [sum(lengths[: k + 1]) for lengths, k in zip(array.chunks, index, strict=True)]
     return tuple(slice(a, b) for a, b in zip(starts, ends, strict=True))
 
 
 def _write_block(path: str, slices: tuple[slice, ...], block: Any) -> None:
-    """Write a block into the Zarr array at `path`."""
+    """Run on a worker: write a block into the Zarr array at `path`. slices: the place of the
+    block."""
     zarr = import_optional("zarr", "to_zarr")
     # By default Zarr leaves out chunks of zeros, which would then be computed again.
     with zarr.config.set({"array.write_empty_chunks": True}):

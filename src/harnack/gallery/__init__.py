@@ -1,6 +1,7 @@
-"""Named scenes, shared by the command line, the docs and the tests. No numerics.
+"""The gallery: named scenes that the command line, the docs and the tests share.
 
-A scene is data: fields, levels, materials and a camera. `Scene.render` hands them to the renderer.
+A scene is data (fields, levels, materials and a camera); `Scene.render` passes it to the renderer.
+Nothing is computed in this package.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Scenes of curves, harmonic polynomials, periodic surfaces, and functions over the plane.
+"""Scenes of curves, harmonic polynomials, periodic surfaces, and functions of the plane.
 
-Functions over the plane give Riemann surfaces (the paper's Fig. 19), level curves and height
-fields.
+A function of the plane gives a Riemann surface (Fig. 19 of Gillespie et al. 2024), level curves or
+a height field.
 """
 
 from __future__ import annotations
@@ -30,18 +30,21 @@ from harnack.tracer import Surface
 
 
 def _curve(loops: Any, level: Any = None, **settings: Any) -> list[Surface]:
+    """The level set of the solid angle of closed curves. loops: vertices (n, 3), or a list of them.
+    settings: keywords of `Surface`."""
     return [Surface(SolidAngle(loops), level, **settings)]
 
 
 def _levels() -> list[Surface]:
-    """Five levels of one polygon, cut open."""
+    """Five level sets of the solid angle of one polygon, cut by a half-space."""
     cut = HalfSpace((0.5, -0.9, 0.0), 0.0)
     levels = [k * math.pi for k in (1.0, 1.5, 2.0, 2.5, 3.0)]
     return _curve(example_curves.wavy_polygon(48), levels, clip=cut)
 
 
 def _holes() -> list[Surface]:
-    """A square with three holes, bent like a sheet in the wind so that no plane contains it."""
+    """A surface spanned by a square with three holes. The curves are bent like a sheet in the wind,
+    so that no plane contains them."""
     edge, *holes = example_curves.square_with_holes(24)
     s = np.linspace(0, 1, 10, endpoint=False)[:, None]
     fine = [(1 - s) * a + s * b for a, b in zip(edge, np.roll(edge, -1, axis=0), strict=True)]
@@ -49,24 +52,29 @@ def _holes() -> list[Surface]:
 
 
 def _on_wave(loop: FloatArray) -> FloatArray:
+    """The points (n, 3) of a loop moved vertically onto a wavy surface."""
     x, y, _ = loop.T
     return np.column_stack([x, y, 0.25 * np.sin(2.2 * x) + 0.2 * np.cos(2.0 * y)])
 
 
 def _periodic(kind: Any, half_wall: float, *, box: bool = False) -> list[Surface]:
-    """The wall between two levels, -half_wall and half_wall, of a periodic function."""
+    """The solid between the levels -half_wall and half_wall of a periodic function.
+
+    kind: the class of the function. box: whether it is cut to a box; otherwise to a ball.
+    """
     domain = Box((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0)) if box else Ball(radius=1.0)
     return [Surface(kind(1.0, domain=domain), (-half_wall, half_wall), side="between")]
 
 
 def _golden_gyroid() -> list[Surface]:
-    """Half of space behind the gyroid, in a box."""
+    """The half of space in which the gyroid's function is negative, cut to a box."""
     domain = Box((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
     return [Surface(Gyroid(1.0, domain=domain), 0.0, side="below")]
 
 
 def _eigenfunctions() -> list[Surface]:
-    """The paper's Fig. 21: the 1/2 level of a sum of two eigenfunctions."""
+    """The solid in which a sum of two Laplacian eigenfunctions is at least 1/2 (Fig. 21 of
+    Gillespie et al. 2024)."""
     terms = [
         WaveProduct(1.0, x=sine_factor(k), y=sine_factor(k), z=sine_factor(k)) for k in (6.0, 2.0)
     ]
@@ -76,34 +84,40 @@ def _eigenfunctions() -> list[Surface]:
 
 
 def _harmonic(field: Field) -> list[Surface]:
+    """The field's default level set."""
     return [Surface(field)]
 
 
 def _on_the_sphere(field: HypersphericalHarmonic, level: float) -> list[Surface]:
-    """Both levels of a function of S^3, whole: nothing is clipped."""
+    """The level sets -level and level of a function on the sphere S^3, projected to space. Both are
+    bounded, so that nothing is clipped."""
     return [Surface(field, [-level, level])]
 
 
 def _lobes() -> list[Surface]:
-    """Those where the function is positive, and where it is negative."""
+    """The lobes of the spherical harmonic with l = 3, m = 2 as two solids: the lobes on which it is
+    positive, and the lobes on which it is negative."""
     lobes = Lobes(3, 2)
     return [Surface(part, 0.0, side="below") for part in (lobes.positive, lobes.negative)]
 
 
 def _quartic() -> list[Surface]:
-    """x^3 y + x y^3 - 3 x y (w^2 + z^2), the example of Gillespie et al. 2024, Appendix E.2. On the
-    sphere it is x y (4 (x^2 + y^2) - 3), hence at most 1/2."""
+    """Level sets of x^3 y + x y^3 - 3 x y (w^2 + z^2) on the sphere S^3 (Gillespie et al. 2024,
+    Appendix E.2). On the sphere it equals x y (4 (x^2 + y^2) - 3), hence is at most 1/2."""
     terms = {(3, 1, 0, 0): 1.0, (1, 3, 0, 0): 1.0, (1, 1, 0, 2): -3.0, (1, 1, 2, 0): -3.0}
     return _on_the_sphere(HypersphericalHarmonic.from_polynomial(terms), 0.15)
 
 
 def _fitted_knot() -> list[Surface]:
-    """Gaussians along a trefoil knot, by a series of 16 x 16 x 9 cosines."""
+    """A solid around a trefoil knot: a sum of Gaussians along the knot, approximated by a series of
+    16 x 16 x 9 cosines."""
     curve = example_curves.torus_knot(2, 3, 150)
     step = np.linalg.norm(np.roll(curve, -1, axis=0) - curve, axis=1)
     width = 0.15 * float(np.ptp(curve, axis=0).max()) / 2
 
     def density(x: FloatArray) -> FloatArray:
+        """The sum of Gaussians at points x (n, 3): the integral along the curve, divided by its
+        value for a straight line."""
         sums = [
             np.exp(-((batch[:, None] - curve) ** 2).sum(axis=2) / width**2) @ step
             for batch in np.array_split(x, len(x) // 4000 + 1)
@@ -255,28 +269,33 @@ SOLIDS = (
 
 
 def _surface(function: Any, part: str = "imag", **settings: Any) -> list[Surface]:
+    """The Riemann surface of a function. part: "real" or "imag", the part of the function that is
+    the height. settings: options of `RiemannSurface`."""
     return [Surface(RiemannSurface(function, part, **settings))]
 
 
 def _elliptic(domain: Volume) -> list[Surface]:
-    """sqrt(z^3 - z): a torus less its points at infinity."""
+    """The Riemann surface of sqrt(z^3 - z), a torus without its points at infinity, cut to
+    `domain`."""
     return _surface("sqrt", argument={0: 1, 1: 1, -1: 1}, height=0.6, domain=domain)
 
 
 def _lemniscates() -> list[Surface]:
-    """Level curves of the potential of three line charges."""
+    """Level curves of the potential of three line charges, as vertical walls."""
     triangle = {complex(math.cos(a), math.sin(a)): 1 for a in (0.5 * math.pi, 3.7, 5.8)}
     field = LevelCurves("log", argument=triangle, domain=Box((-2.2, -2.2, -0.2), (2.2, 2.2, 0.2)))
     return [Surface(field, [-1.2, -0.6, 0.0, 0.6, 1.2, 1.8])]
 
 
 def _field_lines() -> list[Surface]:
-    """Field lines of a charge and its opposite: level curves of the conjugate function."""
+    """Field lines of two opposite line charges, as vertical walls: the level curves of the
+    conjugate of the potential."""
     field = LevelCurves("log", "imag", argument={1: 1, -1: -1})
     return [Surface(field, [k * math.pi / 6 for k in range(12)])]
 
 
 def _ripples() -> list[Surface]:
+    """The graph of a function of x and y that looks like ripples."""
     field = HeightField(
         lambda x, y: exp(-(x**2 + y**2) * 1.5) * sin(x * 5 + cos(y * 4)) * 0.6,
         domain=Box((-1.5, -1.5, -1.0), (1.5, 1.5, 1.0)),

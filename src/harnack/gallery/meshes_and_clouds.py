@@ -19,7 +19,7 @@ _GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
 
 
 def _cut_mesh() -> list[Surface]:
-    """A bumpy sphere with round holes cut into it."""
+    """A bumpy sphere with 14 round holes, closed by the level set of its winding number."""
     vertices, faces = example_meshes.bumpy_sphere(6)
     middles = vertices[faces].mean(axis=1)
     middles /= np.linalg.norm(middles, axis=1, keepdims=True)
@@ -28,7 +28,7 @@ def _cut_mesh() -> list[Surface]:
 
 
 def _spiral_directions(n: int) -> FloatArray:
-    """n directions (n, 3), evenly spread."""
+    """n unit vectors (n, 3), spread evenly over the sphere along a spiral."""
     k = np.arange(n)
     z, angle = 1.0 - (2.0 * k + 1.0) / n, 2.0 * math.pi * _GOLDEN * k
     radius = np.sqrt(1.0 - z * z)
@@ -36,18 +36,20 @@ def _spiral_directions(n: int) -> FloatArray:
 
 
 def _soup() -> list[Surface]:
-    """Loose triangles: every one shrunk about its middle, a tenth of them missing."""
+    """The level set of the winding number of loose triangles: a torus whose triangles are shrunk
+    about their centers, with a tenth of them missing."""
     vertices, faces = example_meshes.torus_mesh(1.0, 0.42, 20, 9)
     faces = example_meshes.remove_faces(faces, 0.1, seed=1)
     corners = vertices[faces]
-    middle = corners.mean(axis=1, keepdims=True)
-    shrunk = (middle + 0.86 * (corners - middle)).reshape(-1, 3)
+    centers = corners.mean(axis=1, keepdims=True)
+    shrunk = (centers + 0.86 * (corners - centers)).reshape(-1, 3)
     field = WindingNumber(shrunk, np.arange(len(shrunk)).reshape(-1, 3))
     return [Surface(field)]
 
 
 def _cloud() -> list[Surface]:
-    """Random points on a quartic with five handles, with its gradients as normals."""
+    """A surface through random points of a quartic with five handles; the normals are the quartic's
+    gradients. Newton's steps move random points onto it."""
     points = np.random.default_rng(2).uniform(-2.5, 2.5, (12000, 3))
     for _ in range(40):
         value, gradient = _tangle(points)
@@ -58,13 +60,15 @@ def _cloud() -> list[Surface]:
 
 
 def _tangle(points: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """x^4 - 5 x^2 + y^4 - 5 y^2 + z^4 - 5 z^2 + 11.8 and its gradient."""
+    """f = x^4 - 5 x^2 + y^4 - 5 y^2 + z^4 - 5 z^2 + 11.8 at points (n, 3), shape (n,), and its
+    gradients (n, 3)."""
     value = (points**4 - 5.0 * points**2).sum(axis=1) + 11.8
     return value, 4.0 * points**3 - 10.0 * points
 
 
 def _knot_cloud() -> list[Surface]:
-    """Points on a tube around a trefoil, like the seeds of a sunflower."""
+    """A surface through points on a tube around a trefoil, arranged like the seeds of a
+    sunflower."""
     n, count = 1200, 8000
     curve = example_curves.torus_knot(2, 3, n)
     tangents = np.roll(curve, -1, axis=0) - np.roll(curve, 1, axis=0)

@@ -17,13 +17,14 @@ PICTURE_OPTIONS = TraceOptions(tolerance=2e-4)
 
 @dataclass(frozen=True)
 class Scene:
-    """A named picture, and how to draw it.
+    """A named scene of the gallery: its surfaces, and how `render` draws them.
 
+    name, title: the name on the command line, and a description in words.
     surfaces: a function that returns the surfaces.
-    materials: a name for each of them (or a single name for all).
-    options: of the traces.
-    demo_spp: samples a pixel in `make demo`, few, to keep that to a few minutes; 0 to leave the
-        scene out of it.
+    materials: the name of each surface's material, or a single name for all surfaces.
+    camera, show, options: options of `render` by these names.
+    demo_spp: samples per pixel in `make demo`, few enough for the demo to take a few minutes; 0
+        leaves the scene out of the demo.
     """
 
     name: str
@@ -36,7 +37,8 @@ class Scene:
     demo_spp: int = 0
 
     def render(self, path: Any = None, **options: Any) -> Any:
-        """Render the picture by `harnack.rendering`; options of `render` override the scene's."""
+        """Render the scene to a file (if `path` is given), and return the picture. options: options
+        of `render` that replace those of the scene."""
         surfaces = self.surfaces()
         return render(surfaces, path, **{**self.settings(len(surfaces)), **options})
 

@@ -1,4 +1,4 @@
-"""Scenes of meshes whose faces are large polygons that are not flat, and of grid shells."""
+"""Scenes of meshes whose faces are large nonplanar polygons, and of grid shells."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _PATCH_OPTIONS = TraceOptions(tolerance=1e-5)
 
 
 def _exoskeleton() -> list[Surface]:
-    """A wavy torus of some 150 patches, and tubes around their edges."""
+    """A wavy torus of some 150 nonplanar polygons, and tubes around their edges."""
     vertices, faces = example_meshes.torus_mesh(1.0, 0.45, 240, 108)
     angle = np.arctan2(vertices[:, 1], vertices[:, 0])
     ring = np.column_stack([np.cos(angle), np.sin(angle), 0.25 * np.sin(3 * angle)])
@@ -36,7 +36,7 @@ def _exoskeleton() -> list[Surface]:
 
 
 def _patches() -> list[Surface]:
-    """A bumpy sphere of 5,200 patches with some eleven corners each."""
+    """A bumpy sphere of 5,200 nonplanar polygons with some eleven corners each."""
     vertices, faces = example_meshes.bumpy_sphere(6)
     mesh = PolygonMesh(*cluster_into_polygons(vertices, faces, 5200))
     return [Surface(mesh)]
@@ -71,18 +71,19 @@ _FAMILIES: tuple[Family, Family] = ("maximum", "minimum")
 
 @dataclass(frozen=True)
 class GridShell:
-    """A grid shell over the region of the ground between an outline and round holes: the solid
-    angle of these curves, with its lines of curvature.
+    """A grid shell (a curved roof of crossing beams) over a region of the ground between an outline
+    and round holes. Its surface is a level set of the solid angle of these curves, and its beams
+    follow lines of curvature.
 
     After Fig. 17 of Gillespie et al. (2024), whose data are not public: outlines and holes are
-    reconstructed. The level -2 pi + a leaves the ground at the angle a/2 everywhere, so that
-    outline and holes are lines of curvature themselves (Joachimsthal), and lines of the other
-    family meet them at right angles: beams that can be built.
+    reconstructed. The level -2 pi + a leaves the ground at the angle a/2 everywhere. So the outline
+    and the holes are lines of curvature themselves (Joachimsthal), and the lines of the other
+    family meet them at right angles.
 
     outline: (n, 2), counter-clockwise.
     holes: (x, y, radius) of each hole.
-    angle: a, twice the angle at which the shell leaves the ground.
-    spacing: the distance of the beams on the outline and the holes.
+    angle: a in radians, twice the angle at which the shell leaves the ground.
+    spacing: the distance of the beams along the outline and the holes.
     thickness: the radius of the beams.
     """
 
@@ -93,30 +94,38 @@ class GridShell:
     thickness: float
 
     def field(self) -> SolidAngle:
-        """The solid angle, whose level `level` is the shell."""
+        """The solid angle of the outline and the holes; the shell is its level set `level`."""
         corners = np.column_stack([self.outline, np.zeros(len(self.outline))])
         return SolidAngle([corners, *(Circle(r, (x, y, 0), (0, 0, -1)) for x, y, r in self.holes)])
 
     @property
     def level(self) -> float:
+        """The level of the solid angle whose level set is the shell."""
         return -2 * math.pi + self.angle
 
     def beams(self, field: SolidAngle) -> list[FloatArray]:
-        """Lines from the rims across the shell, lines that cross these, and the rims."""
-        above = HalfSpace((0, 0, -1), 0.0)
-        points, inward = self._rims()
+        """The center lines of all beams, each (k, 3): lines of curvature from the outline and the
+        holes across the shell, lines of the other family that cross them, and the outline and the
+        holes themselves.
+
+        field: the solid angle.
+        """
+        above_ground = HalfSpace((0, 0, -1), 0.0)
+        points, inward = self._boundary_points_and_normals()
         slope = 0.5 * self.angle
         rise = np.column_stack([math.cos(slope) * inward, np.full(len(points), math.sin(slope))])
         ground = np.column_stack([points, np.zeros(len(points))])
 
         def lines(seeds: FloatArray) -> tuple[list[FloatArray], list[FloatArray]]:
+            """The lines of curvature through seeds (n, 3), of both families (largest and smallest
+            curvature): two lists, each with a line for each seed."""
             step = 0.25 * self.spacing
-            first, second = (
+            maximum_lines, minimum_lines = (
                 curvature_lines(field, seeds, step=step, length=100 * step, family=family,
-                                level=self.level, clip=above)
+                                level=self.level, clip=above_ground)
                 for family in _FAMILIES
             )  # fmt: skip
-            return first, second
+            return maximum_lines, minimum_lines
 
         offset = 0.3 * self.spacing
         candidates = [
@@ -133,8 +142,9 @@ class GridShell:
         ]
         return [*ribs, *_drop_parallel_lines(crossing_lines, 0.55 * self.spacing), *self._edges()]
 
-    def _rims(self) -> tuple[FloatArray, FloatArray]:
-        """Points (n, 2) of the rims, and unit vectors from there into the region."""
+    def _boundary_points_and_normals(self) -> tuple[FloatArray, FloatArray]:
+        """Points (n, 2) on the outline and the holes, spaced by about `spacing`, and the unit
+        normals (n, 2) there that point into the region. Both are in the plane of the ground."""
         points: list[FloatArray] = []
         inward: list[FloatArray] = []
         for a, b in zip(self.outline, np.roll(self.outline, -1, axis=0), strict=True):
@@ -152,6 +162,7 @@ class GridShell:
         return np.concatenate(points), np.concatenate(inward)
 
     def _edges(self) -> list[FloatArray]:
+        """The outline and the holes as closed lines (k, 3) on the ground."""
         closed = np.concatenate([self.outline, self.outline[:1]])
         edges = [np.column_stack([closed, np.zeros(len(closed))])]
         for x, y, r in self.holes:
@@ -161,12 +172,14 @@ class GridShell:
 
 
 def _relative_height(line: FloatArray, reach: float) -> float:
-    """The height range of a line, relative to the reach: lines along a rim stay beside it."""
+    """The difference of the largest and smallest height of a line (k, 3), divided by the length
+    `reach`; -1 for a line without points. It is small for a line that runs along the boundary."""
     return float(line[:, 2].max() - line[:, 2].min()) / reach if len(line) else -1.0
 
 
 def _crossing_cosine(line: FloatArray, other: FloatArray) -> float:
-    """|cos| of the angle at which a line crosses another that passes through its middle."""
+    """|cos| of the angle between two lines (k, 3) where they come closest; 2 for a line that is too
+    short."""
     if len(line) < 3:
         return 2.0
     distance = np.linalg.norm(line[:, None] - other[None], axis=2)
@@ -177,8 +190,8 @@ def _crossing_cosine(line: FloatArray, other: FloatArray) -> float:
 
 
 def _drop_parallel_lines(lines: Sequence[FloatArray], gap: float) -> list[FloatArray]:
-    """The lines, longest first, without those that run beside a kept line for most of their length;
-    of each line, every second point."""
+    """The lines, longest first, without each line that lies within the distance `gap` of longer
+    lines for most of its length. Of each line every second point is returned."""
     kept: list[FloatArray] = []
     for line in sorted(lines, key=len, reverse=True):
         if len(line) < 3:
@@ -193,6 +206,7 @@ def _drop_parallel_lines(lines: Sequence[FloatArray], gap: float) -> list[FloatA
 
 
 def _grid_shell_surfaces(shell: GridShell) -> list[Surface]:
+    """A grid shell as two surfaces: the shell above the ground, and its beams as a solid."""
     field = shell.field()
     ground = HalfSpace((0, 0, -1), 0.0)
     beams = Tube.from_polylines(shell.beams(field), shell.thickness)
@@ -203,6 +217,7 @@ def _grid_shell_surfaces(shell: GridShell) -> list[Surface]:
 
 
 def _regular(sides: int) -> FloatArray:
+    """The corners (sides, 2) of a regular polygon in the unit circle."""
     angle = 2 * math.pi * (np.arange(sides) + 0.5) / sides
     return np.column_stack([np.cos(angle), np.sin(angle)])
 

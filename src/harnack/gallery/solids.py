@@ -1,7 +1,7 @@
 """Scenes of blobs and of solids.
 
 Blobs are metaballs, a surface through points with normals, and molecules. Solids are distance
-surfaces, Boolean combinations of these, noise, and transparent blobs.
+surfaces (level sets of distances), Boolean combinations of them, noise, and transparent blobs.
 """
 
 from __future__ import annotations
@@ -34,11 +34,13 @@ _VAN_DER_WAALS = {"H": 1.2, "C": 1.7, "N": 1.55, "O": 1.52}
 
 
 def _solid(field: Field, level: float) -> list[Surface]:
+    """The solid of the points at which the field is at least `level`."""
     return [Surface(field, level, side="above")]
 
 
 def _metaballs() -> list[Surface]:
-    """Drops around a large one, and a bite taken out of it."""
+    """Metaballs: drops around a large ball, and a blob of negative weight that carves a bite out of
+    it."""
     angle = np.linspace(0, 2 * math.pi, 9, endpoint=False)
     ring = np.column_stack([np.cos(angle), np.sin(angle), 0.35 * np.sin(3 * angle)])
     centers = np.concatenate([[[0.0, 0.0, 0.0]], 1.15 * ring, [[0.35, -0.55, 0.5]]])
@@ -48,7 +50,8 @@ def _metaballs() -> list[Surface]:
 
 
 def _groups() -> list[Surface]:
-    """Two rings of blobs that flow together, each ring by itself, and meet in creases."""
+    """Two groups of blobs, each a ring. Blobs of one ring blend with each other; the two rings meet
+    in creases."""
     angle = np.linspace(0, 2 * math.pi, 12, endpoint=False)
     flat = np.column_stack([np.cos(angle) - 0.5, np.sin(angle), 0 * angle])
     upright = np.column_stack([np.cos(angle) + 0.5, 0 * angle, np.sin(angle)])
@@ -62,17 +65,17 @@ def _through_points() -> list[Surface]:
     for j in range(6):
         for k in range(3):
             u, v = 2 * math.pi * j / 6, 2 * math.pi * (k + 0.5 * (j % 2)) / 3
-            way = np.array([math.cos(u), math.sin(u), 0.0])
-            normal = math.cos(v) * way + math.sin(v) * np.array([0.0, 0.0, 1.0])
-            points.append(way + 0.42 * normal)
+            radial = np.array([math.cos(u), math.sin(u), 0.0])
+            normal = math.cos(v) * radial + math.sin(v) * np.array([0.0, 0.0, 1.0])
+            points.append(radial + 0.42 * normal)
             normals.append(normal)
     return [Surface(HRBF(points, normals), 0.0, side="below")]
 
 
 def _helix() -> Atoms:
-    """The backbone of an alpha helix of 14 residues: 3.6 residues a turn, a rise of 1.5 angstrom
-    each; radius, angle in degrees and height of its atoms, by which bonds have their lengths within
-    0.05 angstrom."""
+    """The backbone of an alpha helix of 14 residues, with 3.6 residues per turn and a rise of 1.5
+    angstrom per residue. The cylindrical coordinates of its atoms (radius, angle in degrees,
+    height) give bond lengths that are right within 0.05 angstrom."""
     backbone = (
         ("N", 1.55, -28.3, -0.89), ("C", 2.28, 0.0, 0.0), ("C", 1.68, 26.3, 1.13),
         ("O", 2.03, 21.9, 2.35), ("C", 3.30, -19.6, 0.75),
@@ -131,6 +134,7 @@ BLOBS = (
 
 
 def _drawn(*solids: Solid) -> list[Surface]:
+    """Each solid as a surface."""
     return [Surface(solid) for solid in solids]
 
 
@@ -141,7 +145,8 @@ def _carved() -> list[Surface]:
 
 
 def _tori() -> list[Surface]:
-    """Two tori of radii 1 and 0.1 blended with (power, radius) = (2, 0.5), (8, 0.5), (8, 0.2)."""
+    """Three pairs of linked tori of radii 1 and 0.1, blended by superellipses with (power, radius)
+    = (2, 0.5), (8, 0.5) and (8, 0.2)."""
     link = Torus(1.0, 0.1).rotated(90, "x")
     pairs = [Torus(1.0, 0.1).blended(link, r, power=p) for p, r in ((2, 0.5), (8, 0.5), (8, 0.2))]
     return _drawn(*(pair.translated((0.0, 2.4 * k, 0.0)) for k, pair in enumerate(pairs)))
@@ -165,7 +170,7 @@ _LETTERS: tuple[tuple[float, tuple[tuple[float, ...], ...]], ...] = (
 
 
 def _letters() -> list[Surface]:
-    """Tubes around 19 cubic Bezier curves."""
+    """A word of tubes around 19 cubic Bezier curves."""
     tubes: list[Solid] = []
     for start, curves in _LETTERS:
         for curve in curves:
@@ -176,11 +181,13 @@ def _letters() -> list[Surface]:
 
 
 def _lava() -> list[Surface]:
+    """A ball displaced by fractal noise."""
     noise = FractalNoise(6, beta=1.0, frequency=1.6, amplitude=0.55, seed=4)
     return _drawn(DisplacedSolid(Sphere(1.0), noise))
 
 
 def _lattice() -> list[Surface]:
+    """A gyroid wall, intersected with a torus."""
     return _drawn(solid(Gyroid(0.5), between=(-0.4, 0.4)) & Torus(0.8, 0.4))
 
 
@@ -192,6 +199,7 @@ def _knot() -> list[Surface]:
 
 
 def _jelly() -> list[Surface]:
+    """A cluster of random blobs, to be drawn transparent."""
     rng = np.random.default_rng(8)
     blobs: Any = Blobs(rng.normal(size=(14, 3)) * 0.55, 0.55, kernel=CompactKernel(1.7))
     return [Surface(blobs, 1.0, side="above")]

@@ -1,4 +1,4 @@
-"""Bezier curves of degrees 2 and 3 as polylines within a proved distance."""
+"""Approximates Bezier curves of degrees 2 and 3 by polylines within a proved distance."""
 
 from __future__ import annotations
 
@@ -14,16 +14,17 @@ _MAX_SEGMENTS = 1_000_000
 
 
 def flatten_bezier(controls: FloatArray, tolerance: float) -> tuple[FloatArray, float]:
-    """Flatten a Bezier curve to a polyline within `tolerance` of it.
+    """Approximate a Bezier curve by a polyline within `tolerance` of it.
 
     controls: (3, d) or (4, d), the control points of a quadratic or a cubic curve.
+    tolerance: the largest distance, in the unit of the control points.
 
-    Returns the vertices (k, d) of the polyline without the first, which is the curve's first point;
-    and a bound of the distance between the curve and the polyline.
+    Returns the vertices (k, d) of the polyline without the first (which is the curve's first
+    point), and a bound of the distance between the curve and the polyline.
 
-    Proof. Let B be the curve, of degree n. A chord between two parameters at a distance h is within
-    h^2/8 max |B''| of the curve, at equal parameters, and |B''| is at most n (n - 1) times the
-    largest second difference of the control points.
+    Proof. Let B be the curve and n its degree. A chord between two points of the curve whose
+    parameters differ by h is within h^2/8 max |B''| of the curve, at equal parameters. |B''| is at
+    most n (n - 1) times the largest second difference of the control points.
 
     Raises:
         ValueError: more than a million segments.

@@ -55,8 +55,8 @@ Edge = tuple[int, int]
 
 
 class OpenChainError(ValueError):
-    """Edges that do not join to closed loops. vertex: the vertex at which a chain of edges ends, or
-    at which too many edges meet."""
+    """The edges do not form closed loops. vertex: a vertex at which a chain of edges ends, or at
+    which too many edges meet. count: the number of edges at this vertex."""
 
     def __init__(self, vertex: int, count: int) -> None:
         super().__init__(f"{count} edges meet at vertex {vertex}")
@@ -85,11 +85,11 @@ def boundary_edges(faces: Iterable[Sequence[int]]) -> list[Edge]:
 
 
 def join_edges(edges: Sequence[Edge]) -> list[list[int]]:
-    """Join all edges to closed loops of vertex indices.
+    """Join all edges (start, end) to closed loops of vertex indices.
 
-    If at every vertex the same number of edges begins and ends, their directions are kept, and a
-    loop ends where it first meets itself. Otherwise exactly two edges must meet at every vertex,
-    and each loop runs in the direction of its first edge.
+    If at every vertex as many edges begin as end, their directions are kept, and a loop ends where
+    it first returns to one of its own vertices. Otherwise exactly two edges must meet at every
+    vertex, and each loop runs in the direction of its first edge.
 
     Raises:
         OpenChainError: neither is the case.
@@ -169,10 +169,10 @@ _GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 class NetFaces(NamedTuple):
     """The faces of a mesh after duplicates were added up.
 
-    faces: (k, 3), no two with the same three vertices.
+    faces: (k, 3), no two faces with the same three vertices.
     multiplicity: (k,) how often each face counts, positive.
-    source: (k,) ascending indices of original faces: `faces[i]` is original face `source[i]`, the
-        first with these vertices and this orientation.
+    source: (k,) ascending: the index of the first original face that has the vertices and the
+        orientation of `faces[i]`.
     """
 
     faces: IntArray
@@ -181,10 +181,9 @@ class NetFaces(NamedTuple):
 
 
 def weld_vertices(vertices: FloatArray) -> IntArray:
-    """For each vertex (n, 3) the index of the first vertex at exactly the same position: (n,).
-
-    -0.0 equals 0.0. `weld_vertices(vertices)[faces]` are the faces of the welded mesh.
-    """
+    """For each vertex (n, 3) the index of the first vertex at exactly the same position, as an
+    array (n,). -0.0 equals 0.0. `weld_vertices(vertices)[faces]` are the faces of the welded
+    mesh."""
     bits = (np.ascontiguousarray(vertices, dtype=np.float64) + 0.0).view(np.uint64)
     order, starts = _group_equal_rows(bits)
     first = np.minimum.reduceat(order, starts) if len(order) else order
@@ -194,12 +193,12 @@ def weld_vertices(vertices: FloatArray) -> IntArray:
 
 
 def net_faces(faces: IntArray) -> NetFaces:
-    """The faces (m, 3) with duplicates added up: same vertices +1, reversed -1.
+    """Add up duplicates among the faces (m, 3) of a welded mesh: a face with the same three
+    vertices counts +1 if it has the same orientation, -1 if it is reversed.
 
-    A face that its reversed duplicates cancel vanishes, and so does a face that uses a vertex
-    twice, since it has no area. The corner with which a face begins makes no difference. The
-    remaining faces are oriented so that their multiplicity is positive, and keep the order of the
-    original faces.
+    A face whose sum is 0 is left out, and so is a face with two equal vertices, which has no area.
+    It makes no difference at which corner a face begins. The remaining faces are oriented so that
+    their multiplicity is positive, in the order of the original faces.
     """
     a, b, c = faces.T
     proper = np.flatnonzero((a != b) & (b != c) & (c != a))
@@ -223,14 +222,15 @@ def net_faces(faces: IntArray) -> NetFaces:
 
 
 def singular_edges(faces: IntArray, multiplicity: npt.ArrayLike = 1) -> tuple[IntArray, IntArray]:
-    """Directed edges (k, 2) that do not cancel between faces (m, 3), and their weights (k,) > 0.
+    """The edges at which a mesh's winding number is singular: directed edges (k, 2) that do not
+    cancel between the faces (m, 3), and their weights (k,) > 0.
 
-    faces: of a welded mesh.
+    faces: of a welded mesh (equal positions have equal indices).
     multiplicity: (m,) how often each face counts, integers of any sign; or one integer for all.
 
-    Edges have the direction that remains after cancellation, and are sorted by their lower, then
-    their higher index. The docstring of this module has the proof that the winding number is
-    singular at these edges alone.
+    Each edge has the direction that remains after cancellation. The edges are sorted by their
+    lower, then by their higher index. The docstring of this module proves that there are no other
+    singular edges.
     """
     if not len(faces):
         return np.zeros((0, 2), dtype=np.int64), np.zeros(0, dtype=np.int64)
@@ -241,12 +241,13 @@ def singular_edges(faces: IntArray, multiplicity: npt.ArrayLike = 1) -> tuple[In
 def net_edges(
     begin: IntArray, end: IntArray, weight: npt.ArrayLike = 1
 ) -> tuple[IntArray, IntArray]:
-    """The directed edges (k, 2) that remain of edges begin -> end (m,) after opposite edges were
-    cancelled, and their weights (k,) > 0.
+    """Cancel opposite edges. Returns the directed edges (k, 2) that remain of the edges begin[i] ->
+    end[i], (m,) each, and their weights (k,) > 0.
 
-    An edge counts `weight` times, (m,) or an integer of any sign for all, and minus that for the
-    reversed edge. An edge from a vertex to itself does not count. The order is by the lower, then
-    the higher index.
+    weight: how often each edge counts, (m,) or one number for all, integers of any sign. The
+        reversed edge counts with the opposite sign. An edge from a vertex to itself does not count.
+
+    The edges are sorted by their lower, then by their higher index.
     """
     if not len(begin):
         return np.zeros((0, 2), dtype=np.int64), np.zeros(0, dtype=np.int64)
@@ -267,12 +268,14 @@ def net_edges(
 
 
 def singular_loops(edges: IntArray, weights: IntArray) -> list[list[int]]:
-    """The closed loops of vertex indices that singular edges form.
+    """Join singular edges to closed loops of vertex indices.
 
-    edges, weights: as `singular_edges` returns them. An edge of weight k occurs k times.
+    edges, weights: directed edges (k, 2) and their weights (k,), as `singular_edges` returns them.
+        An edge of weight w is used w times.
 
-    A loop does not repeat its first vertex at the end, and ends where it first meets itself. As
-    each edge takes a step of Python, this is meant for up to about a million edges.
+    A loop does not repeat its first vertex at the end, and ends where it first returns to one of
+    its own vertices. Each edge takes a step of Python, so this is meant for up to about a million
+    edges.
 
     Raises:
         OpenChainError: the edges are not a result of `singular_edges`: a loop does not close.
@@ -306,10 +309,12 @@ def _group_equal_rows(rows: npt.NDArray[np.uint64]) -> tuple[IntArray, IntArray]
 
 
 def _differ_from_previous(rows: npt.NDArray[np.uint64]) -> npt.NDArray[np.bool_]:
-    """(n - 1,) whether each row but the first differs from the row before."""
+    """Whether each row of an array (n, k), except the first, differs from the row before, as an
+    array (n - 1,)."""
     return (rows[1:] != rows[:-1]).any(axis=1)
 
 
 def _group_lengths(starts: IntArray, count: int) -> IntArray:
-    """The lengths of the groups of `count` entries that begin at `starts`."""
+    """The lengths of groups of consecutive entries. starts: the index at which each group starts.
+    count: the number of all entries."""
     return np.diff(np.append(starts, count))

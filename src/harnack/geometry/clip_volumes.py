@@ -1,4 +1,5 @@
-"""Clip volumes: ball, box, half-space and their intersections; polytopes and their planes."""
+"""Clip volumes, the convex sets to which rays are cut: ball, box, half-space and their
+intersections, and polytopes in general."""
 
 from __future__ import annotations
 
@@ -49,16 +50,17 @@ Prepared = TypeVar("Prepared", bound="Polytope")
 
 @dataclass(frozen=True, eq=False)
 class PlaneTable:
-    """Planes n.x <= h as rows (n, h) of four numbers, for a kernel.
+    """Planes n.x <= h (n a unit normal, h an offset) as rows (n, h) of four numbers, for a kernel.
 
-    backend: where the kernel runs.
-    rows: (m, 4) on the host. Without a buffer, kernels contain these numbers.
-    buffer: the rows on the backend, or None: literals serve volumes that were not prepared.
+    backend: the backend on which the kernel runs.
+    rows: (m, 4) on the host. Without a buffer, kernels contain these numbers as literals.
+    buffer: the rows on the backend; None for volumes that were not prepared.
     plane_count: the number of rows in the buffer as a kernel parameter.
-    max_offset: the largest |h|, a kernel parameter too if there is a buffer.
+    max_offset: the largest |h|; a kernel parameter if there is a buffer.
 
-    Unrolled, a scalar gather at a literal index costs no more than a literal number (0.4 ns a plane
-    and ray in all); a packet gather in a loop makes that 1.1 ns, four planes an iteration.
+    Cost per plane and ray: 0.4 ns if the loop over planes is unrolled, where reading a number from
+    the buffer at a literal index costs no more than a literal; 1.1 ns in a loop with four planes
+    per iteration.
     """
 
     backend: Backend
@@ -88,12 +90,14 @@ class PlaneTable:
         step: Callable[[FoldState, Vec3, Real], FoldState],
         may_change: Callable[..., Mask] | None = None,
     ) -> FoldState:
-        """Apply state = step(state, n, h) to one plane n . x <= h after the other, and return the
+        """Apply state = step(state, n, h) to one plane n.x <= h after the other, and return the
         last state.
 
-        step: gives the next state, from the state, the normal n and the offset h of a plane.
-        may_change: may_change(*state) is false in lanes in which no further plane can change the
-            result; a loop over planes stops there. Unrolled planes are all applied.
+        state: a tuple of arrays.
+        step: returns the next state from the state, the normal n and the offset h of a plane.
+        may_change: may_change(*state) is False in lanes in which no further plane can change the
+            result; a recorded loop stops there. If the loop is unrolled (few planes), all planes
+            are applied.
         """
         index = self.backend.UInt32
         if self.buffer is None or len(self.rows) <= MAX_UNROLLED:
@@ -110,21 +114,21 @@ class PlaneTable:
                 folded = step(folded, self.backend.Array3f(row.x, row.y, row.z), row.w)
             return (k + _PLANES_PER_ITERATION, *folded)
 
-        def goes_on(*values: Any) -> Mask:
+        def may_continue(*values: Any) -> Mask:
             """The lanes in which further planes may change the state."""
             return self.backend.Bool(True) if may_change is None else may_change(*values)
 
         while_loop: Any = dr.while_loop  # its overloads do not know run-time array types
         result: Any = while_loop(
             state=(index(0), *state),
-            cond=lambda k, *values: (k < self.plane_count) & goes_on(*values),  # pyright: ignore
+            cond=lambda k, *values: (k < self.plane_count) & may_continue(*values),  # pyright: ignore
             body=body,
             label="planes",
         )
         return result[1:]
 
     def _entry(self, k: int, i: int) -> Real:
-        """Entry i of row k: a literal, or read from the buffer."""
+        """Entry i of row k, as a literal or read from the buffer."""
         if self.buffer is None:
             return self.backend.Float(float(self.rows[k, i]))
         return dr.gather(self.backend.Float, self.buffer, self.backend.UInt32(4 * k + i))
@@ -142,25 +146,27 @@ def _max_offset(rows: FloatArray) -> float:
 class Polytope(Volume):
     """The intersection of the half-spaces n.x <= h, with unit normals n.
 
-    Rounding: with u the unit roundoff, the computed N = h - n.o and D = n.d are off by at most
-    a few u times |n|.|o| + |h| and |n|.|d| (absolute values by component). Adding such a bound
-    to N and taking it from D, for t >= 0, turns N - t D >= 0 into a condition that every point
-    of the volume still meets, with no case for nearly parallel rays: where D <= 0, it is
-    t >= |N / D| if N < 0, and no condition if N >= 0.
+    Rounding. A point o + t d of a ray lies in a half-space if N - t D >= 0, with N = h - n.o and D
+    = n.d. With u the unit roundoff, the computed N and D are off by at most a few u times |n|.|o| +
+    |h| and |n|.|d| (absolute values of each component). Adding such a bound to N and subtracting it
+    from D, for t >= 0, turns N - t D >= 0 into a condition that every point of the volume still
+    meets. No special case for nearly parallel rays is needed: where D <= 0, the condition is t >=
+    |N / D| if N < 0, and always true if N >= 0.
     """
 
     _device_planes: PlaneTable | None = field(default=None, repr=False, compare=False, kw_only=True)
 
     @abc.abstractmethod
     def planes(self) -> FloatArray:
-        """Rows (nx, ny, nz, h), shape (m, 4), float64, all finite."""
+        """The planes n.x <= h as rows (nx, ny, nz, h), shape (m, 4), float64, all finite."""
 
     def prepare(self: Prepared, backend: Backend) -> Prepared:
         return replace(self, _device_planes=PlaneTable.upload(backend, self.planes()))
 
     def _plane_table(self, backend: Backend) -> PlaneTable:
-        """The prepared table, or a new one: of literals, if there are few planes or while a loop is
-        recorded, when nothing can be uploaded."""
+        """The prepared table of planes if there is one, otherwise a new one. A new table consists
+        of literals if there are few planes, or while a loop is recorded, when nothing can be
+        uploaded."""
         if self._device_planes is not None and self._device_planes.backend == backend:
             return self._device_planes
         rows = self.planes()
@@ -172,13 +178,14 @@ class Polytope(Volume):
     def _slacks(
         self, table: PlaneTable, o: Vec3, d: Vec3
     ) -> Callable[[Vec3, Real], RoundingSlacks]:
-        """A function of (n, h) that gives bounds of the rounding errors of h - n.o and of n.d, for
-        rays o + t d."""
+        """A function of the normal n and the offset h of a plane that returns bounds of the
+        rounding errors of h - n.o and of n.d, for rays o + t d."""
         del table
         eps = clip_rounding(backend_of(o))
         abs_o, abs_d = dr.abs(o), dr.abs(d)
 
         def slacks(n: Vec3, h: Real) -> RoundingSlacks:
+            """Bounds of the rounding errors of h - n.o and of n.d."""
             abs_n = dr.abs(n)
             return eps * (dr.dot(abs_n, abs_o) + dr.abs(h)), eps * dr.dot(abs_n, abs_d)
 
@@ -190,7 +197,8 @@ class Polytope(Volume):
         slacks = self._slacks(table, o, d)
 
         def step(state: tuple[Real, Real], n: Vec3, h: Real) -> tuple[Real, Real]:
-            """The interval [t0, t1] within a further half-space n.x <= h."""
+            """Cut the interval [t0, t1] to the half-space n.x <= h. `room` is h - n.o and `speed`
+            is n.d, with their bounds of rounding errors."""
             t0, t1 = state
             room_slack, speed_slack = slacks(n, h)
             room = h - dr.dot(n, o) + room_slack
@@ -217,6 +225,7 @@ class Polytope(Volume):
         abs_p = dr.abs(p)
 
         def step(state: tuple[Mask], n: Vec3, h: Real) -> tuple[Mask]:
+            """Whether the points also lie in the half-space n.x <= h, up to rounding."""
             slack = eps * (dr.dot(dr.abs(n), abs_p) + dr.abs(h))
             return (state[0] & (dr.dot(n, p) - h <= slack),)
 
@@ -230,7 +239,8 @@ class Polytope(Volume):
         return self._nearest_plane(p)[1]
 
     def _nearest_plane(self, p: Vec3) -> tuple[Real, Vec3]:
-        """The largest signed distance of p from a plane, and that plane's normal."""
+        """The largest of the signed distances of p from the planes (n.p - h), and the normal n of
+        that plane."""
         backend = backend_of(p)
 
         def step(state: tuple[Real, Vec3], n: Vec3, h: Real) -> tuple[Real, Vec3]:
@@ -259,7 +269,7 @@ class Polytope(Volume):
 
 @dataclass(frozen=True)
 class Ball(Volume):
-    """Points within `radius` (> 0) of `center`."""
+    """The points within `radius` (> 0) of `center`."""
 
     center: Point = (0.0, 0.0, 0.0)
     radius: float = 1.0
@@ -278,7 +288,7 @@ class Ball(Volume):
         object.__setattr__(self, "radius", radius)
 
     def _center_and_radius(self, backend: Backend) -> tuple[Vec3, Real]:
-        """Center and radius on the backend: kernel parameters if the ball was prepared, else
+        """Center and radius on the backend: kernel parameters if the ball was prepared, otherwise
         literals."""
         if self._device_numbers is not None and backend_of(self._device_numbers[0]) == backend:
             return self._device_numbers
@@ -289,13 +299,15 @@ class Ball(Volume):
         return replace(self, _device_numbers=(center, dr.opaque(backend.Float, self.radius)))
 
     def clip(self, o: Vec3, d: Vec3, t_min: Real, t_max: Real) -> tuple[Real, Real]:
-        """The interval of `Volume.clip`, by the discriminant r^2 - |perp|^2, where r is the radius,
-        c the center, and perp the vector from c to the nearest point of the line. The usual formula
-        (o.d)^2 - |d|^2 (|o|^2 - r^2) cancels for far origins o.
+        """The interval [t0, t1] of the rays o + t d within the ball (see `Volume.clip`).
 
-        With u the unit roundoff, perp and the parameter of the nearest point are off by a few
-        u |o - c|, the center by u |c| and the radius by u r. The sum of these bounds is added to r
-        and to both ends of the interval."""
+        The line's half-length in the ball follows from r^2 - |perp|^2, where r is the radius, c the
+        center, and perp the vector from c to the nearest point of the line. The usual formula
+        (o.d)^2 - |d|^2 (|o|^2 - r^2) loses all digits for far origins o. With u the unit roundoff,
+        perp and the parameter of the nearest point are off by a few u |o - c|, the center by u |c|
+        and the radius by u r. The sum of these bounds is added to r and to both ends of the
+        interval.
+        """
         backend = backend_of(o)
         center, radius = self._center_and_radius(backend)
         from_center = o - center
@@ -344,7 +356,8 @@ class Ball(Volume):
 
 @dataclass(frozen=True)
 class Box(Polytope):
-    """Points between two corners, lower <= x <= upper; sides may be infinite."""
+    """The points x with lower <= x <= upper in each coordinate. Coordinates of the corners may be
+    infinite."""
 
     lower: Point
     upper: Point
@@ -377,9 +390,11 @@ class Box(Polytope):
 
 @dataclass(frozen=True)
 class HalfSpace(Polytope):
-    """The points x with n.x <= offset, where n is the unit vector along `normal`, which points out.
+    """The points x with n.x <= offset, where n is the unit vector along `normal`; n points out of
+    the half-space.
 
-    offset: the distance of the plane from the origin, negative if n points towards the origin.
+    offset: the distance of the plane from the origin, negative if the origin is outside of the
+        half-space.
     """
 
     normal: Point
@@ -461,8 +476,8 @@ class VolumeIntersection(Volume):
         return normal
 
     def bounds(self) -> tuple[FloatArray, FloatArray]:
-        """Lower and upper corner; lower > upper for some coordinate if the boxes of the volumes do
-        not meet."""
+        """Lower and upper corner, (3,) each, of a box around the intersection. If the boxes of the
+        volumes do not meet, lower > upper for some coordinate."""
         boxes = [v.bounds() for v in self.volumes]
         return np.max([b[0] for b in boxes], axis=0), np.min([b[1] for b in boxes], axis=0)
 

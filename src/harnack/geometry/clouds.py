@@ -1,9 +1,9 @@
-"""Point clouds with normals: validation, the area that each point stands for, and estimated
-normals.
+"""Point clouds with normals: validation, the area of the surface that each point represents, and
+estimated normals.
 
-A cloud is a sample of a surface: points (n, 3), unit normals (n, 3) to the positive (outer) side,
-and areas (n,) whose sum is about the area of the surface. Points at the same position are allowed:
-their dipoles are added, as they should where two layers of a surface touch.
+A cloud is a sample of a surface: points (n, 3), unit normals (n, 3) that point to the positive
+(outer) side, and areas (n,) whose sum is about the area of the surface. Points at the same position
+are allowed; sums over the points count each of them.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ _NONFINITE_ADVICE = "its components must be finite; remove the point"
 
 
 class CloudError(ValueError):
-    """A point cloud that cannot be used; the message says why and what to do."""
+    """A point cloud cannot be used; the message says why and what to do."""
 
 
 def validate_cloud(
@@ -83,7 +83,7 @@ def validate_cloud(
 
 
 def as_cloud_points(points: Any) -> FloatArray:
-    """A new array (n, 3) of finite points, n >= 1.
+    """Points as a new float64 array (n, 3) of finite numbers, n >= 1.
 
     Raises:
         CloudError: points are not numbers of that shape, or have coordinates above 1e100.
@@ -98,7 +98,7 @@ def as_cloud_points(points: Any) -> FloatArray:
 
 
 def as_unit_normals(normals: Any, count: int) -> FloatArray:
-    """A new array (count, 3) of normals, scaled to unit length.
+    """Normals as a new array (count, 3), scaled to unit length.
 
     Raises:
         CloudError: normals are missing or not of that shape, or a normal is zero or not finite.
@@ -130,28 +130,29 @@ def as_unit_normals(normals: Any, count: int) -> FloatArray:
 def estimate_areas(
     points: npt.ArrayLike, normals: npt.ArrayLike, neighbors: int = 20
 ) -> FloatArray:
-    """The area (n,) that each point of a cloud stands for: the area of its Voronoi cell in the
-    tangent plane.
+    """Estimate the area (n,) that each point of a cloud represents: the area of its Voronoi cell
+    (the points of space that are nearer to it than to any other point) in its tangent plane.
 
     Barill et al. 2018, section 3.1, project the nearest neighbors to the tangent plane and take the
     area of the point's Voronoi cell among them. Here the point's Voronoi cell in space is
-    intersected with the tangent plane instead. For points in a plane this is the same; but a point
-    on the other side of a thin wall does not shrink the cell, since its bisecting plane is parallel
-    to the tangent plane. Points at the same position share a cell.
+    intersected with the tangent plane instead. For points in a plane this is the same. But here a
+    point on the other side of a thin wall does not shrink the cell, since its bisecting plane is
+    parallel to the tangent plane. Points at the same position share a cell.
 
     Let R be the distance of the farthest neighbor that is used. All other points can cut the cell
-    only at distances above R/2: so within the disc of radius R/2 the cell is exact, and it is cut
-    off there. At the boundary of an open surface a cell may be unbounded: if all neighbors lie on
-    one side of a line through the point, their mirror images bound the cell too, so that it extends
-    as far outwards as inwards.
+    only at distances above R/2. So within the disc of radius R/2 the cell is exact, and it is cut
+    off at this radius. At the boundary of an open surface a cell may be unbounded: if all neighbors
+    lie on one side of a line through the point, their mirror images bound the cell too, so that it
+    extends as far outwards as inwards. The radius is also limited to three times the median of its
+    neighbors' radii, so that an isolated point gets no more area than its neighbors.
 
-    Outliers: a cell is also cut off at three times the median of these radii of its neighbors, so
-    that a point far from the others gets no more area than they have.
-
-    neighbors: the number of neighbors; more cost time, fewer cut large cells of uneven samples.
+    points, normals: (n, 3) each.
+    neighbors: the number of neighbors that are used; more take more time, fewer cut off large cells
+        of uneven samples.
 
     Raises:
-        CloudError: as `validate_cloud`; all points are at one position; fewer than 3 neighbors.
+        CloudError: points or normals are not valid (see `validate_cloud`); all points are at one
+            position; fewer than 3 neighbors.
     """
     x = as_cloud_points(points)
     n = as_unit_normals(normals, len(x))
@@ -168,7 +169,8 @@ def estimate_areas(
     radii = np.empty(len(positions))
 
     def find_neighbors(rows: slice) -> None:
-        """Find the neighbors of some of the points, and half the distance of the farthest."""
+        """Find the neighbors of a slice of the points (`nearest`), and half the distance of the
+        farthest neighbor (`radii`)."""
         batch = order[rows]
         nearest[batch], distance = nearest_neighbors(tree, x[batch], neighbors)
         radii[position_of[batch]] = 0.5 * distance[:, -1]
@@ -185,8 +187,8 @@ def estimate_areas(
 
 
 def _as_numbers(values: Any, name: str) -> FloatArray:
-    """A new float64 array of the values. Raises CloudError if they are not real numbers, or too
-    many."""
+    """The values as a new float64 array. name: what they are, for messages. Raises `CloudError` if
+    they are not real numbers, or too many."""
     ragged = "are ragged: every row needs as many numbers"
     array = as_real_array(values, name, CloudError, ragged=ragged, other="must be real numbers")
     if array.size > 3 * MAX_POINTS:
@@ -205,7 +207,7 @@ def check_neighbors(neighbors: int) -> None:
 
 
 def build_point_tree(points: FloatArray) -> Any:
-    """A tree for `nearest_neighbors`. points: (n, 3), all different.
+    """A search tree (SciPy's cKDTree) of points (n, 3), all different, for `nearest_neighbors`.
 
     Raises:
         CloudError: there is only a single point.
@@ -219,13 +221,12 @@ def build_point_tree(points: FloatArray) -> Any:
 
 
 def nearest_neighbors(tree: Any, points: FloatArray, count: int) -> tuple[IntArray, FloatArray]:
-    """Indices and distances (m, k) of the nearest neighbors of points (m, 3) of a tree, nearest
-    first.
-
-    A point is not its own neighbor. k = count, or less if the tree has fewer points.
+    """The nearest neighbors of points (m, 3) that belong to a tree: their indices (m, k) and
+    distances (m, k), nearest first. A point is not its own neighbor. k = count, or less if the tree
+    has fewer points.
 
     Raises:
-        CloudError: points lie so close that squared distances vanish.
+        CloudError: a point and all its neighbors lie within 1e-100.
     """
     distance, index = tree.query(points, k=min(count + 1, tree.n))
     if distance[:, -1].min() < 1e-100:
@@ -278,20 +279,20 @@ def estimate_normals(points: npt.ArrayLike, neighbors: int | None = None) -> Flo
     chosen such that the component's extreme points in 26 directions face outward, summed over the
     directions; for a closed surface this is right, however unevenly it is sampled.
 
-    neighbors: the number of neighbors. None chooses: 16; for noisy points up to 64, so that the
-        planes through them are known to a few degrees; and if that is not enough, 64 neighbors
-        among a random subset of the points (with a fixed seed), as sparse as the noise requires.
+    neighbors: the number of neighbors to which planes are fitted. None chooses 16; for noisy points
+        up to 64, so that the planes are known to a few degrees; and if that is not enough, 64
+        neighbors among a random subset of the points (with a fixed seed), as sparse as the noise
+        requires.
 
     As each component faces outward by itself, the inner wall of a hollow body does not face its
     cavity. The side that an open surface faces is a convention; for a flat surface it is the
     positive side of the axis nearest to its normal. If details are smaller than neighborhoods,
-    normals may have the wrong sign: look at the result.
-
-    Points at the same position get the same normal.
+    normals may have the wrong sign: look at the result. Points at the same position get the same
+    normal.
 
     Raises:
-        CloudError: as `validate_cloud` for points; fewer than 4 positions; neighborhoods on a line,
-            which have no plane; fewer than 3 neighbors.
+        CloudError: points are no finite numbers (n, 3) or have coordinates above 1e100; fewer than
+            4 positions; neighborhoods on a line, which have no plane; fewer than 3 neighbors.
     """
     x = as_cloud_points(points)
     if neighbors is not None:
@@ -347,10 +348,13 @@ def _choose_neighborhood(x: FloatArray) -> tuple[int, IntArray]:
 def _transfer_normals(
     x: FloatArray, tree: Any, known_normals: FloatArray, neighbors: int
 ) -> FloatArray:
-    """Normals (n, 3) of the points x (n, 3): normals of the planes that fit the nearest points of
-    the tree, with the signs of the normals of these points.
+    """Unit normals (n, 3) of the points x (n, 3), from a part of the points whose normals are
+    known. Each normal is that of the plane that fits the nearest points of the tree, with the sign
+    on which their known normals agree.
 
-    known_normals: (k, 3) of the points of the tree.
+    tree: the search tree of the k points with known normals.
+    known_normals: (k, 3) of these points.
+    neighbors: the number of points to which a plane is fitted.
     """
     normals = np.empty_like(x)
 
@@ -420,11 +424,11 @@ def _fit_tangent_planes(x: FloatArray, tree: Any, neighbors: int) -> _TangentPla
 
 
 def _agreement(planes: _TangentPlanes, i: Indices, j: Indices) -> FloatArray:
-    """How well the normals of points i and j agree, (m,): the inner product of normal i with normal
-    j mirrored in the plane that bisects the two points.
+    """How well the normals of points i[k] and j[k] agree, for each k: the inner product (m,) of
+    normal i with normal j mirrored in the plane that bisects the two points.
 
-    On a circle, across an edge between two planes and across a thin wall it is 1 if both normals
-    face outward (Xie et al. 2003).
+    i, j: indices (m,) of points. On a circle, across an edge between two planes and across a thin
+        wall the result is 1 if both normals face outward (Xie et al. 2003).
     """
     x, normals = planes.points, planes.normals
     edge = x[j] - x[i]
@@ -436,10 +440,11 @@ def _agreement(planes: _TangentPlanes, i: Indices, j: Indices) -> FloatArray:
 
 
 def _spanning_forest(planes: _TangentPlanes) -> tuple[IntArray, IntArray]:
-    """The spanning forest of the graph of neighbors in which normals agree best.
+    """The spanning forest of the graph of neighbors in which normals agree best: a tree in each
+    connected component, with the smallest sum of weights 1 - |agreement| of its edges.
 
-    Returns the connected component (n,) of each point, counted from 0, and its parent (n,) in the
-    forest; a root is its own parent.
+    Returns, for each point, its connected component (n,), counted from 0, and its parent (n,) in
+    the forest; a root is its own parent.
     """
     import scipy.sparse  # imported here: it takes half a second, and few programs need it
 
@@ -472,10 +477,14 @@ def _spanning_forest(planes: _TangentPlanes) -> tuple[IntArray, IntArray]:
 
 
 def _propagate_signs(planes: _TangentPlanes, parent: IntArray) -> FloatArray:
-    """The sign (n,) that makes each normal agree with the normal of its root, along the path
-    through its ancestors.
+    """The sign (n,) for each normal such that neighbors in the forest agree, on the path from each
+    point to the root of its tree.
 
-    Pointer doubling: after step i, `parent` is the ancestor 2^i generations up, or the root.
+    planes: the planes with their normals. parent: (n,) the parent of each point in the forest; a
+        root is its own parent.
+
+    The signs are multiplied along the paths by pointer doubling: after step i, `parent` is the
+    ancestor 2^i generations up, or the root.
     """
     agreement = _agreement(planes, np.arange(len(parent)), parent)
     sign = np.where(agreement < 0.0, -1.0, 1.0)
@@ -488,10 +497,13 @@ def _propagate_signs(planes: _TangentPlanes, parent: IntArray) -> FloatArray:
 
 
 def _outward_signs(x: FloatArray, normals: FloatArray, component: IntArray) -> FloatArray:
-    """The sign (p,) for each connected component of the cloud that makes the normals of its extreme
-    points face outward.
+    """The sign (p,) for each connected component of the cloud such that the normals of its extreme
+    points in 26 directions, on the whole, face outward. For a flat component, whose extreme points
+    do not decide, it is the sign for which the normals point to the positive side of the axis
+    nearest to them.
 
-    component: (n,) of each point.
+    x, normals: (n, 3) points and normals that agree within each component.
+    component: (n,) the component of each point.
     """
     order = np.argsort(component, kind="stable")
     x, normals, component = x[order], normals[order], component[order]

@@ -75,7 +75,8 @@ def _edge_lengths(x: FloatArray) -> FloatArray:
 
 
 def _is_flat(x: FloatArray) -> bool:
-    """Whether the vertices x (n, 3) lie within PLANE_TOLERANCE of a common plane."""
+    """Whether the vertices x (n, 3) of a polygon of size 1 lie within PLANE_TOLERANCE of a common
+    plane."""
     axes: FloatArray = np.linalg.svd(x - x.mean(axis=0), full_matrices=False)[2]
     return bool(np.ptp(x @ axes[2]) <= PLANE_TOLERANCE)
 
@@ -129,12 +130,12 @@ def _supporting_planes(
 
 
 def _widest_gap_direction(a: FloatArray, b: FloatArray) -> FloatArray:
-    """For each of k sets of n points in the plane, with coordinates a and b, (k, n) each: the
-    middle of the largest gap between their directions as seen from the origin. It is an angle:
-    (k,).
+    """For each of k sets of n points in the plane, with coordinates a and b (k, n): the directions
+    of the points, seen from the origin, leave gaps between them. Returns the middle of the largest
+    gap, an angle (k,) in radians.
 
-    Points at the origin, where the edge itself is, have no direction; the direction of the farthest
-    point is used for them.
+    A point at the origin (an end of the edge itself) has no direction; the direction of the
+    farthest point stands for it.
     """
     distance = np.hypot(a, b)
     angle = np.arctan2(b, a)
@@ -147,7 +148,8 @@ def _widest_gap_direction(a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 def is_simple(x: FloatArray) -> bool:
-    """Whether edges without a common vertex are MIN_SEPARATION apart, and no edge folds back on its
+    """Whether the closed polygon x (n, 3), of size about 1, has no self-intersection with a margin:
+    edges without a common vertex are at least MIN_SEPARATION apart, and no edge folds back on its
     neighbor."""
     count = len(x)
     ends = np.roll(x, -1, axis=0)
@@ -173,12 +175,13 @@ def is_simple(x: FloatArray) -> bool:
 def segment_distance_lower_bound(
     p1: FloatArray, q1: FloatArray, p2: FloatArray, q2: FloatArray
 ) -> FloatArray:
-    """Lower bounds (k,) of the distances between the segments p1 q1 and p2 q2, (k, 3) each.
+    """Lower bounds (k,) of the distances between the segments from p1 to q1 and from p2 to q2, (k,
+    3) each.
 
-    The closest points are found by alternating projection (after Ericson, 'Real-Time Collision
-    Detection', 5.1.9). Whether or not that has converged, the width of the slab between the
-    segments, at right angles to the line that joins the two points, is a lower bound of the
-    distance; if it has converged, it is the distance.
+    The two closest points are approximated by alternating projection (after Ericson, 'Real-Time
+    Collision Detection', 5.1.9). The bound is the width of the slab between the segments, at right
+    angles to the line through the two points. It is valid whether or not the projections have
+    converged; if they have, it is the distance.
     """
     d1, d2, r = q1 - p1, q2 - p2, p1 - p2
     a, e, b = _dot(d1, d1), _dot(d2, d2), _dot(d1, d2)
@@ -269,7 +272,9 @@ class ConvexHull(Polytope):
     def _slacks(
         self, table: PlaneTable, o: Vec3, d: Vec3
     ) -> Callable[[Vec3, Real], RoundingSlacks]:
-        """As `Polytope._slacks`, with one bound for all planes: |n|.|o| <= |o|, as |n| = 1."""
+        """A function of the normal n and the offset h of a plane that returns bounds of the
+        rounding errors of h - n.o and of n.d, for rays o + t d. The bounds are the same for all
+        planes, as |n| = 1 implies |n|.|o| <= |o|."""
         rounding = clip_rounding(backend_of(o))
         offset_slack, slope_slack = (
             rounding * (dr.norm(o) + table.max_offset),
@@ -286,8 +291,8 @@ class ConvexHull(Polytope):
 
 
 def _support(x: FloatArray, normals: FloatArray) -> FloatArray:
-    """For each normal n (m, 3), the largest n.x among the points x (n, 3): (m,). Computed in
-    slices, to save memory."""
+    """For each normal n (m, 3), the largest n.x among the points x (n, 3), as an array (m,). The
+    points are taken in slices, to save memory."""
     columns = np.transpose(normals)
     highest = np.full(len(normals), -np.inf)
     for start in range(0, len(x), 4096):
@@ -296,8 +301,9 @@ def _support(x: FloatArray, normals: FloatArray) -> FloatArray:
 
 
 def _hull_normals(x: FloatArray) -> tuple[FloatArray, bool]:
-    """Unit outward normals (m, 3) of half-spaces that bound the hull of x (n, 3), and whether x is
-    flat or straight. x is centered and of size 1."""
+    """Unit outward normals (m, 3) of half-spaces whose intersection, with suitable offsets, is the
+    hull of points x (n, 3); and whether the points are flat or on a line. x is centered and of size
+    1."""
     axes: FloatArray = np.linalg.svd(x - x.mean(axis=0), full_matrices=len(x) < 3)[2]
     coordinates: FloatArray = np.einsum("ij,kj->ik", x, axes)
     thickness: FloatArray = np.ptp(coordinates, axis=0)
@@ -316,7 +322,8 @@ def _hull_normals(x: FloatArray) -> tuple[FloatArray, bool]:
 
 
 def _facet_normals(x: FloatArray) -> FloatArray | None:
-    """Facet normals by Qhull, which merges coplanar facets; None where it finds x degenerate."""
+    """The unit normals (m, d) of the facets of the convex hull of points x (n, d), computed by
+    Qhull, which merges coplanar facets. None if Qhull finds that the points have no volume."""
     import scipy.spatial  # imported here: it takes half a second, and few programs need it
 
     qhull: Any = scipy.spatial
@@ -328,8 +335,8 @@ def _facet_normals(x: FloatArray) -> FloatArray | None:
 
 
 def _order_by_spread(normals: FloatArray) -> FloatArray:
-    """The same normals in another order, in which the first ones are far from each other: so few
-    planes suffice to recognize most rays that miss the hull."""
+    """The normals (m, 3) in another order, in which the first 24 are far from each other. So the
+    first planes of a hull suffice to recognize most rays that miss it."""
     order, min_distances = [0], np.full(len(normals), np.inf)
     for _ in range(min(len(normals), _LEADING_PLANES) - 1):
         min_distances = np.minimum(min_distances, 1.0 - normals @ normals[order[-1]])
@@ -339,9 +346,9 @@ def _order_by_spread(normals: FloatArray) -> FloatArray:
 
 
 def _distinct_normals(normals: FloatArray) -> FloatArray:
-    """One normal of each group of nearly equal normals, at most MAX_PLANES of them. Normals are
-    grouped by rounding to 9 digits or, if that leaves too many, to fewer; then the six axis
-    directions are added."""
+    """One unit normal of each group of nearly equal normals (n, 3), at most MAX_PLANES of them.
+    Normals are grouped by rounding to 9 digits. If that leaves too many, they are rounded to fewer
+    digits, and the six axis directions are added."""
     digits = 9
     while True:
         _, first = np.unique(np.round(normals, digits), axis=0, return_index=True)

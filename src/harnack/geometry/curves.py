@@ -98,19 +98,19 @@ class Circle:
         return 2 * math.pi * self.radius
 
     def reversed(self) -> Circle:
-        """The same circle, run the other way, such as for a hole in the region that another curve
-        bounds."""
+        """The same circle with the opposite direction, as for a hole in the region that another
+        curve bounds."""
         x, y, z = self.normal
         return Circle(self.radius, self.center, (-x, -y, -z))
 
     def bounds(self) -> tuple[FloatArray, FloatArray]:
-        """Lower and upper corner of the box around it, (3,) each."""
+        """Lower and upper corner, (3,) each, of the box around the circle."""
         half_size = self.radius * np.sqrt(np.maximum(1 - np.square(self.normal), 0))
         return np.array(self.center) - half_size, np.array(self.center) + half_size
 
     def polygon(self, sides: int, *, circumscribed: bool = False) -> FloatArray:
-        """(sides, 3) corners of the regular polygon inscribed in the circle, or circumscribed about
-        it."""
+        """The corners (sides, 3) of a regular polygon with this many sides that is inscribed in the
+        circle or, if `circumscribed`, drawn about it."""
         if sides < 3:
             raise ValueError(f"a polygon needs at least three sides, not {sides}")
         radius = self.radius / math.cos(math.pi / sides) if circumscribed else self.radius
@@ -123,7 +123,7 @@ class Circle:
 
 
 def _numbers(values: Any, name: str, shape: tuple[int, ...]) -> FloatArray:
-    """The values of a circle's attribute as a float64 array of this shape.
+    """The value of a circle's attribute `name` as a float64 array of this shape.
 
     Raises:
         ValueError: another shape, or a number that is not finite.
@@ -139,7 +139,7 @@ def _numbers(values: Any, name: str, shape: tuple[int, ...]) -> FloatArray:
 
 
 def cancel_opposite_circles(circles: Iterable[Circle]) -> tuple[Circle, ...]:
-    """Remove pairs of opposite circles, as `cancel_opposite_edges` does for edges.
+    """The circles without pairs of opposite circles, whose contributions to a solid angle cancel.
 
     Only circles with exactly the same center and radius and exactly opposite normals cancel.
     """
@@ -215,11 +215,11 @@ def validate_loops(loops: LoopsLike, *, closed: bool = True) -> Loops:
 
 
 def validate_curves(curves: Any) -> tuple[Loops, tuple[Circle, ...]]:
-    """Validate closed curves, loops of vertices and circles: any input of `validate_loops`, a
-    `Circle`, or a list in which each entry is a loop or a circle.
+    """Validate closed curves. curves: a `Circle`; a loop (n, 3) of vertices; or a list in which
+    each entry is a loop or a circle. Returns the loops, float64 arrays (n, 3), and the circles.
 
     Raises:
-        CurveError: as `validate_loops`.
+        CurveError: a loop is malformed; the subclass names the fault.
     """
     if isinstance(curves, Circle):
         return (), (curves,)
@@ -239,13 +239,14 @@ def validate_curves(curves: Any) -> tuple[Loops, tuple[Circle, ...]]:
 
 
 def _as_parts(curves: Any) -> list[Any]:
-    """The entries of a list or tuple; an empty list for any other object."""
+    """The entries of a list or tuple as a list; an empty list for any other object."""
     return list(curves) if isinstance(curves, list | tuple) else []  # pyright: ignore[reportUnknownArgumentType, reportUnknownVariableType]
 
 
 def _as_list(loops: Any) -> list[tuple[int, Any]]:
-    """The loops in the argument of `validate_loops`, each with its number. A list is a list of
-    loops if its entries are lists of points; else it is a single loop."""
+    """The loops in the argument of `validate_loops`, as pairs of a number, counted from 0, and a
+    loop. The argument is several loops if its entries are lists of points; otherwise it is a single
+    loop."""
     try:
         array = np.asarray(loops)
     except ValueError:  # loops of different lengths, or points of different lengths
@@ -262,7 +263,7 @@ def _as_list(loops: Any) -> list[tuple[int, Any]]:
 
 
 def _is_point(part: Any) -> bool:
-    """Whether an entry is a list of numbers, such as a vertex."""
+    """Whether an entry of a list is itself a list of numbers, such as a vertex."""
     try:
         return np.ndim(part) == 1
     except ValueError:
@@ -275,8 +276,14 @@ def _numbered(loops: Any) -> list[tuple[int, Any]]:
 
 
 def _validate_loop(loop: Any, name: str, closed: bool = True) -> FloatArray:
-    """The vertices (n, 3) of a validated loop; a last vertex that repeats the first is dropped.
-    name: for messages. Raises: as `validate_loops`.
+    """The vertices (n, 3) of a loop, validated; a last vertex that repeats the first one is
+    dropped.
+
+    name: what the loop is, for messages. closed: False for a curve that ends at its first and last
+        vertex.
+
+    Raises:
+        CurveError: the subclass that names the fault.
     """
     vertices = _as_vertices(loop, name)
     check_finite(vertices, f"vertex {{}} of {name}", NonFiniteVertexError)
@@ -343,17 +350,18 @@ def _too_many(name: str, count: int) -> str:
 
 
 def edge_endpoints(loops: Loops) -> tuple[FloatArray, FloatArray]:
-    """Start and end points of all edges, (m, 3) each, loop by loop in order."""
+    """The start points and the end points of all edges of closed loops, (m, 3) each, loop by
+    loop."""
     return np.concatenate(loops), np.concatenate([np.roll(v, -1, axis=0) for v in loops])
 
 
 def total_length(loops: Loops) -> float:
-    """Sum of the lengths of all edges."""
+    """The sum of the lengths of all edges of loops."""
     start, end = edge_endpoints(loops)
     return float(np.linalg.norm(end - start, axis=1).sum())
 
 
 def bounding_box(loops: Loops) -> tuple[FloatArray, FloatArray]:
-    """Lower and upper corner, (3,) each."""
+    """Lower and upper corner, (3,) each, of the box around loops."""
     vertices = np.concatenate(loops)
     return vertices.min(axis=0), vertices.max(axis=0)

@@ -95,14 +95,15 @@ class NoiseEstimate:
 
 
 def outlier_indices(points: FloatArray, tree: Any) -> IntArray:
-    """The indices of outliers: points whose fourth neighbor is more than six times as far away as
-    the fourth neighbors of its neighbors are in the median, and as those of all points are in the
-    median. tree: of these points."""
+    """The indices of outliers among points (n, 3): points whose fourth neighbor is more than six
+    times as far away as the fourth neighbor of a typical point. Typical are both the median of the
+    point's own neighbors and the median of all points. tree: the search tree of these points."""
     count = min(_OUTLIER_NEIGHBORS, len(points) - 1)
     nearest = np.empty((len(points), count), np.int64)
     distances = np.empty(len(points))
 
     def find_neighbors(rows: slice) -> None:
+        """Find the neighbors of a slice of the points, and the distance of the fourth one."""
         distance, index = tree.query(points[rows], k=count + 1)
         nearest[rows], distances[rows] = index[:, 1:], distance[:, -1]
 
@@ -112,17 +113,17 @@ def outlier_indices(points: FloatArray, tree: Any) -> IntArray:
 
 
 def estimate_noise(points: FloatArray, normals: FloatArray | None, tree: Any) -> NoiseEstimate:
-    """Estimate the noise and the spacing of a cloud.
+    """Estimate the noise and the spacing of a cloud of points (n, 3). tree: the search tree of
+    these points.
 
-    Each of up to 1000 probe points has neighbors, and each neighbor j predicts the height t_j of
-    the surface above the probe (module docstring). The noise is the median, over probes, of the
-    standard deviation of t_j. Without normals, deviations from the plane that fits the neighbors
-    best are used, so that curvature counts as noise.
+    Each of up to 1000 probe points has neighbors. A neighbor j at p_j with the normal n_j predicts
+    that the surface is at the height t_j = (n + n_j)/2 . (p_j - x) above a probe x with the normal
+    n. The noise is the median, over the probes, of the standard deviation of t_j. If `normals` is
+    None, deviations from the plane that best fits the neighbors are used instead, so that curvature
+    counts as noise.
 
     The number of neighbors grows from 16 to 1024, until the farthest is (in the median) 4.5
-    standard deviations away: fewer reach no farther than the noise, and show no surface.
-
-    tree: of these points.
+    standard deviations away: fewer neighbors reach no farther than the noise, and show no surface.
     """
     rng = np.random.default_rng(0)
     probes = np.sort(rng.choice(len(points), min(len(points), _PROBES), replace=False))
@@ -152,8 +153,8 @@ def _deviations_from_planes(offsets: FloatArray) -> FloatArray:
 
 
 def _min_variance_axes(offsets: FloatArray, weights: FloatArray | None) -> FloatArray:
-    """(m, 3) unit vectors along which the offsets (m, k, 3) vary least. weights: (m, k) of the
-    offsets; None for equal weights."""
+    """For each of m points, the unit vector (m, 3) along which the offsets (m, k, 3) of its
+    neighbors vary least. weights: (m, k) of the offsets; None for equal weights."""
     weighted = offsets if weights is None else offsets * weights[:, :, None]
     _, axes = np.linalg.eigh(np.matmul(weighted.transpose(0, 2, 1), offsets))
     return axes[:, :, 0]
@@ -162,10 +163,11 @@ def _min_variance_axes(offsets: FloatArray, weights: FloatArray | None) -> Float
 def _deviations_by_normals(
     offsets: FloatArray, normals: FloatArray, neighbor_normals: FloatArray
 ) -> FloatArray:
-    """For each of m points, the standard deviation (m,) of t_j (module docstring) among the
-    neighbors with a similar normal.
+    """For each of m points, the standard deviation (m,) of the heights t_j that its neighbors with
+    a similar normal predict. A neighbor j with the offset d_j and the normal n_j predicts the
+    surface at the height t_j = (n + n_j)/2 . d_j above a point with the normal n.
 
-    offsets: (m, k, 3) of the neighbors.
+    offsets: (m, k, 3) from each point to its neighbors.
     normals: (m, 3) of the points. neighbor_normals: (m, k, 3).
     """
     is_similar = np.einsum("mi,mki->mk", normals, neighbor_normals) > _MIN_NORMAL_COSINE
@@ -176,11 +178,11 @@ def _deviations_by_normals(
 
 
 class CloudDenoiser:
-    """Moves points of a cloud onto the surface that all of its points show.
+    """Moves points of a noisy cloud onto the surface that the cloud samples.
 
-    points: (n, 3), and `tree` of them. noise: the noise of the cloud.
-    selected: (m,) indices of the points to be moved: all, unless the noise is so large that a
-        random fraction is as good.
+    points: (n, 3). noise: the noise of the cloud. tree: the search tree of the points.
+    selected: (m,) indices of the points to be moved: all of them, unless the noise is so large that
+        a random part of them shows the surface just as well.
     """
 
     def __init__(self, points: FloatArray, noise: NoiseEstimate, tree: Any | None = None) -> None:
@@ -198,12 +200,12 @@ class CloudDenoiser:
 
     @property
     def spacing(self) -> float:
-        """The spacing of the selected points."""
+        """The mean distance between neighboring selected points, in the unit of the points."""
         return self.noise.spacing * math.sqrt(len(self.points) / len(self.selected))
 
     def denoise_points(self, normals: FloatArray) -> FloatArray:
-        """The selected points (m, 3), moved along their normals. normals: (n, 3), of all points;
-        they are known and are not changed."""
+        """The selected points (m, 3), moved along their normals onto the surface. normals: (n, 3),
+        the known normals of all points."""
         points, own_normals = self.points[self.selected], normals[self.selected]
         if len(points) < len(self.points):
             points = _move_along_normals(
@@ -221,8 +223,8 @@ class CloudDenoiser:
 
     def denoise_points_and_normals(self, normals: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Move the selected points and improve their normals, in alternation. Returns points and
-        normals, (k, 3) each. k <= m, as a point is dropped if hardly any neighbor has a normal
-        similar to its own.
+        unit normals, (k, 3) each. k <= m: a point is dropped if hardly any of its neighbors has a
+        normal similar to its own.
 
         normals: (m, 3), estimates for the selected points.
         """
@@ -255,12 +257,14 @@ class CloudDenoiser:
 
 
 def _neighbors(tree: Any, points: FloatArray, count: int) -> Indices:
-    """(m, k) the indices of the points of a tree that are nearest to points (m, 3), which count
-    themselves if they belong to the tree."""
+    """The indices (m, k) of the points of a tree that are nearest to points (m, 3). A point that
+    belongs to the tree is its own first neighbor. k = count, or less if the tree has fewer
+    points."""
     count = min(count, tree.n)
     index = np.empty((len(points), count), np.int32)
 
     def find_slice(rows: slice) -> None:
+        """Find the neighbors of a slice of the points."""
         index[rows] = tree.query(points[rows], k=count)[1].reshape(-1, count)
 
     parallel_over_slices(find_slice, len(points))
@@ -275,21 +279,24 @@ def _move_along_normals(
     normals: FloatArray,
     normal_scale: float,
 ) -> FloatArray:
-    """The points `start` (m, 3), each moved along its normal to where the weighted mean of t_j
-    (module docstring) is 0.
+    """The points `start` (m, 3), each moved along its normal n onto the surface that its neighbors
+    predict. A neighbor j at p_j with the normal n_j predicts that the surface is at the height t_j
+    = (n + n_j)/2 . (p_j - x) above a point x; each point moves to where the weighted mean of t_j is
+    0.
 
     own_normals: (m, 3) of the points `start`.
-    neighbors: (m, k) the indices of their neighbors among `points` (n, 3), which have `normals` (n,
-        3).
-    normal_scale: the difference |n - n_j| at which the weight of a neighbor is 1/e.
+    neighbors: (m, k) indices of their neighbors among `points`.
+    points, normals: (n, 3) each, the points of the cloud and their unit normals.
+    normal_scale: the difference |n - n_j| at which the weight of a neighbor falls to 1/e.
 
-    Weights depend on the distance along the tangent plane only. With the distance in space, the
-    neighbors on the same side of the surface as the point would hold it there.
+    Weights depend on the distance along the tangent plane only. If they depended on the distance in
+    space, neighbors that are off the surface to the same side as the point would hold it there.
     """
     moved = np.empty_like(start)
 
     def move_slice(rows: slice) -> None:
-        """Move the points of a slice."""
+        """Move the points of a slice: `slope` is the derivative, in absolute value, of the mean of
+        t_j along n."""
         n, index = own_normals[rows], neighbors[rows]
         neighbor_normals, offsets = normals[index], points[index] - start[rows, None]
         height = np.einsum("mi,mki->mk", n, offsets)
@@ -315,12 +322,14 @@ def _agreeing_weight(
     normals: FloatArray,
     normal_scale: float,
 ) -> FloatArray:
-    """(m,) the fraction, by weight, of each point's neighbors that have a normal similar to its
-    own.
+    """For each of m points, the fraction (m,) of its neighbors, by weight, that have a normal
+    similar to its own.
 
+    start, own_normals: (m, 3) the points and their unit normals.
+    neighbors: (m, k) indices of their neighbors among `points`.
     is_own: (m, k) whether a neighbor is the point itself, which does not count.
-
-    The other arguments are those of `_move_along_normals`.
+    points, normals: (n, 3) each, the points of the cloud and their unit normals.
+    normal_scale: the difference of two normals at which they count as similar by 1/e only.
     """
     fraction = np.empty(len(start))
 
@@ -330,7 +339,7 @@ def _agreeing_weight(
         offsets = points[index] - start[rows, None]
         height = np.einsum("mi,mki->mk", n, offsets)
         weight = (
-            np.exp(-_DISTANCE_DECAY * _relative(_squared_tangential(offsets, height)))
+            np.exp(-_DISTANCE_DECAY * _relative_to_largest(_squared_tangential(offsets, height)))
             * ~is_own[rows]
         )
         cosine = np.einsum("mi,mki->mk", n, normals[index])
@@ -345,11 +354,14 @@ def _agreeing_weight(
 def _refit_normals(
     points: FloatArray, normals: FloatArray, neighbors: Indices, normal_scale: float
 ) -> FloatArray:
-    """New normals (m, 3) of points (m, 3): normals of the planes that fit those neighbors best that
-    have similar normals. The signs are those of `normals`.
+    """New unit normals (m, 3) of points (m, 3). A normal is that of the plane that best fits the
+    point's neighbors, where neighbors with a similar normal have the largest weight. Its sign is
+    that of the point's old normal.
 
+    normals: (m, 3) the old normals.
     neighbors: (m, k) indices of the neighbors.
-    normal_scale: the difference of two normals at which the weight of a neighbor is 1/e.
+    normal_scale: the difference |n - n'| of two unit normals at which the weight of a neighbor
+        falls to 1/e.
     """
     refitted = np.empty_like(normals)
 
@@ -358,7 +370,7 @@ def _refit_normals(
         index = neighbors[rows]
         offsets = points[index] - points[rows, None]
         cosine = np.einsum("mi,mki->mk", normals[rows], normals[index])
-        weight = _weights(_squares(offsets), cosine, normal_scale)
+        weight = _weights(_squared_lengths(offsets), cosine, normal_scale)
         offsets -= np.einsum("mk,mki->mi", weight, offsets)[:, None]
         axis = _min_variance_axes(offsets, weight)
         is_reversed = np.einsum("mi,mi->m", axis, normals[rows]) < 0
@@ -368,30 +380,33 @@ def _refit_normals(
     return refitted
 
 
-def _squares(offsets: FloatArray) -> FloatArray:
-    """(m, k) squared lengths of offsets (m, k, 3)."""
+def _squared_lengths(offsets: FloatArray) -> FloatArray:
+    """The squared lengths (m, k) of offsets (m, k, 3)."""
     return np.einsum("mki,mki->mk", offsets, offsets)
 
 
 def _squared_tangential(offsets: FloatArray, height: FloatArray) -> FloatArray:
-    """(m, k) squared lengths of the parts of offsets (m, k, 3) along the tangent planes; height:
-    (m, k) the parts normal to them."""
-    return np.maximum(_squares(offsets) - height * height, 0.0)
+    """The squared lengths (m, k) of the parts of offsets (m, k, 3) that are parallel to the tangent
+    planes. height: (m, k) the parts normal to them."""
+    return np.maximum(_squared_lengths(offsets) - height * height, 0.0)
 
 
-def _relative(square: FloatArray) -> FloatArray:
-    """(m, k) squared distances, divided by the largest in each row."""
+def _relative_to_largest(square: FloatArray) -> FloatArray:
+    """The squared distances (m, k), divided by the largest one in each row."""
     return square / np.maximum(square.max(axis=1, keepdims=True), 1e-300)
 
 
 def _normal_weight(cosine: FloatArray, normal_scale: float) -> FloatArray:
-    """(m, k) weights by the cosine between normals: 1 for equal normals, 1/e for a difference of
-    `normal_scale`."""
+    """Weights (m, k) of neighbors by the cosine between normals: 1 for equal normals, 1/e for
+    normals whose difference has the length `normal_scale`."""
     return np.exp(-(2 - 2 * cosine) / normal_scale**2)
 
 
 def _weights(square: FloatArray, cosine: FloatArray, normal_scale: float) -> FloatArray:
-    """(m, k) weights of neighbors, with sum 1 in each row, from their squared distances and the
-    cosines between normals."""
-    weight = np.exp(-_DISTANCE_DECAY * _relative(square)) * _normal_weight(cosine, normal_scale)
+    """Weights (m, k) of the neighbors of m points, with sum 1 in each row. They fall with the
+    squared distance `square` (m, k) and with the angle between normals. cosine: (m, k) of these
+    angles. normal_scale: the difference of two unit normals at which the weight falls to 1/e."""
+    weight = np.exp(-_DISTANCE_DECAY * _relative_to_largest(square)) * _normal_weight(
+        cosine, normal_scale
+    )
     return weight / weight.sum(axis=1, keepdims=True)

@@ -73,12 +73,13 @@ def torus_mesh(major_radius: float, minor_radius: float, n: int, m: int) -> Mesh
 
 
 def remove_faces(faces: IntArray, fraction: float, seed: int) -> IntArray:
-    """The faces (m, 3) without a random fraction of them, in their order: holes everywhere."""
+    """The faces (m, 3) without a random fraction of them, in the same order."""
     return np.delete(faces, _random_faces(faces, fraction, seed), axis=0)
 
 
 def flip_faces(faces: IntArray, fraction: float, seed: int) -> IntArray:
-    """The faces (m, 3), a random fraction of them reversed: w jumps the opposite way there."""
+    """The faces (m, 3) with a random fraction of them reversed; the winding number jumps the
+    opposite way across a reversed face."""
     flipped = faces.copy()
     chosen = _random_faces(faces, fraction, seed)
     flipped[chosen] = faces[chosen][:, [0, 2, 1]]
@@ -88,11 +89,11 @@ def flip_faces(faces: IntArray, fraction: float, seed: int) -> IntArray:
 def duplicate_faces(
     faces: IntArray, fraction: float, seed: int, *, flipped: bool = False
 ) -> IntArray:
-    """The faces (m, 3), followed by a second copy of a random fraction of them; flipped: a reversed
-    copy.
+    """The faces (m, 3), followed by a second copy of a random fraction of them; by reversed copies
+    if `flipped`.
 
-    A duplicate makes w jump by 2 across that face, and a reversed duplicate by 0: a hole that is
-    not seen.
+    The winding number jumps by 2 across a duplicated face. Across a face with a reversed duplicate
+    it does not jump, as if there were a hole.
     """
     copies = faces[_random_faces(faces, fraction, seed)]
     return np.concatenate([faces, copies[:, [0, 2, 1]] if flipped else copies])
@@ -131,7 +132,8 @@ def _icosahedron() -> MeshArrays:
 
 
 def _subdivided(vertices: FloatArray, faces: IntArray) -> MeshArrays:
-    """Each face divided in four at the midpoints of its edges, which become new vertices."""
+    """The mesh with each face divided in four at the midpoints of its edges, which become new
+    vertices."""
     ends = np.roll(faces, -1, axis=1)
     n = len(vertices)
     keys = np.minimum(faces, ends) * n + np.maximum(faces, ends)

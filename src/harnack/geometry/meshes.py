@@ -70,15 +70,15 @@ def validate_mesh(
 
 
 def zero_area_faces(vertices: npt.ArrayLike, faces: npt.ArrayLike) -> IntArray:
-    """Indices (k,) of the faces that count as faces of zero area.
+    """The indices (k,) of the faces that count as faces of zero area.
 
     Twice the area of such a face is at most 8 units in the last place (2^-49) of the square of its
-    longest edge: its vertices lie on a line, or two of them are equal, up to the rounding of a
-    cross product. So it depends neither on the scale nor on the position of the mesh. Such a face
-    has no reliable normal.
+    longest edge: up to the rounding of a cross product, its vertices lie on a line or two of them
+    are equal. This depends neither on the scale nor on the position of the mesh. Such a face has no
+    reliable normal.
 
     Raises:
-        MeshError: as `validate_mesh`, but for zero area.
+        MeshError: the mesh is not valid, apart from faces of zero area (see `validate_mesh`).
     """
     return np.flatnonzero(_measure_faces(*_checked_arrays(vertices, faces))[0])
 
@@ -86,7 +86,8 @@ def zero_area_faces(vertices: npt.ArrayLike, faces: npt.ArrayLike) -> IntArray:
 def without_zero_area_faces(
     vertices: npt.ArrayLike, faces: npt.ArrayLike
 ) -> tuple[FloatArray, IntArray]:
-    """The mesh without the faces of `zero_area_faces`, as `validate_mesh` returns it.
+    """The mesh without its faces of zero area (see `zero_area_faces`): vertices (n, 3) float64 and
+    faces (k, 3) int64, copies that cannot be written to.
 
     All vertices stay, so indices keep their meaning. A face of zero area adds nothing to a winding
     number. If it filled a gap of zero width (a vertex in the middle of its neighbor's edge), the
@@ -94,7 +95,8 @@ def without_zero_area_faces(
     and only make distances to boundary edges smaller than need be.
 
     Raises:
-        MeshError: as `validate_mesh`; no face has an area.
+        MeshError: the mesh is not valid, apart from faces of zero area (see `validate_mesh`); or no
+            face has an area.
     """
     x, triangles = _checked_arrays(vertices, faces)
     is_flat, longest = _measure_faces(x, triangles)
@@ -122,14 +124,15 @@ def solid_angles(corners: FloatArray, point: FloatArray) -> FloatArray:
 
 
 def _checked_arrays(vertices: Any, faces: Any) -> tuple[FloatArray, IntArray]:
-    """Fresh arrays of the right types and shapes, with finite vertices and indices in range."""
+    """Vertices as a new float64 array (n, 3) of finite numbers, and faces as a new int64 array (m,
+    3) of valid indices. Raises `MeshError`."""
     x = _as_vertices(vertices)
     triangles = _as_faces(faces, len(x))
     return x, triangles
 
 
 def _as_vertices(vertices: Any) -> FloatArray:
-    """A new float64 array (n, 3) of finite vertices. Raises MeshError."""
+    """Vertices as a new float64 array (n, 3) of finite numbers. Raises `MeshError`."""
     array = _as_array(vertices, "the vertices", "every vertex needs three coordinates")
     if array.size == 0:
         raise MeshError("there are no vertices: give an array (n, 3)")
@@ -146,7 +149,8 @@ def _as_vertices(vertices: Any) -> FloatArray:
 
 
 def _as_faces(faces: Any, count: int) -> IntArray:
-    """A new int64 array (m, 3) of indices of `count` vertices. Raises MeshError."""
+    """Faces as a new int64 array (m, 3) of indices below `count`, the number of vertices. Raises
+    `MeshError`."""
     array = _as_array(faces, "the faces", "every face needs three indices; triangulate polygons")
     if array.size == 0:
         raise MeshError("there are no faces: give an array (m, 3) of vertex indices")
@@ -167,7 +171,7 @@ def _as_faces(faces: Any, count: int) -> IntArray:
 
 
 def _check_range(faces: npt.NDArray[Any], count: int) -> None:
-    """Raise a MeshError for a face with an index outside of [0, count)."""
+    """Raise `MeshError` if a face (m, 3) has an index outside of [0, count)."""
     if int(faces.min()) >= 0 and int(faces.max()) < count:
         return
     outside = (faces < 0) | (faces >= count)
@@ -185,8 +189,8 @@ def _check_range(faces: npt.NDArray[Any], count: int) -> None:
 
 
 def _as_array(values: Any, name: str, ragged: str) -> npt.NDArray[Any]:
-    """The values as a NumPy array of numbers. ragged: the end of the message for rows of different
-    lengths. Raises MeshError."""
+    """The values as a NumPy array, which is no array of objects. name: what they are, for messages.
+    ragged: the end of the message for rows of different lengths. Raises `MeshError`."""
     try:
         array = np.asarray(values)
     except (ValueError, OverflowError):
@@ -197,7 +201,8 @@ def _as_array(values: Any, name: str, ragged: str) -> npt.NDArray[Any]:
 
 
 def _measure_faces(x: FloatArray, faces: IntArray) -> tuple[BoolArray, FloatArray]:
-    """Whether each face counts as flat, and its longest edge in the maximum norm: (m,) each.
+    """For each face (m, 3) of vertices x (n, 3): whether it counts as a face of zero area, (m,),
+    and the largest difference of two of its vertices in any coordinate, (m,).
 
     Edges are scaled before they are multiplied, so that nothing overflows or underflows.
     """
@@ -224,7 +229,7 @@ def _check_size(longest: FloatArray) -> None:
 
 
 def _zero_area_message(x: FloatArray, faces: IntArray, flat: IntArray) -> str:
-    """The text of an error message about faces of zero area, whose indices are `flat`."""
+    """The text of an error message about faces of zero area. flat: the indices of these faces."""
     a, b, c = (x[k] for k in faces[flat[0]])
     corners = ", ".join(format_vector(corner) for corner in (a, b, c))
     repeated = bool((a == b).all() or (b == c).all() or (c == a).all())

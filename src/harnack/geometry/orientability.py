@@ -1,4 +1,4 @@
-"""Orientability of triangle meshes: whether a mesh has two sides, or a single one as a Moebius
+"""Orientability of triangle meshes: whether a mesh has two sides, or only one, like a Moebius
 strip."""
 
 from __future__ import annotations
@@ -22,11 +22,13 @@ def is_nonorientable(faces: IntArray) -> bool:
 
 
 def orientation_components(faces: IntArray) -> IntArray:
-    """(2m,) component labels in the orientation double cover of m faces: entry k is for face k as
-    given, entry m + k for face k reversed.
+    """Labels (2m,) that show whether the faces (m, 3) of a mesh can be oriented consistently. Entry
+    k belongs to face k as given, entry m + k to face k reversed.
 
-    Neighbors with consistent orientation share a label. A face and its reverse have the same label
-    if and only if their component is non-orientable.
+    Two such oriented faces have the same label if they are connected through neighbors (faces with
+    a common edge that no third face has) whose orientations agree. So face k and its reverse have
+    the same label if and only if the connected component of face k is non-orientable. (The labels
+    are the components of the orientation double cover.)
     """
     import scipy.sparse  # imported here, as it takes half a second and few programs need it
     import scipy.sparse.csgraph as csgraph_module
@@ -51,9 +53,9 @@ def orientation_components(faces: IntArray) -> IntArray:
 
 
 def _face_edges(faces: IntArray) -> tuple[IntArray, IntArray, IntArray]:
-    """The edges of all faces: (3m, 2) directed edges, the first edges of all faces first; (3m,) the
-    index of each as an undirected edge; and for each undirected edge the number of faces that
-    contain it."""
+    """The edges of all faces (m, 3): the directed edges (3m, 2), the first edge of every face
+    first; for each of them its index (3m,) among the undirected edges; and for each undirected edge
+    the number of faces that contain it."""
     pairs = np.concatenate([faces[:, [k, (k + 1) % 3]] for k in range(3)]).astype(np.int64)
     keys = pairs.min(axis=1) * (int(pairs.max(initial=0)) + 1) + pairs.max(axis=1)
     _, edge_of, use_count = np.unique(keys, return_inverse=True, return_counts=True)

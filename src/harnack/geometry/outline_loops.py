@@ -112,8 +112,8 @@ def _is_one_loop(loops: Any) -> bool:
 
 
 def _edges_and_successors(loops: list[FloatArray]) -> tuple[FloatArray, FloatArray, IntArray]:
-    """The starts and ends (m, 2) of all edges, and for each edge the index of the next edge of its
-    loop."""
+    """The edges of closed loops (n, 2): the starts (m, 2) and the ends (m, 2) of all edges, and for
+    each edge the index (m,) of the next edge of the same loop."""
     start = np.concatenate(loops)
     end = np.concatenate([np.roll(loop, -1, axis=0) for loop in loops])
     successor: IntArray = np.arange(1, len(start) + 1, dtype=np.int64)
@@ -175,15 +175,16 @@ def _segments_touch(
 
 
 def _distances(p: FloatArray, a: FloatArray, b: FloatArray) -> FloatArray:
-    """The distances (k,) of points p from the segments from a to b, (k, 2) each."""
+    """The distances (k,) of points p from the segments from a to b; p, a and b are (k, 2)."""
     edge = b - a
     t = ((p - a) * edge).sum(axis=1) / (edge * edge).sum(axis=1)
     return np.linalg.norm(p - a - np.clip(t, 0, 1)[:, None] * edge, axis=1)
 
 
 def _orient_loops(loops: list[FloatArray]) -> Outline:
-    """The outline of simple loops: each is oriented so that the region is on its left. The region
-    lies inside of a loop if an even number of other loops runs around it, else outside of it."""
+    """The outline of loops that neither cross nor touch: each loop is oriented so that the region
+    is on its left. The region lies inside of a loop if an even number of other loops runs around
+    it, otherwise outside."""
     start, end, _ = _edges_and_successors(loops)
     loop_index = np.repeat(np.arange(len(loops)), [len(points) for points in loops])
     oriented: list[FloatArray] = []
@@ -208,7 +209,8 @@ def _area(loop: FloatArray) -> float:
 
 
 def _resolve_crossings(loops: list[FloatArray], rule: FillingRule) -> Outline:
-    """The boundary of the region of loops that cross or touch."""
+    """The outline of the region inside of loops that cross or touch, computed by Clipper2. rule:
+    which points are inside, as for `make_outline`: "even-odd" or "nonzero" winding number."""
     from manifold3d import CrossSection, FillRule
 
     fill = FillRule.EvenOdd if rule == "even-odd" else FillRule.NonZero
@@ -236,8 +238,8 @@ def _make_read_only(loops: list[FloatArray]) -> Outline:
 
 
 def scale_for_clipper(outline: Sequence[FloatArray]) -> tuple[list[FloatArray], float]:
-    """The loops multiplied by a power of two, so large that Clipper2's rounding hardly matters; and
-    that factor."""
+    """The loops multiplied by a power of two, and this factor. It is so large that Clipper2's
+    rounding to 1e-8 hardly matters."""
     largest = max(float(np.abs(loop).max()) for loop in outline)
     scale = 2.0 ** (math.frexp(_CLIPPER_SIZE)[1] - math.frexp(largest)[1])
     return [np.ascontiguousarray(loop * scale) for loop in outline], scale

@@ -44,12 +44,12 @@ _MAX_EXAMINED_FACES = 20_000
 
 @dataclass(frozen=True, eq=False)
 class PolygonFaces:
-    """Faces with any number of corners, in flat arrays.
+    """Polygonal faces with any number of corners and loops, in flat arrays.
 
     vertices: (n, 3).
-    corners: (k,) vertex indices, loop after loop.
-    sizes: (l,) the number of corners of each loop.
-    face_of_loop: (l,) ascending; every face has a loop.
+    corners: (k,) the vertex index of each corner, loop after loop.
+    loop_sizes: (l,) the number of corners of each loop.
+    face_of_loop: (l,) the face of each loop, ascending; every face has at least one loop.
     """
 
     vertices: FloatArray
@@ -116,12 +116,12 @@ class PolygonFaces:
         return is_convex
 
     def _projects_to_convex_polygon(self) -> BoolArray:
-        """(m,) whether each face is a single loop whose projection along its mean normal is a
-        convex polygon, run around once.
+        """For each face, whether it is a single loop whose projection along its mean normal is a
+        convex polygon that is run around once, as an array (m,).
 
-        Such a loop has no self-intersection, for its projection has none, and it lies on the
-        boundary of a convex set, the cylinder over the projection. A turn counts only if its sine
-        is more than a millionth, far above rounding: a face that is called convex is convex.
+        Such a loop has no self-intersection, for its projection has none. It lies on the boundary
+        of a convex set, the cylinder over the projection. A turn counts only if its sine is more
+        than a millionth, far above rounding, so that True is always right.
         """
         x = self.vertices[self.corners]
         face, first = self.face_of_corner, self.first_corners
@@ -283,7 +283,8 @@ def _check_edges(mesh: PolygonFaces) -> None:
 
 
 def _first_repeated_key(keys: IntArray) -> int | None:
-    """The index of the first key that occurs earlier in the array; None if all keys differ."""
+    """The smallest index of a key that also occurs earlier in the array; None if all keys
+    differ."""
     _, first = np.unique(keys, return_index=True)
     if len(first) == len(keys):
         return None
@@ -336,17 +337,19 @@ def cluster_into_polygons(
     smoothing: int = 0,
     seed: int = 0,
 ) -> tuple[FloatArray, list[list[list[int]]]]:
-    """Cut a triangle mesh into about `count` clusters, whose boundaries are polygons with a large
-    number of corners, not planar. Returns the vertices and the polygon faces, each a list of loops.
+    """Cut a triangle mesh into about `count` clusters of triangles. Returns the vertices (k, 3) and
+    the boundary of each cluster as a polygon face, a list of loops of vertex indices. The polygons
+    have many corners and are not planar; they serve as examples for pictures and tests.
 
-    For pictures and tests. Each triangle is a point (centroid, weight * normal) in six dimensions,
-    and Lloyd's algorithm finds the clusters, so that they are compact and bend little
-    (Cohen-Steiner, Alliez and Desbrun 2004 do so with planes).
+    Each triangle is a point (centroid, weight * normal) in six dimensions, and Lloyd's algorithm
+    finds the clusters, so that they are compact and bend little (Cohen-Steiner, Alliez and Desbrun
+    2004 do so with planes). Corners of the polygons are vertices of the mesh; all other vertices
+    are left out.
 
-    Corners of the polygons are vertices of the mesh; vertices inside of clusters are left out.
-    smoothing: the number of times that corners of just two edges are moved to the middle between
-        their position and the mean of their neighbors, since boundaries along triangles are
-        zigzags.
+    vertices, faces: (n, 3) and (m, 3), the triangle mesh.
+    iterations: the number of steps of Lloyd's algorithm. seed: of its random start.
+    smoothing: how often each corner with exactly two edges is moved to the middle between its
+        position and the mean of its two neighbors, since boundaries along triangles are zigzags.
 
     Raises:
         ValueError: fewer than two clusters, or more than triangles.
@@ -398,8 +401,12 @@ def _smoothed(points: FloatArray, edges: IntArray, times: int) -> FloatArray:
 def _clusters(
     vertices: FloatArray, faces: IntArray, count: int, iterations: int, seed: int
 ) -> IntArray:
-    """The cluster (m,) of each triangle, by Lloyd's algorithm in six dimensions
-    (`cluster_into_polygons`)."""
+    """The cluster (m,) of each triangle of a mesh. Triangles are points (centroid, weight * unit
+    normal) in six dimensions, weighted by area, and are clustered by Lloyd's algorithm.
+
+    count: the number of clusters; some may become empty. iterations: the number of Lloyd's steps.
+        seed: of the random initial centers.
+    """
     import scipy.spatial  # imported here: it takes half a second, and few programs need it
 
     spatial: Any = scipy.spatial

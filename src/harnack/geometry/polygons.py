@@ -49,11 +49,12 @@ def cancel_opposite_edges(loops: Loops) -> Loops:
 
 
 def remaining_edges(loops: Loops) -> tuple[FloatArray, FloatArray]:
-    """Starts and ends (k, 3) of the edges of closed loops that remain after
-    `cancel_opposite_edges`, each edge once.
+    """The starts and ends (k, 3) of the edges of closed loops that remain after opposite edges were
+    cancelled, each edge once.
 
-    Around an edge that is run n times net, the solid angle changes by 4 pi n: unless n = 0 it takes
-    every value modulo 4 pi next to each of its points, so that every level set ends there.
+    Around an edge that is run n times net (once in each direction counts 0), the solid angle
+    changes by 4 pi n. Unless n = 0 it takes every value modulo 4 pi next to each point of the edge,
+    so that every level set ends there.
     """
     if not loops:
         return np.zeros((0, 3)), np.zeros((0, 3))
@@ -63,8 +64,8 @@ def remaining_edges(loops: Loops) -> tuple[FloatArray, FloatArray]:
 
 
 def _welded_edges(loops: Loops, points: FloatArray) -> tuple[IntArray, IntArray]:
-    """The begin and the end (m,) of all edges of the loops, as indices of `points`, which are the
-    vertices of all loops. Points at the same position have the same index."""
+    """The first and the last point (m,) of all edges of the loops, as indices of `points` (m, 3),
+    the vertices of all loops. Points at the same position have the same index."""
     index = weld_vertices(points)
     parts = np.split(index, np.cumsum([len(loop) for loop in loops])[:-1])
     return index, np.concatenate([np.roll(part, -1) for part in parts])
@@ -150,16 +151,16 @@ def _group_by_size(sizes: IntArray) -> list[IntArray]:
 
 
 def _fans(polygons: IntArray) -> IntArray:
-    """The triangles (m (k - 2), 3) of polygons (m, k): the fan of each around its first corner."""
+    """The triangles (m (k - 2), 3) of m polygons with k corners each, (m, k): each polygon is
+    divided by the diagonals from its first corner."""
     first = np.broadcast_to(polygons[:, :1], polygons[:, 2:].shape)
     return np.stack([first, polygons[:, 1:-1], polygons[:, 2:]], axis=2).reshape(-1, 3)
 
 
 def _fan_is_invalid(vertices: FloatArray, polygons: IntArray) -> BoolArray:
-    """(m,) whether a triangle of the fan around the first corner is reversed or flat.
-
-    Polygons of zero area count as convex.
-    """
+    """For each of m polygons with k corners (indices (m, k) of `vertices`), whether a triangle of
+    the fan around its first corner is reversed or flat, as an array (m,). Polygons of zero area
+    count as convex."""
     points = vertices[polygons]
     diagonals = points[:, 1:] - points[:, :1]
     areas = np.cross(diagonals[:, :-1], diagonals[:, 1:])
@@ -170,8 +171,9 @@ def _fan_is_invalid(vertices: FloatArray, polygons: IntArray) -> BoolArray:
 
 
 def _projections(vertices: FloatArray, polygons: IntArray) -> FloatArray:
-    """Plane coordinates (m, k, 2) of polygons (m, k), projected along their mean normals; the
-    polygons run counter-clockwise."""
+    """Plane coordinates (m, k, 2) of m polygons with k corners (indices (m, k) of `vertices`), each
+    projected along its mean normal. In the plane the polygons run counter-clockwise and have a size
+    of about 1."""
     offsets = vertices[polygons]
     offsets = offsets - offsets[:, :1]
     normal = np.cross(offsets[:, :-1], offsets[:, 1:]).sum(axis=1)
@@ -185,7 +187,9 @@ def _projections(vertices: FloatArray, polygons: IntArray) -> FloatArray:
 
 
 def _clip_ears(polygon: IntArray, projection: FloatArray) -> IntArray:
-    """The triangles of a polygon (k,) whose projection (k, 2) is not convex."""
+    """The triangles (k - 2, 3) of a polygon (k,), by cutting off ears (triangles at convex
+    corners). projection: (k, 2) the polygon in the plane. A polygon that crosses itself may give
+    another number of triangles."""
     import mapbox_earcut  # imported here, since most files do not need it
 
     ears = np.zeros((0, 3), dtype=np.int64)
@@ -201,10 +205,9 @@ def _clip_ears(polygon: IntArray, projection: FloatArray) -> IntArray:
 
 
 def _perturb_straight_corners(projection: FloatArray) -> FloatArray:
-    """The polygon (k, 2), with corners in the middle of straight edges moved by a tiny amount.
-
-    Such a corner is then not an ear, which would be a triangle of zero area.
-    """
+    """The polygon (k, 2) with each corner in the middle of a straight edge moved inwards by a tiny
+    amount. Ear clipping then does not cut off such a corner, which would give a triangle of zero
+    area."""
     arriving, leaving = (
         projection - np.roll(projection, 1, axis=0),
         np.roll(projection, -1, axis=0) - projection,

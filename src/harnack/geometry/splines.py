@@ -89,7 +89,7 @@ def _as_sample_count(samples: Any) -> int:
 
 
 def _is_list(points: Any) -> bool:
-    """Whether this is a list of curves, as `validate_loops` reads it."""
+    """Whether the argument is a list of curves (arrays of points), and not a single curve."""
     try:
         return np.ndim(points) == 3
     except ValueError:  # curves of different lengths
@@ -97,10 +97,10 @@ def _is_list(points: Any) -> bool:
 
 
 def _spline(x: FloatArray, samples: int, closed: bool, power: float) -> FloatArray:
-    """The vertices of the spline through the points of a loop, with `samples` from each point to
-    the next.
+    """The vertices of the cubic spline through the points x (n, 3) of a curve, `samples` of them
+    from each point to the next.
 
-    x: (n, 3) the points.
+    closed: whether the curve returns to its first point.
     power: from a point to the next, the parameter grows by this power of their distance.
     """
     knots = np.concatenate([x, x[:1]]) if closed else x

@@ -53,10 +53,11 @@ class Volume(abc.ABC):
 
     @abc.abstractmethod
     def clip(self, o: Vec3, d: Vec3, t_min: Real, t_max: Real) -> tuple[Real, Real]:
-        """The interval [t0, t1] of the rays o + t d, 0 <= t_min <= t <= t_max, inside the volume.
+        """The interval [t0, t1] of t in which the points o + t d of each ray lie inside the volume,
+        within 0 <= t_min <= t <= t_max.
 
-        d need not have unit length, but must not be zero. Where a ray misses the volume t0 = inf
-        and t1 = -inf; everywhere else t0 < t1.
+        o, d: origins and directions; d need not have unit length, but must not be zero. If a ray
+            misses the volume, t0 = inf and t1 = -inf; otherwise t0 < t1.
         """
 
     @abc.abstractmethod
@@ -65,7 +66,8 @@ class Volume(abc.ABC):
 
     @abc.abstractmethod
     def signed_distance(self, p: Vec3) -> Real:
-        """Distance to the boundary, negative inside; outside a lower bound of the distance."""
+        """The distance of p to the boundary, negative inside. For points outside it may be a lower
+        bound of the distance."""
 
     @abc.abstractmethod
     def outward_normal(self, p: Vec3) -> Vec3:
@@ -73,7 +75,8 @@ class Volume(abc.ABC):
 
     @abc.abstractmethod
     def bounds(self) -> tuple[FloatArray, FloatArray]:
-        """Lower and upper corner, (3,) each, of an axis-aligned box around it; may be infinite."""
+        """Lower and upper corner, (3,) each, of an axis-aligned box around the volume; coordinates
+        may be infinite."""
 
     @abc.abstractmethod
     def contains_points(self, points: npt.ArrayLike) -> BoolArray:
@@ -81,7 +84,7 @@ class Volume(abc.ABC):
 
     @abc.abstractmethod
     def padded(self, distance: float) -> Volume:
-        """A volume that holds every point within `distance` (>= 0, finite) of this one."""
+        """A volume that contains every point within `distance` (>= 0, finite) of this volume."""
 
     def prepare(self, backend: Backend) -> Volume:
         """An equal volume whose numbers are kernel parameters on the backend.
@@ -99,10 +102,11 @@ def _operands(volume: Volume) -> tuple[Volume, ...]:
 
 
 def clip_rounding(backend: Backend) -> float:
-    """Relative error allowed for one clipping formula: ten roundings of half a unit.
+    """The relative error that is allowed for one formula of clipping: ten roundings of half a unit
+    in the last place.
 
-    The longest chain of roundings among volumes (a plane: normal rounded to the backend, three
-    products, three sums, one division) is nine.
+    The longest chain of roundings among all volumes (a plane: its normal rounded to the backend,
+    three products, three sums, one division) is nine.
     """
     return 10.0 * float(dr.epsilon(backend.Float))
 
@@ -142,10 +146,10 @@ def check_volume(given: object, name: str) -> None:
 
 
 def as_padding(distance: float) -> float:
-    """A padding distance.
+    """The padding distance as a float.
 
     Raises:
-        ValueError: negative, infinite or NaN.
+        ValueError: it is negative, infinite or NaN.
     """
     if not 0.0 <= distance < np.inf:
         raise ValueError(f"the padding must be finite and not negative, not {distance!r}")

@@ -89,16 +89,19 @@ class TangentVoronoi:
         self, points: FloatArray, normals: FloatArray, nearest: npt.NDArray[Any],
         radii: FloatArray, *, mirrored: bool,
     ) -> tuple[FloatArray, BoolArray]:  # fmt: skip
-        """The areas (m,) of cells in units of the squared radii, and a mask (m,) of the points all
-        of whose neighbors lie on one side.
+        """The areas (m,) of the cells of m points, in units of their squared radii; and a mask (m,)
+        of the points whose neighbors all lie on one side of a line through the point.
 
-        mirrored: whether the mirror images of the neighbors count as well.
+        points, normals: (m, 3) the points, and the unit normals of their tangent planes.
+        nearest: (m, k) indices of the neighbors among `positions`.
+        radii: (m,) the radius at which each cell is cut off.
+        mirrored: whether the mirror images of the neighbors at the point count as neighbors too.
 
-        Each neighbor has a bisector line, at distance h_j from the center of the cell. The other
-        lines and the circle leave an interval of line j: an edge of the cell. The cell is star
-        shaped, so its area is the sum of the triangles between these edges and the center, and of
-        circular sectors in the remaining directions. All neighbors lie on one side if one of them
-        has no other neighbor to its left.
+        Each neighbor j has a bisector line in the tangent plane, at the distance h_j from the
+        center of the cell. The other lines and the circle leave an interval of line j: an edge of
+        the cell. The cell is star shaped, so its area is the sum of the triangles between these
+        edges and the center, and of circular sectors in the remaining directions. All neighbors lie
+        on one side if one of them has no other neighbor to its left.
         """
         backend, index = self.backend, self.backend.UInt32
         u, v = (upload_vectors(backend, axis) for axis in orthonormal_basis_rows(normals))
@@ -159,7 +162,7 @@ class TangentVoronoi:
 
 
 def _below(count: Any) -> Callable[..., Mask]:
-    """A loop condition: whether the first number of the state is below `count`."""
+    """The condition of a Dr.Jit loop: whether the first entry of its state is below `count`."""
 
     def is_active(i: Any, *_: Any) -> Mask:
         return i < count
@@ -168,7 +171,8 @@ def _below(count: Any) -> Callable[..., Mask]:
 
 
 def _line_in_disc(backend: Backend, q: tuple[Real, Real], b: Real) -> _BisectorLine:
-    """The line q . y = b as a `_BisectorLine`, relative to the unit disc."""
+    """The line q.y = b in the plane, with its normal scaled to unit length, as a `_BisectorLine`.
+    If it misses the unit disc, its normal becomes 0."""
     length = dr.sqrt(dr.square(q[0]) + dr.square(q[1]))
     crosses = length > b
     inverse = dr.select(crosses, dr.rcp(length), 0)
@@ -182,12 +186,12 @@ def _clip_bisectors(
     bisector: Any,
     line_count: Any,
 ) -> list[tuple[Real, Real, Mask]]:
-    """For each of `own_lines`, the interval (lower, upper) of positions along it that all other
-    lines leave, empty if lower >= upper; and whether another neighbor lies to the left of its
-    neighbor.
+    """For each line of `own_lines`: the interval (lower, upper) of positions along it that lie in
+    the cell, that is in the unit disc and not beyond another line (empty if lower >= upper); and
+    whether some other neighbor lies to the left of the line's neighbor.
 
-    indices: the indices of `own_lines`.
-    bisector: gives the line of an index, in lanes of a mask.
+    indices: the index of each of `own_lines` among all lines.
+    bisector: bisector(i, mask) returns line i, in lanes of the mask.
     line_count: the number of all lines.
     """
     initial: list[Any] = []

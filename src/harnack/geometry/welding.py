@@ -1,9 +1,9 @@
-"""Welding of meshes: vertices at the same position, up to rounding, are joined.
+"""Joins (welds) vertices of meshes that are at the same position up to rounding.
 
 Programs compute a corner once for each face around it, and may get 0 for one face and 2.7e-16 for
 another. As edges are compared by index, such faces would not be neighbors. So corners at boundary
-edges are joined if rounding explains their distance. All other vertices stay as they are, and so
-does a closed mesh.
+edges are joined if rounding explains their distance. All other vertices, and closed meshes, stay as
+they are.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ _MAX_EDGE_FRACTION = 1e-3
 
 
 def rounding_of(vertices: FloatArray) -> float:
-    """The distance by which rounding may separate corners at the same position: four units in the
-    last place of the largest coordinate, of single precision if all coordinates are numbers of
-    single precision."""
+    """The distance by which rounding may separate two corners that should be at the same position:
+    four units in the last place of the largest coordinate of the vertices (n, 3). These are units
+    of single precision if all coordinates are numbers of single precision."""
     single = vertices.astype(np.float32)
     precision = np.float32 if (single == vertices).all() else np.float64
     return _MAX_ULPS * float(np.finfo(precision).eps) * float(np.abs(vertices).max(initial=0.0))
@@ -77,17 +77,21 @@ class Welded:
     def _from_index(
         cls, index: IntArray, vertices: FloatArray, faces: IntArray, rounded: int
     ) -> Welded:
-        """The mesh with vertex k replaced by vertex index[k]. rounded: see `Welded`."""
+        """The mesh in which vertex k is replaced by vertex index[k]. rounded: the number of
+        positions that were joined although rounding separates them."""
         net = net_faces(index[faces])
         return cls(index, net, *singular_edges(net.faces, net.multiplicity), rounded)
 
 
 def _joined_by_rounding(positions: FloatArray, faces: IntArray, candidates: IntArray) -> IntArray:
-    """The representative (n,) of each vertex: itself, or the vertex that it is joined to.
+    """For each vertex the vertex (n,) to which it is joined, or itself.
 
-    positions: (n, 3) of the vertices.
-    faces: (m, 3).
+    positions: (n, 3) of the vertices. faces: (m, 3).
     candidates: (k,) the vertices that may be joined, all at different positions.
+
+    Pairs of candidates are joined if rounding explains their distance. If a face would then lose
+    its area or a corner, the vertices of that face are not joined after all, and the rest is tried
+    again.
     """
     representative = np.arange(len(positions))
     pairs = candidates[pairs_within(positions[candidates], rounding_of(positions[faces]))]
@@ -115,7 +119,7 @@ def _joined_by_rounding(positions: FloatArray, faces: IntArray, candidates: IntA
 
 
 def pairs_within(points: FloatArray, distance: float) -> IntArray:
-    """(k, 2) indices of the pairs of points (n, 3) that are at most a distance apart."""
+    """The pairs of points (n, 3) that are at most `distance` apart, as indices (k, 2)."""
     import scipy.spatial  # imported here: it takes half a second, and few programs need it
 
     spatial = cast("Any", scipy.spatial)

@@ -1,5 +1,5 @@
-"""Legends of live pictures that are colored by numbers: `show` other than "shaded". legend.js draws
-them beside the picture."""
+"""Legends of live pictures whose colors stand for numbers, that is of all values of the option
+`show` but "shaded". legend.js draws a legend beside the picture."""
 
 from __future__ import annotations
 
@@ -28,21 +28,21 @@ NEAR_GRAY, FAR_GRAY, HIT_COLOR = 0.95, 0.12, (0.93, 0.93, 0.90)
 
 
 def evaluations_share(evaluations: Any) -> Any:
-    """The position of numbers of evaluations on their scale, which is logarithmic: 0 for none, 1
-    for `EVALUATIONS_TOP`."""
+    """The positions, on the logarithmic color scale, of numbers of evaluations per ray: 0 for no
+    evaluation, 1 for `EVALUATIONS_TOP` evaluations. evaluations: a number or an array of numbers;
+    the result has its shape."""
     return np.log2(1.0 + np.asarray(evaluations)) / math.log2(1.0 + EVALUATIONS_TOP)
 
 
 def legends() -> dict[str, Any]:
-    """The legend of each kind of picture, by the name of the picture: a title, and either the
-    colors of a scale, from its low end to its high end in equal steps, or swatches, which are names
-    and their colors.
+    """The legends of all kinds of pictures, as JSON data by the value of `show`.
 
-    In a legend, "ticks" are the positions of numbers on the scale, from 0 to 1, and their labels;
-    None for the least and the greatest number that is seen, which are lengths in the unit of the
-    surfaces.
+    Each legend has a "title". A legend of a color scale has "colors", CSS colors at equal steps
+    from the low end to the high end of the scale, and "ticks", pairs of a position from 0 to 1 on
+    the scale and a label. "ticks" is None if the labels are the least and the greatest number in
+    the picture. "swatches" are pairs of a name and its CSS color (None for the background).
     """
-    lost = ["out of steps", _css(OUT_OF_STEPS_COLOR)]
+    out_of_steps_swatch = ["out of steps", _css(OUT_OF_STEPS_COLOR)]
     ticks = [[float(evaluations_share(n)), str(n)] for n in _EVALUATIONS[:-1]] + [
         [1.0, f"{EVALUATIONS_TOP}+"]
     ]
@@ -51,28 +51,29 @@ def legends() -> dict[str, Any]:
             "title": "evaluations of a ray, log scale",
             "colors": [_css(color) for color in viridis(np.linspace(0, 1, _STOPS))],
             "ticks": ticks,
-            "swatches": [lost],
+            "swatches": [out_of_steps_swatch],
         },
         "depth": {
             "title": "depth, in units of the surface",
             "colors": [_css((gray,) * 3) for gray in (NEAR_GRAY, FAR_GRAY)],
             "ticks": None,
-            "swatches": [lost],
+            "swatches": [out_of_steps_swatch],
         },
         "normal": {
             "title": "normal: x, y, z as red, green, blue",
             "swatches": [
                 *([f"+{axis}", _css(0.5 + 0.5 * np.eye(3)[k])] for k, axis in enumerate("xyz")),
                 *([f"-{axis}", _css(0.5 - 0.5 * np.eye(3)[k])] for k, axis in enumerate("xyz")),
-                lost,
+                out_of_steps_swatch,
             ],
         },
         "status": {
             "title": "outcome of a ray",
-            "swatches": [["hit", _css(HIT_COLOR)], ["miss", None], lost],
+            "swatches": [["hit", _css(HIT_COLOR)], ["miss", None], out_of_steps_swatch],
         },
     }
 
 
 def _css(color: Sequence[float] | Any) -> str:
+    """An sRGB color of three numbers from 0 to 1 as CSS text, such as "#f2f2f2"."""
     return "#" + bytes(to_uint8(np.array(color, np.float64))).hex()

@@ -1,5 +1,5 @@
-"""The placement of live surfaces on the stage, and a camera that sees them for all values of their
-sliders."""
+"""Places live surfaces on the stage (the scene's coordinates, in which the floor is horizontal),
+and computes a camera that sees the surfaces for all values of their sliders."""
 
 from __future__ import annotations
 
@@ -28,11 +28,13 @@ _DIRECTIONS = 200
 
 @dataclass(frozen=True)
 class Framing:
-    """The placement of surfaces on the stage, and the camera that sees them.
+    """The placement of surfaces on the stage, and a camera that sees them.
 
-    camera: a camera that turns about a target, as camera.js takes it, in the stage's coordinates.
-    box: the box that stands on the ground, in the coordinates of the surfaces, where more is framed
-        than is seen at first; None otherwise.
+    placement: the similarity that maps coordinates of the surfaces to coordinates of the stage.
+    camera: a camera that turns about a target, as data for camera.js: "target", "distance" in units
+        of the stage; "azimuth", "elevation" and "fov" in degrees.
+    box: the box that stands on the ground, in the coordinates of the surfaces; None if the
+        surfaces' own points stand on the ground.
     """
 
     placement: Placement
@@ -41,12 +43,15 @@ class Framing:
 
     @classmethod
     def of(cls, camera: Camera, up: Any, points: FloatArray, *, is_whole: bool) -> Framing:
-        """The framing of points (n, 3) of the surfaces.
+        """Place points (n, 3) of the surfaces on the stage, and frame them.
 
-        camera: as `render` takes it; its box is framed in place of the points.
-        up: as `render` takes it.
-        is_whole: whether all points to be framed are seen at first; otherwise the box of the points
-            stands on the ground, as in all pictures of an animation.
+        camera: the camera option of `render`. If it has a box, this box is framed in place of the
+            points.
+        up: the up option of `render`, the axis or vector of the surfaces' coordinates that points
+            up.
+        is_whole: whether all points belong to the surfaces at the start. If not (points for other
+            slider values are among them), the bounding box of the points stands on the ground, so
+            that all states have the same placement.
         """
         box = camera.box
         if box is not None:
@@ -58,13 +63,15 @@ class Framing:
         return cls(placement, _orbit(camera, placement, points), box)
 
     def with_box(self, camera: Camera) -> Camera:
-        """A camera for `render` with which the surfaces stand at the same place as here."""
+        """The camera, with this framing's box if it has no box of its own. `render` with this
+        camera places the surfaces on the stage exactly as this framing does."""
         return camera if camera.box is not None else replace(camera, box=self.box)
 
 
 def extreme_points(points: FloatArray) -> FloatArray:
-    """The points, of n (n, 3), that are farthest in any of many directions: they determine the
-    framing of a camera."""
+    """The points, of points (n, 3), that are farthest in at least one of 200 fixed random
+    directions; all points if there are at most 200. A camera that frames them frames nearly all n
+    points."""
     if len(points) <= _DIRECTIONS:
         return points
     directions = np.random.default_rng(0).normal(size=(3, _DIRECTIONS))
@@ -72,7 +79,12 @@ def extreme_points(points: FloatArray) -> FloatArray:
 
 
 def _orbit(camera: Camera, placement: Placement, points: FloatArray) -> dict[str, Any]:
-    """A camera that turns about a point before it, in the coordinates of the stage."""
+    """A camera that turns about a target, as data for camera.js (see `Framing.camera`).
+
+    It stands where `camera` stands when it frames the points (n, 3) after placement, and looks in
+    the same direction. The target is the point of the line of sight that is as far from the camera
+    as the middle of the points' box, measured along the line of sight.
+    """
     on_stage = placement.apply(points)
     pose = camera.pose(on_stage, _SIZE, placement.apply)
     forward = pose.target - pose.origin
@@ -92,5 +104,6 @@ def _orbit(camera: Camera, placement: Placement, points: FloatArray) -> dict[str
 
 
 def _three(point: FloatArray) -> tuple[float, float, float]:
+    """A point (3,) as a tuple of three floats."""
     x, y, z = (float(c) for c in point)
     return x, y, z

@@ -1,6 +1,8 @@
-"""Live scenes: surfaces on the studio's stage, each as a kernel for other GPUs with its data.
+"""Live scenes: surfaces on the studio's stage as data that `renderer.js` draws.
 
-Everything here is plain: numbers, lists and text, as `renderer.js` takes it.
+Each surface has a shader, a kernel translated from Dr.Jit's recording, and the words that the
+shader reads. All data is plain: numbers, lists, text, and arrays of words that `encode_arrays`
+turns into text.
 """
 
 from __future__ import annotations
@@ -100,11 +102,15 @@ class ControlState:
     """The state of the controls of a live scene: its sliders, its edited curve, its cut and its
     settings.
 
-    values: of all sliders.
-    curves: vertices (n, 3) of each loop, in place of those of the field's curve.
-    cut_volume: a volume that cuts all surfaces; a half-space opens them, as `section` of
-        `harnack.Surface` does.
-    settings: a selection of `LIVE_OPTIONS`, in place of those that the scene was opened with.
+    values: the values of all sliders by name.
+    curves: vertices (n, 3) of each loop of the editable curve, in place of the field's own; None if
+        nobody has edited the curve.
+    cut_volume: a volume by which all surfaces are cut, as well as by their own volumes. A
+        half-space is used as the option `section` of `harnack.Surface`, so that one looks inside;
+        any other volume as its option `clip`, so that only the part inside of the volume is kept.
+        None for no cut.
+    settings: values of some of the options `LIVE_OPTIONS`, in place of those that the scene was
+        opened with.
     """
 
     values: Mapping[str, float]
@@ -115,14 +121,18 @@ class ControlState:
 
 @dataclass(frozen=True)
 class LiveScene:
-    """A live scene: its content as a function of sliders, its placement on the stage, and the rays
-    by which devices are checked.
+    """A live scene: its content as a function of sliders, its placement on the stage, and how it is
+    shown.
 
-    points: (n, 3) of each surface, as it is seen at first.
-    camera, up: as `render` takes them.
-    editable: whether the vertices of its curve can be moved.
-    show: the kind of picture shown at first.
-    sources: where fields come from, for scene files.
+    content: the surfaces and options as functions of the sliders.
+    points: visible points (n, 3) of each surface at the start, in the surfaces' coordinates.
+    camera, up: the options of `render` by these names.
+    framing: the placement on the stage, and the camera that is shown at first.
+    backdrop: "light" or "dark", the kind of ground.
+    editable: whether a person can move the vertices of the curve of the scene's `SolidAngle`.
+    show: the kind of picture shown at first, one of `LIVE_MODES`.
+    sources: pairs of a field and its description in scene files, for fields from files or the
+        gallery.
     """
 
     content: SlidingContent
@@ -140,15 +150,18 @@ class LiveScene:
         cls, surfaces: Any, options: Mapping[str, Any], *, edits: bool = False,
         sources: FieldSources = (),
     ) -> LiveScene:  # fmt: skip
-        """The live scene of the arguments of `page` or `view`.
+        """Make the live scene from the arguments of `page` or `view`.
 
-        edits: whether vertices of curves are to be moved, so that the recorded kernel must not
-            depend on them.
-        sources: where fields come from, for scene files.
+        surfaces: a field, a `Surface`, a list of them, or a function of sliders that returns them.
+        options: options of `view` by name; values may be sliders or functions of sliders.
+        edits: whether vertices of curves can be edited. If so, the recorded kernel reads the
+            vertices as data, so that it serves all their positions.
+        sources: pairs of a field and its description in scene files.
 
         Raises:
-            TypeError, ValueError: as `render` does; also for a transparent material, a `show` that
-            is not in `LIVE_MODES`, and a backdrop that is not "light" or "dark".
+            TypeError, ValueError: the errors of `render` for its options; also for a transparent
+                material, a `show` that is not in `LIVE_MODES`, and a backdrop that is not "light"
+                or "dark".
         """
         refuse_others("view", options)
         options = with_flat_options(options)
@@ -175,11 +188,12 @@ class LiveScene:
         )
 
     def framed(self, places: Iterable[Mapping[str, float]]) -> LiveScene:
-        """The live scene, framed so that nothing leaves the picture for these slider values; a box
-        of the camera stays the framed box.
+        """This scene with a placement and a camera such that the surfaces stay in the picture for
+        all slider values in `places`, each a mapping from slider names to values. A scene without
+        sliders, or whose camera has a box, is returned unchanged.
 
-        Slider values for which nothing can be drawn are left out: the error is reported where they
-        are drawn.
+        Slider values for which nothing can be drawn are left out here: drawing them reports the
+        error.
         """
         if not self.content.sliders or self.camera.box is not None:
             return self
@@ -195,16 +209,18 @@ class LiveScene:
 
     @property
     def placement(self) -> Placement:
-        """Where the surfaces stand on the stage."""
+        """The similarity that maps coordinates of the surfaces to coordinates of the stage."""
         return self.framing.placement
 
     @cached_property
     def rays(self) -> tuple[tuple[FloatArray, FloatArray], ...]:
-        """Rays on the stage by which devices are checked, of each surface."""
+        """Test rays for each surface: origins and unit directions, both (2048, 3), in stage
+        coordinates. A browser traces them and compares its results with Dr.Jit's."""
         return tuple(_rays(self.placement.apply(points)) for points in self.points)
 
     def scene(self, title: str) -> JsonDict:
-        """All data that a page needs when it opens, as plain data for `renderer.js`."""
+        """All data that a page needs when it opens, as JSON data for `renderer.js`: placement,
+        camera, sliders, legends and the initial state."""
         place, points = self.placement, np.concatenate(self.points)
         _, settings = self._at(self.initial_controls)
         material = settings.get("material")
@@ -236,12 +252,14 @@ class LiveScene:
 
     @cached_property
     def initial_state(self) -> JsonDict:
-        """The state at the start. Later states are sent as differences from it."""
+        """The state (as `state` returns it) at the start values of all sliders. Later states are
+        sent as differences from it."""
         return self.state(self.initial_controls)
 
     @property
     def pose(self) -> JsonDict:
-        """The camera's position, target and field of view, in the surfaces' coordinates."""
+        """The first camera as {"position": (3,), "target": (3,), "fov": degrees}, in the surfaces'
+        coordinates."""
         orbit, place = self.framing.camera, self.placement
         azimuth, elevation = np.radians([orbit["azimuth"], orbit["elevation"]])
         back = np.array([np.cos(azimuth), np.sin(azimuth), np.tan(elevation)]) * np.cos(elevation)
@@ -251,12 +269,19 @@ class LiveScene:
 
     @property
     def initial_controls(self) -> ControlState:
-        """The state in which nothing has been moved yet."""
+        """The controls at the start: sliders at their start values, no edited curve, no cut."""
         return ControlState(self.content.starts)
 
     def state(self, controls: ControlState) -> JsonDict:
-        """The surfaces of a state as plain data, and the curves at which they end. Its arrays are
-        NumPy's; `encode_arrays` makes them text."""
+        """The surfaces of a state of the controls as data, {"surfaces": a dictionary for each
+        surface as `_kernel_data` returns it, "curves": a list of points for each loop of the
+        boundary curves}. Its arrays of words are NumPy's; `encode_arrays` turns them into text.
+
+        Raises:
+            ValueError: the surfaces and isolines have more colors than the browser's table can
+                hold.
+            SliderValueError: nothing can be drawn at these slider values.
+        """
         drawn = self.surfaces_at(controls)
         with slider_values_in_errors(controls.values):
             placed = [self.place(body) for body in drawn]
@@ -277,12 +302,14 @@ class LiveScene:
         return {"surfaces": surfaces, "curves": [np.asarray(curve).tolist() for curve in curves]}
 
     def surfaces_at(self, controls: ControlState) -> list[StudioObject]:
-        """The surfaces of a state as objects of the studio."""
+        """The surfaces, for a state of the controls, as objects of the studio (surface, material
+        and isolines). Raises `SliderValueError` if they cannot be made at these slider values."""
         with slider_values_in_errors(controls.values):
             return self._drawn(controls)
 
     def _at(self, controls: ControlState) -> tuple[Any, dict[str, Any]]:
-        """The content and its settings."""
+        """The surfaces, and the options of `view` by name, for a state of the controls. Options
+        that a person changed (`controls.settings`) replace those of the scene."""
         content, settings = self.content.at(controls.values)
         settings |= controls.settings
         if "boundary_radius" in controls.settings and settings["boundary_radius"] is None:
@@ -290,6 +317,8 @@ class LiveScene:
         return content, settings
 
     def _drawn(self, controls: ControlState) -> list[StudioObject]:
+        """The surfaces as objects of the studio, with tolerances, cut by the volume of the
+        controls, and with the edited curve in place of the field's own."""
         content, settings = self._at(controls)
         drawn = _studio_objects(content, settings)
         curve = _curve_of(drawn) if self.editable else None
@@ -320,7 +349,8 @@ class LiveScene:
         ]
 
     def render_still(self, controls: ControlState, **options: Any) -> Picture:
-        """A still picture of a state by `render`. options: of `render`, in place of the scene's."""
+        """A still picture of a state of the controls, drawn by `render`. options: options of
+        `render` that replace those of the scene."""
         _, settings = self._at(controls)
         style = {
             name: settings[name] for name in ("isolines", "section_material") if name in settings
@@ -335,12 +365,15 @@ class LiveScene:
         )
 
     def to_scene_text(self, controls: ControlState, **options: Any) -> tuple[str, list[str]]:
-        """The state as the text of a scene file, and the names of the sliders that are not in it,
-        because their functions are Python's: the file has the result of these functions.
-        options: of `render`, besides those of the content.
+        """A state of the controls as the text of a scene file, and the names of the sliders that
+        the text has lost. A slider is lost if a Python function depends on it; the text then
+        holds the result of the function at the slider's value.
+
+        options: more options of `render` to be written.
 
         Raises:
-            SceneFileError: a text cannot hold it.
+            SceneFileError: the content cannot be written as text, for example a field made in
+                Python.
         """
         if isinstance(options.get("camera"), Camera):
             options["camera"] = self.framing.with_box(options["camera"])
@@ -351,39 +384,42 @@ class LiveScene:
             surfaces = _with_loops(content, curve, controls.curves)
         if controls.cut_volume is not None:
             surfaces, settings = _with_cut_options(surfaces, settings, controls.cut_volume)
-        lost: list[str] = []
+        lost_sliders: list[str] = []
         for name, slider in self.content.sliders.items():
             if (
                 self.content.settings.get(name) is slider and name not in controls.settings
             ):  # in the place of what surfaces have
                 settings[name] = replace(slider, start=controls.values[name])
             else:
-                lost.append(name)
-        return to_scene_text(surfaces, {**settings, **options}, self.sources), lost
+                lost_sliders.append(name)
+        return to_scene_text(surfaces, {**settings, **options}, self.sources), lost_sliders
 
     def _fitted(self, body: StudioObject) -> StudioObject:
-        """The object with a tolerance: its own, or one that suits its size on the stage."""
+        """The object with its own hit tolerance, or, if it has none, with a tolerance of 1e-4 in
+        units of the stage."""
         if body.surface.tolerance is not None:
             return body
         tolerance = HitTolerance(_TOLERANCE / self.placement.scale)
         return replace(body, surface=replace(body.surface, tolerance=tolerance))
 
     def place(self, body: StudioObject) -> PlacedSurface:
-        """A surface on the stage, with its data on the backend."""
+        """The object's surface moved to the stage and prepared for tracing in single precision."""
         size = float(np.linalg.norm(np.diff(bounding_box(body.surface), axis=0)))
         backend = choose_backend("single")
         return PlacedSurface.of(body.surface, self.placement, backend, body.isolines, size)
 
 
 def live_options(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """The options of `render` that pages and views take: without those of still pictures only, such
-    as a size, and with "shaded" in place of a `show` that cannot be drawn interactively."""
+    """The options among `settings` that pages and views take. Options for still pictures alone,
+    such as a size, are left out, and "shaded" replaces a `show` that is not in `LIVE_MODES`."""
     options = {name: value for name, value in settings.items() if name not in STILL_OPTIONS}
     return {**options, "show": options["show"] if options.get("show") in LIVE_MODES else "shaded"}
 
 
 def with_cut(surface: TracedSurface, volume: Volume) -> TracedSurface:
-    """A surface cut by one more volume; by a half-space, it is opened to be looked into."""
+    """The surface, cut by one more volume. A half-space becomes part of the surface's `section`, so
+    that one looks inside; any other volume becomes part of its `clip`, outside of which nothing is
+    drawn."""
     name = _cut_option(volume)
     combined = _overlap(getattr(surface, name), volume)
     cut_surface = replace(surface, **cast("Any", {name: combined})).with_call_cache(begins=True)
@@ -393,8 +429,9 @@ def with_cut(surface: TracedSurface, volume: Volume) -> TracedSurface:
 def _with_cut_options(
     surfaces: list[Any], settings: dict[str, Any], volume: Volume
 ) -> tuple[list[Any], dict[str, Any]]:
-    """The surfaces and settings, cut by one more volume: in the settings if they hold the keywords
-    of the surfaces, of which sliders may be values."""
+    """The surfaces and the options, cut by one more volume. The volume becomes an option if the
+    options have keywords of `Surface`, such as a level (whose values may be sliders); otherwise it
+    becomes part of each surface."""
     name = _cut_option(volume)
     if any(option in SURFACE_OPTIONS for option in settings):
         return surfaces, {**settings, name: _overlap(settings.get(name), volume)}
@@ -405,20 +442,23 @@ def _with_cut_options(
 
 
 def _cut_option(volume: Volume) -> str:
-    """The option of surfaces that a volume is the value of."""
+    """The name of the keyword of `Surface` that takes the volume: "section" for a half-space,
+    otherwise "clip"."""
     return "section" if isinstance(volume, HalfSpace) else "clip"
 
 
 def _overlap(previous: Volume | None, volume: Volume) -> Volume:
-    """The intersection of two volumes, of which the first may be None, for all of space."""
+    """The intersection of two volumes; `previous` = None stands for all of space."""
     return volume if previous is None else VolumeIntersection((previous, volume))
 
 
 def _with_loops(content: Any, curve: SolidAngle, loops: Any) -> list[Any]:
-    """Fields and surfaces with other vertices of one curve."""
+    """The surfaces of `content` as a list, with the field `curve` replaced by a `SolidAngle` of
+    `loops`, an array of vertices (n, 3) for each loop."""
     moved = SolidAngle([*loops])
 
     def edited(surface: Any) -> Any:
+        """The surface or field, with the new curve if its field is the old one."""
         if isinstance(surface, Surface) and surface.field is curve:
             return surface.replace(field=moved)
         return moved if surface is curve else surface
@@ -428,10 +468,13 @@ def _with_loops(content: Any, curve: SolidAngle, loops: Any) -> list[Any]:
 
 
 def _objects_at(content: SlidingContent, values: Mapping[str, float]) -> list[StudioObject]:
+    """The content at the given slider values as objects of the studio."""
     return _studio_objects(*content.at(values))
 
 
 def _studio_objects(surfaces: Any, options: Mapping[str, Any]) -> list[StudioObject]:
+    """Surfaces, with the options of `view` by name, as objects of the studio. Raises `ValueError`
+    for a transparent material."""
     studio = {name: options[name] for name in _OF_STUDIO if name in options}
     isolines = parse_isolines(options.get("isolines"))
     bodies = studio_objects(
@@ -444,7 +487,8 @@ def _studio_objects(surfaces: Any, options: Mapping[str, Any]) -> list[StudioObj
 
 
 def _surface_and_trace(options: Mapping[str, Any]) -> dict[str, Any]:
-    """The options of surfaces and traces. Raises TypeError for one that live pictures have not."""
+    """Those of the options that are keywords of `Surface` or options of traces. Raises `TypeError`
+    for an option that `view` does not have."""
     refuse_unknown("view", options)
     return shorthand_among(options)
 
@@ -458,22 +502,28 @@ def check_opaque(material: Material) -> None:
 
 
 def _curve_of(bodies: Sequence[StudioObject]) -> SolidAngle | None:
-    """The field whose curve can be edited; None if there is no such field, or more than one."""
+    """The `SolidAngle` whose vertices can be edited; None if the objects have no such field, or
+    more than one. Curves with circles cannot be edited."""
     fields = {id(body.surface.field): body.surface.field for body in bodies}
     curves = [f for f in fields.values() if isinstance(f, SolidAngle) and not f.circles]
     return curves[0] if len(curves) == 1 else None
 
 
 def _kernel_data(
-    body: StudioObject, placed: PlacedSurface, o: FloatArray, d: FloatArray
+    body: StudioObject, placed: PlacedSurface, origins: FloatArray, directions: FloatArray
 ) -> JsonDict:
-    """A surface as plain data: its shader, the words that the shader reads, its colors, and rays
-    with Dr.Jit's answers."""
+    """A surface as data for `renderer.js`: its shader and the words that the shader reads, its
+    colors and tolerance, and, under "check", the test rays with the results that Dr.Jit computes
+    for them.
+
+    placed: the surface on the stage.
+    origins, directions: (n, 3) of the test rays, in stage coordinates.
+    """
     backend = choose_backend("single")
     lanes = {
-        "o": to_vector3(backend, o),
-        "d": to_vector3(backend, d),
-        "far": backend.Float(np.full(len(o), np.inf, np.float32)),
+        "o": to_vector3(backend, origins),
+        "d": to_vector3(backend, directions),
+        "far": backend.Float(np.full(len(origins), np.inf, np.float32)),
     }
 
     def compute(o: Vec3, d: Vec3, far: Real) -> JsonDict:
@@ -488,7 +538,9 @@ def _kernel_data(
     results = {name: kernel.results.get(f"result {name}") for name in _RESULTS}
     if any(results[name] is None for name in _RESULTS[:-1]):
         raise ValueError("what rays meet is the same for all of them: there is nothing to draw")
-    answers = [np.zeros(len(o), np.uint32) if x is None else as_words(x) for x in results.values()]
+    answers = [
+        np.zeros(len(origins), np.uint32) if x is None else as_words(x) for x in results.values()
+    ]
     return {
         "key": hashlib.sha256(kernel.shader.code.encode()).hexdigest()[:16],
         "code": kernel.shader.code,
@@ -500,22 +552,24 @@ def _kernel_data(
         "check": {
             "lanes": np.stack([as_words(inputs[label]) for label in kernel.shader.lanes]),
             "results": np.stack(answers),
-            "count": len(o),
+            "count": len(origins),
         },
     }
 
 
 def status_of(met: SurfaceHit) -> Any:
-    """The `RayStatus` of each ray."""
-    hit, out, miss = (
+    """The `RayStatus` of each ray as an array of integers. met: the hits of the rays."""
+    hit, out_of_steps, miss = (
         type(met.evaluations)(int(status))
         for status in (RayStatus.HIT, RayStatus.OUT_OF_STEPS, RayStatus.MISS)
     )
-    return dr.select(met.is_out_of_steps, out, dr.select(met.is_hit, hit, miss))
+    return dr.select(met.is_out_of_steps, out_of_steps, dr.select(met.is_hit, hit, miss))
 
 
 def color_index(met: SurfaceHit) -> Any:
-    """The index in `surface_colors` of the color that each ray meets."""
+    """For each ray, the index in `surface_colors` of the color of the hit: 0 for the surface
+    itself, 1 for a filling of a hole, 2 for a cut face on a section, 2 + k for isoline k = 1, 2,
+    ..."""
     index = cast("Any", type(met.evaluations))
     plain = dr.select(
         met.is_on_section, index(_CUT), dr.select(met.is_hole_filling, index(_MENDED), index(0))
@@ -524,32 +578,39 @@ def color_index(met: SurfaceHit) -> Any:
 
 
 def placed_tolerance(body: StudioObject, placed: PlacedSurface) -> float:
-    """The tolerance as a length of the stage."""
+    """The hit tolerance of the object's surface as a length in units of the stage."""
     return body.surface.hit_tolerance.distance * float(placed.scale[0])
 
 
 def _place(kernel: RecordedKernel, label: str) -> int:
-    """The place of a result in the shader's output, or `_NO_OUTPUT` if it is 0 for all rays."""
+    """The index of a result, such as "result t", in the shader's output; `_NO_OUTPUT` if it is 0
+    for all rays, so that the shader does not write it."""
     if label in kernel.constants:
         return _NO_OUTPUT
     return kernel.shader.results.index(label)
 
 
 def _rays(points: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Origins and unit directions (n, 3) of rays from all sides to places near points of the
-    stage."""
+    """2048 pseudo-random rays towards a surface: origins and unit directions, both (2048, 3).
+    Origins lie on a sphere of radius 5 about the middle of the points' box. Each ray goes to a
+    random point of the surface, displaced by about 0.05.
+
+    points: (n, 3) of the surface, in stage coordinates.
+    """
     rng = np.random.default_rng(0)
-    away = rng.normal(size=(_RAYS, 3))
-    away /= np.linalg.norm(away, axis=1, keepdims=True)
-    o = 0.5 * (points.min(axis=0) + points.max(axis=0)) + 5.0 * away
+    outward = rng.normal(size=(_RAYS, 3))
+    outward /= np.linalg.norm(outward, axis=1, keepdims=True)
+    o = 0.5 * (points.min(axis=0) + points.max(axis=0)) + 5.0 * outward
     aims = points[rng.integers(0, len(points), _RAYS)]
     direction = aims + 0.05 * rng.normal(size=(_RAYS, 3)) - o
     return o, direction / np.linalg.norm(direction, axis=1, keepdims=True)
 
 
 def surface_colors(body: StudioObject) -> list[JsonDict]:
-    """The colors of each paint in shaded pictures: linear sRGB of the sides of larger and of
-    smaller values, and whether they are glossy."""
+    """The colors of a surface in shaded pictures, a dictionary for each of: the surface itself,
+    fillings of holes, cut faces on a section, and each isoline. "front" and "back" are the linear
+    sRGB colors of the sides of larger and of smaller values of the field; "glossy" is whether the
+    material is glossy."""
     surface, mi = body.surface, register()
     is_solid = surface.solid_range is not None
     front, back, glossy = _reflectances(body.material.bsdf(solid=is_solid, traced_light=False))
@@ -565,6 +626,7 @@ def surface_colors(body: StudioObject) -> list[JsonDict]:
 
 
 def _paint(front: Any, back: Any, glossy: bool) -> JsonDict:
+    """One entry of `surface_colors`; front, back: Dr.Jit colors of one lane."""
     sides = {"front": front, "back": back}
     return {
         "glossy": glossy,
@@ -573,8 +635,9 @@ def _paint(front: Any, back: Any, glossy: bool) -> JsonDict:
 
 
 def _reflectances(bsdf: Mapping[str, Any]) -> tuple[Any, Any, bool]:
-    """The reflectances of a BSDF's two sides, as shaded pictures use them, and whether it is
-    glossy."""
+    """The colors of a material's front and back side (Dr.Jit colors of one lane), as shaded
+    pictures use them, and whether the material is glossy. bsdf: the material as a Mitsuba
+    dictionary."""
     mi = register()
     plugin = mi.load_dict(dict(bsdf), parallel=False)
     colors: list[Any] = []
@@ -589,8 +652,9 @@ def _reflectances(bsdf: Mapping[str, Any]) -> tuple[Any, Any, bool]:
 
 
 def encode_arrays(value: Any) -> Any:
-    """Replace arrays of 32-bit words by text, which `decodeWords` in renderer.js reads: base64 of
-    gzip data. The tables of meshes are repetitive, and shrink to a tenth."""
+    """The same data with each NumPy array replaced by text: its bytes, compressed by gzip, in
+    base64. `decodeWords` in renderer.js reads it. The tables of meshes are repetitive and shrink to
+    a tenth."""
     if isinstance(value, np.ndarray):
         return base64.b64encode(gzip.compress(value.tobytes(), _LEVEL, mtime=0)).decode()
     if isinstance(value, dict):
@@ -601,18 +665,19 @@ def encode_arrays(value: Any) -> Any:
 
 
 def state_delta(first: JsonDict, state: JsonDict, *, checks: bool = True) -> JsonDict:
-    """Difference between a state and the initial one: changed data words per surface and all other
-    changed entries; or the whole state if its kernels differ. Inverse: `applyDelta` in
-    slider_states.js.
+    """The difference between a state and the initial state of a scene (see `LiveScene.state`). For
+    each surface it holds the indices "at" and the new values "to" of the words that changed, and
+    all other entries that changed. If the surfaces have other kernels or tables of other sizes, the
+    whole state is returned. `applyDelta` in slider_states.js is the inverse.
 
-    checks: whether check rays with their answers are included. With other kernels they always are,
-        as no device has checked these yet.
+    checks: whether the test rays with their results are included. The whole state always includes
+        them, as no browser has checked its kernels yet.
     """
     pairs = [*zip(first["surfaces"], state["surfaces"], strict=False)]
-    alike = len(first["surfaces"]) == len(state["surfaces"]) and all(
+    same_kernels = len(first["surfaces"]) == len(state["surfaces"]) and all(
         old["key"] == new["key"] and len(old["data"]) == len(new["data"]) for old, new in pairs
     )
-    if not alike:
+    if not same_kernels:
         return state
     surfaces: list[JsonDict] = []
     for old, new in pairs:

@@ -1,4 +1,4 @@
-"""One file that opens in any browser, and traces surfaces there."""
+"""Writes one HTML file, a page, that opens in any browser and traces surfaces there."""
 
 from __future__ import annotations
 
@@ -70,31 +70,33 @@ def page(
         hk.page(field, "levels.html", level=hk.Slider(1, 12))
         hk.page(lambda w: hk.fields.Morph(a, b, w=w), "morph.html", w=hk.Slider(0, 1))
 
-    It opens in any browser with WebGPU, without Python and without a network; some want it from
-    https or 127.0.0.1. Where there is none it shows a still picture and says why. The kernel that
-    Dr.Jit records for each surface is in it, translated to WGSL: the same proofs on another GPU.
-    Rounding is not proved there, so that 2,048 rays with Dr.Jit's answers are in the file, too.
-    They are traced first, and if the visitor's device does not agree, nothing of what it says is
-    drawn.
+    The file opens in any browser with WebGPU, without Python and without a network; some browsers
+    offer WebGPU only to pages from https or 127.0.0.1. A browser without WebGPU shows a still
+    picture and says why. The file holds the kernel that Dr.Jit records for each surface, translated
+    to WGSL, so that the visitor's GPU takes the same proved steps. As rounding on that GPU is not
+    proved, the file also holds 2,048 rays for each surface with Dr.Jit's results. The browser
+    traces these rays first, and draws nothing that its GPU computes if the results do not agree.
 
-    surfaces: a field, a `Surface`, or a list of them, as `render` draws them in its studio; or a
-        function of sliders that gives them.
-    path: ends in .html. title: of the page; by default the field's own text.
-    options, keywords: as `render` takes them in its studio: level, clip, tolerance, material,
-        camera, up, boundary_radius, ..., and backdrop="light" or "dark"; those of still pictures
-        alone are refused. A `Slider` may stand in the place of a number, and functions of sliders,
-        by the names of their arguments, in the place of anything. What is drawn at each place of a
-        slider is in the file: of one without a step 33, of two 17 each, and fewer where they would
-        take more than 4 MB (9, of several 5 each, at least). A page with sliders of more than 8 MB
-        is written with a warning.
-    client, checkpoint: as `render` takes them, for the places of sliders.
+    surfaces: a field, a `Surface`, or a list of them, as for `render`; or a function of sliders
+        that returns them.
+    path: the file to write; it must end in .html or .htm. title: of the page; by default the
+        field's own text.
+    options, keywords: options of `render` and of traces: level, clip, tolerance, material, camera,
+        up, boundary_radius, ..., and backdrop="light" or "dark". Options for still pictures alone
+        are refused. The value of an option that is a number may be a `Slider`. Any other value may
+        be a function whose arguments are named like sliders. The file stores a state for every
+        combination of slider values. A slider without a step has 33 values, two such sliders have
+        17 each, and fewer if the states would take more than 4 MB (at least 9 for one slider, 5
+        each for several). A page with sliders of more than 8 MB is written with a warning.
+    client, checkpoint: a Dask client (or its address) that computes the states, and a folder in
+        which finished states are kept, as for `render`.
 
     Raises:
         ValueError: a path that does not end in .html; a surface without bounds; a transparent
-            material; sliders with too many combinations of places; a place of the sliders at which
-            nothing can be drawn, with what is wrong there.
-        UntranslatableError: the kernel holds an operation that is not translated.
-        TypeError: what is no field; an unknown setting; a slider that nothing depends on.
+            material; sliders with too many combinations of values; slider values for which nothing
+            can be drawn (the message says why).
+        UntranslatableError: the kernel holds an operation that has no translation to WGSL.
+        TypeError: a surface that is no field; an unknown option; a slider that nothing depends on.
     """
     target = os.fspath(path)
     settings = with_flat_options({**keywords, "options": options})
@@ -123,13 +125,14 @@ def page(
 
 
 def check_title(title: Any) -> None:
-    """Raise TypeError for a title that is no text."""
+    """Raise `TypeError` if the title is not a string."""
     if not isinstance(title, str):
         raise TypeError(f"title must be text, not {title!r:.60}")
 
 
 def still_png(live: LiveScene) -> str:
-    """A picture of the initial state, as base64 of a PNG file."""
+    """A picture of the initial state, as base64 text of a PNG file. A page shows it where the
+    browser cannot trace."""
     camera = Camera(**live.pose)
     still: Any = live.render_still(
         live.initial_controls, show=live.show, size=_STILL_SIZE, camera=camera
@@ -138,11 +141,12 @@ def still_png(live: LiveScene) -> str:
 
 
 def _places(live: LiveScene) -> dict[str, list[float]]:
-    """The places of the sliders that a page holds: those of their steps, and of sliders without a
-    step as many as make no large file, where what is drawn changes much from place to place.
+    """The slider values for which a page stores states, a list for each slider by name. A slider
+    with a step has all its values; a slider without a step has evenly spaced values, fewer if the
+    states are large (see `_TARGET_BYTES`).
 
     Raises:
-        ValueError: there are too many combinations of places.
+        ValueError: there are more than `_MOST_CHOICES` combinations of slider values.
     """
     sliders = live.content.sliders
     count = max(2, min(_MAX_SLIDER_VALUES, int(_CHOICES ** (1 / max(1, len(sliders))))))
@@ -166,19 +170,23 @@ def _places(live: LiveScene) -> dict[str, list[float]]:
 
 
 def _framing_values(places: Mapping[str, list[float]]) -> Mapping[str, list[float]]:
-    """The places that are framed: all, or of many places every other place and the last one."""
+    """The slider values by which the picture is framed. places: the values of each slider in the
+    page. They are returned unchanged if they have at most `_FRAMED` combinations; otherwise every
+    other value and the last one of each slider."""
     if math.prod(map(len, places.values())) <= _FRAMED:
         return places
     return {name: sorted({*values[::2], values[-1]}) for name, values in places.items()}
 
 
 def _slider_combinations(places: Mapping[str, list[float]]) -> list[dict[str, float]]:
-    """One place of each slider, in all combinations, the last slider's going fastest."""
+    """All combinations of the values of the sliders, each as a value by slider name. The last
+    slider changes fastest."""
     return [dict(zip(places, place, strict=True)) for place in itertools.product(*places.values())]
 
 
 def _slider_state(live: LiveScene, values: Mapping[str, float]) -> JsonDict:
-    """The delta from the initial state to the state at a place of the sliders."""
+    """The state at the given slider values, as its difference from the initial state, in JSON
+    data."""
     with slider_values_in_errors(values):
         state = live.state(ControlState(values))
     return encode_arrays(state_delta(live.initial_state, state, checks=False))
@@ -186,7 +194,13 @@ def _slider_state(live: LiveScene, values: Mapping[str, float]) -> JsonDict:
 
 @dataclass(frozen=True)
 class PageJob:
-    """The job of computing the states of a page: the arguments of `page`, and Mitsuba's variant."""
+    """The arguments of `page` in a form that can be sent to workers, which compute the states of
+    the page.
+
+    surfaces: the content of the page, as `page` takes it.
+    settings: the options of `page` by name, sliders included.
+    variant: the Mitsuba variant of this process, which workers are to use too.
+    """
 
     surfaces: Any
     settings: Mapping[str, Any]
@@ -194,35 +208,36 @@ class PageJob:
 
     @functools.cached_property
     def unframed(self) -> LiveScene:
-        """The live scene of the arguments, framed for the start values of its sliders."""
+        """The live scene of the arguments, framed for the start values of its sliders alone."""
         set_variant(self.variant)
         return LiveScene.of(self.surfaces, dict(self.settings))
 
     @functools.cached_property
     def places(self) -> dict[str, list[float]]:
-        """The slider values that the page holds, by slider."""
+        """The slider values for which the page stores states, by slider name."""
         return _places(self.unframed)
 
     @functools.cached_property
     def live(self) -> LiveScene:
-        """The live scene, framed for all slider values that the page holds."""
+        """The live scene, framed for all slider values that the page stores."""
         return self.unframed.framed(_slider_combinations(_framing_values(self.places)))
 
     @functools.cached_property
     def digest(self) -> str:
-        """A digest of the initial state, to which the deltas of the other states are relative."""
+        """A hash of the initial state, as text. Differences of other states can be applied only to
+        the same initial state."""
         return hashlib.blake2b(
             json.dumps(encode_arrays(self.live.initial_state)).encode()
         ).hexdigest()
 
     def state(self, values: Mapping[str, float], digest: str) -> TaskResult:
-        """The delta of a state, for a combination of slider values, relative to the initial state;
-        as text in bytes.
+        """The difference of the state at the given slider values from the initial state, as
+        {"text": bytes of JSON in an array of uint8}.
 
-        digest: of the initial state that is in the page.
+        digest: the hash of the page's initial state, in the process that writes the page.
 
         Raises:
-            RuntimeError: the initial state of this process is another one.
+            RuntimeError: this process computes an initial state with another hash.
         """
         if self.digest != digest:
             raise RuntimeError(
@@ -234,7 +249,11 @@ class PageJob:
 
 
 def _slider_states(job: PageJob, workers: Executor, advance: Any) -> JsonDict:
-    """The places of the sliders, and the delta of the state at each combination of them."""
+    """{"places": the values of each slider, "frames": the difference from the initial state for
+    each combination of them}, in the order of `_slider_combinations`.
+
+    workers: run the tasks. advance: called with the finished fraction of the work after each task.
+    """
     frames: list[JsonDict] = []
     tasks = [(values, job.digest) for values in _slider_combinations(job.places)]
     for result in workers.run_tasks(job, "state", tasks):
@@ -244,14 +263,20 @@ def _slider_states(job: PageJob, workers: Executor, advance: Any) -> JsonDict:
 
 
 def script(*names: str) -> str:
-    """The JavaScript modules of this folder, joined into one script."""
+    """The named JavaScript modules of this folder, joined into one script without imports and
+    exports."""
     parts = [resource(name) for name in names]
     text = "\n".join(re.sub(r"^import .*?;\n", "", part, flags=re.M | re.S) for part in parts)
     return re.sub(r"^export ", "", text, flags=re.M)
 
 
 def document(scene: Mapping[str, Any], still: str, link: str = "frames") -> str:
-    """The HTML of a page. link: "frames", or "server" if Python answers it."""
+    """The text of an HTML page.
+
+    scene: the data of `LiveScene.scene`. still: base64 text of a PNG file.
+    link: where the page gets other states from: "frames" for states stored in it, or "server" for
+        Python's answers.
+    """
     passes = json.dumps(resource("passes.wgsl"))
     return _PAGE.substitute(
         title=html.escape(scene["title"]),
@@ -265,7 +290,7 @@ def document(scene: Mapping[str, Any], still: str, link: str = "frames") -> str:
 
 
 def resource(name: str) -> str:
-    """The text of a file of this folder."""
+    """The text of a file of this folder, such as a JavaScript module."""
     return resources.files("harnack.live").joinpath(name).read_text(encoding="utf-8")
 
 

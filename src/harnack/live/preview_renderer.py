@@ -1,8 +1,9 @@
-"""Draws live scenes on this machine's own processor, for visitors whose device is slower.
+"""Draws live scenes on the processor of the machine that runs Python, for visitors whose own device
+is slower.
 
-The pictures are those of `show="shaded"` with one ray a pixel, by the same formulas. They need no
-Mitsuba scene, which takes longer to be put together than a small picture to be traced; and no
-kernel is recorded anew for another camera, level, slider or curve of as many vertices.
+The pictures are those of `show="shaded"` with one ray per pixel, by the same formulas. They need no
+Mitsuba scene, whose setup takes longer than tracing a small picture. Cameras, levels, slider values
+and vertices are parameters of the kernels, so that changing them compiles no new kernel.
 """
 
 from __future__ import annotations
@@ -59,9 +60,9 @@ class CameraAxes:
 class Preview:
     """A preview picture.
 
-    pixels: (h, w, 4) of sRGB and 255.
-    depths: the least and the greatest distance that is seen in a picture of depths, on the stage;
-        zeros in other pictures.
+    pixels: (h, w, 4) of bytes: sRGB and opacity 255.
+    depths: the least and the greatest distance to the camera among the hits of a picture of depths,
+        in units of the stage; zeros in other pictures.
     """
 
     pixels: Pixels
@@ -70,7 +71,7 @@ class Preview:
 
 @dataclass(frozen=True)
 class PreviewSurface:
-    """A surface on the stage, and its paints (`live_scene.surface_colors`)."""
+    """A surface on the stage, and its colors, as `live_scene.surface_colors` returns them."""
 
     placed: PlacedSurface
     paints: Sequence[Mapping[str, Any]]
@@ -78,8 +79,9 @@ class PreviewSurface:
 
 @dataclass
 class PreviewRenderer:
-    """Draws surfaces at their places on the stage. While things move it keeps the shadow on the
-    floor, and the hits of the last picture, of which only the light is computed again."""
+    """Draws surfaces on the stage as preview pictures. It keeps the shadow on the floor while
+    things move, and the hits of the last picture for a picture of the same surfaces, camera and
+    size."""
 
     floor: FloorShadow | None = None
     _hit_cache: tuple[Any, dict[str, Any]] | None = None
@@ -94,8 +96,16 @@ class PreviewRenderer:
         ground: str,
         is_idle: bool,
     ) -> Preview:
-        """A picture. is_idle: whether nothing moves, so that it pays to trace the shadow on the
-        floor anew."""
+        """Draw a picture of w x h pixels.
+
+        painted: the surfaces. The hits of the last picture are used again if this is the same list
+            object and nothing else has changed.
+        eye: the camera on the stage.
+        size: (w, h) in pixels.
+        show: one of `LIVE_MODES`, such as "shaded" or "depth".
+        ground: "light" or "dark", the kind of floor and background.
+        is_idle: whether nothing moves. Only then is an existing shadow on the floor computed anew.
+        """
         mi = register()
         light = StudioLight.of(_matrix(eye))
         has_floor = show == "shaded" and eye.origin[2] > FLOOR_HEIGHT
@@ -120,17 +130,22 @@ class PreviewRenderer:
         color = hits["color"]
         sun: Any = mi.Float(1)
         if self.floor is not None and has_floor:
-            sun, above = self.floor.at(hits["position"])
-            sun, above = dr.select(hits["ground"], sun, 1), dr.select(hits["ground"], above, 1)
-            sky = dr.minimum(sky, above)
+            sun, floor_visibility = self.floor.at(hits["position"])
+            sun, floor_visibility = (
+                dr.select(hits["ground"], sun, 1),
+                dr.select(hits["ground"], floor_visibility, 1),
+            )
+            sky = dr.minimum(sky, floor_visibility)
             color = dr.select(hits["ground"], _vector(mi, reflectance, mi.Color3f), color)
-        lit = light.shade(color, hits["normal"], -hits["d"], hits["glossy"], sky, sun)
-        far, z = _vector(mi, reflectance, mi.Color3f), mi.Vector3f(0, 0, 1)
-        wall = light.shade(far, z, z, mi.Bool(False), mi.Float(1))
+        unclipped = light.shade(color, hits["normal"], -hits["d"], hits["glossy"], sky, sun)
+        floor_color, z = _vector(mi, reflectance, mi.Color3f), mi.Vector3f(0, 0, 1)
+        wall = light.shade(floor_color, z, z, mi.Bool(False), mi.Float(1))
         wall = wall * (1 - _DARKER * dr.power(dr.clip(hits["d"].z, 0, 1), 0.7))
-        room = 1 - SHOULDER_START
-        bright = 1 - room * dr.exp((SHOULDER_START - lit) / room)
-        shown = dr.select(hits["met"], dr.select(lit > SHOULDER_START, bright, lit), wall)
+        headroom = 1 - SHOULDER_START
+        compressed = 1 - headroom * dr.exp((SHOULDER_START - unclipped) / headroom)
+        shown = dr.select(
+            hits["met"], dr.select(unclipped > SHOULDER_START, compressed, unclipped), wall
+        )
         shown = dr.clip(dr.select(hits["lost"], mi.Color3f(OUT_OF_STEPS_COLOR), shown), 0, 1)
         srgb = dr.select(
             shown <= 0.0031308, 12.92 * shown, 1.055 * dr.power(shown, 1 / 2.4) - 0.055
@@ -143,7 +158,18 @@ class PreviewRenderer:
         self, mi: Any, painted: Sequence[PreviewSurface], eye: CameraAxes, size: tuple[int, int], *,
         has_floor: bool,
     ) -> dict[str, Any]:  # fmt: skip
-        """The first hits of the rays through the middles of the pixels, arrays by name."""
+        """Trace the rays through the middles of the pixels, row by row. Returns Dr.Jit arrays by
+        name, with a lane for each pixel.
+
+        "t", "d", "position": distance, unit direction and position of the nearest hit.
+        "normal", "gradient": the unit normal towards the camera, and the unit normal towards larger
+        values.
+        "color", "glossy": the color of the hit surface, and whether it is glossy.
+        "met", "lost", "ground": whether the ray hits something, runs out of steps, or hits the
+        floor.
+        "evaluations": the number of evaluations of all surfaces' fields.
+        has_floor: whether the floor is drawn.
+        """
         columns, rows = (dr.opaque(mi.UInt32, n) for n in size)
         index = dr.arange(mi.UInt32, size[0] * size[1])
         pixel = dr.opaque(mi.Float, eye.pixel)
@@ -186,12 +212,15 @@ class PreviewRenderer:
 
 @dataclass(frozen=True)
 class _Casting:
-    """Surfaces that cast shadows on the floor."""
+    """The surfaces that cast shadows on the floor, in the form that `FloorShadow.of` takes. mi:
+    Mitsuba's module."""
 
     mi: Any
     painted: Sequence[PreviewSurface]
 
     def occluded(self, ray: Any, active: Any) -> Any:
+        """For each Mitsuba ray, whether some surface lies between the ray's origin and its end;
+        False for lanes that are not active."""
         vector = mitsuba_backend(self.mi).Array3f
         is_occluded = self.mi.Bool(False)
         for surface in self.painted:
@@ -202,7 +231,12 @@ class _Casting:
 def _color(
     mi: Any, paints: Sequence[Mapping[str, Any]], index: Any, in_front: Any
 ) -> tuple[Any, Any]:
-    """For each ray the color of the paint that it meets, and whether that is glossy."""
+    """For each ray, the color of the surface that it hits, and whether that surface is glossy.
+
+    paints: the colors of the surface, as `live_scene.surface_colors` returns them.
+    index: the index in `paints` for each ray.
+    in_front: whether each ray comes from the side of larger values.
+    """
     color, glossy = mi.Color3f(0), mi.Bool(False)
     for k, paint in enumerate(paints):
         sides = (_vector(mi, paint[name], mi.Color3f) for name in ("front", "back"))
@@ -212,14 +246,16 @@ def _color(
 
 
 def _vector(mi: Any, numbers: Any, kind: Any = None) -> Any:
-    """Three numbers as parameters of kernels, so that other numbers compile no other kernel."""
+    """Three numbers as a vector of type `kind` whose entries are parameters of kernels, so that
+    other numbers use the same kernel."""
     return (mi.Vector3f if kind is None else kind)(
         *(dr.opaque(mi.Float, float(x)) for x in numbers)
     )
 
 
 def _matrix(eye: CameraAxes) -> FloatArray:
-    """The camera's axes to the left, up and forwards as columns."""
+    """The 4 x 4 matrix whose first three columns are the camera's unit vectors to the left, up and
+    forward."""
     matrix = np.eye(4)
     matrix[:3, :3] = np.stack([-eye.right, eye.up, eye.forward], axis=1)
     return matrix
@@ -228,7 +264,13 @@ def _matrix(eye: CameraAxes) -> FloatArray:
 def _aov_preview(
     hits: dict[str, Any], show: str, behind: Sequence[float], size: tuple[int, int]
 ) -> Preview:
-    """A picture of normals, depths, evaluations or outcomes, as colors."""
+    """A picture whose colors stand for numbers: normals, depths, numbers of evaluations, or
+    outcomes of rays (`show` = "normal", "depth", "evaluations", "status").
+
+    hits: the result of `PreviewRenderer._trace`.
+    behind: sRGB of rays that hit nothing, three numbers from 0 to 1.
+    size: (w, h) in pixels.
+    """
     met, lost = to_numpy(hits["met"]), to_numpy(hits["lost"])
     picture, depths = np.empty((len(met), 3)), (0.0, 0.0)
     picture[:] = behind

@@ -99,7 +99,8 @@ FieldSources = Sequence[tuple[Field, Plain]]
 
 
 def check_sources(sources: Any) -> None:
-    """Raise TypeError unless the sources are pairs of a field and its text."""
+    """Raise `TypeError` unless `sources` is a sequence of pairs of a field and a dictionary, the
+    field's entry in a scene file."""
     try:
         is_right = all(
             isinstance(field, Field) and isinstance(text, dict) for field, text in sources
@@ -114,16 +115,19 @@ def check_sources(sources: Any) -> None:
 
 
 class SceneFileError(ValueError):
-    """A text is no scene file, or an object cannot be stored in a scene file."""
+    """The text is no valid scene file, or an object cannot be written to a scene file."""
 
 
 @dataclass(frozen=True)
 class SceneFile:
     """The contents of a scene file.
 
-    surfaces: as `harnack.render`, `page` and `view` take them.
+    surfaces: fields and `Surface` objects, which `harnack.render`, `page` and `view` take.
     settings: options of these functions, by name.
-    sliders: by the names of options, for `page` and `view`; their start values are in `settings`.
+    sliders: sliders by the names of the options that they move, for `page` and `view`. The settings
+        hold the start values of these options.
+    sources: pairs of a field and its entry in the file, for fields of files and of the gallery.
+        Writing the scene again needs them.
     """
 
     surfaces: tuple[Field | Surface, ...]
@@ -133,8 +137,8 @@ class SceneFile:
 
     @property
     def surfaces_with_options(self) -> tuple[Surface, ...]:
-        """The surfaces with the options of the scene that are theirs (level, clip, ...), for
-        `harnack.trace` and whatever else takes a `Surface`."""
+        """The surfaces, each with those options of the scene that are keywords of `Surface` (level,
+        clip, ...). `harnack.trace` and other functions of a `Surface` take them."""
         shorthand = {k: value for k, value in self.settings.items() if k in SURFACE_OPTIONS}
         return tuple(
             surface_and_options("a scene", surface, None, shorthand, SURFACE_OPTIONS)[0]
@@ -143,21 +147,22 @@ class SceneFile:
 
     @property
     def trace_options(self) -> TraceOptions:
-        """The options of traces among those of the scene."""
+        """The options of traces among the settings of the scene, with default values for all
+        others."""
         return TraceOptions(**{k: v for k, v in self.settings.items() if k in TRACE_OPTIONS})
 
 
 def read_scene(path: str | os.PathLike[str]) -> SceneFile:
-    """The scene of a file that `write_scene` or a view has written.
+    """Read a scene file, which `write_scene` or a view has written.
 
         scene = hk.read_scene("mine.json")
         hk.render(scene.surfaces, "mine.png", **scene.settings)
 
-    Files named in it are looked for beside it.
+    Names of files in it are relative to the scene file's folder.
 
     Raises:
-        SceneFileError (a ValueError): the file is no scene file; the message names the part that
-            is wrong, and why.
+        SceneFileError (a ValueError): the file is no scene file; the message names the part that is
+            wrong, and why.
         OSError: the file cannot be read.
     """
     source = Path(path)
@@ -174,8 +179,9 @@ def read_scene(path: str | os.PathLike[str]) -> SceneFile:
 
 
 def _resolve_file(folder: Path, name: str) -> Path:
-    """The path of a file that a scene names. If it does not exist, a file of the same name beside
-    the scene is taken: scenes are sent to others together with their files."""
+    """The path of a file that a scene in `folder` names: the named path or, if nothing exists
+    there, a file of the same name in the folder itself. So a scene can be sent to other people
+    together with its files."""
     path = folder / name
     return path if path.exists() or not (folder / path.name).exists() else folder / path.name
 
@@ -187,18 +193,19 @@ def write_scene(
     sources: FieldSources = (),
     **settings: Any,
 ) -> None:
-    """Write surfaces, and the options by which they are drawn, into a scene file.
+    """Write surfaces, and the options by which they are drawn, to a scene file.
 
         hk.write_scene("mine.json", hk.SolidAngle(curve), level=2.0, material="gold")
 
-    path: ends in .json.
-    surfaces, settings: as `harnack.render` and `page` take them, `options` included, with a
-        `Slider` for options that are numbers.
-    sources: fields that come from files or from the gallery, and where from.
+    path: the file to write; it must end in .json.
+    surfaces, settings: surfaces and options as `harnack.render` and `page` take them, `options`
+        included. The value of an option that is a number may be a `Slider`.
+    sources: pairs of a field and its entry in scene files (as `SceneFile.sources` has them), for
+        fields of files and of the gallery.
 
     Raises:
-        SceneFileError (a ValueError): a text cannot hold something, such as a Python function or a
-            mesh that was made in Python; the message names it.
+        SceneFileError (a ValueError): something cannot be written as text, such as a Python
+            function or a mesh that was made in Python; the message names it.
     """
     target = os.fspath(path)
     check_sources(sources)
@@ -213,33 +220,35 @@ def write_scene(
 
 
 def to_scene_text(surfaces: Any, settings: Mapping[str, Any], sources: FieldSources = ()) -> str:
-    """A scene as text.
+    """The text of a scene file. surfaces, settings, sources: as for `write_scene`, that is
+    surfaces, options of `render` by name (with sliders), and pairs of a field and its entry in
+    scene files.
 
     Raises:
-        SceneFileError: as `write_scene`.
+        SceneFileError: something cannot be written as text; or an option is wrong.
     """
-    listed: list[Any] = [*surfaces] if isinstance(surfaces, list | tuple) else [surfaces]
-    if not listed:
+    surface_list: list[Any] = [*surfaces] if isinstance(surfaces, list | tuple) else [surfaces]
+    if not surface_list:
         raise SceneFileError("there is nothing to write: give at least one field")
     scene: Plain = {
         "harnack": VERSION,
-        "surfaces": [_surface_text(surface, sources) for surface in listed],
+        "surfaces": [_surface_to_json(surface, sources) for surface in surface_list],
     }
     settings = with_flat_options(settings)
     sliders = {name: value for name, value in settings.items() if isinstance(value, Slider)}
     for name in sliders:
         if name not in SLIDER_OPTIONS:
             raise SceneFileError(f"a slider of {name} cannot be written: it is no number")
-    texts = {
-        name: _setting_text(name, value, sources)
+    settings_json = {
+        name: _setting_to_json(name, value, sources)
         for name, value in settings.items()
         if value is not None and name not in sliders
     }
     starts = {name: slider.start for name, slider in sliders.items()}
     values = {name: value for name, value in settings.items() if value is not None}
-    _check_values(SceneFile(tuple(listed), {**values, **starts}))
-    if texts:
-        scene["settings"] = texts
+    _check_values(SceneFile(tuple(surface_list), {**values, **starts}))
+    if settings_json:
+        scene["settings"] = settings_json
     if sliders:
         scene["sliders"] = {
             name: {k: v for k, v in dataclasses.asdict(slider).items() if v is not None}
@@ -249,10 +258,11 @@ def to_scene_text(surfaces: Any, settings: Mapping[str, Any], sources: FieldSour
 
 
 def with_flat_options(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Options by name, where `options`, a `TraceOptions`, is replaced by what it sets.
+    """The options by name, in which the entry "options" (a `TraceOptions`) is replaced by its
+    attributes that differ from their defaults.
 
     Raises:
-        TypeError: an option of traces beside `options`.
+        TypeError: an option of traces stands in both places.
     """
     flat = dict(settings)
     options = flat.pop("options", None)
@@ -267,7 +277,9 @@ def with_flat_options(settings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _json(value: Any, depth: int = 0) -> str:
-    """JSON with a line for each entry, and rows of numbers on one line."""
+    """A value as JSON text with a line for each entry; an entry that fits on one line, such as a
+    row of numbers, stays on one line. depth: the depth of nesting, by which the text is
+    indented."""
     flat = json.dumps(value, allow_nan=False)
     if len(flat) <= 88 - 2 * depth or not isinstance(value, dict | list):
         return flat
@@ -282,35 +294,51 @@ def _json(value: Any, depth: int = 0) -> str:
     return f"{first}\n" + ",\n".join(entries) + "\n" + "  " * depth + last
 
 
-def _surface_text(surface: Any, sources: FieldSources) -> Plain:
+def _surface_to_json(surface: Any, sources: FieldSources) -> Plain:
+    """A field or surface as an entry of "surfaces" in a scene file: its field, its levels and its
+    other keywords.
+
+    Raises:
+        SceneFileError: some part of it cannot be written as text.
+    """
     if isinstance(surface, Field):
-        return {"field": _field_text(surface, sources)}
+        return {"field": _field_to_json(surface, sources)}
     if isinstance(surface, TracedSurface):
         surface = surface.surface
     if not isinstance(surface, Surface):
         raise SceneFileError(f"what is written are fields and surfaces, not {surface!r:.60}")
-    text: Plain = {"field": _field_text(surface.field, sources)}
+    data: Plain = {"field": _field_to_json(surface.field, sources)}
     levels = [float(level) for level in surface.level_values]
-    text["level"] = levels[0] if len(levels) == 1 else levels
+    data["level"] = levels[0] if len(levels) == 1 else levels
     for name, value in surface.keywords.items():
         if value:
-            text[name] = _setting_text(name, value, sources)
-    return text
+            data[name] = _setting_to_json(name, value, sources)
+    return data
 
 
-def _field_text(field: Field, sources: FieldSources) -> Plain:
+def _field_to_json(field: Field, sources: FieldSources) -> Plain:
+    """A field as an entry of a scene file: its entry in `sources` if it has one, otherwise its
+    formula, its curves, or its class and arguments.
+
+    Raises:
+        SceneFileError: the field cannot be written, or would not be the same when read again.
+    """
     for source_field, origin in sources:
         if field is source_field:
             return origin
     if isinstance(field, Expression) and isinstance(field.function, TextFormula):
-        text: Plain = {
+        data: Plain = {
             "formula": field.function.text,
             "parameters": dict(field.function.parameters),
         }
-        extra = {"domain": field.domain, "level": field.default_level, "is_convex": field.is_convex}
+        keywords = {
+            "domain": field.domain,
+            "level": field.default_level,
+            "is_convex": field.is_convex,
+        }
         params = inspect.signature(expression).parameters
-        text |= {k: _to_json_value(v) for k, v in extra.items() if v != params[k].default}
-        return {name: value for name, value in text.items() if value != {}}
+        data |= {k: _to_json_value(v) for k, v in keywords.items() if v != params[k].default}
+        return {name: value for name, value in data.items() if value != {}}
     if type(field) is SolidAngle and not field.circles:
         values = {"lift_bound": field.lift_bound_option, "cells": field.cells}
         params = inspect.signature(SolidAngle).parameters
@@ -322,19 +350,21 @@ def _field_text(field: Field, sources: FieldSources) -> Plain:
             f"a {type(field).__name__} that was made in Python cannot be written into a scene "
             "file, which holds curves, formulas, solids, surfaces of files and of the gallery"
         )
-    text = _object_text(field)
-    _check_round_trip(field, _field_of(text, "field", None))
-    return text
+    data = _object_to_json(field)
+    _check_round_trip(field, _field_of(data, "field", None))
+    return data
 
 
 def _check_cells(options: Mapping[str, Any]) -> None:
-    """Raise SceneFileError for a number of megabytes: a file must not choose the memory used."""
+    """Raise `SceneFileError` if the option "cells" is not a bool. A `SolidAngle` also takes a
+    number of megabytes there; but a file must not choose the memory used."""
     if not isinstance(options.get("cells", True), bool):
         raise SceneFileError(f"cells of a scene are true or false, not {options['cells']!r:.60}")
 
 
 def _check_round_trip(field: Field, copy: Field) -> None:
-    """Raise SceneFileError if the field that was read back from the text differs from the field."""
+    """Raise `SceneFileError` if `copy`, which was read back from the text of `field`, has other
+    values at 256 random points, another default level or another domain."""
     points = np.random.default_rng(0).normal(size=(256, 3))
     same = np.array_equal(field.value(points), copy.value(points), equal_nan=True)
     if not same or field.default_level != copy.default_level or field.domain != copy.domain:
@@ -342,20 +372,24 @@ def _check_round_trip(field: Field, copy: Field) -> None:
                              "arguments do not say all of it")  # fmt: skip
 
 
-def _object_text(instance: Any) -> Plain:
-    """A field or a volume by its class and its arguments."""
+def _object_to_json(instance: Any) -> Plain:
+    """A field or a volume as {class name: {argument: JSON value}}. Arguments that equal their
+    default are left out. An argument that the object does not keep as an attribute is left out too;
+    `_check_round_trip` reports an object that this changes."""
     arguments: Plain = {}
     for name, parameter in inspect.signature(instance.__class__).parameters.items():
         if name.startswith("_") or not hasattr(instance, name):
             continue  # `_check_round_trip` finds what would be lost
         value = getattr(instance, name)
-        if _same(value, parameter.default):
+        if _equals_default(value, parameter.default):
             continue
         arguments[name] = _to_json_value(value)
     return {type(instance).__name__: arguments}
 
 
-def _same(value: Any, default: Any) -> bool:
+def _equals_default(value: Any, default: Any) -> bool:
+    """Whether a value equals the default of its argument; False for values that cannot be compared
+    as a whole, such as arrays."""
     try:
         return bool(value == default)
     except (TypeError, ValueError):  # arrays
@@ -363,11 +397,12 @@ def _same(value: Any, default: Any) -> bool:
 
 
 def _to_json_value(value: Any) -> Any:
-    """Numbers, names, lists, volumes and fields as JSON has them."""
+    """A number, string, sequence, array, volume or field as JSON data. Raises `SceneFileError` for
+    other values."""
     if value is None or isinstance(value, bool | int | str):
         return value
     if isinstance(value, float | np.floating):
-        return _number(float(cast("Any", value)))
+        return _finite_or_text(float(cast("Any", value)))
     if isinstance(value, np.ndarray):
         return _to_json_value(cast("Any", value).tolist())
     if isinstance(value, np.integer):
@@ -375,20 +410,29 @@ def _to_json_value(value: Any) -> Any:
     if isinstance(value, Sequence):
         return [_to_json_value(entry) for entry in cast("Sequence[Any]", value)]
     if isinstance(value, Field):
-        return _field_text(value, ())
+        return _field_to_json(value, ())
     if type(value).__name__ in _constructible_types():
-        return _object_text(value)
+        return _object_to_json(value)
     raise SceneFileError(f"what is of type {type(value).__name__} cannot be written")
 
 
-def _number(value: float) -> Any:
-    """A number for JSON, which has no infinities: they become "inf" and "-inf"."""
+def _finite_or_text(value: float) -> Any:
+    """A number for JSON, which has no infinities: they become "inf" and "-inf". Raises
+    `SceneFileError` for NaN."""
     if math.isnan(value):
         raise SceneFileError("NaN cannot be written")
     return value if math.isfinite(value) else ("inf" if value > 0 else "-inf")
 
 
-def _setting_text(name: str, value: Any, sources: FieldSources) -> Any:
+def _setting_to_json(name: str, value: Any, sources: FieldSources) -> Any:
+    """The value of an option as JSON data.
+
+    name: of the option, a keyword of `render` or of `Surface`.
+
+    Raises:
+        SceneFileError: the option is unknown, or its value cannot be written, such as a Python
+            function.
+    """
     _check_name(name, _KNOWN, "setting")
     if isinstance(value, HitTolerance):
         if value != HitTolerance(value.distance):
@@ -406,7 +450,7 @@ def _setting_text(name: str, value: Any, sources: FieldSources) -> Any:
         names = ("function", "levels", "interval", "width", "color")
         return {key: _to_json_value(v) for key in names if (v := getattr(value, key)) is not None}
     if name == "isolines" and isinstance(value, Sequence):
-        return [_setting_text(name, entry, sources) for entry in cast("Sequence[Any]", value)]
+        return [_setting_to_json(name, entry, sources) for entry in cast("Sequence[Any]", value)]
     try:
         return _to_json_value(value)
     except SceneFileError as wrong:
@@ -417,12 +461,12 @@ def _setting_text(name: str, value: Any, sources: FieldSources) -> Any:
 
 
 def parse_scene(text: str, find: Callable[[str], Path] | None = None) -> SceneFile:
-    """The scene of a text.
+    """The scene that the text of a scene file describes.
 
-    find: the path of a file, from its name in the text; None if the text must not name files.
+    find: returns the path of a file from its name in the text; None refuses texts that name files.
 
     Raises:
-        SceneFileError: as `read_scene`.
+        SceneFileError: the text is no scene; the message names the part that is wrong.
     """
     try:
         data = json.loads(text, parse_constant=_no_number, object_pairs_hook=_reject_duplicate_keys)
@@ -435,6 +479,8 @@ def parse_scene(text: str, find: Callable[[str], Path] | None = None) -> SceneFi
 
 
 def _scene_of(data: Any, find: Callable[[str], Path] | None) -> SceneFile:
+    """The scene that JSON data describes, with all its values checked. find: as for `parse_scene`,
+    returns the path of a named file."""
     scene_data = _object(data, "a scene")
     if scene_data.get("harnack") != VERSION or scene_data["harnack"] is True:
         raise SceneFileError(f'it must say "harnack": {VERSION}, the version of scene files')
@@ -461,7 +507,8 @@ def _scene_of(data: Any, find: Callable[[str], Path] | None) -> SceneFile:
 
 
 def _check_values(scene: SceneFile) -> None:
-    """Raise SceneFileError for values that `render` or `Surface` would refuse later."""
+    """Raise `SceneFileError` for values that `render` or `Surface` would refuse when the scene is
+    drawn."""
     settings = scene.settings
     show = settings.get("show", "shaded")
     try:
@@ -484,10 +531,13 @@ def _check_values(scene: SceneFile) -> None:
 
 
 def _no_number(name: str) -> float:
+    """Raise `ValueError` for the name of a number that Python's JSON reader accepts and JSON does
+    not have: NaN, Infinity or -Infinity."""
     raise ValueError(f"{name} is no number of JSON")
 
 
 def _reject_duplicate_keys(pairs: list[tuple[str, Any]]) -> Plain:
+    """The pairs of a JSON object as a dictionary. Raises `ValueError` if a name occurs twice."""
     data: Plain = {}
     for name, value in pairs:
         if name in data:
@@ -497,12 +547,16 @@ def _reject_duplicate_keys(pairs: list[tuple[str, Any]]) -> Plain:
 
 
 def _object(value: Any, where: str) -> Plain:
+    """The value, if it is a JSON object (a dictionary); otherwise raise `SceneFileError`. where:
+    the place in the file, for the message."""
     if not isinstance(value, dict):
         raise SceneFileError(f"{where} must be an object with names, not {value!r:.60}")
     return cast("Plain", value)
 
 
 def _check_name(name: str, known: Sequence[str], kind: str) -> None:
+    """Raise `SceneFileError` if a name is not among the known names. kind: what is named, for the
+    message."""
     if name not in known:
         raise SceneFileError(f"there is no {kind} {name!r:.60}{did_you_mean(name, known)}")
 
@@ -510,6 +564,12 @@ def _check_name(name: str, known: Sequence[str], kind: str) -> None:
 def _surface_of(
     entry: Any, where: str, find: Callable[[str], Path] | None, sources: list[tuple[Field, Plain]]
 ) -> Field | Surface:
+    """The field or surface that an entry of "surfaces" describes.
+
+    where: the place in the file, for messages.
+    find: returns the path of a named file; None refuses named files.
+    sources: gets a pair of the field and its entry, if the field comes from a file or the gallery.
+    """
     data = dict(_object(entry, where))
     try:
         if "scene" in data:
@@ -520,12 +580,12 @@ def _surface_of(
             raise SceneFileError(f"{where} has no field")
         for name in data:
             _check_name(name, _SURFACE_KEYS, "keyword of a surface")
-        text = data.pop("field")
-        field = _source_of(text, where, find)
+        field_entry = data.pop("field")
+        field = _source_of(field_entry, where, find)
         if field is not None:
-            sources.append((field, text))
+            sources.append((field, field_entry))
         else:
-            field = _field_of(text, f"{where}: field", find)
+            field = _field_of(field_entry, f"{where}: field", find)
         keywords = _settings_of(data, SURFACE_OPTIONS)
         return Surface(field, **keywords) if keywords else field
     except SceneFileError:
@@ -535,6 +595,7 @@ def _surface_of(
 
 
 def _gallery_surface(data: Plain) -> Surface:
+    """The surface of the gallery that {"scene": name, "number": index of its surface} describes."""
     for name in data:
         _check_name(name, ("scene", "number"), "part of a surface of the gallery")
     scene, number = data["scene"], data.get("number", 0)
@@ -547,7 +608,9 @@ def _gallery_surface(data: Plain) -> Surface:
 
 
 def _source_of(text: Any, where: str, find: Callable[[str], Path] | None) -> Field | None:
-    """The field of a surface of the gallery, or of a file; None for other fields."""
+    """The field of a surface of the gallery or of a file; None if the entry `text` (JSON data)
+    describes another kind of field. where, find: as for `_surface_of`, the place in the file for
+    messages, and the function that returns the path of a named file."""
     data = _object(text, f"{where}: field")
     if "scene" in data:
         return _gallery_surface(data).field
@@ -565,6 +628,13 @@ def _source_of(text: Any, where: str, find: Callable[[str], Path] | None) -> Fie
 
 
 def _field_of(value: Any, where: str, find: Callable[[str], Path] | None) -> Field:
+    """The field that an entry describes by curves, by a formula, or by a class and its arguments.
+    where, find: the place in the file for messages, and the function that returns the path of a
+    named file.
+
+    Raises:
+        SceneFileError: the entry describes no field; errors of constructors pass through.
+    """
     data = _object(value, where)
     if "curves" in data:
         for name in data:
@@ -577,9 +647,11 @@ def _field_of(value: Any, where: str, find: Callable[[str], Path] | None) -> Fie
         known = ("formula", "parameters", "domain", "level", "is_convex")
         for name in data:
             _check_name(name, known, "part of a formula")
-        plain = ("formula", "parameters")
+        not_converted = ("formula", "parameters")
         arguments = {
-            name: _from_json_value(part, where) for name, part in data.items() if name not in plain
+            name: _from_json_value(part, where)
+            for name, part in data.items()
+            if name not in not_converted
         }
         arguments["parameters"] = _object(data.get("parameters", {}), f"{where}: parameters")
         if not isinstance(data["formula"], str):
@@ -595,7 +667,9 @@ def _field_of(value: Any, where: str, find: Callable[[str], Path] | None) -> Fie
 
 
 def _from_json_value(value: Any, where: str) -> Any:
-    """Numbers, names and lists as they are; objects of one of the kinds that there are."""
+    """A JSON value as an argument of a constructor: lists become tuples, "inf" and "-inf" become
+    floats, and an object (a dictionary) becomes the field, volume or map of space that it
+    describes. Other values stay as they are. where: the place in the file, for messages."""
     if isinstance(value, list):
         return tuple(_from_json_value(entry, where) for entry in cast("list[Any]", value))
     if value in ("inf", "-inf"):
@@ -614,6 +688,13 @@ def _from_json_value(value: Any, where: str) -> Any:
 
 
 def _construct(kind: type, value: Any, where: str) -> Any:
+    """Call the constructor `kind` with arguments from a JSON object, after checks of their names
+    and types. where: the place in the file, for messages.
+
+    Raises:
+        SceneFileError: an argument is unknown, has the wrong type, or is refused by the
+            constructor.
+    """
     known = [name for name in inspect.signature(kind).parameters if not name.startswith("_")]
     data = _object(value, where)
     for name in data:
@@ -629,6 +710,8 @@ def _construct(kind: type, value: Any, where: str) -> Any:
 
 
 def _settings_of(data: Plain, known: Sequence[str]) -> Plain:
+    """The options that a JSON object describes, by name. known: the names of the options that are
+    allowed."""
     settings: Plain = {}
     for name, value in data.items():
         _check_name(name, known, "setting")
@@ -646,8 +729,9 @@ def _settings_of(data: Plain, known: Sequence[str]) -> Plain:
 
 
 def _constructible_types() -> dict[str, type]:
-    """The classes of scene files by name: solids, volumes, maps of space and some more fields, each
-    determined by its arguments. No constructor reads files or calls its arguments."""
+    """The classes that scene files can name: solids, volumes, maps of space and a few more fields,
+    each determined by its arguments. None of their constructors reads files or calls its
+    arguments."""
     types: dict[str, type] = {kind.__name__: kind for kind in _EXTRA_FIELD_TYPES}
     modules = [
         import_module(f"{solids.__name__}.{info.name}") for info in iter_modules(solids.__path__)

@@ -1,4 +1,4 @@
-"""`view`: a small server on this machine; its page asks Python for whatever changes."""
+"""`view`: a small web server on this machine. Its page asks Python for all changes of the scene."""
 
 from __future__ import annotations
 
@@ -40,7 +40,8 @@ _WAITING = 8
 
 @dataclass(frozen=True)
 class LiveView:
-    """A page that is being served. address: to open in a browser."""
+    """A page that is being served until `close` is called. address: the page's URL, to be opened in
+    a browser."""
 
     address: str
     _loop: asyncio.AbstractEventLoop
@@ -48,7 +49,8 @@ class LiveView:
     _ended: threading.Event
 
     def close(self) -> None:
-        """Stop serving the page. What is being computed for it ends when it reports next."""
+        """Stop serving the page. A computation that is running for the page stops when it next
+        reports progress."""
         if not self._ended.is_set():
             self._loop.call_soon_threadsafe(self._loop.stop)
             self._ended.wait()
@@ -73,7 +75,7 @@ class LiveView:
         self.close()
 
     def _repr_html_(self) -> str:
-        """For notebooks on this machine: the page, in a frame."""
+        """The page in a frame, as notebooks on this machine show it."""
         return f'<iframe src="{self.address}" style="width:100%;height:480px;border:0"></iframe>'
 
 
@@ -91,32 +93,35 @@ def view(
     options: TraceOptions | None = None,
     **keywords: Any,
 ) -> LiveView | Widget:
-    """Show surfaces live in the browser: turned, moved by sliders, their curves dragged.
+    """Show surfaces live in the browser: a person can turn them, move sliders and drag their
+    curves.
 
         hk.view(hk.SolidAngle(vertices))
         hk.view(lambda l, m: hk.SphericalHarmonic(int(l), int(min(l, m))), level=0.1,
                 l=hk.Slider(1, 8, 5, step=1), m=hk.Slider(0, 8, 3, step=1))
 
-    The visitor's browser traces all rays by the kernels that Dr.Jit recorded, as a page of `page`
-    does; Python prepares what has changed and sends it. While a point or a slider moves no kernel
-    is compiled.
+    The visitor's browser traces all rays by the kernels that Dr.Jit recorded, as in a page of
+    `page`. Python prepares what has changed and sends it. Moving a point or a slider compiles no
+    kernel.
 
-    In a notebook that has anywidget (`pip install harnack[notebook]`) it is a live widget, whose
-    `camera`, `sliders`, `points` and `show` are attributes with events. `port` or
-    `open_browser=False` asks for the server there too.
+    In a notebook that has anywidget (`pip install harnack[notebook]`) the result is a live widget,
+    whose `camera`, `sliders`, `points` and `show` are attributes with events. `port` or
+    `open_browser=False` asks for the server in a notebook too.
 
-    surfaces, title, options, keywords: as `page` takes them. The points of the curve of a
-        `SolidAngle` can be moved, inserted (double click), removed (Delete) and smoothed, with undo
-        and redo.
-    host: the address to serve at; anything but this machine's own is open to the network, so that
-        the address of the page then has a token, without which nothing is answered.
-    port: 0 for a free one. height: of a widget, in pixels. open_browser: whether to open a browser.
-    block: whether to return only when Ctrl-C is pressed; by default where Python is not used
+    surfaces, title, options, keywords: as for `page`: a field, a `Surface`, a list of them or a
+        function of sliders; the title; and options of `render` and of traces. The points of the
+        curve of a `SolidAngle` can be moved, inserted (double click), removed (Delete) and
+        smoothed, with undo and redo.
+    host: the address to serve at. Any address but this machine's own is open to the network; then
+        the page's URL has a token, and requests without the token are refused.
+    port: the port to serve at; 0 for a free one. height: of a widget, in pixels. open_browser:
+        whether to open a browser.
+    block: whether to return only when Ctrl-C is pressed; by default True unless Python is used
         interactively.
-    sources: fields that come from files or the gallery, and where from, for scene files that are
-        saved in the view; as `SceneFile` has them.
+    sources: pairs of a field and its entry in scene files, as in `SceneFile`, for fields of files
+        and of the gallery. Scene files that are saved in the view need them.
 
-    Raises what `page` raises; ModuleNotFoundError without aiohttp (`pip install harnack[view]`);
+    Raises the errors of `page`; ModuleNotFoundError without aiohttp (`pip install harnack[view]`);
     OSError for an address that cannot be served at.
     """
     port = as_integer_in_range(port, "port", minimum=0, maximum=65535)
@@ -159,10 +164,10 @@ def view(
 
 
 def check_height(height: Any) -> int:
-    """The height of a widget in pixels.
+    """The height of a widget in pixels, if it is a whole number from 16 to 10,000.
 
     Raises:
-        ValueError: it is none.
+        ValueError: the height is not such a number.
     """
     return as_integer_in_range(height, "height", minimum=16, maximum=10_000)
 
@@ -175,6 +180,11 @@ def in_notebook() -> bool:
 
 
 class _PageServer:
+    """The server of a view's page, and of the requests of its clients (open pages).
+
+    live: the scene. page: the HTML text. token: a secret that requests must have; "" for none.
+    """
+
     def __init__(self, live: LiveScene, page: str, token: str) -> None:
         self.live, self.page, self.token = live, page, token
         # Dr.Jit works on all cores for one question at a time.
@@ -182,7 +192,8 @@ class _PageServer:
         self.clients: set[MessageHandler] = set()
 
     def start(self, host: str, port: int) -> LiveView:
-        """Serves in a thread of its own."""
+        """Serve the page in a new thread, and return the view. Raises `OSError` if the address
+        cannot be served at."""
         try:
             from aiohttp import web
         except ImportError:
@@ -197,6 +208,7 @@ class _PageServer:
         runner = web.AppRunner(application, handle_signals=False, shutdown_timeout=1.0)
 
         async def begin() -> int:
+            """Open the port, and return its number."""
             await runner.setup()
             await web.TCPSite(runner, host, port).start()
             return int(runner.addresses[0][1])
@@ -204,6 +216,8 @@ class _PageServer:
         ended = threading.Event()
 
         def serve() -> None:
+            """Run the event loop until the view is closed, and then end everything that waits for
+            it."""
             asyncio.set_event_loop(loop)
             try:
                 loop.run_forever()
@@ -227,8 +241,9 @@ class _PageServer:
         return LiveView(f"http://{shown}:{bound}/{query}", loop, ended)
 
     def _reason_to_refuse(self, request: web.Request) -> str:
-        """The reason to refuse a request, or "" to answer it. Pages of other servers must not
-        reach this one under any host name."""
+        """The reason to refuse a request as text, or "" to answer it. With a token, the request
+        must have it. Without a token, the request must come from this machine and from the server's
+        own page, since web pages of other sites could send requests too."""
         name = request.host.rsplit(":", 1)[0].strip("[]")
         if self.token:
             token = request.query.get("token", "")
@@ -242,6 +257,7 @@ class _PageServer:
         return ""
 
     async def _serve_page(self, request: web.Request) -> web.Response:
+        """Send the HTML text of the page."""
         from aiohttp import web
 
         wrong = self._reason_to_refuse(request)
@@ -252,6 +268,7 @@ class _PageServer:
         )
 
     async def _serve_count(self, request: web.Request) -> web.Response:
+        """Send the number of open pages."""
         from aiohttp import web
 
         wrong = self._reason_to_refuse(request)
@@ -260,6 +277,8 @@ class _PageServer:
         return web.json_response({"clients": len(self.clients)})
 
     async def _serve_socket(self, request: web.Request) -> web.StreamResponse:
+        """Answer the questions of one open page until it is closed. Questions wait for the worker
+        thread in tasks, at most `_WAITING` of them."""
         from aiohttp import WSMsgType, web
 
         wrong = self._reason_to_refuse(request)
@@ -300,6 +319,8 @@ class _PageServer:
     async def _answer(
         self, socket: web.WebSocketResponse, client: MessageHandler, question: JsonDict
     ) -> None:
+        """Compute the answer to a question in the worker thread, and send it. Progress is sent
+        meanwhile."""
         loop = asyncio.get_running_loop()
 
         def send(part: JsonDict) -> None:
@@ -309,6 +330,7 @@ class _PageServer:
 
 
 async def _send(socket: web.WebSocketResponse, answer: JsonDict | bytes) -> None:
+    """Send an answer, bytes or JSON data, unless the page has been closed."""
     if socket.closed:
         return
     with suppress(ConnectionError):  # it is being closed

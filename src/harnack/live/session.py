@@ -1,6 +1,8 @@
-"""Answers the requests of a page about its live scene, by whichever channel they come.
+"""Answers the requests of a page about its live scene, whether they come by a socket or from a
+notebook.
 
-A request is {"kind": ..., ...}: plain numbers, lists and text from outside, none of it trusted.
+A request is {"kind": ..., ...} of plain numbers, lists and text. All of its parts are checked, as
+it comes from outside.
 """
 
 from __future__ import annotations
@@ -60,7 +62,7 @@ Progress = Callable[[float], None]
 
 
 def _ignore_progress(part: float) -> None:
-    """Progress that nobody asked for."""
+    """Ignore the finished part of some work."""
 
 
 class RequestError(ValueError):
@@ -68,17 +70,17 @@ class RequestError(ValueError):
 
 
 class Cancelled(Exception):
-    """The computation was stopped, because its answer is no longer needed."""
+    """The computation was stopped because its client cancelled it or is gone."""
 
 
 @dataclass
 class _PreviewCache:
-    """The surfaces of a state, prepared for previews.
+    """The surfaces of one state of the controls, prepared for previews.
 
-    key: the controls that they were prepared for.
+    key: the state of the controls, as a tuple that can be compared.
     drawn: the surfaces as objects of the studio.
-    prepared: the surfaces on the stage, with their paints.
-    rays: the number of rays that were traced through them.
+    prepared: the surfaces on the stage, with their colors.
+    rays: the number of rays that were traced through them so far.
     """
 
     key: Any
@@ -88,7 +90,12 @@ class _PreviewCache:
 
 
 class MessageHandler:
-    """Translates between one client's messages and the questions and answers of a `Session`."""
+    """Reads the messages of one client (an open page), and turns the answers of its `Session` into
+    messages.
+
+    session: answers the questions.
+    is_gone: whether the client has closed its page; then running computations stop.
+    """
 
     def __init__(self, live: LiveScene) -> None:
         self.session = Session(live)
@@ -96,10 +103,11 @@ class MessageHandler:
         self._cancelled: set[int] = set()
 
     def read(self, text: str) -> JsonDict | None:
-        """The question in a text; None for a "cancel", which is carried out here.
+        """The question in a message; None for a message of kind "cancel", whose question is marked
+        as cancelled.
 
         Raises:
-            RequestError: the text holds no question.
+            RequestError: the message is no JSON object with a whole number "id".
         """
         try:
             data = json.loads(text)
@@ -117,15 +125,18 @@ class MessageHandler:
         return question
 
     def answer(self, question: JsonDict, send: Callable[[JsonDict], None]) -> JsonDict | bytes:
-        """The message to send back: an object; or for a picture its number, height, width and the
-        ends of its depths (single precision), four bytes each, the last byte first, and then its
-        pixels: red, green, blue and alpha, row by row.
+        """Answer a question. The result is the message to send back: a JSON object or, for a
+        picture, bytes. The bytes are five little-endian numbers of four bytes (the question's id,
+        height, width, and the two ends of the depths in single precision), and then the pixels:
+        red, green, blue and alpha, row by row. Errors become messages too.
 
-        send: sends the progress of long work.
+        send: called with messages about the progress of long work.
         """
         number, done, last = question["id"], 0.0, time.monotonic()
 
         def report(part: float) -> None:
+            """Note that a fraction `part` of the work was finished, and send the progress from time
+            to time. Raises `Cancelled` if the client cancelled the question `number` or is gone."""
             nonlocal done, last
             if self.is_gone or number in self._cancelled:
                 raise Cancelled("stopped, as asked")
@@ -149,7 +160,8 @@ class MessageHandler:
 
 
 class Session:
-    """Answers questions about a live scene, as one client sees it."""
+    """Answers questions about a live scene for one client, and keeps what the next preview can use
+    again."""
 
     def __init__(self, live: LiveScene) -> None:
         self.live = live
@@ -159,8 +171,10 @@ class Session:
     def answer(
         self, question: Mapping[str, Any], report: Progress = _ignore_progress
     ) -> JsonDict | Preview:
-        """The answer to a question; a picture to "draw".
+        """Answer a question: JSON data, or a picture for the kind "draw".
 
+        question: "kind" selects what is asked; "sliders", "loops", "cut" and "settings" are the
+            state of the controls.
         report: called during long work with the fraction of it, from 0 to 1, that was finished
             since the last call; an exception that it raises ends the work.
 
@@ -182,16 +196,19 @@ class Session:
         return kinds[kind](question, self.controls(question), report)
 
     def controls(self, question: Mapping[str, Any]) -> ControlState:
-        """The state that a question asks about.
+        """The state of the controls that a question asks about.
 
         Raises:
-            RequestError: the question makes no sense.
+            RequestError: some part of the state is malformed or out of its range.
         """
         values = self._values(question.get("sliders", {}))
         loops, cut = self._loops(question.get("loops")), _volume(question.get("cut"))
         return ControlState(values, loops, cut, _settings(question.get("settings", {})))
 
     def _values(self, numbers: Any) -> dict[str, float]:
+        """The values of all sliders by name: the values in `numbers`, moved to steps, and start
+        values for the others. Raises `RequestError` for an unknown slider or a value beyond its
+        ends."""
         sliders = self.live.content.sliders
         if not isinstance(numbers, dict):
             raise RequestError("sliders must be numbers by name")
@@ -208,6 +225,8 @@ class Session:
         return values
 
     def _loops(self, curves: Any) -> list[FloatArray] | None:
+        """The vertices (n, 3) of each edited loop; None if `curves` is None, for no edits. Raises
+        `RequestError` for malformed or too many points."""
         if curves is None:
             return None
         if not self.live.editable:
@@ -222,6 +241,7 @@ class Session:
     def _delta_response(
         self, question: Mapping[str, Any], controls: ControlState, report: Progress
     ) -> JsonDict:
+        """The state for the controls as its difference from the initial state, in JSON data."""
         state = self.live.state(controls)
         checks = question.get("checks") is True
         return encode_arrays(state_delta(self.live.initial_state, state, checks=checks))
@@ -229,7 +249,9 @@ class Session:
     def _probe(
         self, question: Mapping[str, Any], controls: ControlState, report: Progress
     ) -> JsonDict:
-        """The first hit of a ray of the surfaces' coordinates, and how far each step was proved."""
+        """The nearest hit of one ray of the surfaces' coordinates, in JSON data: its status,
+        position, normal, value and curvatures, and the distances that the tracer's successive steps
+        reached."""
         origin = _points([question.get("origin")], "origin")
         direction = _points([question.get("direction")], "direction")
         surfaces = [s.surface for s in self.live.surfaces_at(controls)]
@@ -273,7 +295,7 @@ class Session:
     def _preview_response(
         self, question: Mapping[str, Any], controls: ControlState, report: Progress
     ) -> Preview:
-        """A picture of one ray a pixel."""
+        """A preview with one ray per pixel, from the camera "eye" of the question."""
         size = _size(question)
         show, ground = question.get("show", "shaded"), question.get("ground", self.live.backdrop)
         if show not in LIVE_MODES or ground not in GROUNDS:
@@ -298,8 +320,9 @@ class Session:
         )  # fmt: skip
 
     def _surfaces(self, controls: ControlState, rays: int) -> list[PreviewSurface]:
-        """The surfaces, prepared once as long as only the camera moves, and once more where all
-        rays so far pay for cells."""
+        """The surfaces prepared for previews. They are prepared again if the controls changed, or
+        if so many rays were traced that building cells (local expansions of the field, which make
+        each ray cheaper) pays. rays: the number of rays of the next picture."""
         loops = None if controls.curves is None else [loop.tobytes() for loop in controls.curves]
         key = controls.values, loops, controls.cut_volume, controls.settings
         state = self._painted
@@ -318,7 +341,8 @@ class Session:
     def _picture_response(
         self, question: Mapping[str, Any], controls: ControlState, report: Progress
     ) -> JsonDict:
-        """A picture of the state from the camera of the question, as base64 of a PNG file."""
+        """A picture of `render` from the camera of the question, as {"png": base64 text of a PNG
+        file}."""
         size = _size(question)
         picture: Any = self.live.render_still(
             controls, show=question.get("show", "shaded"), size=size, progress=report,
@@ -328,7 +352,8 @@ class Session:
         return {"png": base64.b64encode(picture._repr_png_()).decode()}
 
     def _camera(self, question: Mapping[str, Any]) -> Camera:
-        """The camera of a question, in the surfaces' coordinates."""
+        """The camera of a question. The question gives it in stage coordinates; the result has the
+        surfaces' coordinates."""
         place = self.live.placement
         eye, target, fov = parse_camera(question.get("camera"))
         eye, target = (place.apply_inverse(point[None])[0] for point in (eye, target))
@@ -337,7 +362,8 @@ class Session:
     def _save(
         self, question: Mapping[str, Any], controls: ControlState, report: Progress
     ) -> JsonDict:
-        """The text of a scene file, and the names of sliders that it cannot hold."""
+        """{"text": the scene file of the state, "lost": names of the sliders that it cannot
+        hold}."""
         text, lost = self.live.to_scene_text(
             controls, camera=self._camera(question), show=question.get("show", "shaded"),
             backdrop=question.get("ground", self.live.backdrop), up=self.live.up,
@@ -347,10 +373,9 @@ class Session:
     def _load(
         self, question: Mapping[str, Any], controls: ControlState, report: Progress
     ) -> JsonDict:
-        """Replaces the scene by that of a scene file, and returns it as `LiveScene.scene` does.
-
-        `live_options` selects the settings of the file that are used.
-        """
+        """Replace the scene by that of a scene file, whose text is in the question, and return the
+        new scene's data as `LiveScene.scene` does. Of the settings of the file only those that
+        `live_options` selects are used."""
         text = question.get("text")
         if not isinstance(text, str):
             raise RequestError("text must be that of a scene file")
@@ -363,10 +388,11 @@ class Session:
 
 
 def parse_camera(camera: Any) -> tuple[FloatArray, FloatArray, float]:
-    """Position (3,), target (3,) and field of view, in degrees, of an object that holds them.
+    """Position (3,), target (3,) and field of view in degrees from {"position": ..., "target": ...,
+    "fov": ...}.
 
     Raises:
-        RequestError: the object does not hold them.
+        RequestError: `camera` is no such object, or its numbers make no camera.
     """
     if not isinstance(camera, dict):
         raise RequestError("camera must be an object of position, target and fov")
@@ -385,6 +411,8 @@ def parse_camera(camera: Any) -> tuple[FloatArray, FloatArray, float]:
 
 
 def _size(question: Mapping[str, Any]) -> tuple[int, int]:
+    """The size (w, h) of the asked picture in pixels. Raises `RequestError` if a side is too
+    long."""
     size = check_image_size(question.get("size"))
     if max(size) > _LARGEST_PICTURE:
         raise RequestError(f"size: at most {_LARGEST_PICTURE} pixels a side")
@@ -392,7 +420,8 @@ def _size(question: Mapping[str, Any]) -> tuple[int, int]:
 
 
 def _volume(cut: Any) -> Volume | None:
-    """The volume that cuts all surfaces, in their coordinates; None for no cut."""
+    """The volume that cuts all surfaces, in their coordinates, from {"ball": center and radius},
+    {"box": two corners} or {"plane": normal and offset of a half-space}; None for no cut."""
     if cut is None:
         return None
     kinds = {"ball": 4, "box": 6, "plane": 4}
@@ -411,7 +440,8 @@ def _volume(cut: Any) -> Volume | None:
 
 
 def _settings(data: Any) -> dict[str, Any]:
-    """Settings that a person has changed: see `LIVE_OPTIONS`."""
+    """The options that a person has changed, by name, if they are valid values of `LIVE_OPTIONS`;
+    otherwise raise `RequestError`."""
     if not isinstance(data, dict):
         raise RequestError("settings must be an object with names")
     settings = cast("JsonDict", data)
@@ -433,7 +463,8 @@ def _settings(data: Any) -> dict[str, Any]:
 
 
 def _points(numbers: Any, name: str) -> FloatArray:
-    """Points (n, 3) of finite numbers."""
+    """An array of points (n, 3) from a list of lists. Raises `RequestError`, whose message begins
+    with `name`, unless each has three finite numbers."""
     wrong = f"{name}: points are three finite numbers each"
     try:
         points: FloatArray = np.array(numbers, dtype=np.float64)
@@ -445,6 +476,7 @@ def _points(numbers: Any, name: str) -> FloatArray:
 
 
 def _is_number(value: Any) -> bool:
+    """Whether a value is a finite int or float, and no bool."""
     try:
         as_finite(value, "it")
     except (TypeError, ValueError):

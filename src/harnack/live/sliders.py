@@ -1,4 +1,4 @@
-"""Sliders: numbers that a person moves, and the content of a live view as a function of them."""
+"""Sliders, numbers that a person moves, and the content of a live view as a function of them."""
 
 from __future__ import annotations
 
@@ -34,11 +34,12 @@ _COMBINED = 3
 
 @dataclass(frozen=True)
 class Slider:
-    """A number between two ends that is moved by a person who looks at a page or a view.
+    """A number between two ends that a person moves while looking at a page or a view.
 
     low, high: its ends.
-    start: its value at first; by default the middle, or the step at or before the middle.
-    step: between neighboring values, counted from `low`; None for continuous sliders.
+    start: its value at first; by default the middle, or the largest step below the middle.
+    step: the distance of neighboring values, which are counted from `low`; None for a slider that
+        takes all values.
 
     Raises:
         TypeError: not numbers.
@@ -66,17 +67,19 @@ class Slider:
             raise ValueError(f"start must lie between {self.low} and {self.high}: {self.start}")
 
     def nearest(self, number: float) -> float:
-        """The value of the slider at or below a number, within its ends; the number as it is where
-        only rounding lies between, or where the slider has no step."""
+        """The largest value of the slider that is at most `number`, clipped to the slider's ends. A
+        slider without a step takes the clipped number itself. A number that differs from a step by
+        rounding only is returned unchanged."""
         number = min(max(number, self.low), self.high)
         if self.step is None:
             return number
         steps = math.floor((number - self.low) / self.step + 1e-9)
-        place = min(self.low + self.step * steps, self.high)
-        return number if abs(number - place) <= 1e-9 * self.step else place
+        step_value = min(self.low + self.step * steps, self.high)
+        return number if abs(number - step_value) <= 1e-9 * self.step else step_value
 
     def values(self, count: int) -> list[float]:
-        """All values of the slider, or `count` values evenly spread where it has no step."""
+        """All values of the slider in ascending order; for a slider without a step `count` evenly
+        spaced values, both ends included."""
         if self.step is None:
             return [self.low + (self.high - self.low) * k / (count - 1) for k in range(count)]
         steps = math.floor((self.high - self.low) / self.step + 1e-9)
@@ -85,11 +88,11 @@ class Slider:
 
 @dataclass(frozen=True)
 class SlidingContent:
-    """Content of a live view as a function of sliders.
+    """The surfaces and options of a live view as functions of sliders.
 
-    content: an argument that `hk.render` accepts, or a function of sliders that returns it.
-    settings: options of `view`, constant or functions of sliders.
-    sliders: by name.
+    content: surfaces that `hk.render` accepts, or a function of sliders that returns them.
+    settings: options of `view` by name; a value is a constant, a slider or a function of sliders.
+    sliders: all sliders by name.
     """
 
     content: Any
@@ -98,8 +101,9 @@ class SlidingContent:
 
     @classmethod
     def of(cls, content: Any, options: Mapping[str, Any]) -> SlidingContent:
-        """The content of the arguments of `view` or `page`: a slider is the value of an option that
-        is a number, or the argument of functions.
+        """Make the content from the arguments of `view` or `page`. A slider is either the value of
+        an option that is a number, or has a name of its own, which is an argument of the functions
+        that depend on it.
 
         Raises:
             TypeError: a function has an argument that is no slider, or nothing depends on a slider.
@@ -130,22 +134,24 @@ class SlidingContent:
 
     @property
     def starts(self) -> dict[str, float]:
-        """The start values of the sliders."""
+        """The start value of each slider, by name."""
         return {name: cast("float", slider.start) for name, slider in self.sliders.items()}
 
     @property
     def name(self) -> str:
-        """The name of the initial content, in words."""
+        """A title for the content at the start values: the texts of its fields."""
         content, _ = self.at(self.starts)
         surfaces: list[Any] = [*content] if isinstance(content, list | tuple) else [content]
         return ", ".join(repr(getattr(surface, "field", surface)) for surface in surfaces)
 
     def at(self, values: Mapping[str, float]) -> tuple[Any, dict[str, Any]]:
-        """The content and its settings, for values of all sliders."""
+        """The surfaces, and the options by name, for the given values of all sliders."""
         settings = {name: self._at(name, value, values) for name, value in self.settings.items()}
         return self._at("", self.content, values), settings
 
     def _at(self, name: str, value: Any, values: Mapping[str, float]) -> Any:
+        """The value of one option (or of the content) at the given slider values: a slider's value,
+        a function's result, or the constant itself. name: of the option."""
         if isinstance(value, Slider):
             return values[name]
         if not _is_function(value):
@@ -166,8 +172,8 @@ class SliderValueError(ValueError):
 
 @contextmanager
 def slider_values_in_errors(values: Mapping[str, float]) -> Generator[None]:
-    """Context manager whose errors name the slider values at which they were raised; without
-    sliders errors stay as they are.
+    """Context manager: errors raised in it become errors that name the slider values. If `values`
+    is empty, the errors stay as they are.
 
     Raises:
         SliderValueError: in place of the error.
@@ -179,16 +185,17 @@ def slider_values_in_errors(values: Mapping[str, float]) -> Generator[None]:
     except Exception as wrong:
         if not values:
             raise
-        place = ", ".join(f"{name}={value:g}" for name, value in values.items())
+        values_text = ", ".join(f"{name}={value:g}" for name, value in values.items())
         raise SliderValueError(
-            f"at the place {place} of the sliders: {type(wrong).__name__}: {wrong} (a slider needs "
-            "ends low and high between which there is something to draw)"
+            f"at the place {values_text} of the sliders: {type(wrong).__name__}: {wrong} "
+            "(a slider needs ends low and high between which there is something to draw)"
         ) from wrong
 
 
 def extreme_slider_values(sliders: Mapping[str, Slider]) -> list[dict[str, float]]:
-    """All sliders at their ends, in all combinations of up to three sliders; of more sliders, each
-    in turn at its ends while the others stand at their start values."""
+    """Combinations of slider values at the ends of the sliders' intervals, each by slider name. Up
+    to three sliders: all combinations of ends. More sliders: each slider in turn at its two ends,
+    while all other sliders have their start values."""
     ends = {name: (slider.low, slider.high) for name, slider in sliders.items()}
     if len(sliders) <= _COMBINED:
         return [dict(zip(ends, place, strict=True)) for place in itertools.product(*ends.values())]
@@ -204,4 +211,5 @@ def _arguments(function: Any) -> dict[str, inspect.Parameter]:
 
 
 def _is_function(value: Any) -> bool:
+    """Whether a value is a function of sliders: callable, but no class, field or surface."""
     return callable(value) and not isinstance(value, type | Field | Surface)

@@ -28,9 +28,10 @@ class ValueTypeError(TypeError):
 
 
 def check_types(function: Callable[..., Any], arguments: dict[str, Any]) -> None:
-    """Check arguments of a class or a function against its annotations. Lists are tuples in
-    `arguments`, and may be the values of array arguments too, whose numbers the function itself
-    checks.
+    """Check the arguments of a class or a function against its type annotations.
+
+    arguments: values by name; lists have become tuples. A tuple may also stand for an array; the
+        function itself checks the numbers of arrays.
 
     Raises:
         ValueTypeError: the message names the argument, and the required type.
@@ -39,10 +40,12 @@ def check_types(function: Callable[..., Any], arguments: dict[str, Any]) -> None
     hints = typing.get_type_hints(target, localns=_NAMES)
     for name, value in arguments.items():
         if name in hints and not _fits(value, hints[name]):
-            raise ValueTypeError(f"{name} must be {_words(hints[name])}, not {value!r:.60}")
+            raise ValueTypeError(f"{name} must be {_type_in_words(hints[name])}, not {value!r:.60}")
 
 
 def _fits(value: Any, hint: Any) -> bool:
+    """Whether a value, in which lists have become tuples, can be passed where `hint` is the type
+    annotation."""
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if hint is Any or origin is np.ndarray:
         return True
@@ -63,15 +66,16 @@ def _fits(value: Any, hint: Any) -> bool:
     return not isinstance(hint, type) or isinstance(value, hint)
 
 
-def _words(hint: Any) -> str:
-    """A type in words, for people who write scene files."""
+def _type_in_words(hint: Any) -> str:
+    """A type annotation in words, such as "a list of 3 entries, each a number", for people who
+    write scene files."""
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin in (typing.Union, types.UnionType):
-        return " or ".join(map(_words, arguments))
+        return " or ".join(map(_type_in_words, arguments))
     if origin is typing.Literal:
         return " or ".join(map(repr, arguments))
     if arguments:
-        kinds = dict.fromkeys(_words(kind) for kind in arguments if kind is not Ellipsis)
+        kinds = dict.fromkeys(_type_in_words(kind) for kind in arguments if kind is not Ellipsis)
         count = (
             "" if origin is not tuple or Ellipsis in arguments else f"{len(arguments)} entries, "
         )

@@ -23,16 +23,20 @@ _RENDER = "\nexport default { render: ({ model, el }) => renderWidget(Panel, mod
 
 
 class Widget(anywidget.AnyWidget):
-    """A live surface in a notebook, whose attributes follow what a person moves, and move it.
+    """A live surface in a notebook. Its attributes change when a person moves something, and
+    setting an attribute moves it in the picture.
 
         view = hk.view(field, level=hk.Slider(1, 12))
         view.observe(lambda change: print(change.new["level"]), names="sliders")
         view.sliders = {"level": 6.0}
 
     camera: {"position": (3,), "target": (3,), "fov": degrees} in the surfaces' coordinates, of a
-        picture of 4 : 3. sliders: numbers by name. points: the curves, lists of points (n, 3);
-        those of a `SolidAngle` can be moved. show: one of "shaded", "normal", "depth",
-        "evaluations" and "status". height: of the widget, in pixels.
+        picture of 4 : 3.
+    sliders: values by name.
+    points: the boundary curves, a list of points (n, 3) for each loop. The points of a `SolidAngle`
+        can be moved.
+    show: one of "shaded", "normal", "depth", "evaluations" and "status".
+    height: of the widget, in pixels.
 
     Raises traitlets.TraitError for values that make no sense.
     """
@@ -67,6 +71,8 @@ class Widget(anywidget.AnyWidget):
         super().close()
 
     def _receive(self, _: Any, text: Any, __: Any) -> None:
+        """Read a message of the browser, and have its question answered in the worker thread. The
+        first and third argument, the widget and buffers, are not used."""
         if self._client.is_gone:  # closed, while the message was on its way
             return
         try:
@@ -78,6 +84,7 @@ class Widget(anywidget.AnyWidget):
             self._worker.submit(self._answer, question)
 
     def _answer(self, question: JsonDict) -> None:
+        """Answer a question, and send the answer."""
         answer = self._client.answer(question, self._send_answer)
         if isinstance(answer, bytes):
             self.send({"id": question["id"]}, buffers=[answer])
@@ -85,10 +92,12 @@ class Widget(anywidget.AnyWidget):
             self._send_answer(answer)
 
     def _send_answer(self, answer: JsonDict) -> None:
+        """Send JSON data to the browser."""
         self.send(answer)
 
     @traitlets.validate("height")
     def _checked_height(self, proposal: Any) -> int:
+        """The proposed height, if it is valid; otherwise raise `TraitError`."""
         try:
             return check_height(proposal["value"])
         except ValueError as wrong:
@@ -96,6 +105,8 @@ class Widget(anywidget.AnyWidget):
 
     @traitlets.validate("sliders", "points", "camera")
     def _checked(self, proposal: Any) -> Any:
+        """The proposed value of `sliders`, `points` or `camera` as plain Python numbers, if it is
+        valid; otherwise raise `TraitError`."""
         name, value = proposal["trait"].name, proposal["value"]
         session = self._client.session
         try:
@@ -112,5 +123,5 @@ class Widget(anywidget.AnyWidget):
 
 
 def _listed(value: Any) -> Any:
-    """NumPy's arrays and numbers as Python's lists and numbers."""
+    """A NumPy array or number as Python lists and numbers; JSON's encoder calls this."""
     return value.tolist()

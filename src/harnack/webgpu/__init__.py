@@ -1,10 +1,11 @@
-"""Kernels that Dr.Jit recorded, translated for any GPU behind WebGPU, run there, and compared with
-Dr.Jit.
+"""Translates kernels that Dr.Jit recorded for GPUs that WebGPU supports, runs them there, and
+compares the results with Dr.Jit's.
 
-Dr.Jit prints a recorded kernel as a program for LLVM, loops included. That text is parsed
-(`llvm_parser`) and written as WGSL (`wgsl`). Labels, which Dr.Jit prints, tell which pointer is
-which array (`recording`). So no field is implemented twice; and the result is not trusted: a sample
-of the rays of each call is compared with Dr.Jit's own results (`device`).
+Dr.Jit prints a recorded kernel, loops included, as a program in LLVM's language. `llvm_parser`
+parses this text and `wgsl` writes it in WGSL, WebGPU's language. Labels that Dr.Jit prints tell
+which array each pointer belongs to (`recording`). So no field is implemented twice. The results are
+not trusted: for a sample of the rays of each call they are compared with Dr.Jit's own results
+(`device`).
 """
 
 from __future__ import annotations

@@ -1,4 +1,5 @@
-"""Computation on a GPU behind WebGPU: shaders compiled and run, a sample compared with Dr.Jit.
+"""Runs shaders (programs in WGSL) on a GPU by WebGPU, and compares a sample of the results with
+Dr.Jit's.
 
 The package `wgpu` drives the GPU through Vulkan, Metal or Direct3D.
 """
@@ -45,20 +46,20 @@ _SHADER_CACHE_SIZE = 64
 
 
 class NoDeviceError(RuntimeError):
-    """WebGPU finds no device, or the package `wgpu` is missing."""
+    """WebGPU finds no device, or the package `wgpu` is not installed."""
 
 
 @dataclass(frozen=True)
 class Device:
-    """A WebGPU device. handle: the device object of the package `wgpu`; name: by which the device
-    identifies itself."""
+    """A WebGPU device. handle: the device object of the package `wgpu`. name: the device's own
+    name."""
 
     handle: Any
     name: str
 
     @functools.lru_cache(maxsize=_SHADER_CACHE_SIZE)  # noqa: B019  # devices last as long as the process
     def compile(self, shader: Shader) -> CompiledShader:
-        """The compiled shader; each shader is compiled once."""
+        """Compile a shader for this device. The 64 shaders used last stay compiled."""
         module = self.handle.create_shader_module(code=shader.code)
         pipeline = self.handle.create_compute_pipeline(
             layout="auto", compute={"module": module, "entry_point": "main"}
@@ -68,10 +69,10 @@ class Device:
 
 @functools.cache
 def find_device() -> Device:
-    """The fastest device that there is.
+    """The fastest WebGPU device of this machine.
 
     Raises:
-        NoDeviceError: there is none, or the package `wgpu` is missing.
+        NoDeviceError: there is no device, or the package `wgpu` is not installed.
     """
     try:
         import wgpu
@@ -92,7 +93,8 @@ def find_device() -> Device:
 
 @dataclass(frozen=True)
 class CompiledShader:
-    """A shader, compiled for a device."""
+    """A shader that is compiled for a device. pipeline: the compute pipeline of the package
+    `wgpu`."""
 
     device: Device
     shader: Shader
@@ -101,10 +103,14 @@ class CompiledShader:
     def run(
         self, data: Mapping[str, Any], lanes: Mapping[str, Any], count: int
     ) -> dict[str, Words]:
-        """Run the shader on `count` lanes. Returns the bits of each result, (count,), by label.
+        """Run the shader on `count` lanes. Returns the 32 bits of each result as arrays (count,),
+        by label.
 
-        data: by label, the numbers and tables that the shader reads.
-        lanes: by label, arrays (count,).
+        data: the numbers and tables that the shader reads, by label.
+        lanes: arrays (count,) with an entry for each lane, by label.
+
+        The lanes are computed in batches whose size is adapted so that each takes a fraction of a
+        second.
         """
         packed = pack_shader_data(self.shader, data)
         lane_bits = np.stack([as_words(lanes[label]) for label in self.shader.lanes])
@@ -123,10 +129,11 @@ class CompiledShader:
         return dict(zip(self.shader.results, results, strict=True))
 
     def _dispatch(self, data: Words, lanes: Words) -> Words:
-        """Run the shader on all lanes at once. Returns the bits of its results, (results, count).
+        """Run the shader on all of these lanes at once. Returns the bits of its results, (number of
+        results, count).
 
-        data: the buffer of numbers and tables (`pack_shader_data`).
-        lanes: (arrays, count) the bits of each array of lanes.
+        data: the buffer of numbers and tables, as `pack_shader_data` returns it.
+        lanes: (number of arrays, count) the bits of each array with an entry per lane.
         """
         import wgpu
 
@@ -160,8 +167,11 @@ class CompiledShader:
 
 
 def pack_shader_data(shader: Shader, data: Mapping[str, Any]) -> Words:
-    """The buffer of numbers and tables that a shader reads (`Shader`), with the number of lanes set
-    to 0."""
+    """The buffer of numbers and tables that a shader reads, as 32-bit words (see `Shader` for its
+    layout). The number of lanes, its first word, is 0.
+
+    data: the numbers and tables by label.
+    """
     tables = [as_words(data[label]) for label in shader.tables]
     numbers = [as_words(data[label])[:1] for label in shader.numbers]
     first_start = 2 + len(tables) + len(numbers)
@@ -171,8 +181,8 @@ def pack_shader_data(shader: Shader, data: Mapping[str, Any]) -> Words:
 
 
 def as_words(array: Any) -> Words:
-    """The entries of a number or array as 32-bit words (n,): the bits of 32-bit numbers, other
-    numbers converted to integers."""
+    """The entries of a number or array as 32-bit words (n,): the bits of 32-bit floats and
+    integers. Numbers of other types are converted to integers first."""
     values: npt.NDArray[Any] = np.atleast_1d(
         to_numpy(array) if dr.is_array_v(type(array)) else array
     )
@@ -189,7 +199,7 @@ _CHECKED_LANES = 4096
 
 
 class DeviceMismatchError(RuntimeError):
-    """The results of a device differ from Dr.Jit's."""
+    """The results of a device disagree with Dr.Jit's results for a sample of the lanes."""
 
 
 def evaluate_on_device(
@@ -201,10 +211,13 @@ def evaluate_on_device(
 ) -> Arrays:
     """Evaluate `compute(**lanes)` on a device. Returns NumPy arrays by name.
 
-    compute, data: as `record_kernel` takes them.
-    lanes: Dr.Jit arrays of n entries each.
-    find_mismatch: a function of a sample of the lanes, Dr.Jit's results there and the device's,
-        which describes an error of the latter; it returns nothing if they agree.
+    compute: a function of Dr.Jit arrays that returns Dr.Jit arrays by name, computed by a single
+        kernel.
+    lanes: Dr.Jit arrays of n entries each, by name.
+    data: an object that contains all other arrays that `compute` reads.
+    find_mismatch: compares results for a sample of the lanes. It is called with the indices of
+        these lanes, Dr.Jit's results and the device's results, and returns a description of an
+        error of the device, or "" if the results agree.
 
     Raises:
         UntranslatableError: the kernel contains an unknown operation.
@@ -239,7 +252,7 @@ def evaluate_on_device(
 
 
 def _gather_lanes(array: Any, rows: npt.NDArray[np.int64]) -> Any:
-    """The entries `rows` (k,) of a Dr.Jit array, evaluated."""
+    """The entries of a Dr.Jit array at the indices `rows` (k,), evaluated."""
     index = upload_integers(backend_of(array), rows.astype(np.uint32))
     gathered = dr.gather(type(array), array, index)
     dr.make_opaque(gathered)
@@ -247,8 +260,8 @@ def _gather_lanes(array: Any, rows: npt.NDArray[np.int64]) -> Any:
 
 
 def _columns_to_arrays(columns: Arrays) -> Arrays:
-    """The arrays of results by name, (n,) or (n, 3), from columns with the labels "result name" or
-    "result name k"."""
+    """The results by name, each an array (n,) or (n, 3). columns: arrays (n,) with the labels
+    "result NAME" for numbers, or "result NAME k" for component k of a vector."""
     groups: dict[str, list[npt.NDArray[Any]]] = {}
     for label, column in columns.items():
         groups.setdefault(label.split()[1], []).append(column)

@@ -1,9 +1,9 @@
-"""A parser of kernels that Dr.Jit recorded: straight-line operations on lanes, and nested loops.
+"""Parses kernels that Dr.Jit recorded into operations on single lanes and nested loops.
 
-Dr.Jit writes a kernel for LLVM as a function over packets of lanes. The program of every lane is
-the same, so the parser drops the packets, and with them the masks that only keep the lanes of a
-packet apart. It knows the part of LLVM's language that Dr.Jit writes; anything else is refused by
-name.
+Dr.Jit writes a kernel for LLVM as a function of packets, vectors of several lanes. The program of
+every lane is the same, so the parser replaces packets by single lanes, and drops the masks that
+only keep apart the lanes of a packet. It knows the part of LLVM's language that Dr.Jit writes; any
+other instruction is refused with a message that shows it.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class UntranslatableError(NotImplementedError):
 
 @dataclass(frozen=True)
 class Constant:
-    """A constant of a kernel, as its 32 bits."""
+    """A constant of a kernel. bits: its 32 bits as an integer; 0 or 1 for a "bool"."""
 
     kind: Kind
     bits: int
@@ -46,7 +46,8 @@ Operand: TypeAlias = "str | Constant"
 
 @dataclass(frozen=True)
 class Operation:
-    """result = name(operands); each operand is a constant or the result of an earlier operation."""
+    """The statement result = name(operands). Each operand is a constant or the name of the result
+    of an earlier statement. kind: the type of the result."""
 
     result: str
     kind: Kind
@@ -56,10 +57,10 @@ class Operation:
 
 @dataclass(frozen=True)
 class Load:
-    """result = an entry of an array.
+    """The statement result = an entry of an array.
 
-    source: which entry. "lane": that of the lane. "number": the only one. "table": number
-        index * stride + offset where `mask` holds, else the result is 0.
+    source: which entry is read. "lane": the entry of the lane. "number": the only entry. "table":
+        entry index * stride + offset if `mask` is True (or None), otherwise the result is 0.
     parameter: the index of the array among the parameters of the kernel.
     """
 
@@ -75,7 +76,8 @@ class Load:
 
 @dataclass(frozen=True)
 class Store:
-    """The lane's entry of the array `parameter` = value."""
+    """A statement that stores `value` as the lane's entry of the array with the index
+    `parameter`."""
 
     parameter: int
     kind: Kind
@@ -84,7 +86,8 @@ class Store:
 
 @dataclass(frozen=True)
 class LoopVariable:
-    """A variable of a loop: its value before the first iteration, and after each."""
+    """A variable of a loop. before: its value before the first iteration. after: its value after an
+    iteration, in terms of the values in that iteration."""
 
     name: str
     kind: Kind
@@ -94,7 +97,8 @@ class LoopVariable:
 
 @dataclass
 class Loop:
-    """A loop: `test` computes `condition`; while it holds, `body` runs and `test` again."""
+    """A loop. The statements `test` compute the operand `condition`. If it is True, the statements
+    `body` run and the test is made again; otherwise the loop ends."""
 
     variables: list[LoopVariable] = field(default_factory=list[LoopVariable])
     test: list[Statement] = field(default_factory=list["Statement"])
@@ -109,15 +113,16 @@ Statement: TypeAlias = "Operation | Load | Store | Loop"
 class ComputeKernel:
     """The program that each lane of a kernel runs.
 
-    labels: index of a kernel parameter -> label of its array, where a label is known. An array from
-        which lanes gather at computed indices has the label of the gathered value.
+    statements: the statements in order.
+    labels: for the index of a kernel parameter, the label of its array, if a label is known. An
+        array that lanes read at computed indices has the label of the values read from it.
     """
 
     statements: list[Statement]
     labels: dict[int, str]
 
     def walk(self) -> Iterator[Statement]:
-        """All statements, including the statements in loops."""
+        """Yield all statements, including the statements in loops, in no particular order."""
         pending = list(self.statements)
         while pending:
             statement = pending.pop()
@@ -127,10 +132,10 @@ class ComputeKernel:
 
 
 def parse(text: str) -> ComputeKernel:
-    """Parse a kernel, as `drjit.kernel_history` gives it in LLVM's language.
+    """Parse a kernel from its text in LLVM's language, as `drjit.kernel_history` returns it.
 
     Raises:
-        UntranslatableError: it contains an unknown operation.
+        UntranslatableError: it contains an unknown operation, or no kernel.
     """
     start = text.rfind("define void @drjit_")
     if start < 0:
@@ -144,8 +149,13 @@ def parse(text: str) -> ComputeKernel:
 
 @dataclass
 class _Address:
-    """The address of a load: the array of a parameter, at an index, in records of `stride`
-    numbers."""
+    """The address from which an instruction reads: an array of records of `stride` numbers each,
+    and the index of a record.
+
+    parameter: the index of the array among the kernel's parameters.
+    index: the index of the record; None for the array itself.
+    mask: whether to read at all; None for always.
+    """
 
     parameter: int
     index: Operand | None = None
@@ -191,15 +201,15 @@ _CALLS = {
 
 
 def _ignore(*groups: str) -> None:
-    """The action for instructions without an effect on the lanes."""
+    """The action for instructions that have no effect on single lanes: do nothing."""
     del groups
 
 
 class _LLVMParser:
     """Parses a kernel line by line.
 
-    statements: the statements so far.
-    labels: index of a kernel parameter -> label of its array.
+    statements: the statements parsed so far.
+    labels: for the index of a kernel parameter, the label of its array.
     """
 
     def __init__(self) -> None:
@@ -220,8 +230,9 @@ class _LLVMParser:
         }
 
     def parse_line(self, line: str) -> None:
-        """Parse the next line: a comment (which is a label), the name of a block, or an
-        instruction.
+        """Parse the next line: a comment (a label), the name of a block, or an instruction. An
+        instruction is matched with the patterns for its first word, and the action of the matching
+        pattern is called.
 
         Raises:
             UntranslatableError: the instruction is unknown.
@@ -247,8 +258,8 @@ class _LLVMParser:
             )
 
     def _enter_block(self, block: str) -> None:
-        """Begin a block of the kernel. A loop has four blocks: the part before it, its test, its
-        body and the part after it."""
+        """Begin the block of the kernel named `block`. A loop has four blocks: the part before it,
+        its test (l_N_cond), its body (l_N_body) and the part after it (l_N_done)."""
         self._block = block
         if re.fullmatch(r"l_\d+_cond", block):
             loop = Loop()
@@ -266,7 +277,8 @@ class _LLVMParser:
             self._current_block = outer.body if outer else self.statements
 
     def _value(self, text: str, kind: Kind) -> Operand:
-        """The operand that a text stands for: the name of a result, or a constant of this kind."""
+        """The operand that a text stands for: the name of a result, or a constant of the type
+        `kind`."""
         text = text.strip()
         if text.startswith("%"):
             return self._aliases.get(text, text)
@@ -286,18 +298,19 @@ class _LLVMParser:
         return Constant(kind, int(text) & 0xFFFFFFFF)
 
     def _emit(self, result: str, kind: Kind, name: str, *operands: Operand) -> None:
-        """Add an operation to the current block."""
+        """Append the operation result = name(operands) to the current block."""
         self._current_block.append(Operation(result, kind, name, operands))
 
     def _label_parameter(self, parameter: int) -> None:
-        """Give the current label, if there is one, to a parameter that has none."""
+        """Give the current label, if there is one, to the array of a kernel parameter that has none
+        yet."""
         if self._label is not None:
             self.labels.setdefault(parameter, self._label)
 
     def _grammar(self) -> dict[str, list[tuple[str, Callable[..., None]]]]:
-        """The grammar: for each first word of an instruction, the patterns of such instructions,
-        each with its action. An action takes the result, if there is one, and the groups of the
-        pattern."""
+        """The grammar: for the first word of an instruction, a list of (pattern, action). The
+        action of the first pattern that matches is called with the name of the result (if the
+        instruction has one) and the groups of the pattern."""
         entry = rf"ptr ({_NAME}), <\d+ x i32> (\S+)"
         binary: list[tuple[str, Callable[..., None]]]
         binary = [(rf"(\w+) {_VECTOR} {_OPERAND}, {_OPERAND}", self._arithmetic)]
@@ -377,79 +390,82 @@ class _LLVMParser:
     # The actions of the grammar.
 
     def _test(self, condition: str) -> None:
-        """The condition of the current loop."""
+        """Note the condition of the current loop."""
         self._loops[-1].condition = self._value(condition, "bool")
 
     def _phi(self, result: str, element: str, before: str, after: str) -> None:
-        """A variable of the current loop, with its value before the first iteration and after
-        each."""
+        """Add a variable to the current loop, with its value before the first iteration and after
+        each iteration. element: its LLVM type."""
         kind = self._kind(element)
         variable = LoopVariable(result, kind, self._value(before, kind), after)
         self._loops[-1].variables.append(variable)
 
     def _alias(self, result: str, element: str, value: str) -> None:
-        """Another name for a value."""
+        """Note that the result is another name of a value. element: the value's LLVM type."""
         if element != "ptr":
             self._aliases[result] = self._value(value, self._kind(element))
 
     def _lane(self, result: str, name: str) -> None:
-        """The index of the lane, or the number of lanes."""
+        """Note that the result is the index of the lane, or the number of lanes."""
         self._aliases[result] = "lane" if name == "index" else "count"
 
     def _parameter(self, result: str, number: str) -> None:
-        """The address of the array of a kernel parameter."""
+        """Note that the result is the address of the array of kernel parameter `number`."""
         self._addresses[result] = _Address(int(number))
         self._label_parameter(int(number))
 
     def _pointer(self, result: str, pointer: str) -> None:
-        """Another name for an address."""
+        """Note that the result is another name of an address."""
         self._addresses[result] = self._addresses[pointer]
 
     def _load_number(self, result: str, element: str, pointer: str) -> None:
-        """Load the only entry of an array."""
+        """Append a statement that loads the only entry of an array. element: its LLVM type."""
         source = self._addresses[pointer]
         self._current_block.append(Load(result, self._kind(element), "number", source.parameter))
 
     def _load_lane(self, result: str, element: str, pointer: str) -> None:
-        """Load the lane's entry of an array."""
+        """Append a statement that loads the lane's entry of an array. element: its LLVM type."""
         source = self._addresses[pointer]
         self._current_block.append(Load(result, self._kind(element), "lane", source.parameter))
 
     def _store(self, element: str, value: str, pointer: str) -> None:
-        """Store a value in the lane's entry of an array."""
+        """Append a statement that stores a value as the lane's entry of an array. element: its LLVM
+        type."""
         kind = self._kind(element)
         self._current_block.append(
             Store(self._addresses[pointer].parameter, kind, self._value(value, kind))
         )
 
     def _record(self, result: str, stride: str, pointer: str, index: str) -> None:
-        """The address of a record of `stride` numbers in a table."""
+        """Note that the result is the address of record `index` in a table of records of `stride`
+        numbers."""
         source = self._addresses[pointer]
         self._addresses[result] = _Address(source.parameter, self._value(index, "u32"), int(stride))
 
     def _set_address_mask(self, result: str, mask: str, pointer: str) -> None:
-        """The same address, read only where the mask holds."""
+        """Note that the result is the address `pointer`, to be read only if `mask` is True."""
         source = self._addresses[pointer]
         self._addresses[result] = _Address(
             source.parameter, source.index, source.stride, self._value(mask, "bool")
         )
 
     def _entry(self, result: str, pointer: str, index: str) -> None:
-        """The address of an entry of a table."""
+        """Note that the result is the address of entry `index` of a table."""
         self._record(result, "1", pointer, index)
 
     def _gather_record(self, result: str, pointer: str) -> None:
-        """Note the address from which a record is read; `_extract` reads its numbers."""
+        """Note the address of the record that the result holds; `_extract` reads the record's
+        numbers one by one."""
         self._records[result] = self._addresses[pointer]
 
     def _extract(self, result: str, element: str, record: str, entry: str) -> None:
-        """Load number `entry` of a record."""
+        """Append a statement that loads number `entry` of a record."""
         source = self._records[record]
         self._read_table(result, element, source, int(entry), source.mask)
 
     def _gather(self, result: str, element: str, pointer: str, mask: str) -> None:
-        """Load an entry of a table where the mask holds, else 0. The label of the result becomes
-        that of the table."""
+        """Append a statement that loads an entry of a table if the mask is True, otherwise 0. The
+        current label, that of the result, becomes the label of the table."""
         source = self._addresses[pointer]
         self._read_table(result, element, source, 0, self._value(mask, "bool"))
         self._label_parameter(source.parameter)
@@ -457,7 +473,8 @@ class _LLVMParser:
     def _read_table(
         self, result: str, element: str, source: _Address, entry: int, mask: Operand | None
     ) -> None:
-        """Add the load of number `entry` of the record at an address."""
+        """Append a statement that loads number `entry` of the record at an address if `mask` is
+        True or None, otherwise 0."""
         kind = self._kind(element)
         load = Load(
             result, kind, "table", source.parameter, source.index, source.stride, entry, mask
@@ -466,28 +483,30 @@ class _LLVMParser:
         self._tables[result] = source.parameter
 
     def _arithmetic(self, result: str, name: str, element: str, a: str, b: str) -> None:
-        """An operation on two operands of the same kind as the result."""
+        """Append an operation on two operands of the same type as the result."""
         kind = self._kind(element)
         self._emit(result, kind, name, self._value(a, kind), self._value(b, kind))
 
     def _unary(self, result: str, name: str, element: str, a: str) -> None:
-        """An operation on a single operand."""
+        """Append an operation on a single operand."""
         kind = self._kind(element)
         self._emit(result, kind, name, self._value(a, kind))
 
     def _compare(self, result: str, name: str, element: str, a: str, b: str) -> None:
-        """A comparison of two operands."""
+        """Append a comparison of two operands."""
         kind = self._kind(element)
         self._emit(result, "bool", name, self._value(a, kind), self._value(b, kind))
 
     def _select(self, result: str, mask: str, element: str, a: str, b: str) -> None:
-        """a where the mask holds, else b."""
+        """Append an operation whose result is a if the mask is True, otherwise b."""
         kind = self._kind(element)
         values = self._value(mask, "bool"), self._value(a, kind), self._value(b, kind)
         self._emit(result, kind, "select", *values)
 
     def _convert(self, result: str, name: str, source_type: str, a: str, target_type: str) -> None:
-        """A conversion between types. A bitcast to the same kind is another name of its value."""
+        """Append a conversion of `a` between LLVM types. A bitcast between equal types only gives a
+        value another name; if the value was read from a table, the current label becomes the
+        table's label."""
         kind, source = self._kind(target_type), self._kind(source_type)
         value = self._value(a, source)
         if name == "bitcast" and isinstance(value, str):  # of a value that was read from a table
@@ -499,11 +518,13 @@ class _LLVMParser:
         self._emit(result, kind, f"{name} {source}", value)
 
     def _class(self, result: str, name: str, element: str, value: str, mask: str) -> None:
-        """A test of the class of a float: NaN, infinite and so on, as the bits of `mask` say."""
+        """Append a test whether a float belongs to certain classes (NaN, infinity, zero and so on).
+        mask: the classes as bits, as in AVX-512's `fpclass`."""
         self._emit(result, "bool", f"{name} {mask}", self._value(value, self._kind(element)))
 
     def _call(self, result: str, element: str, function: str, arguments: str) -> None:
-        """A call of a function of LLVM that is one operation here."""
+        """Append the operation that stands for a call of an LLVM function. arguments: their text.
+        Raises `UntranslatableError` for an unknown function."""
         kind = self._kind(element)
         operands = re.findall(r"<\d+ x \w+> (<[^>]*>|[^,\s]+)", arguments)
         stem = re.sub(r"\.(?:v\d+\w*|ps|f32|i32|ss)\b.*", "", function)
@@ -518,7 +539,8 @@ class _LLVMParser:
 
     @staticmethod
     def _kind(element: str) -> Kind:
-        """The kind of a number of this LLVM type."""
+        """The type of numbers in our programs for an LLVM type. Raises `UntranslatableError` for
+        types that other GPUs do not have, such as double precision."""
         if element not in _KINDS:
             raise UntranslatableError(
                 f"a kernel of this field computes with numbers of type {element}: other GPUs have "

@@ -1,8 +1,10 @@
-"""The kernel that Dr.Jit records for a computation, and the array of each of its parameters.
+"""Records the kernel of a computation by Dr.Jit, and finds out which array each of its parameters
+is.
 
-A kernel distinguishes its arrays only by the positions of their pointers. Labels come with it as
-comments: `drjit.set_label` labels a variable, and `JitFlag.PrintIR` prints labels. An array that a
-kernel reads at computed indices is identified by the label of the result of `drjit.gather`.
+A kernel's text distinguishes its arrays only by the positions of their pointers. But Dr.Jit also
+prints labels as comments: `drjit.set_label` labels a variable, and `JitFlag.PrintIR` prints labels.
+An array that a kernel reads at computed indices is identified by the label of the result of
+`drjit.gather`.
 """
 
 from __future__ import annotations
@@ -30,11 +32,12 @@ _RECORDING_LOCK = threading.Lock()
 
 @dataclass(frozen=True)
 class RecordedKernel:
-    """A kernel as a shader, and the arrays that it reads and writes, by their labels.
+    """A kernel as a shader (a program in WGSL), and the arrays that it reads and writes, by their
+    labels.
 
-    data: the numbers and tables that it reads.
-    results: Dr.Jit's own results for the lanes.
-    constants: results that are constants, which no lane computes.
+    data: the numbers and tables that the kernel reads.
+    results: Dr.Jit's own results for the lanes of the recording.
+    constants: results that are the same constant for all lanes, which the kernel does not compute.
     """
 
     shader: Shader
@@ -46,12 +49,12 @@ class RecordedKernel:
 def record_kernel(
     compute: Callable[..., Mapping[str, Any]], lanes: Mapping[str, Any], data: Any
 ) -> RecordedKernel:
-    """Record the kernel of `compute(**lanes)`, which also runs on Dr.Jit's own backend for these
+    """Record the kernel of `compute(**lanes)`. It also runs on Dr.Jit's own backend for these
     lanes.
 
-    compute: returns arrays by name, none of them evaluated, from a single kernel.
-    lanes: arrays by name, of the same length, with two entries at least.
-    data: an object that contains all other arrays which `compute` reads; it is searched for them.
+    compute: returns arrays by name, none of them evaluated, all from a single kernel.
+    lanes: arrays by name, of the same length of at least 2.
+    data: an object that contains all other arrays that `compute` reads; it is searched for them.
 
     Raises:
         UntranslatableError: the kernel contains an unknown operation.
@@ -76,17 +79,17 @@ def record_kernel(
 
 @functools.lru_cache(maxsize=64)
 def _cached_shader(text: str) -> Shader:
-    """The shader of a kernel, given as text."""
+    """The shader for the text of a kernel in LLVM's language."""
     return to_shader(parse(text))
 
 
 def _is_constant(array: Any) -> bool:
-    """Whether an array is a literal: a constant that is not stored."""
+    """Whether a Dr.Jit array is a literal: a constant in the code of kernels."""
     return array.state == dr.VarState.Literal
 
 
 def _evaluate_and_get_ir(arrays: list[Any]) -> str:
-    """Evaluate arrays, and return the text of the kernel that did it.
+    """Evaluate arrays, and return the text, in LLVM's language, of the kernel that computed them.
 
     Raises:
         RuntimeError: that took more than one kernel, or none.
@@ -107,11 +110,11 @@ def _evaluate_and_get_ir(arrays: list[Any]) -> str:
 
 @contextlib.contextmanager
 def _garbage_collection_paused() -> Generator[None]:
-    """Context manager: within it, no thread collects garbage.
+    """Context manager within which no thread collects garbage.
 
-    This avoids a deadlock. To print a kernel, Dr.Jit waits for Python's lock while it holds its
-    own. A thread that collects garbage holds Python's lock, and may wait for Dr.Jit's to free an
-    array.
+    This avoids a deadlock. To print a kernel, Dr.Jit waits for Python's lock while it holds its own
+    lock. A thread that collects garbage holds Python's lock, and may wait for Dr.Jit's lock to free
+    an array.
     """
     was_enabled = gc.isenabled()
     gc.disable()
@@ -123,10 +126,10 @@ def _garbage_collection_paused() -> Generator[None]:
 
 
 class _ArrayLabels:
-    """Labels arrays, with numbers in the order of the calls.
+    """Gives arrays labels, which are numbered in the order of the calls.
 
     Labels are part of the text of a kernel. Data of the same structure get the same labels, so that
-    the kernel is neither translated nor compiled again.
+    their kernel is neither translated nor compiled again.
 
     labeled_arrays: the arrays by label.
     """
@@ -136,7 +139,7 @@ class _ArrayLabels:
         self._tables: dict[int, str] = {}
 
     def label_array(self, array: Any) -> None:
-        """Give an evaluated array the next label; an array of another state is left as it is."""
+        """Give an evaluated array the next label; an array that is not evaluated gets none."""
         if array.state == dr.VarState.Evaluated:
             label = f"data {len(self.labeled_arrays)}"
             dr.set_label(array, label)
@@ -144,13 +147,13 @@ class _ArrayLabels:
 
     @contextlib.contextmanager
     def label_gathers(self) -> Generator[None]:
-        """Context manager: within it, the result of `drjit.gather` is labeled after the array that
-        it was gathered from."""
+        """Context manager within which the result of each `drjit.gather` gets the label of the
+        array that was read. It replaces the function `drjit.gather` meanwhile."""
         module = cast("Any", dr)
         original = module.gather
 
         def gather(dtype: Any, source: Any, index: Any, *args: Any, **kwargs: Any) -> Any:
-            """`drjit.gather`, which also labels its result."""
+            """Call `drjit.gather`, and label its result."""
             gathered = original(dtype, source, index, *args, **kwargs)
             if dr.is_array_v(type(source)) and dr.depth_v(type(source)) == 1:
                 self._label_gathered(gathered, source)
@@ -163,8 +166,9 @@ class _ArrayLabels:
             module.gather = original
 
     def _label_gathered(self, gathered: Any, source: Any) -> None:
-        """Label the components of a gathered value: each by the label of the table `source` or, if
-        it is evaluated already, by a label of its own."""
+        """Label the components of a value that was read from the array `source`: by the label of
+        `source`, or, if a component is evaluated already (it was read at known indices), by a label
+        of its own."""
         for _, leaf in labeled_leaves("", gathered):
             if leaf.state == dr.VarState.Evaluated:  # gathered at known indices
                 self.label_array(leaf)
@@ -172,7 +176,7 @@ class _ArrayLabels:
                 dr.set_label(leaf, self._table_label(source))
 
     def _table_label(self, source: Any) -> str:
-        """The label of an evaluated array that lanes gather from."""
+        """The label of an evaluated array from which lanes read; it gets one at the first call."""
         if source.index not in self._tables:
             label = f"table {len(self._tables)}"
             self._tables[source.index] = label
@@ -182,7 +186,9 @@ class _ArrayLabels:
 
 
 def labeled_leaves(name: str, value: Any) -> list[tuple[str, Any]]:
-    """The flat arrays in a record, dictionary, sequence or nested array, with their names."""
+    """The one-dimensional Dr.Jit arrays in a value, as (label, array). The label is `name` followed
+    by the keys and indices that lead to the array, such as "lane o 0" for component 0 of the entry
+    "o". value: a dictionary, a Dr.Jit vector or nested array; other values contain none."""
     if dr.is_array_v(type(value)):
         if (
             dr.depth_v(type(value)) == 1
@@ -198,8 +204,8 @@ def labeled_leaves(name: str, value: Any) -> list[tuple[str, Any]]:
 
 
 def _find_arrays(data: Any) -> Iterator[Any]:
-    """The flat arrays in an object and in all objects that it refers to, each once, in a fixed
-    order."""
+    """Yield the one-dimensional Dr.Jit arrays in an object and in all objects that it refers to,
+    each once, in an order that depends only on the structure of the object."""
     visited: set[int] = set()
     pending: list[Any] = [data]
     while pending:

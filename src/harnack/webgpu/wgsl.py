@@ -1,9 +1,10 @@
-"""Translation of recorded kernels to WGSL, WebGPU's language, an invocation for each lane.
+"""Translates recorded kernels to WGSL, WebGPU's language; the program runs once for each lane.
 
 WGSL promises less than LLVM: division may be off by 2.5 units in the last place, `fma` may round
-twice, denormals may be zero, and a compiler may assume that infinities and NaN do not occur. So
-constants that are not finite are read from a buffer, NaN and infinity are recognized by their bits,
-and the results of a device are compared with Dr.Jit's (`harnack.webgpu.device`).
+twice, subnormal numbers may be zero, and a compiler may assume that infinities and NaN do not
+occur. So constants that are not finite are computed from a word that is read from a buffer, NaN and
+infinity are recognized by their bits, and the results of a device are compared with Dr.Jit's
+(`harnack.webgpu.device`).
 """
 
 from __future__ import annotations
@@ -68,12 +69,14 @@ _NEGATED_COMPARISONS = {"gt": "le", "ge": "lt", "lt": "ge", "le": "gt"}
 
 @dataclass(frozen=True)
 class Shader:
-    """A kernel in WGSL, and the layout of its buffers. All fields but the code are labels of
-    arrays, in order.
+    """A kernel in WGSL, and the layout of its buffers. All fields except `code` are labels of
+    arrays, in the order of the buffers.
 
-    The buffer of data holds: the number of lanes; 0; the start of each of `tables`; each of
-    `numbers`; then the tables. The buffer of lanes holds for each of `lanes` an entry per lane,
-    array after array; the buffer of results likewise.
+    The buffer of data holds 32-bit words: the number of lanes; 0; the start of each table; each
+    number; then the tables. The buffer of lanes holds the arrays `lanes`, one after the other, with
+    an entry per lane. The buffer of results holds the arrays `results` in the same way.
+
+    numbers, tables: arrays with a single entry, and arrays read at computed indices.
     """
 
     code: str
@@ -84,16 +87,23 @@ class Shader:
 
 
 def to_shader(kernel: ComputeKernel) -> Shader:
-    """The shader of a kernel.
+    """Translate a kernel.
 
     Raises:
-        UntranslatableError: an operation is unknown, or an array has no label.
+        UntranslatableError: an operation is unknown; or an array has no label, by which the caller
+            could pass its contents to the shader.
     """
     return _WGSLWriter(kernel).shader()
 
 
 class _WGSLWriter:
-    """Writes a kernel as a shader, statement by statement."""
+    """Writes a kernel as a shader, statement by statement.
+
+    _buffer_slots: for "number", "table" and "lane", the kernel parameters of this kind in the order
+        of the buffers.
+    _stores: the statements that store results, in the order of the results buffer.
+    _lines, _depth: the lines of code so far, and the depth of indentation.
+    """
 
     def __init__(self, kernel: ComputeKernel) -> None:
         self._kernel = kernel
@@ -110,7 +120,7 @@ class _WGSLWriter:
         self._depth = 1
 
     def shader(self) -> Shader:
-        """The shader of the kernel."""
+        """Write the whole kernel, and return the shader."""
         for statement in self._kernel.statements:
             self._write(statement)
         names = {
@@ -138,18 +148,19 @@ class _WGSLWriter:
         return Shader(code, names["number"], names["table"], names["lane"], results)
 
     def _label(self, parameter: int) -> str:
-        """The label of a kernel parameter. Raises UntranslatableError if it has none."""
+        """The label of the array of a kernel parameter. Raises `UntranslatableError` if it has
+        none."""
         label = self._kernel.labels.get(parameter)
         if label is None:
             raise UntranslatableError(f"parameter {parameter} of a kernel has no name")
         return label
 
     def _emit(self, line: str) -> None:
-        """Add a line of code, indented."""
+        """Append a line of code, indented."""
         self._lines.append("  " * self._depth + line)
 
     def _write(self, statement: Statement) -> None:
-        """Write a statement."""
+        """Append the code of a statement."""
         if isinstance(statement, Loop):
             self._loop(statement)
         elif isinstance(statement, Store):
@@ -163,7 +174,7 @@ class _WGSLWriter:
             self._emit(f"let {_variable(statement.result)} = {self._operation(statement)};")
 
     def _loop(self, loop: Loop) -> None:
-        """Write a loop."""
+        """Append the code of a loop."""
         for node in loop.variables:
             self._emit(
                 f"var {_variable(node.name)}: {node.kind} = {self._operand_text(node.before)};"
@@ -185,8 +196,8 @@ class _WGSLWriter:
         self._emit("}")
 
     def _load(self, load: Load) -> str:
-        """The expression that reads an entry of an array (`Shader` says how the buffers are laid
-        out)."""
+        """The WGSL expression that reads an entry of an array from a buffer (`Shader` describes the
+        layout)."""
         slot = self._buffer_slots[load.source].index(load.parameter)
         if load.source == "lane":
             bits = f"lanes[{slot}u * count + lane]"
@@ -203,7 +214,8 @@ class _WGSLWriter:
         return bits if load.kind == "u32" else f"bitcast<f32>({bits})"
 
     def _operation(self, operation: Operation) -> str:
-        """The expression of an operation."""
+        """The WGSL expression of an operation; `a` holds the expressions of its operands. Integers
+        are unsigned in the shader; signed operations reinterpret their bits."""
         a = [self._operand_text(value) for value in operation.operands]
         name, _, variant = operation.name.partition(" ")
         if name in _INFIX:
@@ -250,7 +262,7 @@ class _WGSLWriter:
                 return _conversion(operation, name, variant, a[0])
 
     def _operand_text(self, value: Operand) -> str:
-        """The expression of an operand: a variable, or a constant with exactly these bits."""
+        """The WGSL expression of an operand: a variable, or a constant with exactly its bits."""
         if isinstance(value, str):
             return _variable(value)
         if value.kind == "bool":
@@ -267,18 +279,19 @@ class _WGSLWriter:
 
 
 def _variable(result: str) -> str:
-    """The WGSL variable of a result."""
+    """The name of the WGSL variable for a result's name in LLVM, such as v_r12 for %r12."""
     return result.replace("%", "v_").replace(".", "_")
 
 
 def _as_signed(text: str) -> str:
-    """The expression as a signed integer with the same bits."""
+    """The WGSL expression that reinterprets an expression's bits as a signed integer."""
     return f"bitcast<i32>({text})"
 
 
 def _float_comparison(predicate: str, x: str, y: str) -> str:
-    """The expression of a comparison of floats. Predicates that begin with "o" (ordered) are false
-    if an operand is NaN; those with "u" (unordered) are true."""
+    """The WGSL expression that compares two floats x and y by an LLVM predicate. Predicates that
+    begin with "o" (ordered) are false if an operand is NaN; those that begin with "u" (unordered)
+    are true."""
     if predicate in ("ord", "uno"):
         any_nan = f"is_nan({x}) | is_nan({y})"
         return any_nan if predicate == "uno" else f"!({any_nan})"
@@ -297,8 +310,8 @@ def _float_comparison(predicate: str, x: str, y: str) -> str:
 
 
 def _float_class_test(classes: int, x: str) -> str:
-    """The expression of a test whether a float is in one of the classes, a bit mask as in AVX-512's
-    `fpclass`."""
+    """The WGSL expression that tests whether the float x belongs to one of some classes (NaN,
+    zeros, infinities, subnormal numbers). classes: their bits, as in AVX-512's `fpclass`."""
     bits = f"bitcast<u32>({x})"
     tests = {
         0x81: f"is_nan({x})",
@@ -314,7 +327,8 @@ def _float_class_test(classes: int, x: str) -> str:
 
 
 def _conversion(op: Operation, name: str, source: str, x: str) -> str:
-    """The expression of the conversion of x from the kind `source` to the kind of the operation.
+    """The WGSL expression that converts x by the LLVM conversion `name`, from the type `source` to
+    the type of the operation `op`.
 
     Raises:
         UntranslatableError: the conversion is unknown.
