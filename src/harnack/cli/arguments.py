@@ -117,7 +117,6 @@ def _add_animate(commands: Any) -> None:
     )  # fmt: skip
     _add_drawing(parser, "animate", "film, .gif or .mp4 (SOURCE.gif)")
     _add_quiet(parser)
-    parser.set_defaults(frames=48, orbit=360.0)
 
 
 def _add_page(commands: Any) -> None:
