@@ -52,8 +52,8 @@ _WELD_DISTANCES = (0.01, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3)
 
 @dataclass(frozen=True)
 class CleanedMesh:
-    """A closed mesh, made from a damaged one. Its first faces are the valid triangles of the damaged
-    mesh (the input), with unchanged coordinates; fillings follow.
+    """A closed mesh, made from a damaged one. Its first faces are the valid triangles of the
+    damaged mesh (the input), with unchanged coordinates; fillings follow.
 
     surface: the mesh.
     kept: (k,) the indices of the input faces that were kept, ascending. Face i < k of the mesh is

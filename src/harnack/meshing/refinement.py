@@ -136,7 +136,8 @@ def _converge_vertices(
     within a step. A vertex is moved only if that brings it closer to the level set, and by less
     than `tolerance` (a length). Boundary vertices stay if `walls` is None.
 
-    walls: None, or the lower and the upper corner (3,) of a box on whose faces the boundary lies."""
+    walls: None, or the lower and the upper corner (3,) of a box on whose faces the boundary
+        lies."""
     samples = function.sample(vertices)
     is_off = samples.distance > _ON_SURFACE * tolerance
     if walls is None:
@@ -342,8 +343,8 @@ class _RefinementMarks:
 
 
 def _normals_turn(function: LevelFunction, corner: FloatArray) -> BoolArray:
-    """(k,) for each of k faces, whether the normals of the level set at two of its corners differ by
-    so much that the surface between them has a crease.
+    """(k,) for each of k faces, whether the normals of the level set at two of its corners differ
+    by so much that the surface between them has a crease.
 
     corner: (k, 3, 3) the corners of the faces."""
     slope = function.sample(corner.reshape(-1, 3)).gradient
@@ -406,7 +407,8 @@ def improve(
     are split where triangles are no longer within `tolerance` (a length) of the level set. Finally
     edges are flipped and vertices moved for larger angles.
 
-    walls: None, or the lower and the upper corner (3,) of a box on whose faces the boundary lies."""
+    walls: None, or the lower and the upper corner (3,) of a box on whose faces the boundary
+        lies."""
     for _ in range(2):
         faces = flip_edges(function, vertices, faces, tolerance)
         vertices = smooth(function, vertices, faces, walls, rounds=2)

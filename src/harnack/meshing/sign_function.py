@@ -61,8 +61,8 @@ _MOST_PROBES, _MIN_VALUE_SHARE = 2000, 0.1
 
 
 def uses_sign_meshing(field: Field) -> bool:
-    """Whether the level sets of a field are meshed by the signs of its values on a lattice. It is so
-    for sums over meshes, points and blobs. Their values cost little, and their promises (proved
+    """Whether the level sets of a field are meshed by the signs of its values on a lattice. It is
+    so for sums over meshes, points and blobs. Their values cost little, and their promises (proved
     bounds of f near a point) are useful only up to the next triangle or point."""
     return isinstance(field, BatchedField | Blobs | HRBF)
 
@@ -186,8 +186,8 @@ class SignFunction(LevelFunction):
         return int((np.abs(value[near]) <= error).sum())
 
     def clearance(self, points: FloatArray) -> FloatArray:
-        """(n,) a proved lower bound of the distance of points (n, 3) from the level set, computed by
-        `level_distance_lower_bound`.
+        """(n,) a proved lower bound of the distance of points (n, 3) from the level set, computed
+        by `level_distance_lower_bound`.
 
         For a winding number it is the smaller of two lengths: the bound for the winding number
         modulo 1, which is smooth across the triangles; and the distance from the triangles."""
@@ -365,9 +365,9 @@ def _secant(first: FloatArray, last: FloatArray, low: FloatArray, high: FloatArr
 def _clearances(
     field: Field, level: float, precision: Precision
 ) -> list[Callable[[FloatArray], FloatArray]]:
-    """A list of functions, each of which takes points (n, 3) and returns lengths (n,). At each point
-    the smallest length is a proved lower bound of the distance to the level set. A winding number
-    has two such functions, another field has one."""
+    """A list of functions, each of which takes points (n, 3) and returns lengths (n,). At each
+    point the smallest length is a proved lower bound of the distance to the level set. A winding
+    number has two such functions, another field has one."""
     backend = choose_backend(precision)
 
     def bound(smooth: Field) -> Callable[[FloatArray], FloatArray]:
