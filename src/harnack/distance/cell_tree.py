@@ -235,8 +235,8 @@ class CellTree:
                 candidate, sorted by estimate.
 
             Candidates with a larger estimate move to the next place, and the last one is dropped.
-            If the new candidate is too close to one of these, so that both lead to the same closest
-            point, that one is dropped instead.
+            If the new candidate and a listed one are so close that both lead to the same closest
+            point, the one with the larger estimate is dropped instead.
             """
             listed, point = [*state], cell.surface_point
             for k in range(0, len(listed), 2):
