@@ -274,9 +274,8 @@ def multiplicity(step: Real, last: Real) -> Real:
     step, last: the current step, and the length of the one before.
 
     Near a root of multiplicity m, each step is about 1 - 1/m times the one before, and a step m
-    times as long as Newton's leads to the root. So the result is m = 1/(1 - |step|/last), where the
-    last two steps have a ratio that belongs to such a root; it is 1 if the steps shrink faster, or
-    hardly at all.
+    times as long as Newton's leads to the root. So the result is 1/(1 - |step|/last), if the ratio
+    of the steps is between 0.4 and 0.97. Otherwise it is 1.
     """
     ratio = dr.abs(step) / last
     is_slow = (ratio > _SLOW_RATES[0]) & (ratio < _SLOW_RATES[1])
