@@ -159,8 +159,9 @@ def check_field(
     Checked: values and gradients are numbers, alike in both precisions within `Sample.value_error`;
     the gradient is that of the value; f is harmonic where a ball of dimension 2 or 3 promises it;
     `differentiable_value` is the value and has this gradient; `hessian`, where there is one, is
-    symmetric, the derivative of the gradient and, of a harmonic f, without trace; the lift of f
-    keeps each promise (`HarmonicBall`, `Lipschitz`, `TaylorRemainder`) on the path to random points
+    symmetric, the derivative of the gradient and, of a harmonic f, without trace; the continuous
+    change of f keeps each promise (`HarmonicBall`, `Lipschitz`, `TaylorRemainder`: a bound of f on
+    a ball about the point) on the path to random points
     of its ball, or for the last two to the point where the path leaves the domain, and at the end
     of a search for the worst pairs of points in these balls (`search_violations`: about 14,000
     pairs for each promise); enclosures along paths, of a field that gives its own

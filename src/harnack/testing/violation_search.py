@@ -1,5 +1,5 @@
-"""Fields sampled as NumPy arrays, the search for violations of promises, and the errors that report
-them."""
+"""Fields sampled as NumPy arrays; the search for points at which a field violates a promise (a
+bound of its function that it states as proved); and the error that reports them."""
 
 from __future__ import annotations
 
