@@ -154,8 +154,7 @@ def _check_header(place: FileLocation, header: dict[str, Any], size: int) -> Non
 
 def _check_supported(place: FileLocation, header: dict[str, Any]) -> None:
     """Raise a FileFormatError if a scene has features that are not supported: vertices that are
-    moved by skins or morph targets, strips or fans of triangles, or points or lines beside
-    triangles."""
+    moved by skins or morph targets, fans of triangles, or points or lines beside triangles."""
     nodes: list[Any] = header.get("nodes", [])
     meshes: list[Any] = header.get("meshes", [])
     if any("skin" in node for node in nodes):

@@ -113,7 +113,8 @@ def text(
 def _text_line_loops(line: str, font: Any, size: float, max_error: float) -> list[FloatArray]:
     """The closed polygons (n, 2) that outline the letters of a line of text.
 
-    font: the font, an object of matplotlib. size: its size, in units of length.
+    font: the name of a font file (.ttf, .otf) or of an installed family; None for the default.
+    size: the size of the font, in units of length.
     max_error: the largest distance between a polygon and the curve of a letter, a length.
 
     Raises:
