@@ -307,7 +307,9 @@ class ClosestPointDescent:
         return self._state_at(y, self.field.evaluate(y))
 
     def _state_at(self, y: Vec3, sample: Sample) -> tuple[Real, _DescentState]:
-        """f - level for the nearest level, and the descent state, from the field's sample at y."""
+        """The number f - level for the level nearest in value, and the state of a descent at y.
+
+        sample: the sample of the field at y."""
         real = self.backend.Float
         scale = lengths.max_norm(y)
         epsilon, gradient_norm = self.backend.machine_epsilon, lengths.safe_norm(sample.gradient)

@@ -92,7 +92,7 @@ class ClosestPoints:
     signed_value: (n,) f - level at the queries, for the level nearest in value.
     lower: (n,) proved lower bounds of the distance.
     violates_promises: (n,) whether a surface point was found, and left out, that is nearer than the
-        field's promises allow.
+        field's promises (proved bounds of f near a point) allow.
     """
 
     points: FloatArray

@@ -431,8 +431,8 @@ class _CurvatureLineTracer:
         return lines[:n], lines[n:]
 
     def _advance(self, state: _LineState) -> tuple[Vec3, Vec3, Mask]:
-        """One Runge-Kutta step. Returns the next point, the principal direction there, and whether
-        that point continues the line."""
+        """Follow all lines of curvature by one step of the Runge-Kutta method. Returns the next
+        points; the unit principal directions there; and the mask of the lines that continue."""
         x, h = state.x, self.step
         first = state.direction
         second, _ = self._direction(x + 0.5 * h * first, first)

@@ -342,8 +342,9 @@ def _check_convertible(
 def _interpret_faces(
     contents: FileGeometry, read_as: ReadAs | None
 ) -> LoadedMesh | LoadedCloud | LoadedCurves | LoadedPolygons:
-    """The faces of a file as a mesh, cloud, curves or polygons, as `read_as` says; None decides
-    between mesh and curves."""
+    """The faces in the contents of a file, in the form that `read_as` asks for: a mesh, a cloud of
+    points, closed curves or polygons. None means a mesh or curves, whichever the faces look like
+    (`_looks_like_curves`)."""
     if read_as == "polygons":
         return _polygons(contents)
     can_be_loops = contents.path.suffix.lower() in _LOOP_FILES
@@ -438,7 +439,7 @@ def _mesh_to_cloud(mesh: LoadedMesh) -> LoadedCloud:
 
 
 def _mesh_to_boundary(path: Path, mesh: LoadedMesh) -> LoadedCurves:
-    """The boundary of a mesh's faces as loops.
+    """The boundary of a mesh's faces as closed curves. path: of the file, for errors.
 
     Raises:
         FileFormatError: the faces have no boundary, or it is not a valid curve.

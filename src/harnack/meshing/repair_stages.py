@@ -604,7 +604,7 @@ def _with_filled_holes(
         The closed mesh; and its entries in `metadata["harnack"]`.
 
     Raises:
-        MeshingError: as `repair`.
+        MeshingError: the fillings cannot be made, or meet the mesh or each other.
     """
     x, together, left = vertices, faces, loops
     if loops and settings.patches == "smooth":

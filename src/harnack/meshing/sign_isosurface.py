@@ -154,7 +154,7 @@ def mesh_from_signs(
         which all of them are.
 
     Raises:
-        MeshingError: as `extract_from_signs`.
+        MeshingError: there is no surface, there are too many cells, or values are not finite.
     """
     level_points = PointsOnLevel.of(function, tolerance).within(*box, volume)
     while True:

@@ -103,8 +103,8 @@ def _cap_series(q: FloatArray, b: FloatArray, dimension: int) -> FloatArray:
 
 
 def _cap_closed_form(q: FloatArray, b: FloatArray, dimension: int) -> FloatArray:
-    """The Poisson integral at q of the indicator of a cap of height b, in closed form; it loses
-    digits at small q."""
+    """The Poisson integral of the indicator of a cap of height b, at the position q on the axis, by
+    a formula in closed form. If its value at q = 0 is subtracted, digits are lost at small q."""
     if dimension == 3:  # the integral of (1-q^2)/2 (1+q^2-2qs)^(-3/2) over [1-b, 1]
         s = np.sqrt((1 - q) ** 2 + 2 * q * b)
         return b * (1 + q) / (s * (s + 1 - q))
