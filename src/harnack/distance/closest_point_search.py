@@ -327,6 +327,9 @@ class _QueryEvaluator:
         """
 
         def compute(p: Vec3) -> tuple[Real | Vec3, ...]:
+            """The query p as rounded; a point of the surface known near it, or NaN; f - level; a
+            proved lower bound of the distance from the level set; and the first-order estimate of
+            that distance."""
             sample = self._field.evaluate(p)
             residual = -self.levels.offset_to_nearest(sample.value)
             boundary = self._field.closest_boundary_point(p)
