@@ -1,8 +1,9 @@
-"""Classifies the cells that may hold a level set: each is proved empty, or gets a slab (two
-parallel planes) that contains the surface, and a point of the surface.
+"""Classifies cubic cells by how a level set passes through them. A cell may be proved to hold no
+point of the level set. In other cells, if possible, a slab (the space between two parallel planes)
+is found that contains the surface, and a point of the surface.
 
-Some of these points lie on the *clip curve*, where the boundary of the field's domain cuts the
-level set; `ClipCurveDescent` finds its closest point.
+The boundary of the field's domain cuts the level set in a curve, the *clip curve*. A point of it is
+found in cells through which it passes; `ClipCurveDescent` finds the closest point of this curve.
 """
 
 from __future__ import annotations
@@ -57,9 +58,11 @@ _MIN_RELATIVE_STEP = 1e-8
 
 @dataclass(frozen=True)
 class ClipCurveDescent:
-    """Descent to the closest point of the clip curve. On this curve f = level and h = 0, where h is
-    the signed distance from the boundary of the field's domain. field and domain are prepared for
-    the backend."""
+    """Descent to the closest point of the clip curve, in which the boundary of the field's domain
+    cuts the level set. On this curve f = level and h = 0, where h is the signed distance from the
+    boundary of the domain.
+
+    field, domain: prepared for the backend."""
 
     backend: Backend
     field: Field
@@ -175,8 +178,8 @@ class ClipCurveDescent:
         return final[1], safe_norm(final[5])
 
     def _at(self, y: Vec3) -> _ClipCurveState:
-        """The state at a point y near the clip curve: derivatives of the curve, and the step back
-        to it."""
+        """The state of the descent at a point y near the clip curve: the derivatives of the curve
+        there, and the step that leads back to it."""
         real, vector = self.backend.Float, self.backend.Array3f
         sample = self.field.evaluate(y)
         gradient, scale = vector(sample.gradient), max_norm(y)
@@ -195,7 +198,7 @@ class ClipCurveDescent:
         sine = 1 - cosine * cosine
 
         def solution(along_u: Real, along_n: Real) -> Vec3:
-            """The shortest vector with these inner products with u and n."""
+            """The shortest vector whose inner products with u and n are `along_u` and `along_n`."""
             first, second = along_u - cosine * along_n, along_n - cosine * along_u
             return (vector(first) * u + vector(second) * n) / sine
 
@@ -218,7 +221,8 @@ class ClipCurveDescent:
 
 @dataclass(frozen=True)
 class _ClipCurveState:
-    """A point near the clip curve.
+    """The geometry at a point near the clip curve, in which the boundary of the field's domain cuts
+    the level set.
 
     is_on: whether the point is on the curve, to the tolerance `near`.
     near: the length within which rounding leaves the level uncertain.
@@ -254,9 +258,9 @@ _DIAGONALS = ((1.0, 1.0, 1.0), (1.0, 1.0, -1.0), (1.0, -1.0, 1.0), (-1.0, 1.0, 1
 
 def taylor_remainder(sample: Sample, radius: Real, degree: int = 1) -> Real:
     """A bound of the Taylor remainder |f(y) - T(y)| for |y - p| <= radius. p is the point of the
-    sample, and T the Taylor polynomial of f about p, of degree 1 or 2. Infinite where the field
-    promises no bound. When the radius decreases, the bound falls at least as fast as
-    radius^(degree + 1)."""
+    sample, and T the Taylor polynomial of f about p, of degree 1 or 2. The bound follows from the
+    sample's promises (proved bounds of f near p); it is infinite if these imply none. When the
+    radius decreases, the bound falls at least as fast as radius^(degree + 1)."""
     bound: Real = dr.inf
     for promise in sample.all_promises:
         bound = fmin(bound, promise.taylor_remainder_bound(sample.value, radius, degree))
@@ -269,9 +273,9 @@ def multiplicity(step: Real, last: Real) -> Real:
 
     step, last: the current step, and the length of the one before.
 
-    At a root like that of u^m, each step is 1 - 1/m times the one before, and a step m times as
-    long as Newton's leads to the root. The result is 1 if the steps shrink faster than that, or
-    hardly at all.
+    Near a root of multiplicity m, each step is about 1 - 1/m times the one before, and a step m
+    times as long as Newton's leads to the root. So the result is 1/(1 - |step|/last), if the ratio
+    of the steps is between 0.4 and 0.97. Otherwise it is 1.
     """
     ratio = dr.abs(step) / last
     is_slow = (ratio > _SLOW_RATES[0]) & (ratio < _SLOW_RATES[1])
@@ -300,7 +304,8 @@ class CellClassifier:
         return self._prepared.field
 
     def nonempty_cells(self, center: FloatArray, half: FloatArray) -> SurfaceCells:
-        """The cubes that are not proved empty, each with the slab that the surface in it lies in.
+        """The cubes that are not proved to be free of the surface. Each has the slab in which its
+        part of the surface lies, if one is found.
 
         center: (n, 3) centers of the cubes.
         half: (n,) half the length of their edges.
@@ -323,8 +328,9 @@ class CellClassifier:
         return cells.select(is_nonempty)
 
     def with_surface_points(self, cells: SurfaceCells) -> SurfaceCells:
-        """The same cells, with a point of the surface and of the clip curve in each where one is
-        found, and the geometry of the surface there."""
+        """The same cells with more of their attributes known: a point of the surface in each cell,
+        and the normal and curvature of the surface there; and a point of the clip curve. A cell in
+        which such a point is not found has `FAR_SENTINEL` in its place."""
         if not len(cells):
             return cells
         radius, start = _CUBE_CIRCUMRADIUS * cells.half, cells.center
@@ -355,9 +361,11 @@ class CellClassifier:
     def _at(
         self, compute: Callable[..., tuple[Any, ...]], points: FloatArray, *values: FloatArray
     ) -> tuple[Any, ...]:
-        """The results of `compute` at points (n, 3), as arrays. values: further arguments of
-        `compute`: vectors (n, 3), or numbers (n,), which are passed as vectors of three equal
-        components."""
+        """Evaluate a function of Dr.Jit vectors at points (n, 3). Returns its results as arrays,
+        (n,) or (n, 3) each.
+
+        values: further arguments of `compute`: vectors (n, 3), or numbers (n,). A number is passed
+            as a vector of three equal components."""
         vectors = (np.tile(value[:, None], 3) if value.ndim == 1 else value for value in values)
         return in_batches(self._backend, compute, points, *vectors)
 
@@ -375,21 +383,22 @@ class CellClassifier:
         return (self._volume.signed_distance(p),)
 
     def _pulled_inside(self, p: Vec3) -> tuple[Real, Vec3]:
-        """A lower bound of the signed distance of p from the domain; and p, or a point of the
-        boundary near p if p is outside."""
+        """A lower bound of the signed distance of p from the domain (positive outside); and the
+        point p if it is inside, otherwise a point of the domain's boundary near p."""
         assert self._volume is not None
         distance = self._volume.signed_distance(p)
         normal = self._volume.outward_normal(p)
         return distance, dr.select(distance > 0, p - self._backend.Array3f(distance) * normal, p)
 
     def _slab(self, p: Vec3, radii: Vec3) -> tuple[Real | Vec3, ...]:
-        """Bounds of the surface in the ball around p.
+        """Bounds of the part of the surface in the ball around p.
 
         radii: the ball's radius, as a vector of three equal components.
 
-        Returns 1 where the ball is proved to hold no level, else 0; and the slab in which the
-        surface lies: unit normal, offset from p along it, and half its thickness. Where no slab is
-        proved the normal is 0 and the thickness `FAR_SENTINEL`.
+        Returns 1 if the ball is proved to contain no point of the level set, else 0; and a slab
+        that contains the surface in the ball: its unit normal, the offset of its middle plane from
+        p along the normal, and half its thickness. If no slab is proved, the normal is 0 and the
+        thickness `FAR_SENTINEL`.
         """
         real, vector, radius = self._backend.Float, self._backend.Array3f, radii.x
         sample = self._field.evaluate(p)
@@ -417,15 +426,15 @@ class CellClassifier:
     def _surface_point_and_plane(
         self, p: Vec3, radii: Vec3, normal: Vec3
     ) -> tuple[Vec3, Vec3, Real, Real]:
-        """A surface point near p, and the shape of the surface there.
+        """Search for a surface point near p, the center of a cell.
 
         radii: the radius of the ball around the cell, as a vector of three equal components.
         normal: the normal of the cell's slab, or 0.
 
-        Returns the surface point, `FAR_SENTINEL` if none is found; the normal of a plane that
-        approximates the surface; the radius about the point up to which the plane is used, which
-        ends at the curve in which the surface ends; and an upper bound of the curvature of the
-        surface there.
+        Returns the surface point, `FAR_SENTINEL` if none is found; the normal of a plane through it
+        that approximates the surface; the radius about the point within which the surface may be
+        replaced by this plane (it is at most the distance to the curve at which the surface ends);
+        and an upper bound of the curvature of the surface within that radius.
         """
         radius, unknown = radii.x, self._backend.Float(FAR_SENTINEL)
         if self.surface.field.has_jumps:
@@ -453,7 +462,10 @@ class CellClassifier:
 
     def _clip_point(self, p: Vec3, radii: Vec3) -> tuple[Vec3, Real]:
         """A point of the clip curve near p, `FAR_SENTINEL` if none is found; and the curvature of
-        the curve there. radii: as in `_slab`."""
+        the curve there.
+
+        radii: the radius of the ball around p in which it is searched, as a vector of three equal
+            components."""
         assert self._clip_descent is not None
         y, curvature = self._clip_descent.closest(p, p)
         is_near = safe_norm(y - p) < 2 * radii.x
@@ -463,7 +475,7 @@ class CellClassifier:
 
     def _newton_point(self, p: Vec3, radius: Real) -> Vec3:
         """The point of the level set to which Newton's method along the gradient leads from p;
-        `FAR_SENTINEL` if it does not converge within 2 `radius` of p."""
+        `FAR_SENTINEL` if it does not converge to a point within the distance 2 `radius` of p."""
         real, vector, count = self._backend.Float, self._backend.Array3f, self._backend.UInt32
         zero = dr.opaque(real, 0.0)  # keeps constant components of a gradient in the loop
 
@@ -525,6 +537,6 @@ class CellClassifier:
 
 
 def _domain(surface: TracedSurface) -> Any:
-    """The volume in which the surface lies: the field's domain, or that intersected with the clip
-    volume."""
+    """The volume in which the surface lies: the intersection of the field's domain and the clip
+    volume, as far as there are any."""
     return surface.field.domain if surface.clip_volume is None else surface.volume

@@ -1,4 +1,5 @@
-"""Nearest points of a level set by branch and bound over cells."""
+"""Searches the nearest points of a level set by branch and bound: space is divided into cubic
+cells; cells that are proved to hold no nearer point are skipped, and others subdivided."""
 
 from __future__ import annotations
 
@@ -56,47 +57,51 @@ _CORNERS = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1
 
 @dataclass
 class SearchResult:
-    """Result of a search: the closest points (n, 3) of the surface, NaN where none was found, and
-    proved lower bounds (n,) of the distance."""
+    """The result of a search for n queries: the closest points (n, 3) of the surface, NaN where
+    none was found; and proved lower bounds (n,) of the distances of the queries from the
+    surface."""
 
     closest: FloatArray
     lower_bounds: FloatArray
 
 
 class DescentMethods(Protocol):
-    """Interface to the closest-point iterations. For query points x (n, 3), each method returns
-    points of the surface (n, 3), NaN where it finds none, and for each a radius about it in which
-    no point of the surface is nearer to x."""
+    """Interface of the iterations that lead from a point near a surface to the closest point of a
+    query x. Each method returns points of the surface (n, 3), NaN where it finds none; and for each
+    of these the radius of a ball about it that is proved to hold no surface point nearer to x."""
 
     def newton_in_kernel(self, x: Vec3, start: Vec3, limit: Real) -> tuple[Vec3, Real, Mask]:
-        """Iterate inside a kernel, from points `start` near the surface. Returns closest points,
-        radii, and the lanes for which `descend` is to be called. Points farther from x than `limit`
-        need not be found."""
+        """Iterate as part of another kernel, from points `start` near the surface, for the queries
+        x. Returns the closest points, the radii, and the mask of the lanes for which `descend` has
+        to be called afterwards. Points farther from x than `limit` need not be found."""
         ...
 
     def descend(
         self, points: FloatArray, start: FloatArray, limit: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Iterate from points `start` (n, 3) near the surface; points farther from the query than
+        """Iterate from points `start` (n, 3) near the surface, for the queries `points` (n, 3).
+        Returns the closest points (n, 3) and the radii (n,). Points farther from the query than
         `limit` (n,) need not be found."""
         ...
 
     def descend_from_boundary(
         self, points: FloatArray, boundary: FloatArray, aside: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Iterate from points `boundary` (n, 3) of the curve at which the surface ends, along the
-        surface where it begins in the direction of x. aside: (n,) the distance from the curve at
-        which the surface is searched."""
+        """Iterate along the surface from points `boundary` (n, 3) of the curve at which it ends.
+        Returns the closest points (n, 3) to the queries `points` (n, 3), and the radii (n,).
+
+        aside: (n,) the distance from the curve, in the direction of the query, at which the surface
+            is searched; the iteration starts there."""
         ...
 
 
 @dataclass(frozen=True)
 class InitialGuess:
-    """Initial guess for the cell search.
+    """What is known about the closest points of n queries before the cells are searched.
 
-    closest: (n, 3) points of the surface, or NaN.
-    estimate: (n,) first-order distance.
-    on_boundary: whether the points `closest` lie on the curve at which the surface ends.
+    closest: (n, 3) for each query a point of the surface, or NaN.
+    estimate: (n,) first-order estimates of the distances.
+    on_boundary: (n,) whether the points `closest` lie on the curve at which the surface ends.
     """
 
     closest: FloatArray
@@ -123,8 +128,9 @@ class StoppingRule:
 
 @dataclass(frozen=True)
 class _Cube:
-    """A cube that contains the surface, or the part of it that is searched. half: half its edge
-    length."""
+    """A cube that contains the surface, or the part of it that is searched.
+
+    half: half the length of its edges."""
 
     center: FloatArray
     half: float
@@ -141,7 +147,12 @@ def search(
     surface: TracedSurface, points: FloatArray, known: InitialGuess, descents: DescentMethods,
     tolerance: StoppingRule, progress: Callable[[str], None],
 ) -> SearchResult:  # fmt: skip
-    """The nearest points of a level set to `points` (n, 3)."""
+    """Search the points of a level set that are nearest to `points` (n, 3), by branch and bound.
+
+    known: what is already known about the closest points.
+    descents: the iterations that lead from a point near the surface to a closest point.
+    tolerance: when the search ends.
+    progress: called with a message before each stage."""
     box = _bounding_box(surface)
     if box is not None:
         if (box[0] > box[1]).any():
@@ -189,8 +200,12 @@ def _search_in_batches(
     tolerance: StoppingRule,
     progress: Callable[[str], None],
 ) -> SearchResult:
-    """The closest points of the surface in the cube `root` to `points` (n, 3), for a batch of the
-    queries at a time. guess: of all queries."""
+    """Search the points of the surface in the cube `root` that are closest to `points` (n, 3), for
+    one batch of the queries after the other.
+
+    guess: what is already known about the closest points of all queries.
+    descents: the iterations that lead from a point near the surface to a closest point.
+    tolerance: when the search ends."""
     classifier = CellClassifier(surface)
     max_cells = _max_cells(surface, len(points), tolerance.prove)
     cells_per_point = _CELLS_PER_PROOF if tolerance.prove else _CELLS_PER_POINT
@@ -222,7 +237,8 @@ def _search_in_batches(
 
 
 def _max_cells(surface: TracedSurface, count: int, is_proved: bool) -> int:
-    """The largest number of cells for a search of `count` queries."""
+    """The largest number of cells into which space is divided for a search of `count` queries.
+    is_proved: whether lower bounds are to be made as large as possible."""
     if surface.field.has_jumps:
         return _MAX_JUMP_CELLS
     limit = min(max(_MAX_CELLS, count // 2), _MAX_PROOF_CELLS) if is_proved else _MAX_CELLS
@@ -234,11 +250,11 @@ def _split(
 ) -> tuple[SurfaceCells, SurfaceCells]:
     """Divide the cube `root` into cells that may hold the surface.
 
-    Each iteration splits the larger half of the cells in eight, until there are at least
-    `min_cells`. A cell in which the surface is in one piece counts as smaller than it is: as a
-    quarter of the thickness of its slab, within which the surface may bend.
+    Each iteration splits the larger half of the cells into eight, until there are at least
+    `min_cells`. If the surface in a cell is in one piece and lies in a slab, then the cell counts
+    as smaller than it is: its size is taken to be a quarter of the slab's thickness.
 
-    Returns few coarse cells, and the final cells, which lie in the coarse ones.
+    Returns the coarse cells of an early iteration, which are few, and the cells of the last one.
     """
     half = root.half / _ROOT_CELLS
     steps = (2 * np.indices((_ROOT_CELLS,) * 3).reshape(3, -1).T + 1 - _ROOT_CELLS) * half
@@ -273,10 +289,11 @@ class _CellSearch:
 
     classifier: proves cells empty, and finds surface points in the others.
     trees: the tree of the coarse cells and that of `cells`; None if there are none.
-    guess: the initial guess of each query.
-    closest: (n, 3) best points so far, or NaN.
-    free: (n,) radius about the best point within which no surface point is nearer to the query.
-    lower: (n,) proved lower bounds of the distances.
+    guess: what was known about the closest point of each query before the search.
+    closest: (n, 3) the best point of each query so far, a point of the surface, or NaN.
+    free: (n,) the radius of a ball about the best point in which no surface point is nearer to the
+        query.
+    lower: (n,) proved lower bounds of the distances of the queries from the surface.
     tolerance: an improvement of the distance by less than this is not pursued.
     max_cells: cells are subdivided while there are no more than these; 0 for no subdivision.
     """
@@ -359,11 +376,16 @@ class _CellSearch:
     def _search_in_kernel(
         self, coarse: CellTree, tree: CellTree, marks: Any
     ) -> tuple[IntArray, FloatArray]:
-        """The work of `_descend_from_best_start` and of one round of `_improve`, in one kernel.
-        Queries for which Newton's method does not converge in it are finished by `_descend`.
+        """Make the first searches for all queries in a single kernel: a descent from the surface
+        point of the coarse cell with the smallest estimated distance; then descents from the
+        surface points of a few other cells that may hold a nearer point. Queries for which Newton's
+        method does not converge in the kernel are finished by `_descend`.
 
-        Returns the indices (k,) of the queries for which another round is worthwhile, and the
-        surface points (n, 3) at which the first descents began.
+        coarse, tree: the tree of the coarse cells, and that of all cells.
+        marks: None, or a Bool array in which the cells that may hold a nearer point are marked.
+
+        Returns the indices (k,) of the queries for which another round of descents is worthwhile;
+        and the surface points (n, 3) at which the first descents started.
         """
         backend = self.backend
         tolerance = dr.opaque(backend.Float, self.tolerance)
@@ -411,14 +433,15 @@ class _CellSearch:
 
     @staticmethod
     def _rounded(lower: FloatArray, points: FloatArray) -> FloatArray:
-        """The lower bounds (n,) of the distances of `points`, less a bound of their rounding
-        errors."""
+        """Lower bounds (n,) of the distances of `points` (n, 3) that hold in spite of rounding:
+        `lower` (n,) less a bound of its rounding error."""
         return lower * (1 - 1e-12) - 1e-15 * np.abs(points).max(axis=1)
 
     @property
     def _is_expensive(self) -> bool:
-        """Whether an evaluation of the field takes longer than a walk through a tree. Then fine
-        cells are used from the first descent on."""
+        """Whether an evaluation of the field takes longer than a walk through a tree of cells. Then
+        even the first descent starts in a fine cell, near the closest point, to save
+        evaluations."""
         return self.classifier.surface.field.has_variable_accuracy
 
     def _is_unproved(self) -> BoolArray:
@@ -427,13 +450,14 @@ class _CellSearch:
         return self.lower < self._distance(slice(None)) - self.tolerance
 
     def _distance(self, rows: IntArray | slice) -> FloatArray:
-        """Distances (k,) of the best points so far; `FAR_SENTINEL` where there is none."""
+        """Distances (k,) of the queries `rows` from their best points so far; `FAR_SENTINEL` where
+        there is none."""
         distances = np.linalg.norm(self.points[rows] - self.closest[rows], axis=1)
         return np.where(np.isnan(distances), FAR_SENTINEL, distances)
 
     def _is_boundary(self, rows: IntArray | slice) -> BoolArray:
-        """(k,) whether the best point is still the initial guess, and that lies on the boundary of
-        the surface."""
+        """(k,) for each of the queries `rows`, whether its best point is still the initial guess
+        and lies on the curve at which the surface ends."""
         return self.guess.on_boundary & (self.closest[rows] == self.guess.closest[rows]).all(axis=1)
 
     def _descend_from_best_start(self, tree: CellTree) -> FloatArray:
@@ -455,8 +479,8 @@ class _CellSearch:
         also continues if the field has jump surfaces (their cells have no tangent planes) or is
         expensive to evaluate. For expensive fields each round tries one candidate only.
 
-        tried: arrays (k, 3) of surface points that were tried already.
-        marks: see `CellTree.closer_candidates`.
+        tried: arrays (k, 3) of surface points at which descents have started already.
+        marks: None, or a Bool array in which the cells that may hold a nearer point are marked.
         """
         for _ in range(_MAX_CANDIDATE_ROUNDS):
             if not len(rows):
@@ -485,10 +509,12 @@ class _CellSearch:
     def _closer_candidates(
         self, tree: CellTree, rows: IntArray, skipped: Sequence[FloatArray], marks: Any
     ) -> list[FloatArray]:
-        """`CellTree.closer_candidates` for the queries `rows` (k,): arrays (k, 3) of surface
-        points. It also raises the lower bounds of these queries.
+        """For the queries `rows` (k,), find the surface points of cells that may hold a nearer
+        point than the best one (`CellTree.closer_candidates`). Returns them as a list of arrays
+        (k, 3), with `FAR_SENTINEL` for none. It also raises the lower bounds of these queries.
 
         skipped: arrays (k, 3) of surface points near which no candidates are wanted.
+        marks: None, or a Bool array in which the cells that may hold a nearer point are marked.
         """
         backend, closest = self.backend, self.closest[rows]
         best = BestCandidate(
@@ -506,8 +532,9 @@ class _CellSearch:
         return [to_numpy(candidate) for candidate in candidates]
 
     def _leave_boundary(self) -> IntArray:
-        """For each query whose best point is on the boundary of the surface, descend along the
-        surface from there. Returns the indices of the queries whose distance this reduced."""
+        """For each query whose best point lies on the curve at which the surface ends, descend
+        along the surface from there. Returns the indices of the queries whose distance became
+        smaller."""
         ids = np.flatnonzero(self._is_boundary(slice(None)))
         distance = self._distance(ids)
         ids, distance = ids[distance > 0], distance[distance > 0]

@@ -107,10 +107,11 @@ class SurfaceCells:
 class BestCandidate:
     """The closest surface point found so far.
 
-    distance: of `point` from the query.
-    exclusion_radius: no surface point within it of `point` is nearer to the query.
-    separation_factor: multiplies the distance from `point` below which another cell's point is
-        skipped, as leading to the same closest point.
+    point: the surface point. distance: its distance from the query.
+    exclusion_radius: the radius of a ball about `point` that is proved to hold no surface point
+        nearer to the query.
+    separation_factor: the surface point of another cell is taken to lead to the same closest point,
+        and is skipped, if it is closer to `point` than this factor times the cell's `separation`.
     """
 
     point: Vec3
@@ -121,14 +122,15 @@ class BestCandidate:
 
 @dataclass(frozen=True)
 class CellTree:
-    """A tree of cells on a backend, for at least one cell."""
+    """A bounding-volume tree over at least one cell that may hold a surface, stored on a
+    backend."""
 
     tree: PackedTree
 
     @classmethod
     def of(cls, backend: Backend, cells: SurfaceCells) -> CellTree:
-        """Build the tree of the cells. A cell with a point of the clip curve has a second record,
-        for that point."""
+        """Build the tree of the cells. If a cell has a point of the clip curve (in which the
+        boundary of the domain cuts the surface), the tree has a second record for that point."""
         clip_ids = np.flatnonzero(cells.clip_point[:, 0] < FAR_SENTINEL)
         count, ids = len(cells), np.concatenate([np.arange(len(cells)), clip_ids])
         is_plain = cells.is_single_piece & (cells.clip_point[:, 0] == FAR_SENTINEL)
@@ -165,8 +167,10 @@ class CellTree:
         return cls(pack_tree(backend, hierarchy, levels, slot_records))
 
     def best_start(self, x: Vec3, limit: Real) -> Vec3:
-        """The surface point of the cell in which the surface has the smallest estimated distance
-        from x (`_CellRecord.estimate`); `FAR_SENTINEL` where no estimate is below `limit`."""
+        """The surface point at which a search for the closest point to x should start. It is the
+        known surface point of the cell in which the surface has the smallest estimated distance
+        from x (`_CellRecord.estimate`). `FAR_SENTINEL` if no estimate is below `limit`, a length.
+        """
         vector = self.tree.backend.Array3f
 
         def visit_cell(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
@@ -192,13 +196,19 @@ class CellTree:
         not separated from `best`, from `points` or from each other (`_SEPARATION`) are skipped. In
         `marks`, if it is not None, a Bool is set for every cell with such a lower bound, whether
         its point is skipped or not.
+
+        points: surface points at which searches started already. tolerance: a length.
         """
         backend = self.tree.backend
         vector, index = backend.Array3f, backend.UInt32
 
         def visit_cell(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
-            """Lower the bound of the distance by that of the cell, mark the cell, and add its point
-            to the list of candidates if it qualifies."""
+            """Visit a cell: reduce the lower bound of the distance to that of the cell, if that is
+            smaller; mark the cell; and add its surface point to the list of candidates, if it
+            qualifies.
+
+            row: the cell's record. state: the lower bound so far, then the list of candidates.
+            """
             lower, *listed = state
             cell = _CellRecord.of(vector, row)
             is_relevant = active & ~cell.is_within(best.point, best.exclusion_radius)
@@ -218,9 +228,16 @@ class CellTree:
             return lower, *update_where_active(is_listed, insert, (*listed,), "listed cells")
 
         def with_candidate(cell: _CellRecord, estimate: Real, state: LoopValues) -> LoopValues:
-            """Insert a cell's point in the list, which is sorted by estimate. A nearer candidate
-            takes the place of a listed one; this one moves on to the next place, unless both lead
-            to the same closest point."""
+            """Insert the surface point of a cell in the list of candidates. Returns the new list.
+
+            estimate: the estimated distance of the surface in the cell from the query.
+            state: the list, of fixed length: alternately the estimate and the surface point of each
+                candidate, sorted by estimate.
+
+            Candidates with a larger estimate move to the next place, and the last one is dropped.
+            If the new candidate and a listed one are so close that both lead to the same closest
+            point, the one with the larger estimate is dropped instead.
+            """
             listed, point = [*state], cell.surface_point
             for k in range(0, len(listed), 2):
                 old, y = listed[k], listed[k + 1]
@@ -232,8 +249,8 @@ class CellTree:
             return tuple(listed)
 
         def may_contain(low: Vec3, high: Vec3) -> Mask:
-            """Whether a box extends outside the ball about the best point in which none is
-            nearer."""
+            """Whether a box, with the corners `low` and `high`, extends outside of the ball about
+            the best point that is proved to hold no nearer point."""
             y = best.point
             corner = vector(*(fmax(high[k] - y[k], y[k] - low[k]) for k in range(3)))
             return dr.squared_norm(corner) >= best.exclusion_radius * best.exclusion_radius
@@ -252,11 +269,15 @@ class CellTree:
         self, x: Vec3, visit_cell: Any, start: LoopValues, limit: Callable[[LoopValues], Real],
         may_contain: Callable[[Vec3, Vec3], Mask] = lambda low, high: low.x <= high.x,
     ) -> LoopValues:  # fmt: skip
-        """Traverse the tree from the root. Returns the final state.
+        """Traverse the tree from the root, and visit its cells. Returns the final state.
 
-        visit_cell: updates the state by the record of a cell.
-        limit: the squared distance from x, for a state, above which boxes are left out.
-        may_contain: whether a box, given by its lower and upper corner, is to be visited.
+        start: the initial state of the traversal.
+        visit_cell: a function of a cell's record, the active lanes and the state that returns the
+            new state.
+        limit: a function of the state; boxes whose squared distance from x is above its result are
+            skipped.
+        may_contain: a function of the lower and the upper corner of a box that tells whether the
+            box is to be visited.
         """
         vector = self.tree.backend.Array3f
 
@@ -273,8 +294,9 @@ class CellTree:
 
 @dataclass(frozen=True)
 class _CellRecord:
-    """The record of a cell in the tree, or of a point of the clip curve in a cell. The attributes
-    are the columns of `SurfaceCells`, and
+    """A record of the tree: a cell, or a point of the clip curve in a cell (the curve in which the
+    boundary of the field's domain cuts the surface). Most attributes are those of a cell in
+    `SurfaceCells`; the others are:
 
     number: the index of the cell; -1 for a point of the clip curve.
     spread: the radius about `surface_point` within which the surface is taken for a plane, or the
@@ -297,8 +319,8 @@ class _CellRecord:
 
     @classmethod
     def of(cls, vector: Any, row: list[Real]) -> _CellRecord:
-        """The record from its row of 16 numbers, in the order in which `CellTree.of` writes
-        them."""
+        """The record that is stored in a row of 16 numbers, in the order in which `CellTree.of`
+        writes them. vector: the type of 3-vectors."""
         return cls(
             vector(*row[:3]), row[3], vector(*row[4:7]), row[7], vector(*row[8:11]), *row[11:16]
         )

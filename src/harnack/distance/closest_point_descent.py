@@ -54,10 +54,10 @@ _MIN_SINGULARITY_FRACTION = 1e-5
 
 @dataclass(frozen=True)
 class _DescentState:
-    """A point y, and properties of the field f there.
+    """The state of a descent: a point y, and properties of the field's function f there.
 
     gradient: grad f(y).
-    level_uncertainty: the length by which rounding may have moved the level.
+    level_uncertainty: the length by which rounding may have moved the level set at y.
     smooth_radius: the radius of the ball on which f is smooth.
     """
 
@@ -71,9 +71,9 @@ class _DescentState:
         return self.y, self.gradient, self.level_uncertainty, self.smooth_radius
 
     def flat_after(self, is_flat: Mask, previous: _DescentState) -> _DescentState:
-        """This state, changed in the lanes `is_flat`, in which f - level and its gradient are 0: it
-        gets the gradient of the previous state, and the rounding of coordinates alone as its
-        uncertainty."""
+        """This state, with changes in the lanes `is_flat`, in which both f - level and the gradient
+        are 0, so that the gradient has no direction. There it gets the gradient of the previous
+        state, and an uncertainty of the level that consists of the rounding of coordinates only."""
         epsilon = float(dr.epsilon(type(self.level_uncertainty)))
         rounding = 4 * epsilon * lengths.max_norm(self.y)
         gradient = dr.select(is_flat, previous.gradient, self.gradient)
@@ -85,14 +85,18 @@ class _DescentState:
         )
 
     def where(self, mask: Mask, other: _DescentState) -> tuple[Any, ...]:
-        """The attributes of this state on lanes of the mask, of the other state elsewhere."""
+        """The attributes of this state in the lanes of the mask, and of the other state in all
+        other lanes, as a tuple in the order of the constructor."""
         pairs = zip(self.parts(), other.parts(), strict=True)
         return tuple(dr.select(mask, first, second) for first, second in pairs)
 
 
 @dataclass(frozen=True)
 class ClosestPointDescent:
-    """Descents to closest points of the level set of a field that is prepared for a backend."""
+    """Searches for points of a level set that are locally closest to query points, by Newton's
+    method and by descents along the surface.
+
+    field: prepared for the backend."""
 
     backend: Backend
     field: Field
@@ -108,10 +112,12 @@ class ClosestPointDescent:
         """Newton's method for the closest-point equations f(y) = level and (x - y) parallel to grad
         f(y), in one kernel, from a point `start` near the surface.
 
+        x: the query. limit: a closest point that is farther from x than this is not pursued.
+
         Returns y, to which `finish` adds the last step; the first-order distance of `start` from
-        the level; a mask of the lanes that failed, as the last step was longer than half the radius
-        in which f is smooth; and a mask of the lanes that stopped early, as their closest point is
-        farther from x than `limit`.
+        the level; the mask of the lanes that failed, because the last step was longer than half the
+        radius of the ball in which f is smooth; and the mask of the lanes that stopped early,
+        because their closest point is farther from x than `limit`.
 
         Each step combines the step of `descend` along the surface, which follows its curvature,
         with a Newton step to the level; both use derivatives at the same point. Convergence is
@@ -125,7 +131,12 @@ class ClosestPointDescent:
         def body(
             y: Vec3, first_step: Real, last: Real, is_lost: Mask, is_far: Mask, k: Any, active: Mask
         ) -> tuple[Any, ...]:
-            """One step from y. last: the length of the step before; k: the number of steps."""
+            """One step from y.
+
+            first_step: the first-order distance of the start from the level.
+            last: the length of the step before. k: the number of steps.
+            is_lost, is_far: the lanes that failed, and those that stopped at the limit.
+            """
             # The rounding error of f takes as long as f itself, and does not matter here.
             sample = dataclasses.replace(self.field.evaluate(y), value_error=0.0)
             residual, state = self._state_at(y, sample)
@@ -159,10 +170,12 @@ class ClosestPointDescent:
         return y, first_step, is_lost, is_far
 
     def finish(self, x: Vec3, y: Vec3) -> tuple[Vec3, Mask, Real]:
-        """The last step, from y onto the level.
+        """Finish a search for the surface point closest to x: one Newton step along the gradient,
+        from the last iterate y onto the level.
 
-        Returns the end of the step; whether it is a closest point to x, by the criterion of
-        `descend`; and a radius about it in which no point of the surface is nearer to x.
+        Returns the end of the step; the mask of the lanes in which it is a local minimum of the
+        distance from x, up to rounding; and the radius of a ball about it in which no point of the
+        surface is nearer to x.
 
         Proof that the step, of length s along grad f, ends on the level: it is Newton's step, so f
         differs from the level at its end by at most the remainder, within s, of the Taylor
@@ -188,8 +201,9 @@ class ClosestPointDescent:
     def descend(self, x: Vec3, start: Vec3) -> tuple[Vec3, Mask, Mask]:
         """Descend from `start` to a closest point of x.
 
-        Returns the last point y; a mask of the lanes in which it is a closest point (a local
-        minimum of the distance); and a mask of the lanes in which it is a point of the level set.
+        x: the query. Returns the last point y; the mask of the lanes in which it is a closest point
+        (a local minimum of the distance); and the mask of the lanes in which it is a point of the
+        level set.
 
         Let g = grad f(y), n = g/|g|, r = x - y, and t the part of r tangential to the surface; A is
         the Hessian of f, w a tangential vector. The surface near y is y + w - (w.Aw/(2|g|)) n + ..,
@@ -263,20 +277,24 @@ class ClosestPointDescent:
         return dr.select(is_found, end.y, dr.nan)
 
     def noise(self, y: Vec3) -> Real:
-        """A bound of the length by which rounding and approximation may have moved the level at
-        y."""
+        """A bound of the length by which rounding and approximation may have moved the level set at
+        a point y of it."""
         return self._evaluate(y)[1].level_uncertainty
 
     def last_step(self, x: Vec3, y: Vec3) -> Vec3:
-        """y moved onto the level, where y is closest to x except for a step as short as in
-        `finish`; NaN elsewhere."""
+        """Make the last step of a search for the point closest to x: move y onto the level along
+        the gradient. Returns the end of the step; NaN if the step is too long for the result to be
+        a closest point up to rounding."""
         residual, state = self._evaluate(y)
         end, is_short = self._step_to_level(x, residual, state)
         return dr.select(is_short & self._is_level_resolved(state), end, dr.nan)
 
     def _step_to_level(self, x: Vec3, residual: Real, state: _DescentState) -> tuple[Vec3, Mask]:
-        """Newton's step to the level, along the gradient. Returns its end, and whether the step is
-        so short that this is still the closest point to x, to rounding."""
+        """One Newton step from the point of a state to the level, along the gradient. Returns the
+        end of the step; and whether the step is so short that, if its start is closest to x except
+        for the distance from the level, its end is closest to x up to rounding.
+
+        residual: f - level at the start."""
         gradient_norm = lengths.safe_norm(state.gradient)
         step = -residual / gradient_norm
         end = dr.fma(self.backend.Array3f(step / gradient_norm), state.gradient, state.y)
@@ -284,11 +302,14 @@ class ClosestPointDescent:
         return end, dr.abs(step) <= limit
 
     def _evaluate(self, y: Vec3) -> tuple[Real, _DescentState]:
-        """f - level at y for the nearest level, and the state at y."""
+        """Evaluate the field at y. Returns f - level for the nearest level, and the descent state
+        at y."""
         return self._state_at(y, self.field.evaluate(y))
 
     def _state_at(self, y: Vec3, sample: Sample) -> tuple[Real, _DescentState]:
-        """f - level for the nearest level, and the descent state, from the field's sample at y."""
+        """The number f - level for the level nearest in value, and the state of a descent at y.
+
+        sample: the sample of the field at y."""
         real = self.backend.Float
         scale = lengths.max_norm(y)
         epsilon, gradient_norm = self.backend.machine_epsilon, lengths.safe_norm(sample.gradient)
@@ -308,7 +329,8 @@ class ClosestPointDescent:
 
     @staticmethod
     def _is_on_level(residual: Real, state: _DescentState) -> Mask:
-        """Whether a point is on the level, to rounding; False where rounding leaves that open."""
+        """Whether the point of a state is on the level, up to rounding. residual: f - level there.
+        False where rounding errors are so large that nothing can be said."""
         is_resolved = ClosestPointDescent._is_level_resolved(state)
         return is_resolved & (
             dr.abs(residual) <= 2 * lengths.safe_norm(state.gradient) * state.level_uncertainty
@@ -316,7 +338,8 @@ class ClosestPointDescent:
 
     @staticmethod
     def _is_level_resolved(state: _DescentState) -> Mask:
-        """Whether the level is not hidden by rounding."""
+        """Whether the position of the level set near the point of a state is not lost in rounding
+        errors."""
         size = lengths.max_norm(state.y)
         return state.level_uncertainty <= _MAX_RELATIVE_UNCERTAINTY * fmax(
             size, state.smooth_radius
@@ -392,12 +415,13 @@ class ClosestPointDescent:
     def _tangential_step(
         self, x: Vec3, state: _DescentState, factor: Real, rows: Rows | None = None
     ) -> tuple[Vec3, Mask]:
-        """The step along the surface from y (see `descend`), and whether y already is a local
-        minimum of the distance from x.
+        """One step along the surface from a point y of it, toward the point closest to x. Returns
+        the step as a vector, and whether y already is a local minimum of the distance from x. (The
+        formula is derived in `descend`.)
 
-        state: the state at y.
+        state: the point y, and the field there.
         factor: the fraction of the largest permitted step that is used.
-        rows: the rows of the Hessian at y, if they are known.
+        rows: the rows of the Hessian at y; None if they are not known.
         """
         plane = TangentPlane.of(state.gradient)
         to_x = x - state.y
@@ -435,23 +459,29 @@ class ClosestPointDescent:
     def _second_derivatives(
         self, y: Vec3, plane: TangentPlane, length: Real
     ) -> tuple[Real, Real, Real]:
-        """u.Au, v.Av and u.Av, for the Hessian A at y and the tangents u, v of the plane. If the
-        field has no Hessian, they are computed by central differences of the gradient over
-        sqrt(epsilon) times `length`: their errors only cost steps."""
+        """The numbers u.Au, v.Av and u.Av, where A is the Hessian of the field at y, and u and v
+        are the two unit tangents of the plane. If the field has no Hessian, they are computed by
+        central differences of the gradient over sqrt(epsilon) times `length`. Errors of these
+        differences make a descent slower, but not wrong."""
         if self.has_hessian:
             return plane.restrict_hessian(self.field.hessian(y))
         vector, count = self.backend.Array3f, self.backend.UInt32
         h = fmax(self.backend.machine_epsilon**0.5 * length, 1e-30)
 
         def body(along_u: Vec3, along_v: Vec3, k: Any) -> tuple[Any, ...]:
-            """Evaluate the gradient at node k of four: y + h u, y - h u, y + h v, y - h v; and add
-            it to the derivatives of the gradient along u and v."""
+            """Add the term of node k to the central differences. The four nodes are y + h u,
+            y - h u, y + h v and y - h v. An even node begins a difference, an odd node completes
+            it.
+
+            along_u, along_v: the derivatives of the gradient along u and v, as far as they are
+                summed.
+            """
             direction, step = dr.select(k < 2, plane.u, plane.v), dr.select((k & 1) == 0, h, -h)
             gradient = self.field.evaluate(dr.fma(vector(step), direction, y)).gradient
-            change = gradient * (0.5 / step)
-            first, second = dr.select((k & 1) == 0, change, along_u + change), along_v + change
-            second = dr.select((k & 1) == 0, change, second)
-            return dr.select(k < 2, first, along_u), dr.select(k < 2, along_v, second), k + 1
+            term = gradient * (0.5 / step)
+            new_u, new_v = dr.select((k & 1) == 0, term, along_u + term), along_v + term
+            new_v = dr.select((k & 1) == 0, term, new_v)
+            return dr.select(k < 2, new_u, along_u), dr.select(k < 2, along_v, new_v), k + 1
 
         def is_active(*state: Any) -> Mask:
             return state[-1] < 4

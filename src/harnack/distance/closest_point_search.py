@@ -1,22 +1,24 @@
 """Searches the closest points of a surface: among the triangles of a closed mesh, or by branch and
 bound over cells.
 
-Every search ends at a root of f, at the first hit of a ray or on a triangle. So closest points are
-points of the surface, and distances are upper bounds whatever path led there; a point that is
-nearer than the proved lower bound is refused.
+Every search ends at a root of f - level, at the first hit of a ray, or on a triangle. So the points
+found are points of the surface, and their distances are upper bounds of the true distances. A point
+that is nearer than the proved lower bound is rejected.
 
-Cells that are proved empty are left out. Descents begin at a known surface point of each of the
-other cells (`cell_search`): first, in one kernel, from a few coarse cells; then, for queries to
-which a finer cell may hold a nearer point, from the surface points of four finer cells. Around a
-closest point there is a ball that holds no nearer point (`exclusion_ball`). It settles most
-queries, as boxes within it are left out. The remaining cells bound the distance from below, and are
-subdivided for proofs.
+Cells are cubes that may hold the surface; those that are proved empty are left out. In most other
+cells a point of the surface is known, from which a descent to the closest point can start
+(`cell_search`). For each query, the first descent starts in a coarse cell. If finer cells may hold
+a nearer point, further descents start in four of these. Around each closest point found, a ball is
+proved to hold no nearer point (`exclusion_ball`). Cells inside this ball need no search, which
+settles most queries. The cells that remain give a lower bound of the distance, and they are
+subdivided if proofs are wanted.
 
-For a closed mesh, a tree finds the nearest of the triangles of the level set (`level_triangles`).
-For a mesh with holes, the part of the surface off its triangles is part of a level set of the
-winding number w modulo 1, which is smooth (`JumpSurface.without_jumps`). A closest point of that
-level set counts if w itself has the level there. Compared with this, rays that closed in on each
-point took 18 times as long, and a tenth of them ended too far away.
+For a closed mesh, a tree finds the nearest triangle of the level set (`level_triangles`). If a mesh
+has holes, its surface also has parts off the triangles. There the winding number w has the level,
+and so does w modulo 1, which is smooth across the triangles (`JumpSurface.without_jumps`).
+Therefore the level set of w modulo 1 is searched, and a closest point of it is accepted only if w
+itself has the level there. (A search by rays toward ever nearer points was slower by a factor of
+18, and a tenth of its results were too far away.)
 """
 
 from __future__ import annotations
@@ -90,7 +92,7 @@ class ClosestPoints:
     signed_value: (n,) f - level at the queries, for the level nearest in value.
     lower: (n,) proved lower bounds of the distance.
     violates_promises: (n,) whether a surface point was found, and left out, that is nearer than the
-        field's promises allow.
+        field's promises (proved bounds of f near a point) allow.
     """
 
     points: FloatArray
@@ -125,7 +127,8 @@ def _find_sorted(
     backend: Backend, surface: TracedSurface, levels: Levels, points: FloatArray,
     progress: Callable[[str], None], is_proved: bool,
 ) -> ClosestPoints:  # fmt: skip
-    """`find_closest` for points (n, 3) that are sorted along a Morton curve."""
+    """The closest point of a surface to each of the query points (n, 3), which are sorted along a
+    Morton curve: the work of `find_closest`, with the same parameters."""
     mesh = LevelTriangles.of(surface)
     if mesh is not None and mesh.is_complete:
         return _closest_on_mesh(backend, surface, levels, mesh, points)
@@ -169,12 +172,13 @@ def _search_smooth_part(
     tolerance: StoppingRule,
     progress: Callable[[str], None],
 ) -> SearchResult:
-    """Search the smooth part of a surface that has jumps, and merge the result with closest points
-    already known on its jump surfaces.
+    """Search the part of a surface that does not lie on jump surfaces (the facets across which its
+    field f jumps, such as triangles). The result is merged with closest points on jump surfaces.
 
-    smooth: `JumpSurface.without_jumps` of the surface's field.
+    smooth: a field without jumps that differs from f by a constant between jump surfaces
+        (`JumpSurface.without_jumps`).
     points: (n, 3) the query points.
-    known: points of the surface on its jump surfaces.
+    known: for each query, a point of the surface on a jump surface, if one is known.
 
     Proof of the lower bounds: the surface lies in the union of the level sets of `smooth` and the
     jump surfaces, so it is no nearer than the nearer of the two. A point found on a level set of
@@ -239,8 +243,11 @@ def _with_singular_points(
 def _closest_on_mesh(
     backend: Backend, surface: TracedSurface, levels: Levels, mesh: LevelTriangles, points: Any
 ) -> ClosestPoints:
-    """`find_closest` for a surface that consists of triangles only: the nearest point of the
-    triangles. The lower bound is the distance less an allowance for rounding."""
+    """The closest point to each query on a surface that consists of triangles only, with the
+    parameters and the result of `find_closest`. The lower bound is the distance less an allowance
+    for rounding.
+
+    mesh: the triangles of the surface."""
     prepared, nearest = surface.evaluator(backend), mesh.upload(backend)
 
     def compute(p: Vec3) -> tuple[Real | Vec3, ...]:
@@ -270,10 +277,14 @@ class _QueryEvaluator:
     """Evaluates one surface's field on a backend and runs the closest-point descents, for arrays of
     query points.
 
-    The attributes with an underscore are made from these three: the field prepared for the backend;
-    the descent on it; the descent on the field without truncation errors (None if it has none); the
-    domain; the descent to the clip curve, at which the domain cuts the surface (None without a
-    domain); and, for fields with jumps, the surface prepared for rays, in double precision.
+    The attributes with an underscore are made from the given ones:
+
+    _field: the field, prepared for the backend.
+    _descent, _exact_descent: the closest-point descent on the level set of that field; and on the
+        level set of the field without truncation errors (None if the field has no such errors).
+    _domain, _clip: the field's domain; and the descent to the clip curve, in which the boundary of
+        the domain cuts the surface (None without a domain).
+    _tracer: for fields with jumps, the surface prepared for tracing rays in double precision.
     """
 
     backend: Backend
@@ -316,6 +327,9 @@ class _QueryEvaluator:
         """
 
         def compute(p: Vec3) -> tuple[Real | Vec3, ...]:
+            """The query p as rounded; a point of the surface known near it, or NaN; f - level; a
+            proved lower bound of the distance from the level set; and the first-order estimate of
+            that distance."""
             sample = self._field.evaluate(p)
             residual = -self.levels.offset_to_nearest(sample.value)
             boundary = self._field.closest_boundary_point(p)
@@ -419,19 +433,28 @@ class _QueryEvaluator:
     def descend(
         self, points: FloatArray, start: FloatArray, limit: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """As `cell_search.DescentMethods` says: by Newton's method and descent, or by rays for
-        fields with jumps.
+        """Find the closest points of the surface to query points, by Newton's method, and by a
+        slower descent where that does not converge. For fields that jump, a compass search with
+        rays is used instead (`compass_search`).
 
-        A row of `start` that equals its query stands for an unknown start: Newton's method leads
-        from the query to the level first. A closest point that lies outside the domain is replaced
-        by one on the clip curve.
+        points: (n, 3) the queries.
+        start: (n, 3) points near the surface from which the searches start. A row that equals its
+            query means that no start is known; Newton's method then first leads to the surface.
+        limit: (n,) closest points that are farther from their query than this need not be found.
+
+        Returns:
+            The closest points (n, 3), NaN where none is found or it is farther than the limit. One
+            that lies outside the field's domain is replaced by the closest point of the clip curve,
+            in which the boundary of the domain cuts the surface. And radii (n,): in the ball of
+            this radius about the closest point, no point of the surface is nearer to the query; 0
+            if that is not proved.
         """
         if self.surface.field.has_jumps:
 
-            def by_rays(p: Vec3, start: Vec3) -> tuple[Vec3]:
+            def by_compass_search(p: Vec3, start: Vec3) -> tuple[Vec3]:
                 return (compass_search(self._tracer, p, start),)
 
-            return in_batches(self._tracer.backend, by_rays, points, start)[0], np.zeros(
+            return in_batches(self._tracer.backend, by_compass_search, points, start)[0], np.zeros(
                 len(points)
             )
         is_unknown = (start == points).all(axis=1)
@@ -443,9 +466,9 @@ class _QueryEvaluator:
 
             start = start.copy()
             (start[is_unknown],) = in_batches(self.backend, to_level, points[is_unknown])
-        limits = np.tile(limit[:, None], 3)
+        limits = np.tile(limit[:, None], 3)  # as `in_batches` takes arrays (n, 3) only
         closest, y, free, is_unfinished, is_far = in_batches(
-            self.backend, self._newton_numbers, points, start, limits
+            self.backend, self._newton_with_float_masks, points, start, limits
         )
         rows = np.flatnonzero(is_unfinished)
         if len(rows):
@@ -466,16 +489,21 @@ class _QueryEvaluator:
     def descend_from_boundary(
         self, points: FloatArray, boundary: FloatArray, aside: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """As `cell_search.DescentMethods` says.
+        """Find the closest points of the surface to queries whose best point so far lies on the
+        curve at which the surface ends. Each search starts on the surface beside that curve.
 
-        At the distance `aside` from a boundary point b, in the direction of the query, f is
-        evaluated. If the level is near there to first order, Newton's method finds the surface, and
-        the descent begins at that point, unless it lies on the side of b away from the query.
+        points: (n, 3) the queries. boundary: (n, 3) the points b on the curve.
+        aside: (n,) the distance from b, in the direction of the query, at which f is evaluated. If
+            the level is near there to first order, Newton's method leads to the surface, and the
+            descent starts there, unless that point lies on the side of b away from the query.
+
+        Returns the closest points (n, 3), NaN where none is found; and radii (n,) of balls about
+        them that hold no point of the surface nearer to the query.
         """
 
         def arc_to_level(p: Vec3, b: Vec3, lengths: Vec3) -> tuple[Real]:
-            """The first-order distance of the level from the point at a distance from b towards
-            p."""
+            """The first-order distance of the level from the point that lies at the distance
+            lengths.x from b in the direction of p."""
             way = p - b
             sample = self._field.evaluate(b + lengths.x / safe_norm(way) * way)
             return (
@@ -483,8 +511,9 @@ class _QueryEvaluator:
             )
 
         def near_edge(p: Vec3, b: Vec3, lengths: Vec3) -> tuple[Vec3]:
-            """The surface point to which Newton's method leads from that point; NaN if it is on the
-            side of b away from p."""
+            """The surface point to which Newton's method leads from the point that lies at the
+            distance lengths.x from b in the direction of p; NaN if the surface point is on the side
+            of b away from p."""
             way = p - b
             y = self._descent.newton_to_level(b + lengths.x / safe_norm(way) * way)
             towards = dr.dot(way, y - b) > -_MAX_OPPOSING_COSINE * safe_norm(way) * safe_norm(y - b)
@@ -509,8 +538,16 @@ class _QueryEvaluator:
         return self._inside_domain_or_nan(closest), free
 
     def newton_in_kernel(self, x: Vec3, start: Vec3, limit: Real) -> tuple[Vec3, Real, Mask]:
-        """As `cell_search.DescentMethods` says. A closest point on the boundary of the domain or
-        outside it is left to `descend`."""
+        """Newton's method for the closest point to the query x, as part of another kernel.
+
+        start: a point near the surface. limit: a closest point farther from x than this need not be
+            found.
+
+        Returns the closest point, NaN if none is found; the radius of a ball about it in which no
+        surface point is nearer to x; and the mask of the lanes for which `descend` has to be called
+        afterwards: those in which the method did not converge, or led out of the domain or to its
+        boundary.
+        """
         p, vector = self.backend.Array3f(x), cast("Any", type(x))
         closest, _, free, is_unfinished, _ = self._newton(p, self.backend.Array3f(start), limit)
         if self._domain is not None:
@@ -519,12 +556,14 @@ class _QueryEvaluator:
         return vector(closest), type(x.x)(free), is_unfinished
 
     def _newton(self, p: Vec3, start: Vec3, limit: Real) -> tuple[Vec3, Vec3, Real, Mask, Mask]:
-        """Newton's method for the point closest to p, from `start`.
+        """Newton's method for the surface point closest to p, from the point `start` near the
+        surface.
 
-        Returns the closest point, NaN if the method does not converge to one no farther than the
-        level near `start`; the last iterate, from which `_descend` goes on; the radius about the
-        closest point in which none is nearer; whether the search is to go on; and whether it ended
-        farther than `limit` from p.
+        Returns the closest point, NaN if the method does not converge, or converges to a point that
+        is farther from p than the surface near `start`; the last iterate, from which `_descend` can
+        continue; the radius of a ball about the closest point in which no surface point is nearer
+        to p; the mask of the lanes in which the search has to continue; and the mask of the lanes
+        that stopped because their closest point is farther than `limit` from p.
         """
         y, first_step, is_lost, is_far = self._descent.newton(p, start, self.backend.Float(limit))
         closest, is_converged, free = self._descent.finish(p, y)
@@ -534,18 +573,21 @@ class _QueryEvaluator:
         is_closest = is_converged & ~is_lost & (safe_norm(p - closest) <= bound)
         return dr.select(is_closest, closest, dr.nan), y, free, ~(is_converged | is_lost), is_far
 
-    def _newton_numbers(
+    def _newton_with_float_masks(
         self, p: Vec3, start: Vec3, limit: Vec3
     ) -> tuple[Vec3, Vec3, Real, Real, Real]:
-        """`_newton` with 1 and 0 in place of its two masks. limit: a vector of three equal
-        components."""
+        """The results of `_newton`, in a form that `in_batches` can pass on: the two masks among
+        them are returned as numbers, 1 for True and 0 for False.
+
+        limit: the limit of `_newton`, three times as the components of a vector."""
         one, zero = self.backend.Float(1), self.backend.Float(0)
         *results, is_unfinished, is_far = self._newton(p, start, limit.x)
         return *results, dr.select(is_unfinished, one, zero), dr.select(is_far, one, zero)
 
     def _descend(self, p: Vec3, start: Vec3) -> tuple[Vec3, Real]:
-        """The closest point to p by descent from `start`, NaN if the descent does not end on the
-        level; and the radius about it in which none is nearer, 0 if the descent does not converge.
+        """The closest surface point to p that a descent from `start` finds, NaN if the descent does
+        not end on the level; and the radius of a ball about it in which no surface point is nearer
+        to p, 0 if the descent does not converge.
         """
         y, is_converged, on_level = self._descent.descend(p, start)
         return dr.select(on_level, y, dr.nan), dr.select(
@@ -553,11 +595,14 @@ class _QueryEvaluator:
         )
 
     def remove_truncation(self, points: FloatArray, closest: FloatArray) -> FloatArray:
-        """Move closest points onto the level set of the field without the truncation error of its
-        treecode: by Newton's method for the closest point, or straight to the level where that
-        fails. A point that would leave the domain is not moved.
+        """Move closest points onto the exact level set. They were found on the level set of an
+        approximate field, a treecode with a truncation error; the exact field sums all terms.
 
-        points, closest: (n, 3) the queries and their closest points, NaN for none.
+        points, closest: (n, 3) the queries, and their closest points, NaN for none.
+
+        Returns the closest points (n, 3) on the exact level set, found by Newton's method. Where
+        that fails, a point is moved straight to the exact level. A point that would leave the
+        domain is not moved.
         """
         rows = np.flatnonzero(np.isfinite(closest[:, 0]))
         exact = self._exact_descent
@@ -580,8 +625,8 @@ class _QueryEvaluator:
     def _corrected(
         self, exact: ClosestPointDescent, points: FloatArray, closest: FloatArray
     ) -> FloatArray:
-        """The closest points (n, 3) on the level set of the exact field; NaN where they are not
-        found.
+        """The closest points (n, 3) to `points` (n, 3) on the level set of the exact field; NaN
+        where they are not found.
 
         exact: the descent on the field that sums all terms one by one.
         closest: (n, 3) the closest points on the level set of the approximate field.
@@ -630,8 +675,8 @@ class _QueryEvaluator:
         return closest
 
     def level_uncertainty(self, points: FloatArray) -> FloatArray:
-        """Bounds (n,) of how far rounding and approximation may have moved the level set at points
-        (n, 3) on it."""
+        """Bounds (n,), lengths, of how far rounding and approximation may have moved the level set
+        at points (n, 3) that lie on it."""
         if not len(points):
             return np.zeros(0)
 
@@ -642,15 +687,21 @@ class _QueryEvaluator:
 
 
 class _LinearlyShiftedField(Field):
-    """The sum of a field and, in each lane, a linear function of the point: value + slope . (p -
-    at). Its error is the rounding error of the field, without the truncation error."""
+    """The sum of a field and of the linear function value + slope . (p - anchor) of the point p,
+    one function for each lane.
 
-    def __init__(self, field: Field, at: Vec3, value: Real, slope: Vec3) -> None:
-        self._field, self._at, self._value, self._slope = field, at, value, slope
+    The linear function is the truncation error of the field at the anchor, with its gradient, so
+    the sum has hardly any truncation error near the anchor. Its stated error is the rounding error
+    of the field alone."""
+
+    def __init__(self, field: Field, anchor: Vec3, value: Real, slope: Vec3) -> None:
+        self._field, self._anchor, self._offset, self._slope = field, anchor, value, slope
 
     def evaluate(self, p: Vec3) -> Sample:
+        """The sample of the sum at p. The value error of the field includes its truncation error,
+        which is subtracted here."""
         sample = self._field.evaluate(p)
-        shifted = sample.shifted(dr.dot(self._slope, p - self._at) + self._value)
+        shifted = sample.shifted(dr.dot(self._slope, p - self._anchor) + self._offset)
         return replace(
             shifted,
             gradient=sample.gradient + self._slope,
@@ -669,8 +720,9 @@ def _length(vectors: FloatArray) -> FloatArray:
 
 
 def _size(surface: TracedSurface, points: FloatArray) -> float:
-    """The diagonal of the surface's volume; if that is unknown or infinite, the extent of the
-    points, at least 1."""
+    """The size of a surface, a length: the diagonal of the box that is known to contain it. If
+    there is no finite one, the largest extent of the query points (n, 3) along an axis, at least
+    1."""
     if surface.volume is not None:
         lower, upper = surface.volume.bounds()
         if np.isfinite([lower, upper]).all():

@@ -117,7 +117,8 @@ def signed_distance(
 
 
 def _outwards(field: Field) -> float:
-    """The sign by which a distance that grows with f becomes negative inside the solid."""
+    """1 or -1: the factor that makes a distance with the sign of f - level negative inside. It is
+    -1 for fields that are larger inside."""
     return -1.0 if field.is_larger_inside else 1.0
 
 
@@ -178,13 +179,13 @@ def distance_bounds(
 ) -> DistanceBounds:
     """Distances of points (n, 3) from a level set, with proved lower bounds.
 
-    `lower` is proved by the field's promises. By these, some cells hold no surface; in others the
-    surface lies in a slab; and around every closest point there is a ball that holds no nearer
-    point of the surface. `lower` is the distance to the nearest slab or nonempty cell outside of
-    that ball. If `lower` is less than `upper` by more than 1e-6 of the size of the surface, cells
-    are subdivided. The number of cells is limited to about half the number of points, but not to
-    less than 60,000. So a few points are proved to that tolerance; among many points, those for
-    which the balls suffice.
+    `lower` is proved by the field's promises (proved bounds of f near a point). These imply that
+    some cubic cells of space hold no surface; that in others the surface lies in a slab between two
+    parallel planes; and that a ball around each closest point holds no nearer point of the surface.
+    `lower` is the distance to the nearest slab, or cell without a slab, outside of that ball. If
+    `lower` is less than `upper` by more than 1e-6 of the size of the surface, cells are subdivided,
+    but into no more cells than about half the number of points, or 60,000 if that is more. So for a
+    few points this tolerance is reached; for many points, only if the balls suffice.
 
     `upper` is the distance to a point of the surface, found by several descents. Where `lower` is
     less than `upper`, the true distance may lie anywhere between the two.
@@ -206,10 +207,11 @@ def _find(
     *,
     is_proved: bool = False,
 ) -> ClosestPoints:
-    """`find_closest` for the points, with the clip of the surface made part of the field's domain.
-    Warns of points without a result.
+    """Find the closest point of a surface to each of `points` (n, 3), and warn if some points have
+    none. The surface's clip is made part of the field's domain first.
 
-    name: of the public function, for messages.
+    name: the name of the public function, for messages.
+    is_proved: whether the lower bounds of the result are made as large as can be proved.
     """
     if surface.clip_volume is not None:
         if surface.field.has_jumps:
@@ -239,7 +241,8 @@ def _surface(
     verb: the name of the public function, for messages.
 
     Raises:
-        TypeError, ValueError: as `surface_and_options`; an option that distances do not have.
+        TypeError, ValueError: the surface or an option is not valid, or distances do not have such
+            an option.
         NotImplementedError: a field with jumps whose distance is not known.
     """
     target, choices = surface_and_options(verb, surface, options, keywords, _HONORED)
@@ -256,7 +259,8 @@ def _surface(
 
 
 def _warn_of_failures(name: str, result: ClosestPoints) -> None:
-    """Warn of queries without a result, and of results that a promise of the field contradicts."""
+    """Warn if no surface was found for some queries; and if, for some, the point found is nearer
+    than the field's promises (proved bounds of f near a point) allow, so that they are wrong."""
     count = len(result.closest)
     unresolved = int(np.isnan(result.closest[:, 0]).sum())
     if unresolved:
@@ -291,21 +295,24 @@ def _check_domain(field: Field, points: FloatArray) -> None:
 
 
 def _first_order(backend: Backend, field: Field, levels: Levels, p: Vec3) -> Real:
-    """The first-order distance of p from the nearest level, with the sign of f - level."""
+    """The first-order estimate (f - level)/|grad f| of the distance of p from the level set, with
+    the level nearest in value if there are several. levels: the levels."""
     del backend
     sample = field.evaluate(p)
     return first_order_distance(-levels.offset_to_nearest(sample.value), sample.gradient)
 
 
 def _second_order(backend: Backend, field: Field, levels: Levels, p: Vec3) -> Real:
-    """The second-order distance of p from the nearest level, with the sign of f - level."""
+    """The second-order estimate of the distance of p from the level set, with the sign of f -
+    level. With several levels, that of the level nearest in value. levels: the levels."""
     del backend
     sample, rows = field.evaluate(p), field.hessian(p)
     return second_order_distance(-levels.offset_to_nearest(sample.value), sample.gradient, rows)
 
 
 def _signed_lower_bound(backend: Backend, field: Field, levels: Levels, p: Vec3) -> Real:
-    """The proved lower bound of the distance of p from the levels, with the sign of f - level."""
+    """The proved lower bound of the distance of p from the level sets of all levels, with the sign
+    of f - level for the level nearest in value. levels: the levels."""
     sample = field.evaluate(p)
     residual = -levels.offset_to_nearest(sample.value)
     return dr.copysign(level_distance_lower_bound(backend, field, levels, p, sample), residual)

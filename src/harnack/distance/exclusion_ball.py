@@ -1,4 +1,5 @@
-"""The ball about a closest point of a level set that is proved to hold no nearer one."""
+"""A ball about the closest point of a level set to a query, which is proved to hold no point of the
+level set that is nearer to the query."""
 
 from __future__ import annotations
 
@@ -69,8 +70,8 @@ def exclusion_radius(sample: Sample, rows: Rows | None, x: Vec3, y: Vec3) -> Rea
 
 @dataclass(frozen=True)
 class _HessianBounds:
-    """Bounds of the Hessian H of f at y. f is taken with the sign for which x - y is along the
-    gradient n |g|.
+    """Bounds of the Hessian H of f at a surface point y. The sign of f is chosen such that the
+    gradient g = |g| n points toward the query x.
 
     least_tangential: the smallest eigenvalue in the tangent plane, or 0 if that is positive.
     across: |Hn - (n.Hn) n|.
@@ -85,7 +86,8 @@ class _HessianBounds:
 
     @classmethod
     def of(cls, sample: Sample, rows: Rows, to_query: Vec3) -> _HessianBounds:
-        """The bounds from the sample and the rows of the Hessian at y. to_query: x - y."""
+        """The bounds for the sample of f at y. rows: the three rows of the Hessian of f at y.
+        to_query: the vector x - y from y to the query x."""
         plane = TangentPlane.of(sample.gradient)
         eigen = SymmetricEigen2.of(*plane.restrict_hessian(rows))
         smallest = dr.select(dr.dot(to_query, plane.n) > 0, eigen.smallest, -eigen.largest)

@@ -60,9 +60,13 @@ class JumpSurfaceSearch:
     most: int
 
     def closest(self, x: Vec3, limit: Real) -> tuple[Vec3, Vec3]:
-        """A point of the surface on a facet, nearer to x than `limit`, NaN where none is found; and
-        the vector from x to the nearest facet, whether that is part of the surface or not, infinite
-        if it is not nearer than `limit`.
+        """Search for the point closest to x of the part of the surface that lies on facets.
+
+        limit: only facets nearer to x than this are examined.
+
+        Returns a point of the surface on a facet, NaN if none is found; and the vector from x to
+        the nearest facet, whether that is part of the surface or not, infinite if it is farther
+        than `limit`.
 
         Facets are examined in the order of their distance, each at its point y nearest to x. If the
         facet is part of the surface at y, a short ray through y along the facet's normal hits the
@@ -88,11 +92,12 @@ class JumpSurfaceSearch:
         )
 
         def body(*state: Any) -> tuple[Any, ...]:
-            """Try one probe of one facet, and choose the next.
+            """Trace one probe, a short ray through the nearest point of a facet, and choose the
+            next probe or facet.
 
-            The state: the facet's attributes, the index of the probe (0 for the normal, then the
-            edges), the surface point found, the vector to the nearest facet, the number of facets
-            examined, and whether to continue.
+            state: the attributes of the facet; the index of the probe (0 for the ray along the
+                normal, 1 to 6 for the edges of the tetrahedron); the surface point found; the
+                vector to the nearest facet; the number of facets examined; and whether to continue.
             """
             last = NearestFacet(*state[:5])
             probe, best, nearest, count, active = state[5:]
@@ -140,11 +145,12 @@ class JumpSurfaceSearch:
         return is_hit, hit.facet, dr.fma(vector(hit.t), direction, o)
 
     def _next_jump(self, x: Vec3) -> NextJump:
-        """A function that lists the facets of the field in the order of their distance from x; for
-        a field that does not list its facets, only the nearest one.
+        """Make a function that finds the facets across which the field jumps, one after the other
+        in the order of their distance from x. If the field cannot list its facets, the function
+        finds only the nearest one.
 
-        The function takes the sort key and index of the facet before, the largest distance, and the
-        active lanes.
+        The function takes the sort key and the index of the facet before, the largest distance, and
+        the active lanes; it returns the next facet.
         """
         field, backend = self.surface.field, self.surface.backend
         real, index = backend.Float, backend.UInt32
@@ -153,7 +159,8 @@ class JumpSurfaceSearch:
             facet = _nearest_jump_by_differences(backend, field, x)
 
             def single_facet(after: tuple[Real, Any], limit: Real, active: Mask) -> NearestFacet:
-                """The nearest facet, if none was given before; else no facet."""
+                """The nearest facet if `after` stands for the start of the list, otherwise no
+                facet."""
                 del active
                 is_first = (after[0] < 0) & (facet.sort_key < limit)
                 sort_key = dr.select(is_first, facet.sort_key, dr.inf)
@@ -163,7 +170,8 @@ class JumpSurfaceSearch:
             return single_facet
 
         def listed_facet(after: tuple[Real, Any], limit: Real, active: Mask) -> NearestFacet:
-            """The next facet of the field's list."""
+            """The facet that follows the facet `after` (its sort key and index) in the field's
+            list, if it is not farther than `limit`."""
             nearest = field.nearest_facet(x, after, limit, active)
             if nearest is None:
                 raise RuntimeError("nearest_sheet tells sheets at some times and not at others")
@@ -175,10 +183,10 @@ class JumpSurfaceSearch:
 def straddles_level(surface: SurfaceTracer, y: Vec3, radius: Real, active: Mask) -> Mask:
     """Whether f takes values on both sides of a level within 1.74 radii of y.
 
-    It is evaluated at the corners of a tetrahedron and, on its edges, just before a jump surface.
-    Two values on different sides prove that the surface crosses the path between them, where f
-    passes the level continuously or by a jump. No gradient is needed: it is unbounded at the edge
-    of a jump surface, where f takes exactly the values between those on both sides.
+    f is evaluated at the corners of a tetrahedron around y and, along its edges, just before each
+    jump surface. Two values on different sides of the level prove that the surface crosses the path
+    between them: f passes the level there, continuously or by a jump. No gradient is used, because
+    it is unbounded near the edge of a jump surface.
     """
     backend, field = surface.backend, surface.field.exact(surface.backend)
     real, index, vector = backend.Float, backend.UInt32, backend.Array3f
@@ -219,8 +227,10 @@ def _select(mask: Mask, first: NearestFacet, second: NearestFacet) -> NearestFac
 
 
 def _probe(vector: Any, index: Any, normal: Vec3) -> tuple[Vec3, Vec3]:
-    """Start and end of a probe about the origin. index: 0 for the probe along the normal, k + 1 for
-    edge k of the tetrahedron."""
+    """The start and the end of a probe, a segment near the origin along which a ray is traced.
+
+    index: 0 for the segment along `normal`; k + 1 for edge k of a tetrahedron about the origin.
+    vector: the type of 3-vectors."""
     start, end = -normal, normal
     for k, (i, j) in enumerate(_EDGES):
         start = dr.select(index == k + 1, vector(*_CORNERS[i]), start)
@@ -229,8 +239,8 @@ def _probe(vector: Any, index: Any, normal: Vec3) -> tuple[Vec3, Vec3]:
 
 
 def _nearest_jump_by_differences(backend: Backend, field: Field, x: Vec3) -> NearestFacet:
-    """The facet nearest to x, for a field that knows only the distance d of its facets: the facet
-    lies in the direction in which d falls.
+    """The facet nearest to x, for a field that knows only the distance d(x) from its nearest facet:
+    the facet lies at the distance d in the direction in which d falls fastest.
 
     That direction is computed by central differences over h = r d. Their truncation error is about
     r^2. Rounding moves d by epsilon s, where s is the size of the coordinates, which adds
@@ -277,8 +287,8 @@ _HIT_TEST_RADIUS = 1024.0
 
 @dataclass(frozen=True)
 class _HitPlane:
-    """The tangent plane of a hit, relative to the query x: the points x + r with r . normal =
-    offset, |normal| = 1. normal = 0 stands for no plane."""
+    """The plane tangent to the surface at the hit of a ray. It consists of the points x + r with
+    r . normal = offset, where x is the query and |normal| = 1. normal = 0 stands for no plane."""
 
     normal: Vec3
     offset: Real
@@ -290,7 +300,8 @@ class _HitPlane:
         return cls(normal, dr.select(mask, first.offset, second.offset))
 
     def is_apart(self, other: _HitPlane) -> Mask:
-        """Whether both are planes, and not nearly parallel."""
+        """The mask of the lanes in which both this and the other one are planes (not the
+        placeholder for none), and not nearly parallel."""
         return (
             dr.squared_norm(dr.cross(self.normal, other.normal)) > _MIN_PLANE_SINE * _MIN_PLANE_SINE
         )
@@ -321,8 +332,9 @@ class _HitPlane:
 
 @dataclass(frozen=True)
 class _HitPlanes:
-    """Three planes tangent to the surface. The first belongs to the best point. The others belong
-    to the last two hits whose planes are parallel neither to the first nor to each other."""
+    """Three planes tangent to the surface, from which a compass search guesses where creases are.
+    The first is the plane at the best point so far. The other two are the planes of the last two
+    hits that are parallel neither to the first plane nor to each other."""
 
     first: _HitPlane
     second: _HitPlane
@@ -383,17 +395,20 @@ class _HitPlanes:
 
 
 def compass_search(surface: SurfaceTracer, x: Vec3, foot: Vec3) -> Vec3:
-    """Compass search over ray directions from x, starting at the surface point `foot`. Returns
-    points of the surface that are no farther from x.
+    """Search for the surface point closest to x by a compass search over directions of rays from x.
+    It starts at the surface point `foot`, and returns a point of the surface that is no farther
+    from x.
 
-    It reaches closest points on creases of two jump surfaces, on curves where a smooth part ends at
-    a jump surface, and on edges cut by a volume, which no other search here can follow.
+    It finds closest points that descents along a smooth surface cannot reach: on creases of two
+    jump surfaces, on curves where a smooth part ends at a jump surface, and on edges that a volume
+    cuts.
 
-    Rays leave x at an angle to the best direction; a nearer first hit becomes the best. If no
-    direction improves it, the angle is reduced, down to sqrt(epsilon). To be fast along creases,
-    each hit adds its tangent plane, and a round starts with rays to the nearest points of the
-    planes' intersections. Every accepted point is a first hit about which f straddles the level
-    (`straddles_level`), hence on the surface.
+    In each round, rays leave x in directions tilted by some angle against the direction of the best
+    point. A first hit that is nearer becomes the best point. If no ray of a round improves it, the
+    angle is reduced, down to sqrt(epsilon). To be fast along creases, the tangent planes of hits
+    are stored, and a round begins with rays to the points nearest to x in the intersections of
+    these planes. A hit is accepted only if f takes values on both sides of the level around it
+    (`straddles_level`), so that it is a point of the surface.
     """
     backend = surface.backend
     real, vector, count = backend.Float, backend.Array3f, backend.UInt32
@@ -459,19 +474,23 @@ def compass_search(surface: SurfaceTracer, x: Vec3, foot: Vec3) -> Vec3:
 
 
 def is_on_surface(surface: SurfaceTracer, y: Vec3, hit: MarchResult, active: Mask) -> Mask:
-    """Whether f has values on both sides of a level about the hit y, so that y is on the surface.
+    """Whether the hit y of a ray is a point of the surface: f takes values on both sides of a level
+    around it.
 
-    A hit alone does not prove that beside the edge of a jump surface: the gradient is unbounded
-    there, so that a ray is within the tolerance of any level to first order, and a ray that begins
-    there may hit the facet at once, whatever value f has.
+    hit: the result of tracing the ray. active: the lanes to be tested.
+
+    A hit alone is no proof near the edge of a jump surface, for two reasons. The gradient is
+    unbounded there, so that every point is within the tolerance of any level to first order. And a
+    ray that begins there may hit the facet at once, whatever value f has.
     """
     radius = _HIT_TEST_RADIUS * surface.backend.machine_epsilon * fmax(max_norm(y), hit.t)
     return straddles_level(surface, y, radius, active)
 
 
 def _tilt_direction(d: Vec3, step: Real, angle: Real) -> Vec3:
-    """The unit direction of d + step w, where w is the unit vector normal to d at the angle `angle`
-    about d. step is so the tangent of the tilt."""
+    """The unit vector along d + step w. d is a unit vector, and w the unit vector at right angles
+    to d that is given by the angle `angle` (in radians) about d. So `step` is the tangent of the
+    angle between d and the result."""
     vector = cast("Any", type(d))
     u, v = orthonormal_basis(d)
     sine, cosine = dr.sincos(angle)
@@ -479,7 +498,8 @@ def _tilt_direction(d: Vec3, step: Real, angle: Real) -> Vec3:
 
 
 def _spiral_direction(vector: Any, n: Real) -> Vec3:
-    """Direction number n of `_SPHERE_RAYS` directions that are spread evenly over the sphere."""
+    """The unit vector with number n of `_SPHERE_RAYS` unit vectors that are spread evenly over the
+    sphere, along a spiral."""
     z = 1 - (2 * n + 1) / _SPHERE_RAYS
     radius = dr.sqrt(1 - z * z)
     sine, cosine = dr.sincos(_GOLDEN_ANGLE * n)

@@ -40,7 +40,7 @@ _SIDE_DISTANCE = 1e-9
 
 @dataclass(frozen=True)
 class LevelTriangles:
-    """The triangles of a level set, scaled.
+    """The triangles of a level set of a mesh's winding number, in scaled coordinates.
 
     corners: (k, 3, 3) in coordinates of at most about 1; the unscaled corners are center + size
         times these.
@@ -54,10 +54,12 @@ class LevelTriangles:
 
     @classmethod
     def of(cls, surface: TracedSurface) -> LevelTriangles | None:
-        """The triangles of a surface: of the boundary of a `MeshSolid`, or of a level set of the
-        winding number of a mesh, without clip and domain; None for other surfaces. For a mesh that
-        is not closed, only triangles that are proved to belong to the surface as a whole; but all
-        triangles, if the surface consists of triangles only."""
+        """The triangles of which a surface consists, wholly or in part. The surface is the boundary
+        of a `MeshSolid`, or a level set of the winding number of a mesh, without clip and domain;
+        for other surfaces the result is None.
+
+        If the surface also has parts off the triangles, as that of a mesh with holes, the result
+        has only those triangles that are proved to belong to the surface as a whole."""
         if isinstance(surface.field, MeshSolid) and surface.clip_volume is None:
             if surface.field.domain is not None or any(surface.level_values):
                 return None
@@ -107,22 +109,23 @@ class LevelTriangles:
 def _tree(
     backend: Backend, vertices: FloatArray, faces: Any, *, slabs: bool = False
 ) -> TriangleTree:
-    """The tree of triangles vertices[faces]. slabs: whether its nodes store slabs as well as
-    boxes."""
+    """A tree that finds the nearest of some triangles. vertices: (n, 3). faces: (m, 3). slabs:
+    whether its nodes store slabs, between parallel planes, as well as boxes; they bound flat groups
+    of triangles more tightly."""
     tree = build_balanced_tree(vertices[faces].mean(axis=1), leaf_size=_LEAF_SIZE)
     return TriangleTree.of(backend, tree, triangle_records(vertices, faces), slabs=slabs)
 
 
 def _proved_on_level(surface: TracedSurface, corners: FloatArray, size: float) -> BoolArray:
-    """A mask (k,) of the triangles that are proved to belong to a level as a whole.
+    """(k,) the mask of the triangles that are proved to belong to a level set as a whole.
 
-    corners: (k, 3, 3) of triangles through which no other triangle passes.
-    size: of the mesh.
+    corners: (k, 3, 3) the corners of triangles through which no other triangle passes.
+    size: the size of the mesh, a length.
 
-    Proof. The jumps of f are whole numbers. Without them, f is smooth about the triangle's center,
-    and has no level modulo 1 within the radius that `level_distance_lower_bound` proves. If the
-    ball of that radius about the center contains the triangle, then f, on either side of the whole
-    triangle, is on the same side of the level as right beside the center.
+    Proof. f is the winding number, which jumps by whole numbers. f modulo 1 is smooth around the
+    triangle's center; within the radius that `level_distance_lower_bound` proves, it does not take
+    the level modulo 1. Let the ball of that radius about the center contain the triangle. Then on
+    either side of the triangle, f stays on the side of the level on which it is beside the center.
     """
     backend, field = choose_backend("double"), surface.field
     prepared = surface.evaluator(backend)

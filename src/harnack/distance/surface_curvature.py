@@ -75,8 +75,8 @@ def curvature(
 ) -> CurvatureSamples:
     """Mean and Gaussian curvature of the level sets of a field through points (n, 3).
 
-    surface: a field, or a `Surface` whose levels, clip and section say where it is drawn: the
-        curvature at a point is that of the level set through it, whatever its level.
+    surface: a field, or a `Surface`. The curvature at a point is that of the level set through the
+        point, whatever its level is; levels, clip and section of a `Surface` have no effect.
     options: a `TraceOptions`; curvatures use its `precision` alone. None is double precision.
     keywords: `precision`, in place of `options`.
 
@@ -104,7 +104,9 @@ def curvature(
         prepared = field.prepare(backend)
 
         def from_field(p: Vec3, acceptance: Real) -> tuple[Real | Vec3, ...]:
-            """The curvatures at p by the field's own derivatives."""
+            """The curvatures at p, from the gradient and Hessian that the field computes inside of
+            a kernel (`_Derivatives.curvatures`). acceptance: the acceptance factor of a treecode;
+            the larger it is, the smaller the error."""
             refined = (
                 prepared.at_accuracy(acceptance) if prepared.has_variable_accuracy else prepared
             )
@@ -116,7 +118,9 @@ def curvature(
         return _refine_accuracy(backend, field, from_field, points, prepared.has_variable_accuracy)
 
     def from_tree(p: Vec3, acceptance: Real) -> tuple[Real | Vec3, ...]:
-        """The curvatures at p by the tree sum of a field that is evaluated in batches."""
+        """The curvatures at p, from the tree sums of a field that is evaluated in batches
+        (`_Derivatives.curvatures`). acceptance: the acceptance factor of the treecode; the larger
+        it is, the smaller the error."""
         values = field.values_at(p, 2, acceptance)
         if values.gradient is None or values.hessian is None:
             raise RuntimeError(f"{type(field).__name__}: values_at(x, 2) gave no derivatives")
@@ -136,11 +140,13 @@ def _refine_accuracy(
     points: Any,
     can_refine: bool,
 ) -> CurvatureSamples:
-    """The curvatures at points (n, 3), evaluated again with larger acceptance factors where their
-    error is too large.
+    """The curvatures at points (n, 3). Where their error is too large, they are evaluated again,
+    with
+    a more accurate treecode: with larger acceptance factors (`_ACCEPTANCE_FACTORS`), by which
+    clusters of terms are expanded as a whole only from farther away.
 
-    evaluate: gives the values of `_Derivatives.curvatures` at points, for an acceptance factor (see
-        `_ACCEPTANCE_FACTORS`).
+    evaluate: a function of points and an acceptance factor that returns the values of
+        `_Derivatives.curvatures`.
     can_refine: whether the field's accuracy depends on that factor.
     """
 
@@ -169,8 +175,8 @@ def _refine_accuracy(
 
 
 def _size(field: Field, points: FloatArray) -> float:
-    """The size of the surface: the diagonal of the box that holds it; if there is no finite one,
-    the largest coordinate of the points."""
+    """The size of a field's surface, a length: the diagonal of the box that is proved to contain
+    it. If there is no finite box, the largest absolute coordinate of the points (n, 3)."""
     volume = field.extent((field.default_level,))
     if volume is not None:
         lower, upper = volume.bounds()
@@ -181,7 +187,8 @@ def _size(field: Field, points: FloatArray) -> float:
 
 @dataclass(frozen=True)
 class _Derivatives:
-    """First and second derivatives of f at points, with bounds of their errors.
+    """The first and second derivatives of a function f at points, as computed, with bounds of their
+    errors.
 
     gradient: grad f.
     rows: the three rows of the Hessian.
@@ -196,8 +203,9 @@ class _Derivatives:
     hessian_error: Real
 
     def curvatures(self) -> tuple[Real | Vec3, ...]:
-        """Mean and Gaussian curvature, normal, bounds of the errors of both curvatures, and a
-        number: 0 where the field states that its derivatives are exact, else 1.
+        """Compute the curvatures of the level set. Returns the mean and the Gaussian curvature; the
+        unit normal; bounds of the errors of both curvatures; and a number, which is 0 where the
+        field states that its derivatives have no error, and 1 elsewhere.
 
         Bounds. Let g, A be the computed gradient and Hessian, G = |g|, n = g/G, (u, v) an
         orthonormal basis of the plane at right angles to n, and M = (u, v)^T A (u, v) with T = tr M
@@ -267,7 +275,8 @@ class _Derivatives:
 
 
 def _or_infinite(is_known: Any, error: Real) -> Real:
-    """The error bound rounded up; infinity where it is not known or not finite."""
+    """An error bound rounded up, so that it stays a bound. Infinity in lanes in which the bound is
+    not known (the mask `is_known` is False) or not finite."""
     return dr.select(is_known & dr.isfinite(error), error * (1 + 1e-5), dr.inf)
 
 
@@ -382,8 +391,8 @@ class _LineState:
 
 @dataclass(frozen=True)
 class _CurvatureLineTracer:
-    """Follows the lines of one family. largest: 1 for the family of the larger principal curvature,
-    0 for the smaller."""
+    """Follows the lines of curvature of one family. largest: 1 for the lines along the direction of
+    the larger principal curvature, 0 for those along the smaller one."""
 
     backend: Backend
     field: Field
@@ -422,8 +431,8 @@ class _CurvatureLineTracer:
         return lines[:n], lines[n:]
 
     def _advance(self, state: _LineState) -> tuple[Vec3, Vec3, Mask]:
-        """One Runge-Kutta step. Returns the next point, the principal direction there, and whether
-        that point continues the line."""
+        """Follow all lines of curvature by one step of the Runge-Kutta method. Returns the next
+        points; the unit principal directions there; and the mask of the lines that continue."""
         x, h = state.x, self.step
         first = state.direction
         second, _ = self._direction(x + 0.5 * h * first, first)
@@ -435,8 +444,11 @@ class _CurvatureLineTracer:
         return end, last, is_known & (dr.dot(first, last) > _MIN_STEP_COSINE)
 
     def _direction(self, x: Vec3, previous: Vec3 | None) -> tuple[Vec3, Mask]:
-        """The principal direction at x, with the sign that agrees with `previous` (either sign if
-        that is None); and whether it is well defined and the step short enough for the curvature.
+        """The unit principal direction at x; and the mask of the lanes in which the line can be
+        continued there: the direction is well defined, and the step is short enough for the
+        curvature.
+
+        previous: the direction before, with which the sign of the result agrees; None for any sign.
         """
         plane = TangentPlane.of(self.field.evaluate(x).gradient)
         eigen = SymmetricEigen2.of(*plane.restrict_hessian(self.field.hessian(x)))
@@ -453,7 +465,8 @@ class _CurvatureLineTracer:
         )
 
     def _on_surface(self, x: Vec3, steps: int) -> Vec3:
-        """x after `steps` steps of Newton's method along the gradient, towards the level."""
+        """The point to which `steps` steps of Newton's method along the gradient lead from x,
+        toward the level set."""
 
         def step(x: Vec3) -> Vec3:
             sample = self.field.evaluate(x)
@@ -466,7 +479,8 @@ class _CurvatureLineTracer:
 
 
 def _iterate(step: Callable[[Vec3], Vec3], x: Vec3, times: int, backend: Backend) -> Vec3:
-    """The result of `step` applied `times` times to x; the kernel contains it once."""
+    """The result of applying the function `step` to x `times` times. It is a loop of the kernel, so
+    that the compiled kernel contains the code of `step` only once."""
     if times == 1:
         return step(x)
 
@@ -484,10 +498,14 @@ def _iterate(step: Callable[[Vec3], Vec3], x: Vec3, times: int, backend: Backend
 def _join_halves(
     ahead: FloatArray, behind: FloatArray, step: float, clip: Volume | None
 ) -> FloatArray:
-    """One polyline (k, 3) from the two halves of a line, which begin at its seed.
+    """Join the two halves of a line of curvature, which both begin at its seed, to one polyline
+    (k, 3).
 
-    Each half is first cut where it leaves the clip volume. If `ahead` returns to the seed, the line
-    is closed: it is `ahead` up to there, and ends with the seed again.
+    ahead, behind: (i, 3), (j, 3) the halves. step: the arc length of a step.
+    clip: the volume at whose boundary the halves are cut; None for no cut.
+
+    If `ahead` returns to the seed, the line is closed. Then the result is `ahead` up to there, and
+    it ends with the seed again.
     """
     if clip is not None:
         ahead, behind = (_until_exit(half, clip) for half in (ahead, behind))
@@ -510,7 +528,8 @@ def _join_halves(
 
 
 def _after_second_step(count: int) -> BoolArray:
-    """A mask (count,) of the steps of a line, False for the first two, which pass near the seed."""
+    """(count,) a mask of the points of a line that is False for the first two and True for all
+    others. The first two are near the seed even if the line does not return to it."""
     return np.arange(count) > 1
 
 

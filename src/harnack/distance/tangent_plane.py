@@ -53,15 +53,16 @@ class TangentPlane:
         return cls(gradient_norm, n, u, v)
 
     def restrict_hessian(self, rows: tuple[Vec3, Vec3, Vec3]) -> tuple[Real, Real, Real]:
-        """u.Au, v.Av and u.Av of a symmetric matrix A given by its rows."""
+        """The numbers u.Au, v.Av and u.Av for a symmetric 3x3 matrix A, such as a Hessian, where u
+        and v are the unit tangents of the plane. rows: the three rows of A."""
         along_u, along_v = matvec(rows, self.u), matvec(rows, self.v)
         return dr.dot(self.u, along_u), dr.dot(self.v, along_v), dr.dot(self.u, along_v)
 
 
 @dataclass(frozen=True)
 class SymmetricEigen2:
-    """The two eigenvalues of a symmetric 2x2 matrix; (cosine, sine) is the unit eigenvector of the
-    larger one."""
+    """The eigenvalues and eigenvectors of a symmetric 2x2 matrix. (cosine, sine) is the unit
+    eigenvector of the larger eigenvalue, (-sine, cosine) that of the smaller one."""
 
     largest: Real
     smallest: Real
@@ -85,8 +86,8 @@ class SymmetricEigen2:
         )
 
     def combination(self, most: Real, least: Real) -> tuple[Real, Real]:
-        """The vector (u, v) with these coordinates in the basis of eigenvectors; `most`
-        belongs to the larger eigenvalue."""
+        """The vector (u, v) whose coordinates in the basis of unit eigenvectors are `most`, for the
+        eigenvector of the larger eigenvalue, and `least`, for the other."""
         return (
             dr.fma(self.cosine, most, -self.sine * least),
             dr.fma(self.sine, most, self.cosine * least),
@@ -108,7 +109,8 @@ def matvec(rows: tuple[Vec3, Vec3, Vec3], vector: Vec3) -> Vec3:
 
 
 def first_order_distance(above: Real, gradient: Vec3) -> Real:
-    """above/|grad f| with above = f - level. Off by O(d^2) at distance d from a smooth surface.
+    """The first-order estimate of the signed distance from a level set: above/|grad f|, where
+    above = f - level. Its error is O(d^2) at the distance d from a smooth surface.
 
     Proof. Let y be the closest point of the level set, N its normal grad f/|grad f|(y), and
     x = y + d N (x - y is normal at the closest point; d has the sign of above). Taylor's formula
@@ -121,10 +123,12 @@ def first_order_distance(above: Real, gradient: Vec3) -> Real:
 
 
 def second_order_distance(above: Real, gradient: Vec3, rows: tuple[Vec3, Vec3, Vec3]) -> Real:
-    """d1/(1 - k d1/2) with d1 = above/|grad f|, k = n.An/|grad f|: off by O(d^3).
+    """The second-order estimate of the signed distance d of a point x from a level set:
+    d1/(1 - k d1/2) with above = f - level, d1 = above/|grad f| and k = n.An/|grad f|. Its error is
+    O(d^3).
 
-    n is the unit gradient, A the Hessian, both at x; k is how fast the slope changes along n, not
-    a curvature of the surface.
+    gradient, rows: grad f at x, and the three rows of the Hessian A there; n is the unit gradient.
+    k tells how fast the slope changes along n; it is not a curvature of the surface.
 
     Proof. With x = y + d N as in `first_order_distance`, Taylor along that line is
     above = d N.g - d^2 N.AN/2 + O(d^3), whose root is d = e + (N.AN/N.g) e^2/2 + O(d^3) with
@@ -160,11 +164,12 @@ def in_batches(
     points: Any,
     *others: FloatArray,
 ) -> tuple[Any, ...]:
-    """The results of `compute` for points of shape (n, 3), as float64 arrays (n,) or (n, 3).
+    """Evaluate a function of Dr.Jit vectors at points (n, 3), for one batch after the other.
+    Returns its results as a tuple of float64 arrays, (n,) for numbers and (n, 3) for vectors.
 
-    compute: a function of Dr.Jit vectors that returns a tuple of numbers and vectors.
-    others: further arguments of `compute`, of the same shape as the points; their values are not
-        checked.
+    compute: the function. It takes the points, and one vector for each of `others`, and returns a
+        tuple of numbers and vectors.
+    others: further arguments of `compute`, arrays (n, 3) each, whose values are not checked.
 
     Raises:
         TypeError, ValueError: points that are not an (n, 3) array of finite numbers of at most

@@ -49,8 +49,9 @@ class FileLocation:
 
 @dataclass(frozen=True, eq=False)
 class FileLocations:
-    """The locations of the members of a list in a file. numbers: the number of each member, such as
-    its line."""
+    """The locations in a file of all members of a list, such as of all vertices.
+
+    numbers: for each member, the number of its line, or its position in the file."""
 
     path: Path
     noun: str
@@ -112,30 +113,34 @@ class FileGeometry:
 
 
 def ranks_in_lists(sizes: IntArray) -> IntArray:
-    """The position of each entry within its list, for lists of these sizes stored one after the
-    other: 0 to size - 1 for each list."""
+    """For lists that are stored one after the other in one array, the position of each entry within
+    its own list: 0 to size - 1 for each list. sizes: (m,) the lengths of the lists."""
     ranks = np.arange(int(sizes.sum()), dtype=np.int64)
     ranks -= np.repeat(np.cumsum(sizes) - sizes, sizes)
     return ranks
 
 
 def triangles_as_polygons(path: Path, corners: IntArray) -> PolygonList:
-    """Triangles (m, 3) as polygons."""
+    """The triangles with the vertex indices `corners` (m, 3), read from the file `path`, as a
+    `PolygonList`."""
     sizes = np.full(len(corners), 3, dtype=np.int64)
     return PolygonList(corners.ravel(), sizes, FileLocations(path, "triangle", range(len(corners))))
 
 
 def check_finite(coordinates: FloatArray, places: FileLocations) -> None:
-    """Raise FileFormatError for the first row (n, k) with a number that is not finite."""
+    """Raise a FileFormatError if a number in the rows (n, k) of `coordinates` is not finite. The
+    message names the location of the first such row. places: the locations of the rows."""
     wrong = np.flatnonzero(~np.isfinite(coordinates).all(axis=1))
     if wrong.size:
         raise places[wrong[0]].error("coordinates must be finite")
 
 
 def check_indices(polygons: PolygonList, count: int, *, first: int = 0) -> None:
-    """Raise FileFormatError for the first index outside of [0, count).
+    """Raise a FileFormatError if a vertex index of the polygons is outside of [0, count). The
+    message names the first such index and its location.
 
-    first: the index that the file gives its first vertex, for messages.
+    count: the number of vertices.
+    first: the index that the file's format gives to the first vertex (0 or 1), for the message.
     """
     corners = polygons.corners
     wrong = np.flatnonzero((corners < 0) | (corners >= count))
@@ -149,7 +154,8 @@ def read_bytes(path: Path) -> bytes:
     """All bytes of a file.
 
     Raises:
-        FileFormatError: missing, a directory or a device, unreadable, empty, above 256 MiB.
+        FileFormatError: the file is missing, a directory or a device, unreadable, empty, or larger
+            than 256 MiB.
     """
     place = FileLocation(path)
     try:
@@ -175,7 +181,8 @@ def read_bytes(path: Path) -> bytes:
 
 
 def check_element_count(place: FileLocation, count: int) -> None:
-    """Raise FileFormatError for more than MAX_ELEMENTS vertices, faces and lines."""
+    """Raise a FileFormatError if `count`, the number of vertices, faces and lines that a file
+    declares, is larger than MAX_ELEMENTS. place: the location that the message names."""
     if count > MAX_ELEMENTS:
         raise place.error(
             f"{count:,} elements are too many in a file whose faces differ in size: at most "
@@ -235,7 +242,8 @@ def check_writable(path: str | os.PathLike[str]) -> None:
 
 
 def _writable_target(path: str | os.PathLike[str]) -> Path:
-    """The file that `path` names, links followed."""
+    """The file to which `path` leads if symbolic links are followed. Raises an OSError if a file
+    cannot be written there."""
     cannot = f"cannot write {_printable_path(path)}"
     try:
         target = Path(os.path.realpath(path))
@@ -263,8 +271,9 @@ def _remove(partial: Path) -> None:
 
 
 def _partial_name(target: Path) -> Path:
-    """A random name for a partial file beside the target. It is not longer than the target's name
-    if that is long, so that the file system accepts it as well."""
+    """A random name, in the folder of `target`, for the file that is written first and then renamed
+    to `target`. If the target's name is long, this name is no longer, so that the file system
+    accepts it as well."""
     token = f".{secrets.token_hex(4)}.partial"
     stem = os.fsencode(target.stem)
     prefix = os.fsdecode(stem[: max(0, len(stem) - len(token) - 1)])
@@ -288,7 +297,8 @@ def _printable_path(path: str | os.PathLike[str]) -> str:
 
 
 def _write_error(path: str | os.PathLike[str], error: OSError) -> OSError:
-    """The error that says which file could not be written, why, and what to do."""
+    """An OSError of the kind of `error`, whose message says that the file `path` could not be
+    written, why, and what to do."""
     number = error.errno
     reason = _WRITE_ADVICE.get(number or 0) or f"{error.strerror or error}; name a file elsewhere"
     write_error = type(error)(f"cannot write {_printable_path(path)}: {reason}")

@@ -1,5 +1,5 @@
-"""Readers of geometry files, meshes, clouds, closed curves, blobs and molecules, by the extension
-of the file, with a summary of the contents."""
+"""Readers of files with meshes, point clouds, closed curves, blobs or molecules. The extension of
+the file's name decides how it is read. Results contain a summary of the file's contents."""
 
 from __future__ import annotations
 
@@ -93,14 +93,18 @@ def read_loops(path: str | os.PathLike[str], *, boundary: bool = False) -> list[
 
 
 def closed_curves_of(contents: FileGeometry, *, boundary: bool = False) -> list[FloatArray]:
-    """The closed curves of an .obj or .ply file whose contents were read; see `read_loops`."""
+    """The closed curves, arrays (n, 3), in the contents of an .obj or .ply file, by the rules of
+    `read_loops`.
+
+    contents: what was read from the file.
+    boundary: whether to return the boundary of the surface that the faces form, not the faces."""
     placed = _boundary_loops(contents) if boundary else _all_loops(contents)
     return [_validated(loop, place) for loop, place in placed]
 
 
 def _validated(loop: FloatArray, place: FileLocation) -> FloatArray:
-    """The loop, validated as a closed curve; raises a FileFormatError with its place if it is
-    none."""
+    """The loop (n, 3), after a check that it is a valid closed curve. Raises a FileFormatError that
+    names its place in the file if it is not."""
     try:
         return validate_loops(loop)[0]
     except CurveError as error:
@@ -108,8 +112,8 @@ def _validated(loop: FloatArray, place: FileLocation) -> FloatArray:
 
 
 def _all_loops(contents: FileGeometry) -> list[LocatedLoop]:
-    """The closed curves of a file, and their places: its faces and its joined polylines; the
-    vertices of a .ply file without either are a single loop.
+    """The closed curves of a file, each with its place in the file. These are its faces and its
+    polylines, joined end to end. If a .ply file has neither, its vertices are a single curve.
 
     Raises:
         FileFormatError: there are none, or polylines are open.
@@ -126,8 +130,8 @@ def _all_loops(contents: FileGeometry) -> list[LocatedLoop]:
 
 
 def _joined_polylines(contents: FileGeometry) -> list[LocatedLoop]:
-    """The closed curves that the polylines of a file form, and their places: closed polylines as
-    they are, the edges of all others joined.
+    """The closed curves that the polylines of a file form, each with its place in the file. A
+    polyline that is closed is a curve; the edges of all other polylines are joined to curves.
 
     Raises:
         FileFormatError: an edge of length zero, or edges that do not form closed curves.
@@ -154,7 +158,8 @@ def _joined_polylines(contents: FileGeometry) -> list[LocatedLoop]:
 
 
 def _open_message(error: OpenChainError, position: FloatArray) -> str:
-    """The message about edges that do not form closed curves at a vertex at `position`."""
+    """The message of an error about edges that cannot be joined to closed curves, because at the
+    vertex at `position` (3,) they end, or more than two meet."""
     point = position.tolist()
     if error.count == 1:
         return (
@@ -168,7 +173,8 @@ def _open_message(error: OpenChainError, position: FloatArray) -> str:
 
 
 def _boundary_loops(contents: FileGeometry) -> list[LocatedLoop]:
-    """The loops of the boundary of a file's faces, and their place.
+    """The closed curves that form the boundary of the surface of a file's faces, each with its
+    place in the file.
 
     Raises:
         FileFormatError: there are no faces, or their surface is closed.
@@ -291,7 +297,8 @@ def read_geometry(path: str | os.PathLike[str], read_as: ReadAs | None = None) -
 
 
 def _read_geometry(path: Path, kind: str, read_as: ReadAs | None) -> LoadedGeometry:
-    """`read_geometry` for a valid extension `kind` and a valid `read_as`."""
+    """Read a file of the format `kind` (an extension such as ".obj") in the way `read_as`: the work
+    of `read_geometry` after both have been checked."""
     if kind == ".blobs":
         _check_convertible(path, read_as, (), "blobs")
         return read_metaballs(path, read_bytes(path))
@@ -320,8 +327,8 @@ def _read_geometry(path: Path, kind: str, read_as: ReadAs | None) -> LoadedGeome
 def _check_convertible(
     path: Path, read_as: ReadAs | None, choices: tuple[str, ...], noun: str
 ) -> None:
-    """Raise a FileFormatError unless `read_as` is None or one of `choices`. noun: the contents of
-    the file, for the message."""
+    """Raise a FileFormatError if the contents of a file cannot be read in the way `read_as`, that
+    is, unless it is None or one of `choices`. noun: what the contents are, for the message."""
     needs = {
         "winding": "faces", "dipole": "points or faces", "loops": "polylines or faces",
         "polygons": "faces",
@@ -335,8 +342,9 @@ def _check_convertible(
 def _interpret_faces(
     contents: FileGeometry, read_as: ReadAs | None
 ) -> LoadedMesh | LoadedCloud | LoadedCurves | LoadedPolygons:
-    """The faces of a file as a mesh, cloud, curves or polygons, as `read_as` says; None decides
-    between mesh and curves."""
+    """The faces in the contents of a file, in the form that `read_as` asks for: a mesh, a cloud of
+    points, closed curves or polygons. None means a mesh or curves, whichever the faces look like
+    (`_looks_like_curves`)."""
     if read_as == "polygons":
         return _polygons(contents)
     can_be_loops = contents.path.suffix.lower() in _LOOP_FILES
@@ -357,7 +365,7 @@ def _interpret_faces(
 
 
 def _polygons(contents: FileGeometry) -> LoadedPolygons:
-    """The polygons of a file with three corners or more, each to be spanned by a surface."""
+    """The polygons of a file that have three corners or more, not triangulated."""
     sizes = contents.faces.sizes
     ends, indices = np.cumsum(sizes), np.flatnonzero(sizes >= 3)
     polygons = [contents.faces.corners[ends[k] - sizes[k] : ends[k]] for k in indices]
@@ -370,7 +378,8 @@ def _polygons(contents: FileGeometry) -> LoadedPolygons:
 
 
 def _looks_like_curves(contents: FileGeometry) -> bool:
-    """Whether a polygon has more than four corners, and no two polygons share an edge."""
+    """Whether the polygons of a file are probably meant as curves and not as the faces of a mesh:
+    some polygon has more than four corners, and no two polygons share an edge."""
     faces = contents.faces
     if faces.sizes.max() <= 4:
         return False
@@ -430,7 +439,7 @@ def _mesh_to_cloud(mesh: LoadedMesh) -> LoadedCloud:
 
 
 def _mesh_to_boundary(path: Path, mesh: LoadedMesh) -> LoadedCurves:
-    """The boundary of a mesh's faces as loops.
+    """The boundary of a mesh's faces as closed curves. path: of the file, for errors.
 
     Raises:
         FileFormatError: the faces have no boundary, or it is not a valid curve.
@@ -464,7 +473,8 @@ def _cloud(contents: FileGeometry) -> LoadedCloud:
 
 
 def _as_curves(loops: list[FloatArray], reason: str) -> LoadedCurves:
-    """The loops with their summary. reason: why they are read as curves."""
+    """Closed curves (n, 3) as a `LoadedCurves`, with a summary that gives their number and the
+    reason why the file is read as curves."""
     noun = "loop" if len(loops) == 1 else "loops"
     return LoadedCurves(
         tuple(loops), f"{len(loops):,} {noun} of {sum(map(len, loops)):,} vertices: {reason}"

@@ -42,11 +42,14 @@ _IGNORED_EXTENSIONS = ("KHR_materials", "KHR_texture", "KHR_lights", "EXT_textur
 
 
 def read_gltf(path: Path, data: bytes) -> FileGeometry:
-    """All triangles of a scene, placed by its nodes; if it has none, its points.
+    """All triangles of the scene in a .glb or .gltf file, moved to the positions that its nodes
+    give them. If it has no triangles, all its points.
+
+    data: the bytes of the file.
 
     Raises:
-        FileFormatError: truncated, malformed, asking for more data than it holds, compressed, a
-            referenced file that is missing, neither triangles nor points.
+        FileFormatError: the file is truncated, malformed or compressed; it asks for more data than
+            it holds; a file that it refers to is missing; or it has neither triangles nor points.
     """
     import trimesh  # here, since it takes half a second
 
@@ -102,7 +105,8 @@ def _header(place: FileLocation, data: bytes) -> dict[str, Any]:
 
 
 def _buffer_files(path: Path, header: dict[str, Any]) -> dict[str, bytes]:
-    """The contents of the separate files in which a scene stores its buffers."""
+    """The contents of the separate files in which a scene stores its buffers, by the names that the
+    header gives them. path: of the scene's file."""
     files: dict[str, bytes] = {}
     for buffer in header.get("buffers", []):
         uri: Any = buffer.get("uri")
@@ -120,9 +124,10 @@ def _buffer_files(path: Path, header: dict[str, Any]) -> dict[str, bytes]:
 
 
 def _check_header(place: FileLocation, header: dict[str, Any], size: int) -> None:
-    """Refuse headers that need unsupported extensions or features, or that ask for more data than
-    the file has. size: of the file and its buffers, in bytes. A malformed header may raise any
-    error."""
+    """Raise a FileFormatError if a header needs extensions or features that are not supported, or
+    asks for more data than the file has. A malformed header may raise an error of any type.
+
+    size: the number of bytes of the file and its buffers."""
     for name in header.get("extensionsRequired", []):
         if not str(name).startswith(_IGNORED_EXTENSIONS):
             raise place.error(f"it needs the extension {name}, which is not read: save it without")
@@ -148,8 +153,8 @@ def _check_header(place: FileLocation, header: dict[str, Any], size: int) -> Non
 
 
 def _check_supported(place: FileLocation, header: dict[str, Any]) -> None:
-    """Refuse scenes with features that are not supported: vertices that are moved by anything but
-    nodes, fans of triangles, and points or lines beside triangles."""
+    """Raise a FileFormatError if a scene has features that are not supported: vertices that are
+    moved by skins or morph targets, fans of triangles, or points or lines beside triangles."""
     nodes: list[Any] = header.get("nodes", [])
     meshes: list[Any] = header.get("meshes", [])
     if any("skin" in node for node in nodes):
@@ -168,7 +173,8 @@ def _check_supported(place: FileLocation, header: dict[str, Any]) -> None:
 
 
 def _corner_counts(place: FileLocation, header: dict[str, Any], accessors: list[Any]) -> list[int]:
-    """The number of corners that each mesh of the header lists."""
+    """For each mesh in the header of a scene, the number of triangle corners that it lists.
+    accessors: the header's descriptions of arrays, which contain their lengths."""
     corner_counts: list[int] = []
     for mesh in header.get("meshes", []):
         total = 0
@@ -185,8 +191,10 @@ def _corner_counts(place: FileLocation, header: dict[str, Any], accessors: list[
 
 
 def _check_nodes(place: FileLocation, header: dict[str, Any], corner_counts: list[int]) -> None:
-    """Refuse nodes that do not form trees of moderate depth, or whose meshes have too many corners
-    in all. corner_counts: the number of corners of each mesh."""
+    """Raise a FileFormatError if the nodes of a scene do not form trees, or trees that are too
+    deep; or if the meshes at all nodes together have too many corners.
+
+    corner_counts: the number of corners of each mesh."""
     nodes: list[Any] = header.get("nodes", [])
     children = {k: node.get("children", []) for k, node in enumerate(nodes)}
     descendants = [child for child_list in children.values() for child in child_list]

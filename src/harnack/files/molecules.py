@@ -54,7 +54,9 @@ def read_molecule(path: str | os.PathLike[str]) -> Atoms:
 
 
 def parse_molecule(path: Path, data: bytes) -> Atoms:
-    """The atoms of a file with these contents; see `read_molecule`."""
+    """The atoms in the bytes `data` of a molecule's file: those of the first model, without
+    alternatives, water and hydrogen (`read_molecule`). path: of the file, whose extension gives the
+    format."""
     place = FileLocation(path)
     if b"\0" in data:
         raise place.error("this is binary data, not the text that its extension announces")
@@ -96,9 +98,9 @@ def parse_molecule(path: Path, data: bytes) -> Atoms:
 
 
 def _text(data: bytes, *, is_cif: bool) -> str:
-    """The text of a file, without byte order mark and with uniform line ends. In .pdb files, whose
-    format counts columns and in which gemmi counts bytes, each non-ASCII letter becomes a single
-    byte."""
+    """The text of a molecule's file, without byte order mark, and with "\\n" as line end. In the
+    text of a .pdb file, each non-ASCII letter is replaced by a single byte: the format is given by
+    columns, which gemmi counts in bytes."""
     data = data.removeprefix(b"\xef\xbb\xbf")
     if is_cif:
         return data.decode("utf-8", "replace")
@@ -111,9 +113,10 @@ def _text(data: bytes, *, is_cif: bool) -> str:
 
 
 def _drop_alternate_locations(model: Any) -> list[Any]:
-    """The atoms of a model without alternatives. Among atoms that are marked as alternatives by
-    different letters, only the first of each name is kept, in the first residue at each position. A
-    line TER ends a chain: the same residue number after it is another position.
+    """The atoms of a model of a molecule, without alternatives. Of several residues at the same
+    position only the first is kept; in a residue, of several atoms with the same name that are
+    marked by different letters as alternatives, only the first. A line TER in the file ends a
+    chain; the same residue number after it stands for another position.
     """
     residues: dict[tuple[int, str], tuple[str, str]] = {}
     first_altlocs: dict[tuple[int, str, str, str], str] = {}
@@ -139,12 +142,14 @@ def _count_atom_lines(text: str) -> int:
 
 
 def _check_coordinates(path: Path, text: str) -> None:
-    """Check that columns 31 to 54 of all atoms are three numbers. gemmi would read a word as 0, and
-    of digits before a letter the digits alone. As in gemmi, a line is an atom by its first four
-    letters, in upper or lower case, since serial numbers above 99,999 may follow directly.
+    """Check that columns 31 to 54 of each line of a .pdb file that describes an atom are three
+    numbers. gemmi does not check this: it reads a word as 0, and "12x" as 12.
+
+    As in gemmi, a line describes an atom if its first four letters, in upper or lower case, say so,
+    since a serial number above 99,999 may follow directly.
 
     Raises:
-        FileFormatError: the message names the first line where they are not.
+        FileFormatError: some line has other columns; the message names the first one.
     """
     for number, line in enumerate(text.split("\n"), start=1):
         if line[:4].upper() not in _ATOM_LINES:

@@ -36,8 +36,9 @@ _MAX_SIDES = 100_000
 
 
 def regular_polygon(sides: int, radius: float) -> Outline:
-    """The regular polygon with this number of sides, at least 3, its corners at `radius` from the
-    origin, the first on the x axis: `Extrusion(regular_polygon(6, 5.0), height)` is a prism.
+    """The regular polygon with this number of sides, at least 3. Its corners have the distance
+    `radius` from the origin, and the first one is on the x axis. For example,
+    `Extrusion(regular_polygon(6, 5.0), height)` is a hexagonal prism.
 
     Raises:
         ValueError: fewer sides, or a radius that is not positive.
@@ -110,10 +111,11 @@ def text(
 
 
 def _text_line_loops(line: str, font: Any, size: float, max_error: float) -> list[FloatArray]:
-    """The loops (n, 2) of a line of text.
+    """The closed polygons (n, 2) that outline the letters of a line of text.
 
-    font: as in `text`.
-    max_error: the largest distance between a polygon and the curve of a letter.
+    font: the name of a font file (.ttf, .otf) or of an installed family; None for the default.
+    size: the size of the font, in units of length.
+    max_error: the largest distance between a polygon and the curve of a letter, a length.
 
     Raises:
         ValueError: an unknown font, or a letter that it lacks.
@@ -153,8 +155,10 @@ _POINTS_OF_CODE = {2: 1, 3: 2, 4: 3}
 
 
 def _path_to_loops(points: FloatArray, codes: list[int], max_error: float) -> list[FloatArray]:
-    """The closed loops (n, 2) of a path of matplotlib. Its curves are flattened within the distance
-    `max_error`."""
+    """The closed polygons (n, 2) of a path of matplotlib, with its curves replaced by polylines
+    within the distance `max_error`.
+
+    points, codes: (k, 2), (k,) the path's points, and the code of matplotlib for what each is."""
     loops: list[list[FloatArray]] = []
     k = 0
     while k < len(codes):
@@ -172,7 +176,8 @@ def _path_to_loops(points: FloatArray, codes: list[int], max_error: float) -> li
 
 
 def _drop_degenerate_loops(loops: list[FloatArray]) -> list[FloatArray]:
-    """The loops with at least three different points; all others enclose nothing."""
+    """Those of the loops (n, 2) that have at least three different points. Loops with fewer points
+    enclose no area."""
     return [loop for loop in loops if len(np.unique(loop, axis=0)) > 2]
 
 
@@ -238,8 +243,8 @@ def _parse_svg(data: bytes) -> Element:
     count = depth = 0
 
     def start_element(name: str, attributes: dict[str, str]) -> None:
-        """Add an element, without the prefix of its name. Raises a ValueError if there are too
-        many."""
+        """Add an element of the XML file to the tree, with its name without the prefix of the
+        namespace. Raises a ValueError if there are too many elements."""
         nonlocal count, depth
         count, depth = count + 1, depth + 1
         if count > _MAX_SVG_ELEMENTS or depth > _MAX_SVG_DEPTH:
@@ -270,10 +275,10 @@ def _parse_svg(data: bytes) -> Element:
 def _filled_shapes(
     element: Element, transform: FloatArray, inherited: dict[str, str]
 ) -> Iterator[tuple[str, FloatArray, FillingRule]]:
-    """The filled shapes of an element and the elements in it: the path data, transform (3, 3) and
-    fill rule of each.
+    """Yield the filled shapes of an SVG element and of all elements in it. A shape is given by its
+    path data, its transform (3, 3) to the picture's coordinates, and its fill rule.
 
-    transform: of the element's parent.
+    transform: (3, 3) the transform of the element's parent.
     inherited: the style properties that the parent passes on.
 
     Raises:
@@ -321,8 +326,9 @@ _CUTTING = ("clip-path", "mask")
 
 
 def _styles(element: Element) -> dict[str, str]:
-    """The properties of an element by name; its style overrides its attributes. A transform is
-    included only if it is in the style."""
+    """The style properties of an SVG element, by name. They are given by its attributes and by its
+    attribute `style`, which overrides the others. A transform is included only if it is in
+    `style`."""
     names = (*_INHERITED, *_CUTTING, "transform-origin")
     styles = {name: element.attrib[name].strip() for name in names if name in element.attrib}
     names = (*names, "transform")
@@ -373,9 +379,10 @@ def _outline_of(
 ) -> Outline:
     """The outline of the union of filled shapes, y upwards.
 
-    shapes: as `_filled_shapes` gives them.
+    shapes: for each shape its path data, its transform (3, 3), and its fill rule.
     scale: the length of the file's unit.
-    tolerance: in the file's unit; None for the default.
+    tolerance: the largest distance between polygons and curves, in the file's unit; None for a
+        thousandth of the picture's size.
 
     Raises:
         ValueError: nothing is filled.
@@ -404,7 +411,7 @@ def _outline_of(
 
 
 def _segments(data: str) -> list[Any]:
-    """The segments of path data.
+    """The segments (lines, Bezier curves and arcs, objects of svgpathtools) of SVG path data.
 
     Raises:
         ValueError: malformed data, or a number that is not finite.
@@ -427,8 +434,9 @@ def _segments(data: str) -> list[Any]:
 
 
 def _loops(segments: list[Any], matrix: FloatArray, tolerance: float) -> list[FloatArray]:
-    """The closed loops (n, 2) of segments, under a transform (3, 3). A loop consists of segments
-    each of which begins where the one before ends. Curves are flattened within `tolerance`."""
+    """The closed polygons (n, 2) that the segments of an SVG path form, under the transform
+    `matrix` (3, 3). A polygon is made of consecutive segments, each of which begins where the one
+    before ends. Curves are replaced by polylines within the distance `tolerance`."""
     loops: list[list[FloatArray]] = []
     end_point: complex | None = None
     for segment in segments:
@@ -449,9 +457,11 @@ def _loops(segments: list[Any], matrix: FloatArray, tolerance: float) -> list[Fl
 
 
 def _arc(arc: Any, matrix: FloatArray, tolerance: float) -> FloatArray:
-    """The points (n, 2) of a polyline within `tolerance` of an elliptic arc, without the arc's
-    first point, under a transform. n chords of an arc of angle a are within r (a/n)^2/8 of it,
-    where r is its larger radius."""
+    """A polyline within `tolerance` of an elliptic arc, under the transform `matrix` (3, 3).
+    Returns its points (n, 2) without the first one.
+
+    The number of chords follows from a bound of their error: if an arc of the angle a and the
+    larger radius r is divided into n chords, they are within r (a/n)^2/8 of it."""
     angle = math.radians(abs(float(arc.delta)))
     max_radius = max(abs(arc.radius.real), abs(arc.radius.imag))
     max_radius *= float(np.linalg.norm(matrix[:2, :2], 2))
@@ -464,7 +474,7 @@ def _arc(arc: Any, matrix: FloatArray, tolerance: float) -> FloatArray:
 
 
 def _transform_points(matrix: FloatArray, points: list[complex]) -> FloatArray:
-    """Points given as complex numbers x + i y, under a transform (3, 3): (n, 2)."""
+    """(n, 2) points, given as complex numbers x + i y, under the transform `matrix` (3, 3)."""
     return np.array([_xy(point) for point in points]) @ matrix[:2, :2].T + matrix[:2, 2]
 
 

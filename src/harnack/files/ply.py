@@ -1,8 +1,9 @@
-"""Reading Stanford .ply, ascii and binary: vertices, faces and edges; all other elements are
+"""Reading Stanford .ply files, ascii and binary: vertices, faces and edges. Other elements are
 ignored.
 
-All rows of an element are read at once, property by property: the position of a property in each
-row follows from the properties before it and the lengths of the lists among them.
+A file is a header and rows of elements, such as one row for each vertex. Properties of a row are
+numbers or lists. Each property is read in all rows of an element at once; its position in a row
+follows from the properties before it, and the lengths of the lists among these.
 """
 
 from __future__ import annotations
@@ -57,8 +58,11 @@ _PADDING = b"\0 \t\r\n"
 
 @dataclass(frozen=True)
 class Property:
-    """A property of an element. code: the type of its values; length_code: the type of the length,
-    for a list."""
+    """A property that the header of a .ply file declares: a number, or a list of numbers, in each
+    row of an element.
+
+    code: the type of the numbers, as a format character of the module `struct`.
+    length_code: for a list, the type of its length; None for a single number."""
 
     name: str
     code: str
@@ -77,8 +81,10 @@ class PlyElement:
 
 @dataclass(frozen=True)
 class PlyHeader:
-    """The header of a PLY file. byte_order: "<" or ">", "" for ascii. size, lines: the bytes and
-    the lines before the first row."""
+    """The header of a .ply file.
+
+    byte_order: "<" or ">" for a binary file, "" for ascii.
+    size, lines: the number of bytes and the number of lines before the first row."""
 
     byte_order: str
     elements: tuple[PlyElement, ...]
@@ -86,13 +92,13 @@ class PlyHeader:
     lines: int
 
     def declared_rows(self, size: int) -> int:
-        """The number of rows that the header declares. `size`, of the file, limits the count of
-        each element: a file has no room for more."""
+        """The number of rows that the header declares for all elements. The number for a single
+        element counts as at most `size`, the file's size in bytes, as a file cannot hold more."""
         return sum(min(section.count, size) for section in self.elements)
 
 
 class BinaryValues:
-    """The numbers in the bytes of a file, read at byte positions."""
+    """The bytes of a binary file, from which numbers are read at byte positions."""
 
     def __init__(self, data: bytes, byte_order: str) -> None:
         self.size = len(data)
@@ -100,21 +106,24 @@ class BinaryValues:
         self.byte_order = byte_order
 
     def read(self, where: IntArray, code: str) -> npt.NDArray[Any]:
-        """The numbers at byte positions. Positions outside of the file give arbitrary numbers:
-        `_columns` and its callers detect them by the ends of the rows."""
+        """The numbers that are stored at the byte positions `where` (n,). code: their type, a
+        format character of the module `struct`.
+
+        A position outside of the file gives an arbitrary number. Callers detect such positions,
+        since the rows that contain them end after the file's end."""
         kind = np.dtype(self.byte_order + code)
         last_position = self.size - kind.itemsize  # the header alone is longer than a number
         all_numbers = np.ndarray((last_position + 1,), kind, self.data, strides=(1,))
         return all_numbers[np.clip(where, 0, last_position)].astype(kind.newbyteorder("="))
 
     def width(self, code: str) -> int:
-        """The number of bytes that a number takes."""
+        """The number of bytes of a number of the type `code`, a format character of `struct`."""
         return struct.calcsize("=" + code)
 
 
 class TextValues:
-    """The numbers of an element in a text file, read at positions counted in words. counts: (n,)
-    the number of words of each row."""
+    """The numbers of all rows of an element in a text file, read at positions counted in words from
+    the first row. counts: (n,) the number of words of each row."""
 
     def __init__(self, rows: TextLines) -> None:
         numbers, self.counts = read_floats(rows, convert=_any_number)
@@ -122,15 +131,16 @@ class TextValues:
         self.size = len(numbers)
 
     def read(self, where: IntArray, code: str) -> npt.NDArray[Any]:
-        """The numbers at these positions; as integers if `code` is an integer type and all of them
-        are whole. Positions outside give arbitrary numbers."""
+        """The numbers at the word positions `where` (n,). They are returned as integers if `code`
+        (a format character of `struct`) is an integer type and all of them are whole. A position
+        outside of the rows gives an arbitrary number."""
         values = self._numbers[np.clip(where, 0, self.size)]
         if code in "fd" or (values != np.rint(values)).any():
             return values
         return np.clip(values, -(2.0**53), 2.0**53).astype(np.int64)
 
     def width(self, code: str) -> int:
-        """The number of words that a number takes."""
+        """The number of words of a number in a text file, 1 for every type `code`."""
         return 1
 
 
@@ -148,11 +158,11 @@ def _any_number(word: bytes, place: FileLocation) -> float:
 
 @dataclass(frozen=True, eq=False)
 class PropertyColumn:
-    """A property in all rows of an element: row k begins it at positions[k] + offset.
+    """A property of an element in all n rows. In row k, its numbers begin at positions[k] + offset.
 
-    code: its type, as for the module `struct`.
-    positions: (n,).
-    list_lengths: (n,) for a list property, None for a single number.
+    code: the type of the numbers, as a format character of the module `struct`.
+    positions: (n,) in bytes for a binary file, in words for a text file.
+    list_lengths: (n,) the lengths of the lists; None for a property that is a single number.
     """
 
     code: str
@@ -204,10 +214,12 @@ class ElementTable:
 
 
 def read_ply(path: Path, data: bytes) -> FileGeometry:
-    """Vertices, their normals if all have nx, ny and nz, faces, and edges as polylines of two.
+    """Read the bytes `data` of a .ply file. The result has its vertices, with their normals if they
+    have nx, ny and nz; its faces; and its edges, as polylines with two vertices.
 
     Raises:
-        FileFormatError: a malformed header, fewer data than it declares, an index out of range.
+        FileFormatError: the header is malformed, the file has fewer data than it declares, or an
+            index is out of range.
     """
     header = _header(path, data)
     _check_elements(path, header)
@@ -236,8 +248,8 @@ def read_ply(path: Path, data: bytes) -> FileGeometry:
 
 
 def _check_elements(path: Path, header: PlyHeader) -> None:
-    """Refuse elements that contain faces in a form that is not read, and elements that occur
-    twice."""
+    """Raise a FileFormatError if a header declares an element twice, or an element that contains
+    faces in a form that is not supported, such as strips of triangles."""
     names = [section.name for section in header.elements]
     for name in names:
         is_odd = name.lower() in ("vertex", "face", "edge") and name != name.lower()
@@ -250,7 +262,7 @@ def _check_elements(path: Path, header: PlyHeader) -> None:
 
 
 def _check_end(path: Path, remainder: bytes) -> None:
-    """Refuse data after the last row."""
+    """Raise a FileFormatError if there are data (`remainder`) after the last row of the file."""
     if remainder.strip(_PADDING):
         raise FileLocation(path).error(
             "more follows than the rows that its header promises: its counts are too small"
@@ -260,7 +272,11 @@ def _check_end(path: Path, remainder: bytes) -> None:
 def _polygons(
     table: ElementTable, corners: npt.NDArray[Any], sizes: IntArray, count: int
 ) -> PolygonList:
-    """The polygons of these corners, which must be indices of `count` vertices."""
+    """The polygons with the vertex indices `corners`, one polygon after the other, and `sizes` (m,)
+    corners each. Raises a FileFormatError if an index is not in [0, count).
+
+    table: the rows of the element, for their locations in the file. count: the number of
+        vertices."""
     polygons = PolygonList(corners.astype(np.int64), sizes, table.places)
     if corners.dtype.kind == "f" and corners.size:
         k = int(np.argmax(corners != np.rint(corners)))
@@ -274,8 +290,11 @@ def _polygons(
 def _columns(
     section: PlyElement, values: Values, begins: IntArray, places: FileLocations
 ) -> tuple[dict[str, PropertyColumn], IntArray]:
-    """The columns of an element whose rows begin at the positions `begins` (n,), by name; and the
-    position (n,) at which each row ends."""
+    """The properties of an element in all its rows, as columns by name; and the position (n,) at
+    which each row ends.
+
+    values: the numbers of the file. begins: (n,) the position at which each row begins.
+    places: the locations of the rows, for errors."""
     columns: dict[str, PropertyColumn] = {}
     positions, offset = begins, 0
     for prop in section.properties:
@@ -360,8 +379,11 @@ def _binary_tables(path: Path, data: bytes, header: PlyHeader) -> dict[str, Elem
 
 
 def _row_ends(section: PlyElement, values: BinaryValues, begin: int) -> Iterator[int]:
-    """The position at which each row of an element ends, row by row. begin: the start of the first
-    row. Raises struct.error if a row ends after the end of the file."""
+    """Yield the position at which each row of an element ends, one row after the other, for
+    elements whose rows have different lengths because they contain lists.
+
+    begin: the position at which the first row begins.
+    Raises struct.error if a row ends after the end of the file."""
     fixed_bytes = 0
     lists: list[tuple[int, struct.Struct, int]] = []
     for prop in section.properties:

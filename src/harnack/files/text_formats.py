@@ -42,8 +42,8 @@ def read_xyz(path: Path, data: bytes) -> FileGeometry:
     Further columns are ignored. `#` begins a comment.
 
     Raises:
-        FileFormatError: lines with different numbers of columns or fewer than three, words, numbers
-            that are not finite; columns 4 to 6 that are not normals (lengths far from 1).
+        FileFormatError: lines have different numbers of columns, or fewer than three; a word is not
+            a finite number; or columns 4 to 6 are not normals, as their lengths are far from 1.
     """
     lines = split_content_lines(path, data)
     if not len(lines):
@@ -72,11 +72,13 @@ def read_xyz(path: Path, data: bytes) -> FileGeometry:
 
 
 def read_loops_text(path: Path, data: bytes) -> list[tuple[FloatArray, FileLocation]]:
-    """Read a .loops file: a loop (n, 3) a line, as x y z repeated. Returns the loops and their
-    locations. `#` begins a comment.
+    """Read the bytes `data` of a .loops file, which has a closed curve on each line: the
+    coordinates x y z of all its points, one point after the other. `#` begins a comment. Returns
+    the curves, arrays (n, 3), and the location of each in the file.
 
     Raises:
-        FileFormatError: a word that is not a number, or a line whose count is not a multiple of 3.
+        FileFormatError: a word is not a number, or the number of words of a line is not a multiple
+            of 3.
     """
     lines = split_content_lines(path, data)
     if not len(lines):
@@ -98,9 +100,10 @@ _COLUMNS = "x y z radius [weight [group]]"
 
 @dataclass(frozen=True, eq=False)
 class Metaballs:
-    """Blobs from a file: centers (n, 3), radii (n,), weights (n,), and groups (n,) or None.
+    """The n blobs (metaballs) of a file: their centers (n, 3), radii (n,) and weights (n,); and the
+    number of the group of each (n,), or None if the file names no groups.
 
-    summary: the contents of the file.
+    summary: a text about the contents of the file.
     """
 
     centers: FloatArray
@@ -171,17 +174,19 @@ _UNSUPPORTED_OBJ_STATEMENTS = (b"curv", b"curv2", b"surf", b"bzp", b"bsp", b"fo"
 
 
 def read_obj(path: Path, data: bytes) -> FileGeometry:
-    """Vertices, faces (`f`) and polylines (`l`) of a Wavefront .obj file, and normals of a cloud if
-    there is one for each vertex.
+    """Read the bytes `data` of a Wavefront .obj file: its vertices, faces (`f`) and polylines
+    (`l`); and for a point cloud the normals, if there are as many normals as vertices.
 
-    Points `p` choose vertices and their normals. Statements of groups, materials and textures are
-    ignored; statements that define further surface are refused.
+    If there are statements `p`, the result has only the vertices that they name, with their
+    normals. Groups, materials and textures are ignored. Statements that define other surfaces, such
+    as splines, are an error.
 
-    Indices may be negative (counted back from the last vertex so far) and carry texture and normal
-    indices after slashes, which are not read.
+    An index may be negative; then it counts back from the last vertex before the statement. It may
+    be followed by slashes and the indices of a texture vertex and a normal, which are ignored in
+    faces and polylines.
 
     Raises:
-        FileFormatError: a malformed statement, an index out of range.
+        FileFormatError: a statement is malformed, or an index is out of range.
     """
     lines = split_content_lines(path, data)
     if b"\\" in data:
@@ -223,9 +228,11 @@ def read_obj(path: Path, data: bytes) -> FileGeometry:
 def _parse_obj_points(
     path: Path, vertices: FloatArray, normals: FloatArray | None, rows: dict[bytes, TextLines]
 ) -> FileGeometry:
-    """The vertices that statements `p` name, with normals if all of these name one.
+    """The vertices that the statements `p` of an .obj file name, with their normals if all of these
+    statements name one.
 
-    rows: the lines of each statement, by keyword.
+    vertices: (n, 3) all vertices of the file. normals: (k, 3) all its normals, or None.
+    rows: the lines of the statements, by their keyword.
 
     Raises:
         FileFormatError: an index out of range, or normals for only some of the points.
@@ -246,7 +253,8 @@ def _parse_obj_points(
 
 
 def _join_continued_lines(lines: TextLines) -> TextLines:
-    """The lines, where a line that ends with a backslash is joined with the next one."""
+    """The same lines, except that a line that ends with a backslash is joined with the next one to
+    a single line."""
     pieces: list[list[bytes]] = []
     numbers: list[int] = []
     continued = 0  # the number of the line that continues the last
@@ -266,10 +274,12 @@ def _join_continued_lines(lines: TextLines) -> TextLines:
 def _parse_obj_polygons(
     lines: TextLines, too_few: str, min_corners: int, vertices: TextLines
 ) -> PolygonList:
-    """The faces or polylines of statements, with vertices counted from 0.
+    """The faces or polylines that statements of an .obj file define, with vertex indices from 0.
 
-    too_few: the error of a statement with fewer corners than `min_corners`.
-    vertices: the lines of all vertices.
+    lines: the lines of the statements, `f` or `l`.
+    too_few: the error message for a statement with fewer corners than `min_corners`.
+    vertices: the lines of all vertices. A negative index counts back from the last of these before
+        the statement.
 
     Raises:
         FileFormatError: too few corners, or an index out of range.
@@ -302,11 +312,12 @@ def _parse_obj_polygons(
 
 
 def read_off(path: Path, data: bytes) -> FileGeometry:
-    """Vertices and faces of an .off file. Colors, normals and textures are ignored.
+    """Read the vertices and faces in the bytes `data` of an .off file. Colors, normals and textures
+    are ignored.
 
     Raises:
-        FileFormatError: no .off file of points in space, truncated, malformed, an index out of
-            range, a coordinate that is not finite.
+        FileFormatError: it is not an .off file of points in space, is truncated or malformed, an
+            index is out of range, or a coordinate is not finite.
     """
     count, faces_count, lines = _parse_off_header(path, split_content_lines(path, data))
     if len(lines) < count + faces_count:
@@ -339,7 +350,7 @@ def read_off(path: Path, data: bytes) -> FileGeometry:
 
 
 def _number_or_nan(word: bytes, _: FileLocation) -> float:
-    """The number that a word is, NaN for other words."""
+    """The number that a word of a text file stands for; NaN if it is not a number."""
     try:
         return float(word)
     except ValueError:
@@ -349,8 +360,10 @@ def _number_or_nan(word: bytes, _: FileLocation) -> float:
 def _integers(
     rows: TextLines, numbers: FloatArray, row_of: IntArray, word_of: IntArray
 ) -> IntArray:
-    """Numbers (k,) as integers. row_of, word_of: (k,) the row and the word in that row from which
-    each was read, for messages.
+    """The numbers (k,), which were read from words of lines, as integers.
+
+    rows: the lines. row_of, word_of: (k,) for each number, the index of its line, and its position
+        among the words of that line, for messages.
 
     Raises:
         FileFormatError: a number is no integer.
@@ -403,10 +416,12 @@ _KEYWORDS = (b"solid", b"facet", b"outer", b"vertex", b"endloop", b"endfacet", b
 
 
 def read_stl(path: Path, data: bytes) -> FileGeometry:
-    """The triangles of an .stl file, where corners at the same position become the same vertex.
+    """Read the triangles in the bytes `data` of an .stl file, text or binary. Corners at the same
+    position become a single vertex.
 
     Raises:
-        FileFormatError: truncated, malformed, a coordinate that is not finite, no triangles.
+        FileFormatError: the file is truncated or malformed, a coordinate is not finite, or there
+            are no triangles.
     """
     corners = _parse_binary_stl(path, data) if _is_binary(data) else _parse_text_stl(path, data)
     if not len(corners):
@@ -419,8 +434,9 @@ def read_stl(path: Path, data: bytes) -> FileGeometry:
 
 
 def _is_binary(data: bytes) -> bool:
-    """Whether an .stl file is binary. Many binary files begin with "solid" as well, so the length
-    decides first."""
+    """Whether an .stl file with the bytes `data` is binary. The word "solid" at the beginning is no
+    proof of a text file, since many binary files begin with it as well. So the length is tested
+    first, which a binary file gives in its header."""
     if (
         len(data) >= _STL_HEADER_BYTES
         and len(data) == _STL_HEADER_BYTES + _stl_facet_count(data) * _FACET.itemsize
@@ -430,7 +446,7 @@ def _is_binary(data: bytes) -> bool:
 
 
 def _stl_facet_count(data: bytes) -> int:
-    """The number of triangles in the header of a binary .stl file."""
+    """The number of triangles that the header of a binary .stl file states."""
     return int.from_bytes(data[_STL_HEADER_BYTES - 4 : _STL_HEADER_BYTES], "little")
 
 

@@ -1,4 +1,5 @@
-"""Numbers in text files: parsed all at once, and word by word only where that fails."""
+"""Numbers in text files. All numbers of a file are parsed at once, which is fast; if that fails,
+they are parsed word by word, to find the wrong word for the error message."""
 
 from __future__ import annotations
 
@@ -34,7 +35,8 @@ _Number = TypeVar("_Number", int, float)
 
 @dataclass(frozen=True, eq=False)
 class TextLines:
-    """Lines of a text file, such as all lines with content, and their locations."""
+    """Some lines of a text file, for example all that are not blank, and the location of each in
+    the file."""
 
     text: list[bytes]
     locations: FileLocations
@@ -81,7 +83,7 @@ def split_content_lines(
 
 
 def parse_finite(word: bytes, place: FileLocation) -> float:
-    """The finite number that a word is.
+    """The finite number that a word of a text file stands for. place: its location, for the error.
 
     Raises:
         FileFormatError: the word is not a finite number.
@@ -96,7 +98,8 @@ def parse_finite(word: bytes, place: FileLocation) -> float:
 
 
 def parse_vertex_index(word: bytes, place: FileLocation) -> int:
-    """An integer that can be the index of a vertex.
+    """The integer that a word of a text file stands for, small enough for the index of a vertex.
+    place: its location, for the error.
 
     Raises:
         FileFormatError: the word is not such an integer.
@@ -114,7 +117,7 @@ def parse_vertex_index(word: bytes, place: FileLocation) -> int:
 
 
 def _is_integral(word: bytes) -> bool:
-    """Whether a word is a number that is an integer, such as 3.000e+00."""
+    """Whether a word of a text file is a number whose value is an integer, such as 3.000e+00."""
     try:
         return b"_" not in word and float(word).is_integer()
     except ValueError:
@@ -122,7 +125,8 @@ def _is_integral(word: bytes) -> bool:
 
 
 def excerpt(word: bytes) -> str:
-    """A word from a file, short and printable, in quotes."""
+    """A word from a file in quotes, as it is shown in messages: shortened if it is long, and with
+    unprintable characters escaped."""
     shown = word[:32].decode("ascii", "backslashreplace")
     return repr(shown + ("..." if len(word) > 32 else ""))
 
@@ -133,9 +137,10 @@ def read_table(
     *,
     too_few_message: str = "{} numbers are too few: {} are expected",
 ) -> FloatArray:
-    """The first numbers of each line, all finite: (n, columns). Further words are ignored.
+    """Read a table (n, columns) of finite numbers: the first `columns` words of each of n lines.
+    Further words of a line are ignored.
 
-    too_few_message: the error of a line with fewer numbers.
+    too_few_message: the error message for a line with fewer words.
 
     Raises:
         FileFormatError: naming the first line with too few numbers, or with a word that is not a
@@ -156,12 +161,13 @@ def read_table(
 def read_floats(
     lines: TextLines, *, convert: Callable[[bytes, FileLocation], float] = parse_finite
 ) -> tuple[FloatArray, IntArray]:
-    """The numbers of all lines, one after the other, and the count (n,) of numbers of each line.
+    """The numbers in all words of n lines, as one array; and the number (n,) of words of each line.
 
-    convert: converts a word to a number, or raises; used if not all words are finite numbers.
+    convert: a function that converts a word to a number or raises an error. It is called only if
+        not all words are finite numbers.
 
     Raises:
-        FileFormatError: as `convert` raises it.
+        FileFormatError: `convert` raises it for some word.
     """
     table = _parse_with_numpy(lines)
     if table is not None and np.isfinite(table).all():
@@ -170,10 +176,11 @@ def read_floats(
 
 
 def read_integers(lines: TextLines) -> tuple[IntArray, IntArray]:
-    """The integers of all lines, one after the other, and the count (n,) of integers of each line.
+    """The integers in all words of n lines, as one array; and the number (n,) of words of each
+    line.
 
     Raises:
-        FileFormatError: naming the line of the first word that is not an integer.
+        FileFormatError: some word is not an integer; the message names the line of the first one.
     """
     table = _parse_with_numpy(lines)
     if table is not None and (np.abs(table) < 2.0**53).all() and (table == np.rint(table)).all():
@@ -182,9 +189,10 @@ def read_integers(lines: TextLines) -> tuple[IntArray, IntArray]:
 
 
 def _parse_with_numpy(lines: TextLines, columns: Sequence[int] | None = None) -> FloatArray | None:
-    """A table (n, k) of the numbers of all lines, parsed by NumPy; None if that fails.
+    """The numbers of n lines as a table (n, k), parsed by NumPy, which is fast. None if that fails,
+    because some word is not a number, or because lines have different numbers of words.
 
-    columns: the columns to read. None: all columns, if all lines have the same number of them.
+    columns: the columns to read; None for all.
     """
     if not len(lines) or b"_" in b"\n".join(lines.text):
         return None
@@ -200,18 +208,20 @@ def _parse_with_numpy(lines: TextLines, columns: Sequence[int] | None = None) ->
 
 
 def _row_lengths(table: FloatArray) -> IntArray:
-    """(n,) the number of numbers in each row of a table (n, k): k for all."""
+    """(n,) the lengths of the rows of a table (n, k), an array in which each entry is k."""
     return np.full(len(table), table.shape[1], dtype=np.int64)
 
 
 def _parse_words(
     lines: TextLines, kind: type[_Number], convert: Callable[[bytes, FileLocation], _Number]
 ) -> tuple[npt.NDArray[Any], IntArray]:
-    """The numbers of all lines, one line after the other, and the number of numbers (n,) of each
-    line. For lines of different lengths, or with words that are not plain numbers.
+    """Parse n lines word by word. Returns the numbers of all lines as one array; and the number
+    (n,) of words of each line. It serves lines with different numbers of words, and words that are
+    not plain numbers.
 
-    kind: float or int, which converts most words.
-    convert: converts each word if `kind` fails for one; it is slower, and raises for invalid words.
+    kind: float or int, by which all words are converted, if that succeeds.
+    convert: a function that converts a word, or raises an error for an invalid one. It is slower,
+        and is called for every word if `kind` fails for one.
     """
 
     def slow_numbers() -> Iterator[_Number]:

@@ -36,12 +36,13 @@ _UNITS = {
 
 
 def read_3mf(path: Path, data: bytes) -> FileGeometry:
-    """All triangles of the parts in a file's build, at their positions in the build, in
-    millimeters. Colors and settings are ignored, also the setting that a part is not to be printed.
+    """Read all triangles in the bytes `data` of a .3mf file: those of the parts in its build (what
+    is to be printed), at their positions there, in millimeters. Colors and settings are ignored,
+    including the setting that a part is not to be printed.
 
     Raises:
-        FileFormatError: a file that is not an archive, is too large when unpacked, is malformed, or
-            has no triangles; or packages are missing.
+        FileFormatError: the file is not an archive, is too large when unpacked, is malformed, or
+            has no triangles; or Python packages that are needed to read it are missing.
     """
     import trimesh  # here, since it takes half a second
 
@@ -69,7 +70,7 @@ def read_3mf(path: Path, data: bytes) -> FileGeometry:
 
 
 def _contents(place: FileLocation, scene: Any) -> FileGeometry:
-    """The triangles of a scene's nodes in one coordinate system, in millimeters.
+    """The triangles of all nodes of a trimesh scene, in one coordinate system and in millimeters.
 
     Raises:
         FileFormatError: an unknown unit, an index out of range, numbers that are not finite, or no

@@ -1,14 +1,15 @@
-"""Triangles of a level set in tetrahedra, for functions that may be angles; and the tetrahedra.
+"""Marching tetrahedra: the triangles in which the level set of a function cuts tetrahedra. The
+function may be an angle, known modulo its period.
 
-The continuous change of the function along an edge is its *lift*. The signed number of level
-crossings is that of the lift: 0 or +-1 if cells are small enough. For a real-valued function it
-follows from the signs at the ends. For an angle, the lift may differ from the difference of the
-wrapped values by whole periods. The crossings of a tetrahedron's edges between corners off the
-level determine on which side of the level each corner lies, if they are consistent around every
-face; that is checked, and that at most one level passes between the corners. A corner on the level,
-such as a vertex of the curve, becomes a mesh vertex.
+For each edge of the tetrahedra, the signed number of level crossings is counted, which is 0, 1 or
+-1 if cells are small enough. For a real-valued function it follows from the signs at the ends. For
+an angle it follows from the continuous change of the function along the edge, which may differ from
+the difference of the values by whole periods. From the crossings of its edges it follows on which
+side of the level each corner of a tetrahedron lies. It is checked that the crossings of the three
+edges of each face add up, and that at most one level passes between the corners of a tetrahedron. A
+corner on the level, such as a vertex of the curve at which a surface ends, becomes a mesh vertex.
 
-Tetrahedra between points are Delaunay's, by Qhull (`delaunay`).
+`delaunay` makes tetrahedra between points, by Qhull.
 """
 
 from __future__ import annotations
@@ -51,7 +52,7 @@ _ROOT_ERROR, _MIN_END_DISTANCE = 1e-10, 1e-4
 class Tetrahedra:
     """Tetrahedra and their edges.
 
-    points: (n, 3).
+    points: (n, 3) the vertices of the tetrahedra.
     corners: (m, 4) the points of each tetrahedron, by index.
     ends: (k, 2) the points at the ends of each edge, the lower index first.
     edges: (m, 6) the edges of each tetrahedron, by index, for the pairs of corners (0, 1), (0, 2),
@@ -69,7 +70,8 @@ class Tetrahedra:
         return cls(points, corners, edges.vertices, edges.edge_of_pair.reshape(len(_PAIRS), -1).T)
 
     def edge_between(self, i: int, j: int, rows: IntArray) -> tuple[IntArray, IntArray]:
-        """The edge between corners i and j of each of the tetrahedra `rows` (k,).
+        """The edge between corners i and j (from 0 to 3) of each of the tetrahedra with the indices
+        `rows` (k,).
 
         Returns:
             The indices (k,) of the edges; and their directions (k,): 1 if the edge leads from
@@ -117,13 +119,14 @@ def delaunay(points: FloatArray) -> Tetrahedra:
 
 @dataclass(frozen=True)
 class EdgeCrossings:
-    """How a function crosses its level along the edges of tetrahedra. Edges with an end on the
-    level have no crossings.
+    """How a function crosses its level along the k edges of tetrahedra. An edge with an end on the
+    level has no crossings.
 
     count: (k,) for each edge the number of upward crossings minus that of downward crossings.
-    change: (k,) the continuous change of the function along each edge.
-    proved: the number of edges whose change is proved to be the difference of the values, wrapped
-        by the period.
+    change: (k,) the continuous change of the function from the first to the second end of each
+        edge. For an angle, it may differ from the difference of the values by whole periods.
+    proved: the number of edges along which the change of an angle is proved to be the difference of
+        the values, moved by whole periods into half a period around 0.
     integrated_count: the number of edges along which the change was integrated."""
 
     count: IntArray
@@ -137,14 +140,17 @@ def count_crossings(
 ) -> EdgeCrossings:
     """Count how a function crosses its level along every edge of tetrahedra.
 
-    For an angle, the change along an edge is needed. Within `LevelSamples.quarter_period_radius` of
-    a point the function changes by less than a quarter of its period. So if the radii of both ends
-    together cover the edge, it changes by less than half a period along the edge, and the change is
-    the wrapped difference of the values. Along other edges the change is integrated
-    (`Field.continuous_change`).
+    points: the vertices of the tetrahedra, with the values of the function there.
+
+    For an angle, the continuous change along each edge is needed. Each vertex has a radius within
+    which the function is proved to change by less than a quarter of its period
+    (`LevelSamples.quarter_period_radius`). If the radii of both ends together are as long as the
+    edge, the function changes by less than half a period along it. Then the change is the
+    difference of the values, moved by whole periods into half a period around 0. Along other edges
+    the field integrates its change (`Field.continuous_change`).
 
     Raises:
-        MeshingError: the field of an uncovered edge cannot be integrated.
+        MeshingError: the field cannot integrate its change along an edge.
     """
     a, b = tets.ends.T
     value = points.samples.value
@@ -170,10 +176,10 @@ def count_crossings(
 def _integrate_change(
     field: Field, p: FloatArray, q: FloatArray, wrapped: FloatArray, period: float
 ) -> FloatArray:
-    """(n,) the continuous change of f along the segments from p to q (n, 3), as the field
-    integrates it.
+    """(n,) the continuous change of the field's function f along the segments from p to q (n, 3),
+    as the field integrates it.
 
-    wrapped: (n,) the differences of the values at the ends, from which it differs by whole periods.
+    wrapped: (n,) the differences f(q) - f(p). The change differs from them by whole periods.
 
     Raises:
         MeshingError: the field cannot integrate its change, or the result does not differ by whole
@@ -206,12 +212,12 @@ def extract_triangles(
     crossings: EdgeCrossings,
     roots_of: EdgeRootFinder | None = None,
 ) -> tuple[FloatArray, IntArray]:
-    """The triangles of the level set in tetrahedra.
+    """The triangles in which the level set of a function cuts tetrahedra.
 
-    points, tets, crossings: the tetrahedra's points, with the function there; the tetrahedra; and
-        how the function crosses its level along their edges.
-    roots_of: computes where edges meet the level of a real-valued function; None for a search along
-        them.
+    points: the vertices of the tetrahedra, with the values of the function there.
+    crossings: how the function crosses its level along the edges of the tetrahedra `tets`.
+    roots_of: a function that computes the points where edges meet the level of a real-valued
+        function; None to search for these points along the edges (`_roots`).
 
     Returns:
         Vertices (n, 3) and faces (m, 3), counter-clockwise as seen from where the function is
@@ -278,8 +284,10 @@ def extract_triangles(
 
 
 def is_cut(points: TetrahedronPoints, tets: Tetrahedra, crossings: EdgeCrossings) -> BoolArray:
-    """(m,) whether the level set passes between the corners of each tetrahedron, or through one of
-    them."""
+    """(m,) for each tetrahedron, whether the level set passes between its corners or through one of
+    them.
+
+    points: the vertices of the tetrahedra `tets`, with the values of the function there."""
     return points.is_on_level[tets.corners].any(axis=1) | (crossings.count[tets.edges] != 0).any(
         axis=1
     )
@@ -291,7 +299,8 @@ def _mean(points: FloatArray, index: IntArray) -> FloatArray:
 
 
 def _halves(vertices: FloatArray, ring: list[IntArray]) -> tuple[IntArray, IntArray]:
-    """The two triangles (k, 3) of quadrilaterals, which are cut along their shorter diagonal.
+    """Cut k quadrilaterals along their shorter diagonals. Returns the corners (k, 3) of the first
+    and of the second triangle of each.
 
     ring: the indices (k,) of the four corners, in their order around the quadrilateral."""
     a, b, c, d = ring
@@ -303,8 +312,9 @@ def _halves(vertices: FloatArray, ring: list[IntArray]) -> tuple[IntArray, IntAr
 
 
 def _sides(points: TetrahedronPoints, tets: Tetrahedra, crossings: EdgeCrossings) -> IntArray:
-    """(m, 4) the signed number of levels between the first corner of each tetrahedron that is off
-    the level and its other corners; 0 for corners on the level.
+    """(m, 4) for each corner of each of m tetrahedra, on which side of the level it lies: the
+    signed number of level crossings on the way to this corner from the first corner of the
+    tetrahedron that is not on the level. It is 0 for corners on the level.
 
     Raises:
         LocalizedMeshingError: the crossings of three edges of a face do not add up.
@@ -342,12 +352,13 @@ def _roots(
     crossings: EdgeCrossings,
     edges: IntArray,
 ) -> FloatArray:
-    """(r, 3) the points where edges meet the level set.
+    """(r, 3) the points where edges of tetrahedra meet the level set.
 
-    edges: (r,) the indices of the edges, each of which crosses it.
+    edges: (r,) the indices of these edges, each of which has a crossing.
 
-    They are found by secants if the function has `secant_steps`, else by Chandrupatla's method. An
-    edge with an end outside (`OUTSIDE_VALUE`) is cut in its middle."""
+    The points are found by the secant method if the function has `secant_steps`, else by
+    Chandrupatla's method. If an end of an edge has the value `OUTSIDE_VALUE`, which stands for the
+    outside of the meshed region, the point is the middle of the edge."""
     a, b = tets.ends[edges].T
     p, direction = points.points[a], points.points[b] - points.points[a]
     value, change = points.samples.value[a], crossings.change[edges]
@@ -357,9 +368,11 @@ def _roots(
         value = value - np.where(crossings.count[edges] > 0, function.period, 0)
 
     def lifted_values(t: FloatArray, *args: FloatArray) -> FloatArray:
-        """f - level at fractions t of edges. args: the start (3 arrays), the direction (3),
-        the value at the start and the change along the edge, for each edge. Values of an angle are
-        moved by the whole number of periods that brings them nearest to the middle of the change.
+        """(k,) f - level at the fractions t (k,) of k edges. Values of an angle are moved by the
+        whole number of periods that brings them nearest to the middle of the change.
+
+        args: eight arrays (k,): the three coordinates of the start of each edge, the three of the
+            vector to its end, f - level at the start, and the change along the edge.
         """
         origin, edge, start, rise = (
             np.stack(args[0:3], axis=-1), np.stack(args[3:6], axis=-1), args[6], args[7]
@@ -385,11 +398,11 @@ def _illinois(
 ) -> FloatArray:
     """(r,) the fractions of edges at which they meet the level set, by a few secant steps.
 
-    p, edge: (r, 3) one end of each edge, and the vector to the other.
-    low, high: (r,) the values at these ends.
+    p, edge: (r, 3) one end of each edge, and the vector to the other end.
+    low, high: (r,) the values of f - level at these two ends, of different signs.
 
-    If the root is on the same side of the secant's root twice or more in a row, the value at the
-    end that stays is halved (the Illinois method)."""
+    Each step replaces one end of the search interval. If it is the same end twice or more in a row,
+    the value at the other end is halved for the next secant (the Illinois method)."""
     left, right = np.zeros(len(p)), np.ones(len(p))
     up = high > low
     low, high = (np.where(up, low, -low), np.where(up, high, -high))
@@ -419,7 +432,8 @@ def _chandrupatla(
 
     start, direction: (r, 3) one end of each edge, and the vector to the other.
     value, change: (r,) f - level at that end, and its change along the edge.
-    lifted_values: the function of the fraction and of these eight numbers whose root is searched.
+    lifted_values: the function whose root is searched, of the fraction and of eight more arrays
+        (r,): the coordinates of `start` and `direction`, `value` and `change`.
 
     Raises:
         MeshingError: roots are not found.
@@ -444,15 +458,15 @@ def _chandrupatla(
 def _faces_on_the_level(
     function: LevelFunction, points: TetrahedronPoints, tets: Tetrahedra
 ) -> tuple[IntArray, FloatArray]:
-    """Faces between two tetrahedra, with all three corners on the level, that separate its two
-    sides.
+    """The faces of tetrahedra that are part of the level set: all three corners are on the level,
+    and the two tetrahedra at the face lie on different sides of the level.
 
     Returns:
-        The faces (k, 3), and vectors (k, 3) through them in the direction in which the function
-        rises.
+        The corners (k, 3) of the faces; and for each face a vector (k, 3) through it, from the side
+        where the function is smaller to the side where it is larger.
 
-    The side of a tetrahedron is that of its fourth corner or, if this is on the level too, of its
-    center.
+    The side on which a tetrahedron lies is that of its fourth corner or, if that is on the level
+    too, of its center.
     """
     is_on = points.is_on_level[tets.corners]
     triples: list[IntArray] = []
@@ -494,12 +508,12 @@ def _wrap(change: FloatArray, period: float) -> FloatArray:
 def _side_sample(
     function: LevelFunction, points: TetrahedronPoints, tets: Tetrahedra, table: IntArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Points (n, 3) in tetrahedra at faces, and the function (n,) there.
+    """For tetrahedra at given faces, a point (n, 3) of each tetrahedron off the face, and the value
+    (n,) of f - level there. The point is the corner opposite to the face or, if that is on the
+    level, the center of the tetrahedron.
 
-    table: (n, 5) the three corners of each face, the index of a tetrahedron with this face, and
-        which of its corners is not on the face.
-
-    The point is that corner or, if it is on the level too, the center of the tetrahedron."""
+    table: (n, 5) one row for each tetrahedron and face: the three corners of the face, the index of
+        the tetrahedron, and which of its corners (0 to 3) is opposite to the face."""
     corners = tets.corners[table[:, 3]]
     apex = corners[np.arange(len(table)), table[:, 4]]
     side_points, value = points.points[apex], points.samples.value[apex]

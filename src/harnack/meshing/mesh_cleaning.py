@@ -52,12 +52,14 @@ _WELD_DISTANCES = (0.01, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3)
 
 @dataclass(frozen=True)
 class CleanedMesh:
-    """A closed mesh in which the valid triangles of the input come first, bit by bit.
+    """A closed mesh, made from a damaged one. Its first faces are the valid triangles of the
+    damaged mesh (the input), with unchanged coordinates; fillings follow.
 
     surface: the mesh.
-    kept: (k,) for each of the first k faces, the index of the input face that it is; ascending.
-    turned: the indices of the input faces among these that are reversed in the mesh.
-    left_out: for each reason, the number of input triangles that were removed for it.
+    kept: (k,) the indices of the input faces that were kept, ascending. Face i < k of the mesh is
+        input face kept[i].
+    turned: those of the indices in `kept` whose faces have the reverse orientation in the mesh.
+    left_out: for each reason, the number of input faces that were removed for it.
     holes: the number of filled holes."""
 
     surface: TriangleMesh
@@ -70,7 +72,10 @@ class CleanedMesh:
 def clean_and_fill(
     vertices: FloatArray, faces: IntArray, report: Callable[[str], None]
 ) -> CleanedMesh:
-    """Keep the valid triangles of a mesh, and put fillings in place of all others and over holes.
+    """Keep the valid triangles of a mesh (those that have an area, are no duplicates and intersect
+    no others). Fill all holes, also those left by removed triangles.
+
+    report: called with a message before each step.
 
     Raises:
         MeshingError: half of the triangles or more would be removed, or most of them are loose.
@@ -99,13 +104,13 @@ def clean_and_fill(
 
 
 def weld_near_corners(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray, IntArray, float]:
-    """Join near corners of loose triangles, by moving them to their mean.
-
-    Corners are near if they are closer than a certain distance. Several distances are tried, and
-    that which leaves the fewest edges open is used.
+    """Join corners of loose triangles (which share no vertices): corners that are closer to each
+    other than some distance become one vertex at their mean. Of several distances, the one that
+    leaves the fewest open edges is used.
 
     Returns:
-        The vertices (n, 3); the faces (m, 3); and the largest move of a corner, a length.
+        The joined vertices (k, 3); the faces (m, 3), with indices of these; and how far the
+        farthest corner was moved, a length.
 
     Raises:
         MeshingError: the triangles are not loose, or most edges stay open.
@@ -137,7 +142,7 @@ def weld_near_corners(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray
 
 @dataclass(frozen=True)
 class _WorkingMesh:
-    """A mesh while it is cleaned, and where its faces come from.
+    """A mesh while it is cleaned, and the input face that each of its faces comes from.
 
     vertices: (n, 3), those of the input first. faces: (m, 3).
     source_face: (m,) the index of the input face that each face is; -1 for a face of a filling.
@@ -226,12 +231,13 @@ class _WorkingMesh:
             state = state.keep_faces(piece != fins[area[fins].argmin()], "branching")
 
     def filled(self, loops: list[IntArray]) -> tuple[_WorkingMesh, list[IntArray], str]:
-        """Fill holes.
+        """Fill holes, if the fillings pass the checks of `fill_holes`.
 
-        loops: the vertices around each hole.
+        loops: for each hole, the indices (k,) of the vertices around it.
 
         Returns:
-            The mesh with the fillings that pass the checks; the loops that are not filled; and why.
+            The mesh with the fillings as last faces; the loops of the holes that stay open; and the
+            reason for these, "" if there are none.
         """
         if not loops:
             return self, [], ""
@@ -250,16 +256,18 @@ class _WorkingMesh:
         return state, filling.unfilled_loops, filling.reason
 
     def without_ring(self, places: IntArray) -> _WorkingMesh:
-        """The mesh without the faces at these vertices. places: indices of vertices."""
+        """The mesh without the faces that have a corner among `places`, indices of vertices. Input
+        faces among the removed ones are counted under the reason "around"."""
         is_bad = np.zeros(len(self.vertices), np.bool_)
         is_bad[places] = True
         return self.keep_faces(~np.asarray(is_bad[self.faces].any(axis=1)), "around")
 
     def result(self, holes: int) -> CleanedMesh:
-        """The cleaned surface: faces are oriented outwards, faces inside of the solid are dropped,
-        and input faces come first.
+        """The cleaned mesh, from a closed working mesh. Three things are done: faces are reversed
+        where necessary, so that all face outwards; faces inside of the solid are removed; and the
+        faces that come from the input are put first, in the input's order.
 
-        holes: the number of filled holes, which is passed on.
+        holes: how many holes were filled so far, an entry of the result.
 
         Raises:
             MeshingError: the surface passes through itself.
@@ -275,7 +283,7 @@ class _WorkingMesh:
         if passes_itself(mesh, shells.component_of_face):
             raise MeshingError("it passes through itself along edges that lie on faces")
         is_outer = shells.bound()
-        dropped = int((source[~is_outer] >= 0).sum())
+        dropped_count = int((source[~is_outer] >= 0).sum())
         faces, source, is_turned = (
             faces[is_outer],
             source[is_outer],
@@ -283,15 +291,16 @@ class _WorkingMesh:
         )
         turned = source[is_turned & (source >= 0)]
         surface = TriangleMesh.without_unused_vertices(self.vertices, faces)
-        counts = self.counts | {"inside": dropped}
+        counts = self.counts | {"inside": dropped_count}
         return CleanedMesh(surface, source[source >= 0], turned, counts, holes)
 
 
 def _pieces(edges: Edges, count: int) -> IntArray:
-    """(m,) the number of the piece that each face belongs to. Faces belong to one piece if a chain
-    of faces connects them, in which neighbors share an edge of exactly two faces.
+    """(m,) for each face the number of its piece. Two faces belong to one piece if a chain of faces
+    leads from one to the other, in which consecutive faces share an edge that has exactly two
+    faces.
 
-    edges: of all `half_edges`. count: the number of faces, m."""
+    edges: the edges of the mesh, made from its `half_edges`. count: m, the number of faces."""
     import scipy.sparse  # imported here: it takes half a second
     import scipy.sparse.csgraph as csgraph_module
 
@@ -302,10 +311,12 @@ def _pieces(edges: Edges, count: int) -> IntArray:
 
 
 def against_neighbors(x: FloatArray, faces: IntArray) -> BoolArray:
-    """(m,) which faces to reverse so that faces that share an edge agree in orientation.
+    """(m,) the mask of the faces to reverse, so that faces that share an edge agree in orientation.
 
-    In each connected part of the surface, one orientation is chosen: the one in which faces with
-    the larger area are already. Parts with only one side are left as they are."""
+    x: (n, 3) the vertices. faces: (m, 3).
+
+    A connected part of the surface has two consistent orientations. The one that reverses less area
+    is chosen. In one-sided parts, such as a Moebius strip, no face is reversed."""
     m, part = len(faces), orientation_components(faces)
     corner = x[faces]
     area = row_norms(area_normals(corner))

@@ -53,8 +53,10 @@ def flip_edges(
     faces: IntArray,
     tolerance: float,
 ) -> IntArray:
-    """Faces (m, 3) after rounds of flips. Each flip makes the smaller of the smallest angles of two
-    triangles larger; of several flips of a triangle, only the best is done.
+    """Flip edges of a mesh in rounds, and return its faces (m, 3) after that. A flip replaces the
+    edge between two triangles by the other diagonal of their quadrilateral; it is made if the
+    smallest of all angles of both triangles becomes larger. Of several possible flips of a
+    triangle, only the best is made in a round.
 
     tolerance: a length, the largest distance of the midpoints of new edges and of the centers of
         new triangles from the level set, estimated by the gradient there."""
@@ -106,11 +108,14 @@ def _quadrilaterals(faces: IntArray) -> tuple[IntArray, IntArray]:
 def _independent_flips(
     rows: IntArray, gain: FloatArray, pairs: IntArray, key: IntArray, face_count: int
 ) -> IntArray:
-    """Choose flips that do not interfere: each is the best of all that change either of its two
-    faces, and no two make the same edge.
+    """Choose flips of edges that can be made at the same time: no two change the same face or make
+    the same new edge. Returns the indices of the chosen pairs. A chosen flip gains more than every
+    other candidate that changes one of its two faces.
 
-    rows: (k,) the candidates, indices of pairs of faces. gain: (n,) of all pairs.
-    pairs: (n, 2) the two faces of each pair. key: (n,) a number of the new edge of each."""
+    rows: (k,) the candidates, as indices of the n pairs of neighboring faces.
+    gain: (n,) how much the smallest angle grows by the flip of each pair.
+    pairs: (n, 2) the two faces of each pair.
+    key: (n,) a number that identifies the new edge of each pair."""
     rows = rows[np.argsort(-gain[rows], kind="stable")]
     rank = np.arange(len(rows))
     best_rank = np.full(face_count, len(rows))
@@ -124,10 +129,11 @@ def _independent_flips(
 def _flips_stay_near(
     function: LevelFunction, vertices: FloatArray, new: IntArray, tolerance: float
 ) -> BoolArray:
-    """(k,) whether flips keep the surface. new: (k, 2, 3) the two new triangles of each flip.
+    """(k,) for each of k flips, whether the mesh stays near the level set. That is so if the middle
+    of the new edge and the centers of both new triangles are within `tolerance` (a length) of the
+    level set, estimated by the gradient there, and if both triangles face along the gradient.
 
-    The middle of the new edge and the centers of both triangles have to be within `tolerance` of
-    the level set, by the gradient there, and both triangles have to face along the gradient."""
+    new: (k, 2, 3) the corners of the two new triangles of each flip."""
     corner = vertices[new]  # (k, 2, 3, 3)
     normal = np.cross(corner[:, :, 1] - corner[:, :, 0], corner[:, :, 2] - corner[:, :, 0])
     middle = corner[:, 0, :2].mean(axis=1)
@@ -165,9 +171,10 @@ def collapse_slivers(
     fixed: BoolArray,
     tolerance: float,
 ) -> IntArray:
-    """The faces without the slivers whose shortest edge can be contracted to one of its ends.
+    """Remove slivers (triangles with a tiny angle) by contracting their shortest edge to one of its
+    ends, if possible. Returns the faces that are left, with their new corners.
 
-    fixed: (n,) which vertices may not be removed, as those of the boundary.
+    fixed: (n,) the mask of the vertices that may not be removed, such as those of the boundary.
     tolerance: a length, the largest distance of the centers of new triangles from the level set.
 
     An edge (u, v) can be contracted to u without a change of topology if v is not fixed and if u
@@ -200,8 +207,9 @@ def collapse_slivers(
 
 
 def _can_contract(faces: IntArray, target: int, source: int) -> bool:
-    """Whether the edge between two vertices has two faces and satisfies the link condition
-    (`collapse_slivers`)."""
+    """Whether the edge between the vertices `source` and `target` can be contracted without a
+    change of topology. It can if it has two faces, and if its ends have only two neighbors in
+    common, the third corners of these faces (the link condition)."""
     target_faces, source_faces = (faces[(faces == v).any(axis=1)] for v in (target, source))
     common = np.setdiff1d(np.intersect1d(target_faces, source_faces), [target, source])
     beside = source_faces[(source_faces == target).any(axis=1)]
@@ -237,12 +245,12 @@ def relax_vertices(
     tolerance: float,
     walls: Walls,
 ) -> FloatArray:
-    """Vertices (n, 3), moved where that makes the smallest angle around them larger. Boundary
-    vertices stay.
+    """Move vertices of thin triangles along the surface, if that makes the smallest angle of the
+    triangles around them larger. Returns the vertices (n, 3). Boundary vertices stay.
 
     tolerance: a length, the largest distance of the centers of triangles around moved vertices from
         the level set.
-    walls: the lower and the upper corner of the box, on whose faces points stay; or None."""
+    walls: None, or the lower and the upper corner (3,) of a box to which vertices are confined."""
     fixed = np.zeros(len(vertices), np.bool_)
     fixed[boundary_edges(faces)] = True
     vertices = vertices.copy()
@@ -265,12 +273,12 @@ def relax_vertices(
 
 @dataclass(frozen=True)
 class _VertexStars:
-    """The faces around some vertices.
+    """The stars of k vertices: the faces around each of them. They are stored as p pairs of a
+    vertex and a face around it.
 
-    centers: (k,) the vertices.
-    owner: (p,) for each pair of such a vertex and a face around it, the vertex, as an index of
-        `centers`.
-    face: (p,) the face of each pair.
+    centers: (k,) the indices of the vertices.
+    owner: (p,) the vertex of each pair, as a position in `centers`.
+    face: (p,) the index of the face of each pair.
     corners: (p, 3) the corners of that face, the vertex first."""
 
     centers: IntArray
@@ -280,7 +288,8 @@ class _VertexStars:
 
     @classmethod
     def of(cls, faces: IntArray, centers: IntArray, count: int) -> _VertexStars:
-        """The stars of the vertices `centers` (k,) in a mesh. count: the number of all vertices."""
+        """The stars of the vertices with the indices `centers` (k,) in a mesh with `faces` (m, 3).
+        count: the number of all vertices of the mesh."""
         index = np.full(count, -1, np.int64)
         index[centers] = np.arange(len(centers))
         face, column = np.nonzero(index[faces] >= 0)
@@ -288,13 +297,15 @@ class _VertexStars:
         return cls(centers, index[corners[:, 0]], face, corners)
 
     def least(self, of_pairs: FloatArray) -> FloatArray:
-        """(k,) the smallest of the numbers (p,) of the pairs of each vertex."""
+        """(k,) for each vertex, the smallest of the numbers `of_pairs` (p,) that belong to its
+        faces."""
         smallest = np.full(len(self.centers), np.inf)
         np.minimum.at(smallest, self.owner, of_pairs)
         return smallest
 
     def mean(self, of_pairs: FloatArray) -> FloatArray:
-        """(k, 3) the mean of the vectors (p, 3) of the pairs of each vertex."""
+        """(k, 3) for each vertex, the mean of the vectors `of_pairs` (p, 3) that belong to its
+        faces."""
         count = np.bincount(self.owner, minlength=len(self.centers))
         sums = [
             np.bincount(self.owner, of_pairs[:, axis], minlength=len(self.centers))
@@ -310,16 +321,20 @@ def _best_places(
     stars: _VertexStars,
     walls: Walls,
 ) -> tuple[FloatArray, FloatArray]:
-    """Find good positions for the vertices of stars.
+    """For each of k vertices, find a position at which the smallest angle of the triangles around
+    it is large.
 
-    Targets for a vertex are: the mean of the positions at which one of its triangles would be
-    equilateral; the mean of the midpoints of the edges opposite to it; the mean of these two; and
-    the position at which its thinnest triangle would be equilateral. The vertex is tried at half of
-    the way and at all of the way to each.
+    stars: the faces around the k vertices.
+    walls: None, or the lower and the upper corner (3,) of a box to which positions are confined.
+
+    There are four targets for a vertex: the mean of the positions at which one of its triangles
+    would be equilateral; the mean of the midpoints of the edges opposite to it; the mean of these
+    two means; and the position at which its thinnest triangle would be equilateral. The vertex is
+    tried at half of the way and at all of the way to each target.
 
     Returns:
-        The position (k, 3) where the smallest angle around the vertex is largest, moved onto the
-        level set; and that smallest angle (k,) there.
+        The best position (k, 3) for each vertex, moved onto the level set; and the smallest angle
+        (k,) around the vertex there, in radians.
     """
     center, a, b = (vertices[stars.corners[:, k]] for k in range(3))
     normal = np.cross(a - center, b - center)
@@ -350,10 +365,13 @@ def _best_places(
 def _least_at(
     positions: FloatArray, stars: _VertexStars, a: FloatArray, b: FloatArray, normal: FloatArray
 ) -> FloatArray:
-    """(k,) the smallest angle around the vertices of stars if they are at `positions` (k, 3); -1
-    where a triangle turns by more than 60 degrees.
+    """(k,) for each of k vertices, the smallest angle (in radians) of the triangles around it if it
+    is moved to its position in `positions` (k, 3); -1 if that turns one of these triangles by more
+    than 60 degrees.
 
-    a, b: (p, 3) the other two corners of the face of each pair. normal: (p, 3) its unit normal."""
+    stars: the faces around the vertices, as p pairs of a vertex and a face.
+    a, b: (p, 3) the other two corners of the face of each pair.
+    normal: (p, 3) the unit normal of the face of each pair, before the move."""
     center = positions[stars.owner]
     cross = np.cross(a - center, b - center)
     size = row_norms(cross)
@@ -366,9 +384,12 @@ def _least_at(
 def _independent_moves(
     rows: IntArray, gain: FloatArray, stars: _VertexStars, faces: IntArray, vertex_count: int
 ) -> IntArray:
-    """Choose the vertices that gain more than all candidates among their neighbors.
+    """Choose moves of vertices that can be made at the same time: no two chosen vertices are
+    neighbors. A candidate is chosen if it gains more than all candidates among its neighbors.
+    Returns the chosen ones of `rows`.
 
-    rows: (j,) the candidates, indices of `stars.centers`. gain: (k,) of all stars."""
+    rows: (j,) the candidates, as positions in `stars.centers`.
+    gain: (k,) for all k stars, how much the smallest angle grows by the move."""
     rank = np.full(vertex_count, len(rows))
     ordered = rows[np.argsort(-gain[rows], kind="stable")]
     rank[stars.centers[ordered]] = np.arange(len(rows))
@@ -386,12 +407,12 @@ def _moves_stay_near(
     rows: IntArray,
     tolerance: float,
 ) -> BoolArray:
-    """(j,) whether the vertices `rows` (j,) of stars may move to their targets.
+    """(j,) for each of j vertices, whether it may move to its target without the mesh leaving the
+    level set. The target has to be on the level set; the centers of the triangles around it have to
+    be within `tolerance` (a length) of the level set; and these have to face along the gradient.
 
-    targets: (k, 3) for all stars.
-
-    A target has to be on the level set, the centers of the triangles around it within `tolerance`
-    of the level set, and the triangles have to face along the gradient."""
+    stars: the faces around k vertices. rows: (j,) the vertices, as positions in `stars.centers`.
+    targets: (k, 3) the targets of all k vertices."""
     moved = np.zeros(len(stars.centers), np.bool_)
     moved[rows] = True
     pairs = np.flatnonzero(moved[stars.owner])

@@ -1,4 +1,4 @@
-"""Meshes of level sets: `mesh`."""
+"""The function `mesh`: triangle meshes of level sets, and closed meshes of solids."""
 
 from __future__ import annotations
 
@@ -237,7 +237,8 @@ def mesh(
         triangles = largest_body(triangles)
 
     def check(one: TriangleMesh) -> None:
-        """Raise unless a changed mesh is still a manifold and, for a solid, near the level."""
+        """Raise a MeshingError unless the mesh `one`, which was changed, is still a manifold and,
+        for a solid, within the tolerance of the level set."""
         if solid:
             made.check_level(one)
         check_manifold(one.faces)
@@ -255,10 +256,11 @@ def mesh(
 
 @dataclass(frozen=True)
 class _MeshOptions:
-    """Arguments of `mesh`, checked.
+    """The checked arguments of `mesh`.
 
-    volume: the volume by which the level set is cut; None if it is not.
-    spacing: the size of cells; None to choose it. The other attributes are named as in `mesh`."""
+    volume: the volume to which the level set is cut; None if it is not cut.
+    spacing: the size of cells, a length; None to choose it.
+    The other attributes are arguments of `mesh` with the same names."""
 
     volume: Volume | None
     tolerance: MeshTolerance
@@ -272,12 +274,13 @@ class _MeshOptions:
 class _RawMesh:
     """A mesh of a level set before it is thickened or simplified.
 
-    surface: the mesh. size: the longest side of its box.
-    facts: what `metadata["harnack"]` says of it.
+    surface: the mesh. size: the longest side of its box, a length.
+    facts: its entries in `metadata["harnack"]`.
     function: the function of which it is a level set.
-    check_level: raises a MeshingError unless a mesh is within the tolerance of the level set.
-    is_checked: whether that has been done, and the surface is known to be a manifold that does not
-        pass through itself."""
+    check_level: a function that raises a MeshingError unless a given mesh is within the tolerance
+        of the level set.
+    is_checked: whether it is already known that `surface` is within the tolerance of the level set,
+        and that it is a manifold that does not pass through itself."""
 
     surface: TriangleMesh
     size: float
@@ -294,14 +297,16 @@ def _mesh_from_signs(
     is_thick: bool,
     asked: _MeshOptions,
 ) -> _RawMesh:
-    """Mesh a level set, or the closed surface of a solid, by the signs of f - level.
+    """Mesh a level set of the field's function f, or the closed surface of a solid, by the signs of
+    f - level on a lattice.
 
-    level: None for the default. solid: as `_level_and_solid` returns it.
-    is_thick: whether the level set is to be thickened.
+    level: the level; None for the field's default.
+    solid: False for a level set; True for the points of a `Solid`; or the interval (low, high) of
+        the values of f in a solid.
+    is_thick: whether the level set will be thickened.
 
     Raises:
-        MeshingError: as `mesh_from_signs`; also if the result is empty, or not near the level at
-            all.
+        MeshingError: the result is empty, or far from the level set; or `mesh_from_signs` fails.
     """
     ends = _ends_by_signs(field, level, solid, is_thick)
     levels = tuple(end for end in ends if math.isfinite(end))
@@ -319,14 +324,17 @@ def _mesh_from_signs(
     losses: list[LostParts] = []
 
     def function(one: float, side: float) -> SignFunction:
-        """The function side * (f - one) for a level `one`."""
+        """The function side * (f - one), whose level set 0 is the level set `one` of f."""
         return SignFunction.of(field, one, filled, cells, side=side, most_faces=asked.most_faces)
 
     is_apart = False
 
     def signed(one: float, side: float, closed: bool) -> TriangleMesh:
-        """The mesh of the level `one`. side: 1, or -1 to swap its two sides. closed: whether it is
-        closed at the box. Its facts and lost parts are appended to the lists."""
+        """The mesh of the level set `one` of f. side: 1; or -1 to reverse all faces. closed:
+        whether the mesh is closed by parts of the box's faces, rather than ending there.
+
+        Its entries for the metadata are appended to the list of facts; the parts of the level set
+        that it lacks, to the list of losses."""
         nonlocal is_apart
         try:
             made, lost, more = mesh_from_signs(
@@ -381,7 +389,11 @@ def _ends_by_signs(
     solid: tuple[float, float] | bool,
     is_thick: bool,
 ) -> tuple[float, float]:
-    """The interval of values of f inside of the solid; for a level set, from its level to infinity.
+    """The interval (low, high) of the values of f inside of a solid. For a level set it is the
+    interval from its level to infinity.
+
+    level: the level; None for the field's default. is_thick: whether it will be thickened.
+    solid: False for a level set; True for the points of a `Solid`; or the interval itself.
 
     Raises:
         TypeError: a surface across which f jumps is to be thickened.
@@ -400,9 +412,11 @@ def _ends_by_signs(
 
 
 def _cells_by_signs(field: Field, size: float, spacing: float | None) -> tuple[float, int]:
-    """The size of cells, and the largest number of attempts with ever smaller ones.
+    """The size of the cells that are tried first, a length, and the largest number of attempts with
+    ever smaller cells.
 
-    size: the longest side of the box. spacing: the size that was asked for; None to choose it."""
+    size: the longest side of the box, a length.
+    spacing: the size that the caller asked for; None to choose it."""
     if spacing is not None:
         return float(spacing), 1
     cells, attempts = size / _SIGN_CELLS, _SIGN_ATTEMPTS
@@ -419,8 +433,11 @@ def _faces_alone(
     solid: tuple[float, float] | bool,
     asked: _MeshOptions,
 ) -> _RawMesh:
-    """The triangles of a mesh that is its own spanning surface, cut by the volume and otherwise
-    unchanged.
+    """Mesh the level set of the winding number of an open mesh whose triangles lie on that level
+    set, such as a mesh of a `SolidAngle`. The result are these triangles, cut by the volume of the
+    arguments and otherwise unchanged.
+
+    level: the level. solid: False; any other value is an error here.
 
     Raises:
         MeshingError: a solid was asked for, nothing is left, or there are too many triangles.
@@ -450,10 +467,10 @@ def _faces_alone(
 def _check_has_thickness(
     field: Field, whole: Manifold, ends: tuple[float, float], tolerance: float
 ) -> None:
-    """Raise a MeshingError if the surfaces at both levels are the same triangles, since the field
-    jumps across both levels there.
+    """Raise a MeshingError if a solid between two levels has no thickness. That is so if the field
+    jumps from below the one to above the other: then both level sets are the same triangles.
 
-    whole: the solid between them. ends: the two levels."""
+    whole: the solid. ends: the two levels. tolerance: a length."""
     if 2 * abs(whole.volume()) < tolerance * whole.surface_area():
         low, high = (f"{one:g}" for one in ends)
         raise MeshingError(
@@ -463,18 +480,18 @@ def _check_has_thickness(
 
 
 def _merge_facts(facts: list[dict[str, Any]]) -> dict[str, Any]:
-    """The facts of a solid from those of the surfaces at its two levels: counts are added, and of
-    lengths the larger is taken."""
+    """Merge the metadata entries (facts) of the surfaces at the two levels of a solid: counts are
+    added, and of two lengths the larger one is taken."""
     sums = ("evaluations", "undecided", "flat", "far", "looked_at", "lost", "sought")
     larger = {key: max(one[key] for one in facts) for key in ("spacing", "within")}
     return {**facts[0], **larger, **{key: sum(one[key] for one in facts) for key in sums}}
 
 
 def _check_sign_accuracy(field: Field, facts: dict[str, Any], tolerance: float) -> bool:
-    """Warn if more than one in a hundred vertices and centers of triangles are farther than the
-    tolerance from the level. Returns whether it warned.
+    """Warn if more than one in a hundred vertices and centers of triangles are farther than
+    `tolerance` (a length) from the level set. Returns whether there was a warning.
 
-    facts: from `mesh_from_signs`.
+    facts: the metadata entries that `mesh_from_signs` returned.
 
     Raises:
         MeshingError: some of them are farther than several cells from the level.
@@ -501,10 +518,11 @@ def _check_sign_accuracy(field: Field, facts: dict[str, Any], tolerance: float) 
 
 
 def _warn_of_lost(field: Field, losses: list[LostParts], is_told: bool) -> None:
-    """Warn if parts of the level set are missing from the mesh.
+    """Warn if the mesh lacks parts of the level set.
 
-    is_told: whether a warning says already that the mesh is coarse. Then only thin parts and points
-        far from the mesh are worth another one."""
+    losses: the missing parts, for each level that was meshed.
+    is_told: whether another warning already says that the mesh is coarse. Then there is a warning
+        only for thin parts, and for parts far from the mesh."""
     for lost in losses:
         if lost.matter and (lost.show_thin_parts or not is_told):
             warnings.warn(
@@ -515,17 +533,21 @@ def _warn_of_lost(field: Field, losses: list[LostParts], is_told: bool) -> None:
 
 
 def _accept(surface: TriangleMesh) -> None:
-    """A check that accepts every surface: for meshes by signs, distances were measured before."""
+    """Accept every surface. This is the check of the distance from the level set for meshes that
+    were made from signs, whose distances have been measured before."""
 
 
 def _level_and_solid(
     surface: Surface, thickness: float | None
 ) -> tuple[float | None, tuple[float, float] | bool]:
-    """What to mesh: a level set or a solid.
+    """Decide what to mesh: a level set of the field's function f, or a solid.
+
+    thickness: of the closed part that is made of the surface; None for none.
 
     Returns:
-        The level, or None for the default; and False for the level set, True for the points of a
-        `Solid`, or the interval (low, high) of the values of f in a solid, which then has no level.
+        The level, or None for the field's default; and one of three: False for the level set; True
+        for the points of a `Solid`; or, for a solid given by values of f, the interval (low, high)
+        of these values. In the last case the level is None.
 
     Raises:
         ValueError: several levels; a solid that is to be thickened.
@@ -551,15 +573,16 @@ def _level_and_solid(
 def _check_level(
     function: LevelFunction, made: TriangleMesh, tolerance: float, volume: Volume | None
 ) -> None:
-    """Raise a MeshingError unless a mesh is within the tolerance of the level set, and inside the
-    volume."""
+    """Raise a MeshingError unless the mesh `made` is within `tolerance` (a length) of the level set
+    of the function, and inside the volume if there is one."""
     if volume is not None:
         check_inside(made.vertices, volume, tolerance)
     check_near_level(function, made.vertices, made.faces, tolerance, volume)
 
 
 def _checked(field: Field) -> Field:
-    """The field, if it can be meshed. A `SolidAngle` is made anew from its loops.
+    """Return the field, if it can be meshed. For a `SolidAngle`, return a new one with the same
+    loops.
 
     Raises:
         TypeError: it has patches, circles, jumps that meshing by signs does not handle, or values
@@ -591,15 +614,18 @@ def _mesh_solid(
     solid: tuple[float, float] | Literal[True],
     asked: _MeshOptions,
 ) -> _RawMesh:
-    """The closed surface of a solid, put together from meshes of smooth levels.
+    """Make the closed surface of a solid from meshes of smooth level sets, which are combined by
+    unions, intersections and differences.
 
-    solid: True for the points of a `Solid`, or the interval of the values of f."""
+    level: the level; None for the field's default.
+    solid: True for the points of a `Solid`; or the interval (low, high) of the values of f in the
+        solid."""
     region = LevelFunction(*solid_and_level(field, solid, level), most_faces=asked.most_faces)
     evaluations = [0]
 
     def angle_mesher(error: float, cells: float) -> AngleMesher:
-        """A function that meshes level sets of angles. error: its tolerance. cells: its size of
-        cells."""
+        """A function that meshes level sets of angles. error: the tolerance of these meshes; cells:
+        their size of cells; both are lengths."""
 
         def mesh_angle(angle: SolidAngle, value: float) -> TriangleMesh:
             """The mesh of the level set of an angle at `value`."""
@@ -618,7 +644,8 @@ def _mesh_solid(
         _check_level(region, made, asked.tolerance.at(size), asked.volume)
 
     def check(made: TriangleMesh, size: float) -> None:
-        """Raise unless the mesh is a manifold near the level set."""
+        """Raise a MeshingError unless the mesh is a manifold within the tolerance of the level set.
+        size: the longest side of its box."""
         check_manifold(made.faces, made.vertices)
         check_level(made, size)
 
@@ -645,8 +672,9 @@ def _mesh_solid(
 
 
 def _mesh_level_set(field: Field, level: float | None, asked: _MeshOptions) -> _RawMesh:
-    """Mesh a level set of a function that is smooth nearly everywhere, or of an angle. level: None
-    for the default of the field."""
+    """Mesh a level set of a function that is smooth nearly everywhere, or of an angle.
+
+    level: the level; None for the field's default."""
     level = field.default_level if level is None else float(level)
     function = LevelFunction(field, level, most_faces=asked.most_faces)
     field.validate_levels((level,))
@@ -683,10 +711,11 @@ def _mesh_in_lattice(
     attempts: int,
     report: Callable[[str], None],
 ) -> tuple[TriangleMesh, dict[str, Any]]:
-    """The level set of a real-valued field in a box, and facts about it.
+    """Mesh the level set of a real-valued function in a box. Returns the mesh, and its entries in
+    `metadata["harnack"]`.
 
-    It is meshed in the cells of a lattice of size `spacing`. If that fails in a way that smaller
-    cells may mend, they are made smaller, with at most `attempts` attempts.
+    The mesh is made in lattice cells of size `spacing`. If that fails in a way that smaller cells
+    may mend, it is made again in smaller ones, with at most `attempts` attempts in all.
 
     Raises:
         MeshingError: the last attempt failed.
@@ -728,7 +757,13 @@ def _mesh_spanning_curve(
     seed: int,
     report: Callable[[str], None],
 ) -> tuple[TriangleMesh, dict[str, Any]]:
-    """The level set of an angle, which ends at its curve, and facts about it."""
+    """Mesh the level set of an angle, a surface that ends at the angle's curve. Returns the mesh,
+    and its entries in `metadata["harnack"]`.
+
+    tolerance: the largest distance of triangles from the level set, a length.
+    spacing: the size of the cells that are tried first, a length.
+    attempts: the largest number of attempts with ever smaller cells.
+    seed: of the small random moves that keep points in general position."""
     ends = box.lower, box.upper
     made = mesh_spanning_curve(
         function, spacing, attempts, ends, box.has_walls, seed, tolerance, report
@@ -757,8 +792,10 @@ class _MeshingBox:
 
 
 def _is_outside_inside(field: Field, ends: tuple[float, float], box: _MeshingBox) -> bool:
-    """Whether the outside of `box`, which contains all levels, belongs to the solid on which f lies
-    between both ends. No level passes there, so that the value at one point decides."""
+    """Whether the outside of `box` belongs to the solid in which f lies between two levels.
+
+    ends: the two levels. The box contains both level sets. So the outside belongs to the solid
+    either as a whole or not at all, and the value of f at one point of it decides."""
     center, half = 0.5 * (box.lower + box.upper), 0.5 * (box.upper - box.lower)
     signs = np.array(np.meshgrid(*[[-1.0, 0.0, 1.0]] * 3)).reshape(3, -1).T
     signs = signs[signs.any(axis=1)]
@@ -772,7 +809,8 @@ def _is_outside_inside(field: Field, ends: tuple[float, float], box: _MeshingBox
 
 
 def _unlimited_box(field: Field, volume: Volume | None) -> _MeshingBox:
-    """The box of the volume, for a solid that goes on outside of the box of its levels.
+    """The box of the clip volume, for a solid that continues outside of the box that contains its
+    level sets.
 
     Raises:
         MeshingError: the volume has no bounds, so that the solid has none.
@@ -787,11 +825,14 @@ def _unlimited_box(field: Field, volume: Volume | None) -> _MeshingBox:
 
 
 def _box(field: Field, levels: tuple[float, ...], volume: Volume | None) -> _MeshingBox:
-    """The box in which level sets are meshed: around their extent, if they have one, and the
-        volume.
+    """The box in which level sets of a field are meshed. It contains the intersection of two
+    regions: the extent of the level sets (a region proved to contain them) and the clip volume.
+    Either may be unknown or unbounded.
+
+    levels: the levels. volume: the clip volume, or None.
 
     Raises:
-        MeshingError: neither has bounds, or they have no point in common.
+        MeshingError: neither region is bounded, or they have no point in common.
     """
     extent, level = field.extent(levels), levels[0]
     if volume is None and extent is None and isinstance(field, SolidAngle):
@@ -827,11 +868,14 @@ def _box(field: Field, levels: tuple[float, ...], volume: Volume | None) -> _Mes
 
 
 def _around_curve(field: SolidAngle, extent: Volume | None, volume: Volume | None) -> _MeshingBox:
-    """The box in which the surface of a curve is meshed. It contains the whole surface, which is
-    cut later; or, if the surface has no extent, the curve and the volume.
+    """The box in which a level set of a `SolidAngle` is meshed, a surface that spans a curve.
+
+    extent: a region proved to contain the surface, or None. If there is one, the box contains the
+        whole surface, which is cut later; otherwise it contains the curve and the clip volume.
+    volume: the clip volume, or None.
 
     Raises:
-        MeshingError: the volume has no bounds.
+        MeshingError: there is no extent, and the clip volume is unbounded.
     """
     if extent is not None:
         return _MeshingBox(*_bounds_of(extent), False)
@@ -846,7 +890,8 @@ def _around_curve(field: SolidAngle, extent: Volume | None, volume: Volume | Non
 
 
 def _bounds_of(volume: Volume | None) -> tuple[FloatArray, FloatArray]:
-    """The lower and the upper corner (3,) of the bounding box of a volume, which is not None."""
+    """The lower and the upper corner (3,) of the bounding box of a volume, which must not be
+    None."""
     assert volume is not None
     lower, upper = (np.array(end, np.float64) for end in volume.bounds())
     return lower, upper

@@ -32,7 +32,7 @@ class MeshTolerance:
         return cls(None if hits is None else hits.distance)
 
     def at(self, size: float) -> float:
-        """The tolerance for a surface of this size, a length.
+        """The tolerance, a length, for a surface of this size (the longest side of its box).
 
         Raises:
             ValueError: the tolerance that was given is half of the size or more.
@@ -46,6 +46,9 @@ class MeshTolerance:
         return length
 
     def within(self, size: float) -> float:
-        """The tolerance for a part of a surface, of this size. Unlike `at` it does not fail if the
-        part is smaller than the tolerance that was given: the result is at most 0.4 of the size."""
+        """The tolerance, a length, for one component of a surface. size: the longest side of the
+        component's box.
+
+        It is the tolerance that was given, but at most 0.4 `size`, since a small component could
+        vanish within a larger one. If none was given, it is 1e-3 of `size`. It never raises."""
         return self.at(size) if self.length is None else min(self.length, 0.4 * size)

@@ -1,9 +1,9 @@
-"""The local repair of closed meshes in which a few vertices or faces are off the level set.
+"""The local repair of closed meshes of which a few vertices or faces are off the level set.
 
-Offsets of meshes have creases everywhere. Where another part cuts a triangle that lies across a
-crease, the pieces have centers and corners of their own. One in a hundred thousand of these may be
-farther from the level set than the triangle's center. There, edges across the crease are cut at the
-crease, and the new faces are checked together with the faces around them.
+A triangle may lie across a crease of the surface, with its center near the level set. If another
+solid cuts this triangle, the pieces have other centers and corners, which may be farther from the
+level set; this happens for about one piece in a hundred thousand. Then the edges across the crease
+are split at the crease, and the new faces are checked together with the faces around them.
 """
 
 from __future__ import annotations
@@ -39,11 +39,12 @@ def project_outliers(
     tolerance: float,
     check: Callable[[TriangleMesh], None],
 ) -> TriangleMesh | None:
-    """Mend a closed surface of which a few points are too far from the level set.
+    """Mend a closed surface of which a few vertices or centers of faces are too far from the level
+    set (far, for short).
 
-    Far vertices are moved onto the level set. Faces with a far center are cut at the midpoints of
-    their edges that are off the level set, or at the center, and the new vertices are moved onto
-    it.
+    Far vertices are moved onto the level set. A face with a far center is split at the midpoints of
+    those of its edges that are off the level set, or at its center if there are none, and the new
+    vertices are moved onto the level set.
 
     surface: none of its triangles pass through each other, and nearly all are near the level set.
     places: (k, 3) the far vertices and the far centers of faces.
@@ -83,18 +84,19 @@ def _project_and_split(
     points: FloatArray,
     tolerance: float,
 ) -> tuple[tuple[FloatArray, IntArray], BoolArray] | None:
-    """Move vertices at `points` onto the level set, and cut the faces with a center at `points`.
+    """Move the vertices that lie at one of `points` (k, 3) onto the level set, and split the faces
+    whose center lies at one of them.
 
-    Such a face is cut at the midpoints of its edges that are off the level set by more than half of
-    the tolerance, or at its center if there are none. The new vertices are moved onto the level
-    set.
+    A face is split at the midpoints of those of its edges that are off the level set by more than
+    half of `tolerance` (a length), or at its center if there are none. The new vertices are moved
+    onto the level set.
 
     is_new: (m,) the mask of the faces that earlier calls made.
 
     Returns:
-        The vertices and the faces; and the mask of the new faces, including those of `is_new` that
-        are left and the faces at moved vertices. None if a point is neither a vertex nor a center,
-        or would be moved by more than two tolerances.
+        The vertices and the faces; and the mask of the faces to be checked: those made by this call
+        or by earlier ones, and the faces at moved vertices. None if a point is neither a vertex nor
+        the center of a face, or would be moved by more than two tolerances.
     """
     vertices, faces = surface.vertices, surface.faces
     corners = _rows_at(points, vertices)
@@ -147,12 +149,14 @@ def _check_new_faces(
     tolerance: float,
     check: Callable[[TriangleMesh], None],
 ) -> TriangleMesh | None:
-    """Check that the new faces pass through no others, and mend the surface if they do.
+    """Check that the new faces of a surface pass through no other faces; if they do, try to mend
+    the surface by contracting and flipping edges.
 
     is_new: (m,) the mask of the new faces.
 
     Returns:
-        The surface, if nothing crosses; the mended surface, if `check` accepts it; else None.
+        The surface, if no faces cross; the mended surface, if none cross any more and `check`
+        accepts it; None otherwise.
     """
     vertices, faces = surface.vertices, surface.faces
     nearby = _in_boxes_of(vertices[faces], np.flatnonzero(is_new))

@@ -46,7 +46,7 @@ _WORDS = re.compile(r"\{([^{}|]*)\|([^{}|]*)\}")
 
 @dataclass(frozen=True, eq=False)
 class PrintProblem:
-    """A problem of a mesh that is to be printed.
+    """A kind of problem of a mesh that is to be printed, and where it occurs.
 
     kind: the name of the problem, such as "open edges".
     count: how often it occurs.
@@ -66,10 +66,10 @@ class PrintCheck:
     """The result of checking a mesh that is to be printed.
 
     problems: errors first, then hints.
-    size: (x, y, z), the edge lengths of the bounding box.
-    volume: None if the mesh is not closed.
+    size: (x, y, z) the edge lengths of the bounding box, in the mesh's unit.
+    volume: the enclosed volume, in that unit cubed; None if the mesh is not closed.
     triangles: the number of triangles.
-    parts: the number of components, which are not connected by vertices."""
+    parts: the number of connected components; faces that share a vertex are connected."""
 
     problems: tuple[PrintProblem, ...]
     size: tuple[float, float, float]
@@ -173,11 +173,13 @@ def _has_errors(problems: Sequence[PrintProblem]) -> bool:
 
 
 def _mesh_of(part: Any) -> tuple[FloatArray, IntArray, PrintProblem]:
-    """Read a mesh, and join its vertices that are at one place or apart by rounding.
+    """Read a mesh, and join its vertices that are at the same place or differ only by rounding.
+
+    part: a trimesh.Trimesh, (vertices, faces), or the name of a file.
 
     Returns:
-        The vertices; the faces between joined vertices, including faces without an area; and a hint
-        with the number of vertices that were apart by rounding.
+        The joined vertices (n, 3); the faces (m, 3), including faces without an area; and a problem
+        (a hint) that counts the vertices that differed by rounding.
     """
     if isinstance(part, str | os.PathLike):
         read = read_geometry(cast("Any", part), "winding")
@@ -207,9 +209,11 @@ def _mesh_of(part: Any) -> tuple[FloatArray, IntArray, PrintProblem]:
 
 
 def _problem(kind: str, locations: FloatArray, text: str, *, is_fatal: bool = True) -> PrintProblem:
-    """A problem at some locations (k, 3), with its message.
+    """Make a problem that occurs at k locations (k, 3), with its message.
 
-    text: has {} for the number, and words that depend on it as {one|several}."""
+    text: a format for the message. {} stands for k; {one|several} for the word before the bar if k
+        is 1, and for the word after it otherwise.
+    is_fatal: whether the problem is an error, and not only a hint."""
     count = len(locations)
     near = "" if not count else f", {'' if count == 1 else 'such as '}at {point_text(locations[0])}"
     text = _WORDS.sub(lambda pair: pair[1 if count == 1 else 2], text)
@@ -217,8 +221,11 @@ def _problem(kind: str, locations: FloatArray, text: str, *, is_fatal: bool = Tr
 
 
 def _topology(x: FloatArray, faces: IntArray) -> list[PrintProblem]:
-    """The problems of edges, of orientation, of duplicate faces, of vertices where parts touch and
-    of faces without an area."""
+    """The problems of how faces are connected: open edges and edges of more than two faces,
+    neighbors of opposite orientation, duplicate faces, vertices where sheets touch, and faces
+    without an area.
+
+    x, faces: (n, 3), (m, 3) the mesh."""
     flat = zero_area_faces(x, faces)
     vanished = (faces == np.roll(faces, 1, axis=1)).any(axis=1)
     used = faces[~vanished]
@@ -267,12 +274,12 @@ def _topology(x: FloatArray, faces: IntArray) -> list[PrintProblem]:
 
 
 def _component_problems(shells: Shells, is_closed: bool, is_clear: bool) -> list[PrintProblem]:
-    """The problems of components: those that are inside out, inside others, loose or tiny, and
-        cavities.
+    """The problems of the connected components of a mesh: components that are inside out, or lie in
+    the material of other components; several separate bodies; tiny bodies; and cavities.
 
     is_closed: whether the mesh is closed.
-    is_clear: whether also no faces pass through each other, so that a component is inside another
-        one as a whole or not at all."""
+    is_clear: whether the mesh is closed and no faces pass through each other. Then a component
+        lies inside another one either as a whole or not at all."""
     volumes, none = shells.volumes, np.zeros(len(shells.volumes), np.bool_)
     middle = 0.5 * (shells.lower + shells.upper)
     length = (shells.upper - shells.lower).max(axis=1)
@@ -311,10 +318,13 @@ def _component_problems(shells: Shells, is_closed: bool, is_clear: bool) -> list
 def _contacts(
     x: FloatArray, faces: IntArray, shells: Shells, is_closed: bool
 ) -> tuple[PrintProblem, PrintProblem]:
-    """Two problems: faces that pass through or lie on others, and faces that only touch others.
+    """Two problems of a mesh: faces that pass through other faces or lie on them; and faces that
+    only touch other faces.
 
-    Faces without an area close gaps between corners and edges that lie on each other. So for a
-    component with such faces, contacts with itself are not reported."""
+    If a component has faces without an area, its contacts with itself are not reported: such faces
+    close gaps of width zero, where other faces touch each other necessarily.
+
+    x, faces: (n, 3), (m, 3) the mesh. shells: its connected components."""
     is_flat = np.zeros(len(faces), np.bool_)
     is_flat[zero_area_faces(x, faces)] = True
     is_plain = np.isin(shells.component_of_face, shells.component_of_face[is_flat], invert=True)
@@ -345,8 +355,8 @@ def _contacts(
 
 
 def _thin_walls(x: FloatArray, faces: IntArray, wall: float, is_solid: bool) -> PrintProblem:
-    """The problem of walls thinner than `wall`, a length; if the mesh bounds no solid, that they
-    could not be measured."""
+    """The problem of places that are thinner than `wall`, a length. If the mesh bounds no solid,
+    the problem says instead that thickness could not be measured."""
     if not is_solid:
         # The name differs from that of walls that were measured to be thin.
         why = "how thick walls are is not known before the rest is mended"
@@ -370,9 +380,11 @@ def _coarse_faces(x: FloatArray, faces: IntArray, wall: float) -> PrintProblem:
 
 
 def _size_problems(size: tuple[float, float, float], bed: list[float] | None) -> list[PrintProblem]:
-    """The problems of the size: a likely other unit, and a part that does not fit.
+    """The problems of the size of a part: it is so small or large that its unit may be another one
+    (inches or meters); and it does not fit into the printer.
 
-    size: (x, y, z) of the part. bed: (x, y, z) of the space that it has to fit in; None for any."""
+    size: (x, y, z) the edge lengths of the part's bounding box.
+    bed: [x, y, z] those of the space into which it has to fit; None if any size fits."""
     longest, nowhere = max(size), np.zeros((0, 3))
     text = " x ".join(f"{length:.4g}" for length in size)
     problems: list[PrintProblem] = []

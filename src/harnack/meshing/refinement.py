@@ -79,11 +79,12 @@ def refine(
     are within the tolerance (a length); or until refinement is found to diverge, which the caller
     has to check (`check_near_level`).
 
-    walls: the lower and the upper corner of the box on whose faces the boundary lies, so that its
-        edges are split too; None if the boundary stays as it is.
-    where: which midpoints and centers count. The midpoints of edges that are split at the border of
-        that region are moved onto the level set as well: otherwise these edges would be split again
-        and again, as they end off the level set.
+    walls: None, or the lower and the upper corner (3,) of a box on whose faces the boundary lies.
+        If it is None, boundary edges stay as they are; otherwise they are split too.
+    where: a function of points (k, 3) that returns the mask (k,) of the points that lie in the
+        region to be refined; None for everywhere. An edge that leads out of that region may be
+        split as well. Its midpoint is always moved onto the level set: otherwise the new edges
+        would end off the level set, and would be split again and again.
 
     Returns the vertices and the faces.
 
@@ -128,11 +129,15 @@ def refine(
 def _converge_vertices(
     function: LevelFunction, vertices: FloatArray, faces: IntArray, tolerance: float, walls: Walls
 ) -> FloatArray:
-    """Vertices after more of Newton's steps for those that are not yet on the level set. There are
-    such vertices beside the dipoles of a cloud, where the gradient changes within a step. A vertex
-    is moved only if that brings it closer to the level, and by less than the tolerance.
+    """Make more of Newton's steps for the vertices that are not yet on the level set. Returns all
+    vertices (n, 3).
 
-    Boundary vertices stay, unless the boundary lies in `walls`."""
+    There are such vertices beside the dipoles of a point cloud, where the gradient changes much
+    within a step. A vertex is moved only if that brings it closer to the level set, and by less
+    than `tolerance` (a length). Boundary vertices stay if `walls` is None.
+
+    walls: None, or the lower and the upper corner (3,) of a box on whose faces the boundary
+        lies."""
     samples = function.sample(vertices)
     is_off = samples.distance > _ON_SURFACE * tolerance
     if walls is None:
@@ -154,20 +159,22 @@ def _converge_vertices(
 def _project_to_creases(
     function: LevelFunction, vertices: FloatArray, ends: IntArray, moved: FloatArray, walls: Walls
 ) -> FloatArray:
-    """Move the new vertices of edges that cut off a sharp crease onto the crease.
+    """The new vertices (k, 3) of k edges that are split. If an edge cuts off a sharp crease of the
+    surface, its new vertex is put onto the crease; otherwise it is the given one.
 
-    ends: (k, 2) the vertices of the edges.
-    moved: (k, 3) their middles, moved onto the level set. Returned, except for those edges.
+    ends: (k, 2) the indices of the vertices at the ends of each edge.
+    moved: (k, 3) the midpoints of the edges, moved onto the level set by Newton's method.
+    walls: None, or the lower and the upper corner (3,) of a box to which points are confined.
 
-    Newton's method leads to one of the two sides of a crease, and an edge along the normal of that
-    side leads back to its end: cut there again and again, its length stays the same. Instead, take
-    the point of both tangent planes at the ends that is nearest to the middle. It is on the crease,
-    as far as the sides of the crease are flat (Kobbelt et al. 2001). The new vertex is where the
-    segment from the middle to this point passes the level.
+    Newton's method moves a midpoint to one of the two sides of a crease, possibly back to an end of
+    the edge; then splitting would not shorten the edge. Instead, take the point nearest to the
+    midpoint in the line in which the tangent planes at both ends meet. It is on the crease if the
+    sides of the crease are flat (Kobbelt et al. 2001). The new vertex is where the segment from the
+    midpoint to this point passes the level.
 
-    There is a crease if normals turn by 20 degrees or more between the ends, and by nearly all of
-    that angle between the moved middle and one of the ends; on a smooth surface they turn by about
-    half of it there."""
+    An edge cuts off a crease if the normals at its ends differ by 20 degrees or more, and the
+    normals at the moved midpoint and at one of the ends differ by nearly that angle. On a smooth
+    surface the latter two differ by about half of it."""
     used, index = np.unique(ends, return_inverse=True)
     slope = function.sample(vertices[used]).gradient
     at_ends = (slope / np.maximum(row_norms(slope), 1e-300)[:, None])[index.reshape(-1, 2)]
@@ -196,12 +203,13 @@ def _project_to_creases(
 def _crease_corners(
     function: LevelFunction, vertices: FloatArray, faces: IntArray, walls: Walls
 ) -> FloatArray:
-    """A point (k, 3) on the level set for each of the faces (k, 3), which cut off a corner of the
-    surface.
+    """New vertices (k, 3) on the level set for faces (k, 3) that cut off a corner of the surface,
+    one for each face.
 
-    If the normals at the vertices of a face are independent, their tangent planes meet in a point.
-    The result is where the segment from the face's center to this point passes the level; if it
-    does not, or if normals are not independent, it is the center, moved onto the level set."""
+    If the normals at the three vertices of a face are linearly independent, the tangent planes at
+    these vertices meet in a point. The new vertex is where the segment from the face's center to
+    this point passes the level. If it does not pass the level, or if the normals are dependent, the
+    new vertex is the center of the face, moved onto the level set by Newton's method."""
     corner = vertices[faces]
     center = corner.mean(axis=1)
     span = np.stack([row_norms(corner[:, k] - corner[:, k - 1]) for k in range(3)]).max(axis=0)
@@ -220,14 +228,16 @@ def _crease_corners(
 def _level_along(
     function: LevelFunction, start: FloatArray, along: FloatArray, limit: FloatArray, walls: Walls
 ) -> tuple[FloatArray, BoolArray]:
-    """Search for the level set along segments from `start` (k, 3).
+    """Search for the level set along segments.
 
-    along: (k, 3) the displacements from start to end, which are shortened to at most `limit` (k,),
-        a length. The search goes on for a quarter of that beyond the end.
+    start, along: (k, 3) the start of each segment, and the vector to its end. A vector longer than
+        `limit` (k,) is shortened to that length. The search goes a quarter of the length beyond the
+        end.
+    walls: None, or the lower and the upper corner (3,) of a box to which points are confined.
 
     Returns:
-        The first crossing (k, 3) on each segment, and the mask (k,) of segments that cross the
-        level. Where there is none, the point has no meaning.
+        The first crossing (k, 3) of the level on each segment; and the mask (k,) of the segments
+        that cross the level. If a segment does not cross it, its point has no meaning.
     """
     along = along * np.minimum(1, limit / np.maximum(row_norms(along), 1e-300))[:, None]
     low, high = np.zeros(len(start)), np.full(len(start), _SEARCH_LENGTH)
@@ -251,25 +261,27 @@ def _level_along(
 def unrefined_midpoints(
     function: LevelFunction, vertices: FloatArray, faces: IntArray, tolerance: float
 ) -> FloatArray:
-    """(k, 3) the midpoints of the edges that `refine` would still split."""
+    """(k, 3) the midpoints of the edges of a mesh that `refine` would still split, because the mesh
+    is farther than `tolerance` (a length) from the level set there."""
     marks = _RefinementMarks.of(function, vertices, faces, tolerance, None, None)
     return marks.middle[marks.marked]
 
 
 @dataclass(frozen=True)
 class _RefinementMarks:
-    """The edges of a mesh, and which of them are to be split.
+    """The k edges of a mesh with m faces, and which edges are to be split.
 
     edges: (m, 3) the indices of the edges of each face.
     ends: (k, 2) the vertices at the ends of each edge.
     middle: (k, 3) the midpoints of the edges. span: (k,) their lengths.
-    samples: the function at the midpoints.
-    is_beyond: (k,) edges whose midpoint counts and is farther than the tolerance from the level
-        set.
-    is_off: (m,) faces whose center counts and is farther than the tolerance from the level set.
-    marked: (k,) edges to be split.
-    misses_corner: (m,) faces that are off although the midpoints of their edges are not, as they
-        cut off a corner of a surface with creases. They get a new vertex within."""
+    samples: values and gradients of the function at the midpoints.
+    is_beyond: (k,) the mask of the edges whose midpoint is farther than the tolerance from the
+        level set (and lies in the region that is refined).
+    is_off: (m,) the mask of the faces whose center is that far.
+    marked: (k,) the mask of the edges to be split.
+    misses_corner: (m,) the mask of the faces that cut off a corner of the surface, where creases
+        meet: their center is too far from the level set, but no midpoint of their edges is. Such a
+        face gets a new vertex in its interior."""
 
     edges: IntArray
     ends: IntArray
@@ -291,13 +303,18 @@ class _RefinementMarks:
         walls: Walls,
         where: Where,
     ) -> _RefinementMarks:
-        """Mark the edges to be split: those whose midpoint is farther than `tolerance` from the
-        level set; and, for each face whose center is so far, the longest edge that may be split.
-        For functions with creases, faces are excepted that cut off a corner (`misses_corner`).
+        """Decide which edges of a mesh are to be split.
 
-        walls: the lower and the upper corner of the box, on whose faces the boundary lies, so that
-            its edges may be split; None if the boundary stays as it is.
-        where: which midpoints and centers count."""
+        These are the edges whose midpoint is farther than `tolerance` (a length) from the level
+        set; and of each face whose center is that far, the longest edge that may be split. Boundary
+        edges and very short edges are never split. A face that cuts off a corner of a surface with
+        creases is noted in `misses_corner` instead.
+
+        vertices, faces: (n, 3), (m, 3) the mesh.
+        walls: None, or the lower and the upper corner (3,) of a box on whose faces the boundary of
+            the mesh lies; then boundary edges may be split too.
+        where: a function of points (k, 3) that returns the mask (k,) of those that count. Midpoints
+            and centers that do not count are taken to be on the level set. None: all count."""
         ends, edges, is_boundary = _edges(faces)
         if walls is not None:  # the boundary lies in the walls, and so do the middles of its edges
             is_boundary = np.zeros_like(is_boundary)
@@ -326,7 +343,8 @@ class _RefinementMarks:
 
 
 def _normals_turn(function: LevelFunction, corner: FloatArray) -> BoolArray:
-    """(k,) whether normals at two corners of a face differ by the angle of a crease.
+    """(k,) for each of k faces, whether the normals of the level set at two of its corners differ
+    by so much that the surface between them has a crease.
 
     corner: (k, 3, 3) the corners of the faces."""
     slope = function.sample(corner.reshape(-1, 3)).gradient
@@ -347,7 +365,8 @@ def _edges(faces: IntArray) -> tuple[IntArray, IntArray, BoolArray]:
 
 
 def split_faces(vertices: FloatArray, faces: IntArray, middle: IntArray) -> IntArray:
-    """Split faces (m, 3) at the midpoints of their edges.
+    """Split faces (m, 3) at the midpoints of some of their edges, into two, three or four faces
+    each. Returns all faces (k, 3), unsplit ones first.
 
     middle: (m, 3) the vertices at the midpoints of the edges 01, 12 and 20 of each face; -1 for
         edges that are not split."""
@@ -365,9 +384,9 @@ def split_faces(vertices: FloatArray, faces: IntArray, middle: IntArray) -> IntA
         pair = (number == 2) & ~cut[:, k]
         # The edge from a to b is not cut; y and z are the middles of the other edges.
         (a, b, c), y, z = faces[pair][:, order].T, middle[pair, order[1]], middle[pair, order[2]]
-        first = row_norms(vertices[a] - vertices[y])
-        second = row_norms(vertices[b] - vertices[z])
-        shorter = (first < second)[:, None]
+        length_ay = row_norms(vertices[a] - vertices[y])
+        length_bz = row_norms(vertices[b] - vertices[z])
+        shorter = (length_ay < length_bz)[:, None]
         parts.append(np.stack([z, y, c], axis=1))
         parts.append(np.where(shorter, np.stack([a, b, y], 1), np.stack([a, b, z], 1)))
         parts.append(np.where(shorter, np.stack([a, y, z], 1), np.stack([b, y, z], 1)))
@@ -382,11 +401,14 @@ def improve(
     walls: Walls,
     report: Callable[[str], None],
 ) -> tuple[FloatArray, IntArray]:
-    """Improve the angles of triangles. Returns the vertices and the faces.
+    """Improve the angles of the triangles of a mesh. Returns the vertices (n, 3) and faces (m, 3).
 
-    Edges are flipped and vertices smoothed in turn, and slivers are contracted. Then edges are
-    split again where triangles are no longer within `tolerance`, and finally edges are flipped and
-    vertices moved for larger angles."""
+    First, edges are flipped and vertices smoothed in turn. Then slivers are contracted, and edges
+    are split where triangles are no longer within `tolerance` (a length) of the level set. Finally
+    edges are flipped and vertices moved for larger angles.
+
+    walls: None, or the lower and the upper corner (3,) of a box on whose faces the boundary
+        lies."""
     for _ in range(2):
         faces = flip_edges(function, vertices, faces, tolerance)
         vertices = smooth(function, vertices, faces, walls, rounds=2)
@@ -407,10 +429,11 @@ def smooth(
     walls: Walls,
     rounds: int = 3,
 ) -> FloatArray:
-    """The vertices (n, 3), moved halfway to the mean of their neighbors and back onto the level
-    set, for some rounds. Boundary vertices stay, and moves that turn a face by much are undone.
+    """Smooth a mesh: in each round, every vertex is moved halfway to the mean of its neighbors, and
+    then back onto the level set. Returns the vertices (n, 3). Boundary vertices stay, and moves
+    that turn a face by much are undone.
 
-    walls: the lower and the upper corner of the box, on whose faces points stay; or None."""
+    walls: None, or the lower and the upper corner (3,) of a box to which vertices are confined."""
     ends, _, _ = _edges(faces)
     boundary = np.unique(boundary_edges(faces))
     free = np.zeros(len(vertices), np.bool_)
@@ -447,11 +470,16 @@ def smooth_within_tolerance(
     tolerance: float,
     where: Where = None,
 ) -> FloatArray:
-    """Smooth vertices as `smooth` does, but undo that for the vertices of faces that are then too
-    far from the level set, as beside a crease.
+    """Smooth a mesh: move its vertices towards the mean of their neighbors and back onto the level
+    set, for some rounds (`smooth`). Returns the vertices (n, 3).
 
-    Too far are faces whose center, or the midpoint of one of whose edges, is farther than
-    `tolerance` (a length). where: which midpoints and centers count."""
+    Beside a crease, that can move faces away from the level set. A face is too far if its center,
+    or the midpoint of one of its edges, is farther than `tolerance` (a length) from it. The
+    vertices of such faces get their former positions.
+
+    walls: None, or the lower and the upper corner (3,) of a box to which vertices are confined.
+    where: a function of points (k, 3) that returns the mask (k,) of those that are to be within the
+        tolerance; None for all."""
     after = smooth(function, vertices, faces, walls)
     rows = np.arange(len(faces))
     for _ in range(8):
@@ -471,10 +499,13 @@ def smooth_within_tolerance(
 
 
 def _undo_flipped(before: FloatArray, after: FloatArray, faces: IntArray) -> FloatArray:
-    """The vertices `after`, except that the vertices of faces that turned over go back to `before`.
+    """The vertices (n, 3) after a move, with the move undone at faces (m, 3) that it turned over: a
+    face whose normal turned by more than about 70 degrees gets its former vertices.
 
-    A face counts as turned over if its normal turned by more than about 70 degrees. That is
-    repeated, as reverting vertices may turn other faces; if it does not end, all vertices go back.
+    before, after: (n, 3) the vertices before and after the move.
+
+    Undoing a move at some vertices may turn other faces over, so this is repeated. If it does not
+    come to an end, all vertices get their positions in `before`.
     """
     for _ in range(8):
         corner = after[faces]

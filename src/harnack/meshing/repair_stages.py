@@ -4,13 +4,15 @@ where possible.
 Stages are tried in turn, from the one that keeps most to the one that always gives a result: all
 triangles stay and holes are filled; bodies that overlap are united (`bodies`; for a surface that
 passes through itself, pieces of its faces, `joined_pieces`); only valid triangles stay
-(`mesh_cleaning`); corners of loose triangles are merged; everything is remeshed from signs, on the
-surface where the winding number is 1/2.
+(`mesh_cleaning`); triangles that share no vertices are joined at near corners; everything is
+remeshed: the surface on which the winding number of the mesh is 1/2 is extracted from signs.
 
-A result is not accepted for being closed: each is compared with the winding number of the input
-(`intended_solid`). Smooth hole fillings have minimal bending (`hole_filling`), and nothing is
-proved of them but that they intersect nothing; those on which w = 1/2 (`harmonic_filling`) have a
-proof, and a dent where the surface was round.
+That a result is closed is not enough. The solid that it bounds is compared with the winding number
+of the input, and the result is rejected if they disagree (`intended_solid`). Holes are filled in
+one of two ways. Smooth fillings, of minimal bending (`hole_filling`), are proved only to intersect
+neither the mesh nor each other. Harmonic fillings (`harmonic_filling`) are parts of the surface on
+which the winding number is 1/2 modulo 1, and it is proved which surface they approximate; but they
+have a dent where the surface was round.
 """
 
 from __future__ import annotations
@@ -72,8 +74,8 @@ _ATTEMPTS, _FEW_ATTEMPTS, _FEW_EDGES = 6, 1, 1000
 # If the mesh is remeshed: the number of cells across it. If that takes more triangles than the
 # first of the next numbers, as for a rough surface, cells are made larger by the second, at most as
 # often as the third says.
-_ACROSS_ANEW = 48
-_MOST_ANEW, _GROWTH, _MAX_GROWTHS = 80_000, 1.4, 3
+_CELLS_ACROSS = 48
+_MAX_TRIANGLES, _GROWTH, _MAX_GROWTHS = 80_000, 1.4, 3
 
 # Points lie in a plane if the smallest of their singular values is at most this fraction of the
 # largest.
@@ -192,7 +194,7 @@ def repair(
     largest = flag(largest, "largest")
     keywords = {} if tolerance is None else {"tolerance": tolerance}
     accuracy = MeshTolerance.of(trace_options("repair", options, keywords, ("tolerance",)))
-    asked = _checked_settings(keep, filling, accuracy, cell_size, seed, teller(progress))
+    settings = _checked_settings(keep, filling, accuracy, cell_size, seed, teller(progress))
     _check_is_mesh(mesh)
     _check_encloses(mesh)
     intended = IntendedSolid.of(mesh, as_it_is=keep == "all")
@@ -207,20 +209,20 @@ def repair(
     reasons, results = list[str](), list[_Result]()
     for name in names:
         try:
-            surface, facts = stages[name](intended, asked)
+            surface, facts = stages[name](intended, settings)
         except (MeshError, MeshingError) as error:
             if name == names[-1] and not results:
                 raise
             reasons.append(str(error))
-            asked.report(f"{error}; so not all is kept")
+            settings.report(f"{error}; so not all is kept")
             continue
-        asked.report("comparing with what was given")
+        settings.report("comparing with what was given")
         away = 2 * accuracy.at(intended.size) + facts.get("moved", 0.0)
         results.append(_Result(surface, facts, intended.difference(surface, away)))
         if results[-1].difference is None:
             break
         reasons.append(f"the result of {facts['stage']} is another solid: {results[-1].difference}")
-        asked.report(f"{reasons[-1]}; so another way")
+        settings.report(f"{reasons[-1]}; so another way")
     best = min(results, key=lambda result: result.badness)
     moved = best.facts.get("moved", 0.0)
     if moved > 2 * accuracy.at(intended.size):
@@ -236,8 +238,11 @@ def repair(
 
 @dataclass(frozen=True)
 class _RepairOptions:
-    """The arguments of `repair`, checked. patches is its `filling`, spacing its `cell_size`, and
-    report its `progress`."""
+    """The arguments of `repair`, checked.
+
+    patches: "smooth" or "harmonic", the argument `filling`.
+    spacing: the size of cells, a length, the argument `cell_size`; None to choose it.
+    report: called with messages, the argument `progress`."""
 
     keep: Keep | None
     patches: Patches
@@ -255,7 +260,7 @@ def _checked_settings(
     seed: int,
     report: Callable[[str], None],
 ) -> _RepairOptions:
-    """The arguments of `repair`, checked.
+    """Check the arguments of `repair`, and collect them in one object.
 
     Raises:
         ValueError: one of them is not among the allowed values.
@@ -281,13 +286,15 @@ class _Result:
 
     @property
     def badness(self) -> float:
-        """`Difference.badness`; 0 if the result does not differ from the input."""
+        """How much the result differs from the input, by which results are compared
+        (`Difference.badness`); 0 if it does not differ."""
         return 0.0 if self.difference is None else self.difference.badness
 
     def finished(self, more: dict[str, Any], largest: bool) -> trimesh.Trimesh:
-        """The mesh that `repair` returns. It warns if the result differs from the input.
+        """The mesh that `repair` returns. Warns if the result differs from the input.
 
-        more: further facts. largest: whether to keep only the body of the largest volume."""
+        more: entries that are added to `metadata["harnack"]`.
+        largest: whether to keep only the body with the largest volume."""
         from harnack.meshing.closed_mesh import ClosedMesh
 
         surface = self.surface
@@ -315,8 +322,8 @@ class _Result:
 
 
 def _count_kept(surface: TriangleMesh, whole: TriangleMesh, first: int) -> int:
-    """How many of the first `first` faces of the mesh `whole` are among the faces of `surface`, by
-    the coordinates of their corners."""
+    """How many of the first `first` faces of the mesh `whole` are also faces of `surface`. Faces
+    are the same if their corners have the same coordinates."""
     corners = [one.vertices[one.faces].reshape(-1, 9) for one in (surface, whole)]
     present = {row.tobytes() for row in corners[0]}
     return sum(row.tobytes() in present for row in corners[1][:first])
@@ -332,10 +339,11 @@ def _check_is_mesh(mesh: Any) -> None:
 
 
 def _check_encloses(mesh: Any) -> None:
-    """Raise if a mesh cannot enclose anything.
+    """Check that a mesh can enclose something.
 
     Raises:
-        MeshError: all faces lie in a plane, or the mesh has one side only; or as `validate_mesh`.
+        MeshError: all faces lie in a plane, or the mesh has one side only, like a Moebius strip; or
+            `validate_mesh` rejects it.
     """
     vertices, faces = validate_mesh(
         np.asarray(mesh.vertices), np.asarray(mesh.faces), allow_zero_area=True
@@ -359,39 +367,42 @@ def _check_encloses(mesh: Any) -> None:
 
 
 def _unite_bodies(
-    intended: IntendedSolid, asked: _RepairOptions
+    intended: IntendedSolid, settings: _RepairOptions
 ) -> tuple[TriangleMesh, dict[str, Any]]:
-    """Stage "boolean_union": the boundary of the solid of a closed mesh that passes through itself,
-    or whose parts overlap or touch. Returns it with facts for the metadata.
+    """Stage "boolean_union": the boundary of the solid that a closed mesh describes, which passes
+    through itself, or whose components overlap or touch.
+
+    Returns:
+        The boundary; and its entries in `metadata["harnack"]`.
 
     Raises:
-        MeshError, MeshingError: as `repair`; also if nothing of the mesh overlaps.
+        MeshError, MeshingError: nothing of the mesh overlaps, or the union cannot be computed.
     """
     vertices, faces = intended.vertices, intended.oriented
     if len(singular_edges(faces)[0]):
         raise MeshError("the mesh is not closed")
-    if _is_fine(vertices, faces):
+    if _bounds_a_solid(vertices, faces):
         raise MeshError("nothing of it passes through or lies in itself")
     facts = {"stage": "boolean_union", "kept": 0}
-    slivers = 0.5 * asked.tolerance.at(intended.size)
+    slivers = 0.5 * settings.tolerance.at(intended.size)
     if len(intended.parts) > 1 and sum(map(len, intended.parts)) == len(faces):
-        asked.report(f"uniting {len(intended.parts):,} parts")
+        settings.report(f"uniting {len(intended.parts):,} parts")
         try:
             return united_parts(vertices, faces, intended.parts, slivers), facts
         except (MeshError, MeshingError) as error:
-            asked.report(f"{error}; so all at once")
-    asked.report("cutting faces along each other")
+            settings.report(f"{error}; so all at once")
+    settings.report("cutting faces along each other")
     try:
         return mended_by_cuts(vertices, faces, slivers), facts
     except MeshingError as error:
-        asked.report(f"{error}; so by cells")
-    made = mesh_of(MeshSolid(vertices, faces), progress=asked.report)
+        settings.report(f"{error}; so by cells")
+    made = mesh_of(MeshSolid(vertices, faces), progress=settings.report)
     return TriangleMesh(np.asarray(made.vertices), np.asarray(made.faces, np.int64)), facts
 
 
-def _is_fine(vertices: FloatArray, faces: IntArray) -> bool:
-    """Whether triangles meet only in shared edges and vertices, and no part is inside out or in the
-    material of another."""
+def _bounds_a_solid(vertices: FloatArray, faces: IntArray) -> bool:
+    """Whether a mesh bounds a solid: its triangles meet only in shared edges and vertices, and no
+    component is inside out or in the material of another one."""
     try:
         _check_sides(TriangleMesh.without_unused_vertices(vertices, faces))
     except MeshError:
@@ -402,47 +413,52 @@ def _is_fine(vertices: FloatArray, faces: IntArray) -> bool:
 # All made anew.
 
 
-def _remesh(intended: IntendedSolid, asked: _RepairOptions) -> tuple[TriangleMesh, dict[str, Any]]:
-    """Stage "remeshed": the surface on which the winding number is 1/2, which is closed whatever
-    the mesh is. Returns it with facts for the metadata."""
+def _remesh(
+    intended: IntendedSolid, settings: _RepairOptions
+) -> tuple[TriangleMesh, dict[str, Any]]:
+    """Stage "remeshed": extract the surface on which the winding number of the mesh is 1/2. It is
+    closed whatever the mesh is. Returns it, and its entries in `metadata["harnack"]`."""
     intended.check_encloses()
     corners = without_zero_area_faces(intended.vertices, intended.oriented)
     field = WindingNumber(*corners)
-    if asked.spacing is not None:
-        made = _by_signs(field, asked.spacing, asked)
+    if settings.spacing is not None:
+        made = _mesh_half_level(field, settings.spacing, settings)
     else:
-        spacing = float(np.ptp(corners[0], axis=0).max()) / _ACROSS_ANEW
+        spacing = float(np.ptp(corners[0], axis=0).max()) / _CELLS_ACROSS
         try:
-            made = _of_bounded_size(field, spacing, asked)
+            made = _remesh_of_bounded_size(field, spacing, settings)
         except MeshingError:
-            made = _by_signs(field, 0.6 * spacing, asked)
+            made = _mesh_half_level(field, 0.6 * spacing, settings)
     facts = made.metadata["harnack"] | {"stage": "remeshed", "kept": 0}
     return TriangleMesh(np.asarray(made.vertices), np.asarray(made.faces, np.int64)), facts
 
 
-def _of_bounded_size(
-    field: WindingNumber, spacing: float, asked: _RepairOptions
+def _remesh_of_bounded_size(
+    field: WindingNumber, spacing: float, settings: _RepairOptions
 ) -> trimesh.Trimesh:
-    """The surface on which the winding number is 1/2, with larger cells if it would have too many
-    triangles, as for a noisy mesh: the time of the checks grows with their number.
+    """Extract the surface on which the winding number is 1/2. If it has too many triangles, as for
+    a noisy mesh, it is extracted again from larger cells, because the time of the checks grows with
+    the number of triangles.
 
-    spacing: the size of cells that is tried first."""
+    spacing: the size of cells that is tried first, a length."""
     for k in range(_MAX_GROWTHS):
         try:
-            return _by_signs(field, spacing * _GROWTH**k, asked, _MOST_ANEW)
+            return _mesh_half_level(field, spacing * _GROWTH**k, settings, _MAX_TRIANGLES)
         except TriangleLimitError as error:
-            asked.report(f"{error}; so of larger cells")
-    return _by_signs(field, spacing * _GROWTH**_MAX_GROWTHS, asked)
+            settings.report(f"{error}; so of larger cells")
+    return _mesh_half_level(field, spacing * _GROWTH**_MAX_GROWTHS, settings)
 
 
-def _by_signs(
-    field: WindingNumber, spacing: float, asked: _RepairOptions, most: int = 2_000_000
+def _mesh_half_level(
+    field: WindingNumber, spacing: float, settings: _RepairOptions, most: int = 2_000_000
 ) -> trimesh.Trimesh:
-    """The surface on which the winding number is 1/2. spacing: the size of cells. most: the largest
-    number of triangles."""
+    """Extract the surface on which the winding number is 1/2, from the signs of its values.
+
+    spacing: the size of cells, a length. most: the largest number of triangles; a
+        TriangleLimitError is raised if it takes more."""
     return mesh_of(
-        field, level=0.5, side="above", tolerance=asked.tolerance.length, cell_size=spacing,
-        max_triangles=most, progress=asked.report,
+        field, level=0.5, side="above", tolerance=settings.tolerance.length, cell_size=spacing,
+        max_triangles=most, progress=settings.report,
     )  # fmt: skip
 
 
@@ -450,33 +466,38 @@ def _by_signs(
 
 
 def _keep_valid(
-    intended: IntendedSolid, asked: _RepairOptions
+    intended: IntendedSolid, settings: _RepairOptions
 ) -> tuple[TriangleMesh, dict[str, Any]]:
-    """Stage "cleaned": the valid triangles, with fillings in place of all others and over holes.
-    Returns the mesh with facts for the metadata.
+    """Stage "cleaned": keep the valid triangles, and fill everything else (holes, and the places of
+    removed triangles).
+
+    Returns:
+        The closed mesh; and its entries in `metadata["harnack"]`: how many triangles were kept,
+        turned over, left out for each reason, and added by fillings ("patches"), how many holes
+        were filled, and how many fillings are harmonic (none in this stage).
 
     Raises:
-        MeshError, MeshingError: as `repair`.
+        MeshError, MeshingError: too few triangles are valid, or a hole cannot be filled.
     """
     vertices, faces = without_zero_area_faces(intended.vertices, intended.faces)
-    made = clean_and_fill(vertices, faces, asked.report)
-    flat = len(intended.faces) - len(faces)
-    left_out = {"flat": made.left_out["flat"] + flat}
-    return made.surface, {
+    cleaned = clean_and_fill(vertices, faces, settings.report)
+    flat_count = len(intended.faces) - len(faces)
+    flat = {"flat": cleaned.left_out["flat"] + flat_count}
+    return cleaned.surface, {
         "stage": "cleaned",
-        "kept": len(made.kept),
-        "turned": _count_turned(intended, made),
-        "left_out": made.left_out | left_out,
-        "holes": made.holes,
-        "patches": len(made.surface.faces) - len(made.kept),
+        "kept": len(cleaned.kept),
+        "turned": _count_turned(intended, cleaned),
+        "left_out": cleaned.left_out | flat,
+        "holes": cleaned.holes,
+        "patches": len(cleaned.surface.faces) - len(cleaned.kept),
         "harmonic": 0,
     }
 
 
 def _count_turned(intended: IntendedSolid, cleaned: CleanedMesh) -> int:
-    """How many of the kept triangles have the reverse orientation of their input triangle. A
-    triangle may be reversed twice: with its part in `IntendedSolid`, and against its neighbors in
-    the cleaning."""
+    """How many of the kept triangles have the reverse of their orientation in the input. A triangle
+    may be reversed twice, which leaves it as it was: once with its whole component
+    (`IntendedSolid`), and once to agree with its neighbors (in the cleaning)."""
     turned_before = np.delete(
         intended.is_turned, zero_area_faces(intended.vertices, intended.faces)
     )
@@ -489,17 +510,20 @@ def _count_turned(intended: IntendedSolid, cleaned: CleanedMesh) -> int:
 
 
 def _weld_loose(
-    intended: IntendedSolid, asked: _RepairOptions
+    intended: IntendedSolid, settings: _RepairOptions
 ) -> tuple[TriangleMesh, dict[str, Any]]:
-    """Stage "welded": triangles whose near corners are merged, with fillings. No triangle is kept
-    bit by bit. Returns the mesh with facts for the metadata.
+    """Stage "welded": merge near corners of loose triangles (which share no vertices), clean the
+    mesh and fill its holes. Vertices move, so no triangle counts as kept.
+
+    Returns:
+        The closed mesh; and its entries in `metadata["harnack"]`.
 
     Raises:
-        MeshError, MeshingError: as `repair`.
+        MeshError, MeshingError: the triangles are not loose, or the mesh cannot be cleaned.
     """
     corners = without_zero_area_faces(intended.vertices, intended.faces)
     vertices, faces, moved = weld_near_corners(*corners)
-    made = clean_and_fill(vertices, faces, asked.report)
+    made = clean_and_fill(vertices, faces, settings.report)
     count = len(made.kept)
     return made.surface, {
         "stage": "welded",
@@ -518,36 +542,41 @@ def _weld_loose(
 
 
 def _fill_only(
-    intended: IntendedSolid, asked: _RepairOptions
+    intended: IntendedSolid, settings: _RepairOptions
 ) -> tuple[TriangleMesh, dict[str, Any]]:
-    """Stage "filled": all triangles of the mesh stay, and its holes are filled. Returns the mesh
-    with facts for the metadata.
+    """Stage "filled": keep all triangles of the mesh, and fill its holes.
+
+    Returns:
+        The closed mesh; and its entries in `metadata["harnack"]`.
 
     Raises:
-        MeshError, MeshingError: as `repair`.
+        MeshError: some triangles cannot be kept (`_vertices_and_faces_to_keep`).
+        MeshingError: the fillings cannot be made.
     """
-    vertices, faces = _checked(intended)
+    vertices, faces = _vertices_and_faces_to_keep(intended)
     if intended.is_turned.any():
         raise MeshError("a part of the mesh is inside out")
     edges = checked_boundary_edges(faces)
-    if asked.keep is None and len(crossing := intersecting_faces(vertices, faces)):
+    if settings.keep is None and len(crossing := intersecting_faces(vertices, faces)):
         raise MeshError(f"{len(crossing):,} triangles of the mesh pass through others")
     loops = hole_loops(vertices, faces, edges)
-    if asked.patches == "smooth":
+    if settings.patches == "smooth":
         try:
-            return _kept_with(vertices, faces, loops, asked)
+            return _with_filled_holes(vertices, faces, loops, settings)
         except MeshingError as error:
-            if asked.keep is None:
+            if settings.keep is None:
                 raise
-            asked.report(f"{error}; once more, with harmonic patches alone")
-    return _kept_with(vertices, faces, loops, dataclasses.replace(asked, patches="harmonic"))
+            settings.report(f"{error}; once more, with harmonic patches alone")
+    return _with_filled_holes(
+        vertices, faces, loops, dataclasses.replace(settings, patches="harmonic")
+    )
 
 
-def _checked(intended: IntendedSolid) -> tuple[FloatArray, IntArray]:
-    """The vertices and faces of a mesh whose triangles can all be kept.
+def _vertices_and_faces_to_keep(intended: IntendedSolid) -> tuple[FloatArray, IntArray]:
+    """The vertices (n, 3) and faces (m, 3) of the input, if all of its triangles can be kept.
 
     Raises:
-        MeshError: different vertices are at the same place; or as `validate_mesh`.
+        MeshError: several vertices are at the same place, or `validate_mesh` rejects the mesh.
     """
     vertices, faces = validate_mesh(intended.vertices, intended.faces)
     used = np.unique(faces)
@@ -562,38 +591,44 @@ def _checked(intended: IntendedSolid) -> tuple[FloatArray, IntArray]:
     return vertices, faces
 
 
-def _kept_with(
-    vertices: FloatArray, faces: IntArray, loops: list[IntArray], asked: _RepairOptions
+def _with_filled_holes(
+    vertices: FloatArray, faces: IntArray, loops: list[IntArray], settings: _RepairOptions
 ) -> tuple[TriangleMesh, dict[str, Any]]:
-    """The mesh with fillings over its holes. Returns it with facts for the metadata.
+    """Fill the holes of a mesh.
 
-    loops: the vertices around each hole. Holes get smooth fillings if `asked` says so, and harmonic
-        ones if it does not or if smooth ones fail.
+    vertices, faces: (n, 3), (m, 3) the mesh.
+    loops: for each hole, the indices (k,) of the vertices around it. A hole gets a smooth filling
+        if the options ask for these; a harmonic filling if they do not, or if the smooth one fails.
+
+    Returns:
+        The closed mesh; and its entries in `metadata["harnack"]`.
 
     Raises:
-        MeshingError: as `repair`.
+        MeshingError: the fillings cannot be made, or meet the mesh or each other.
     """
     x, together, left = vertices, faces, loops
-    if loops and asked.patches == "smooth":
-        asked.report(f"filling {len(loops):,} holes")
+    if loops and settings.patches == "smooth":
+        settings.report(f"filling {len(loops):,} holes")
         field = WindingNumber(vertices, faces)
         made = fill_holes(vertices, faces, loops, lambda p: field.value(p, precision="double"))
         x, together = np.concatenate([x, made.vertices]), np.concatenate([faces, made.faces])
         left = made.unfilled_loops
-        asked.report(f"{len(left):,} holes are left" + f": {made.reason}" * bool(left))
+        settings.report(f"{len(left):,} holes are left" + f": {made.reason}" * bool(left))
     rest = HarmonicFilling(vertices[:0], faces[:0], True, 0.0, 0)
     if left:
         edges = checked_boundary_edges(together)
-        if asked.keep is None and len(edges) > _FEW_EDGES:
+        if settings.keep is None and len(edges) > _FEW_EDGES:
             raise MeshingError(f"{len(left):,} holes of {len(edges):,} edges have no smooth patch")
-        attempts = _ATTEMPTS if asked.keep == "all" else _FEW_ATTEMPTS
-        how = HoleFillingOptions(asked.tolerance, asked.spacing, asked.seed, attempts, asked.report)
+        attempts = _ATTEMPTS if settings.keep == "all" else _FEW_ATTEMPTS
+        how = HoleFillingOptions(
+            settings.tolerance, settings.spacing, settings.seed, attempts, settings.report
+        )
         rest = harmonic_patches(x, together, edges, how)
         x, together = np.concatenate([x, rest.vertices]), np.concatenate([together, rest.faces])
     surface = TriangleMesh.without_unused_vertices(x, together)
-    if loops or asked.keep is None:
+    if loops or settings.keep is None:
         _check_touching(together)
-    if asked.keep is None:
+    if settings.keep is None:
         _check_sides(surface)
     return surface, {
         "stage": "filled",
@@ -609,8 +644,8 @@ def _kept_with(
 
 
 def _check_sides(surface: TriangleMesh) -> None:
-    """Raise a MeshError if a part is inside out, lies in the material of another one, or passes
-    through itself or others."""
+    """Raise a MeshError if a component of a mesh is inside out, lies in the material of another
+    one, or passes through itself or another one."""
     shells = Shells.of(surface)
     depths = shells.nesting_depths()
     if ((shells.volumes < 0) & (depths == 0)).any():
@@ -622,7 +657,8 @@ def _check_sides(surface: TriangleMesh) -> None:
 
 
 def _check_touching(faces: IntArray) -> None:
-    """Raise a MeshingError unless the faces around each vertex are connected by edges."""
+    """Raise a MeshingError if two sheets of a mesh touch in a vertex: unless, around each vertex,
+    all faces are connected by shared edges."""
     if len(places := nonmanifold_vertices(faces)):
         raise MeshingError(
             f"faces touch in {len(places):,} vertices alone, such as vertex {places[0]}: such a "

@@ -1,9 +1,10 @@
-"""The local repair of closed meshes a few of whose triangles intersect each other.
+"""The local repair of closed meshes of which a few triangles intersect each other.
 
-Where solids are cut by each other corners are rounded, and where triangles in a plane are merged
-slivers without an area remain: such triangles intersect their neighbors by about a rounding error.
-Contracting or flipping an edge near them repairs most of these. Edges are tried in turn, with exact
-signs, on the few triangles around.
+When solids are cut along each other, the new corners are rounded. When triangles in a plane are
+merged, slivers without an area remain. In both cases some triangles intersect their neighbors by
+about a rounding error. Most of these intersections vanish if an edge near them is contracted or
+flipped. Such changes are tried one after the other, and the triangles around each are tested
+exactly.
 """
 
 from __future__ import annotations
@@ -45,10 +46,10 @@ _NO_AREA = 1e-4
 
 
 def resolve_self_intersections(surface: TriangleMesh, length: float) -> TriangleMesh:
-    """A closed surface, mended so that none of its triangles pass through each other
-    (`resolve_local_intersections`). It is returned unchanged if none do.
+    """Mend a closed surface so that no two of its triangles pass through each other, by contracting
+    and flipping edges (`resolve_local_intersections`). It is returned unchanged if none do.
 
-    length: how far one change may move the surface.
+    length: the largest distance by which one change may move the surface.
 
     Raises:
         MeshingError: vertices are not finite.
@@ -70,7 +71,8 @@ def resolve_local_intersections(
     """Contract and flip edges near crossing triangles, so that fewer cross.
 
     crossing: the indices of all faces that cross others (`intersecting_faces`).
-    length: how far one change may move the surface. Vertices are removed or stay where they are.
+    length: the largest distance by which one change may move the surface. Vertices are removed or
+        stay where they are.
 
     Returns:
         The changed closed surface, and the number of triangles that still cross.
@@ -96,15 +98,18 @@ def resolve_local_intersections(
 def _regions(
     vertices: FloatArray, faces: IntArray, crossing: IntArray
 ) -> Iterator[tuple[IntArray, IntArray]]:
-    """Separate neighborhoods of crossing faces.
+    """Divide the surroundings of crossing faces into neighborhoods that have no face in common.
 
-    A neighborhood grows in three steps: the faces that share a corner with crossing faces (the near
-    faces); the faces that share a corner with those; and all faces whose bounding boxes meet the
-    bounding box of the result. Neighborhoods with a face in common are merged.
+    A neighborhood grows in three steps. It begins with the near faces, which share a corner with
+    crossing faces. Then come the faces that share a corner with near faces; and then all faces
+    whose bounding boxes meet the bounding box of the faces so far. Neighborhoods with a face in
+    common are merged.
 
-    Yields: The indices of the faces of a neighborhood, and the vertices that may be removed: those
-        of near faces. Faces that replace removed ones lie within the bounding box, so they cross no
-        face outside of the neighborhood."""
+    crossing: the indices of the crossing faces.
+
+    Yields: For each neighborhood the indices of its faces; and the indices of the vertices that may
+        be removed, which are the corners of near faces. If only these are removed, the new faces
+        lie within the bounding box, so they cross no face outside of the neighborhood."""
     import scipy.sparse  # imported here: it takes half a second
     import scipy.sparse.csgraph as csgraph_module
 
@@ -138,10 +143,11 @@ def _faces_at_corners(faces: IntArray, targets: IntArray) -> IntArray:
 
 @dataclass(frozen=True)
 class _Neighborhood:
-    """Some faces of a mesh, with vertices numbered anew.
+    """A few faces of a mesh that are changed together, with their vertices numbered from 0.
 
     vertices: (n, 3). faces: (m, 3).
-    is_movable: (n,) the vertices all of whose faces are in the neighborhood; these may be removed.
+    is_movable: (n,) the mask of the vertices that may be removed. All faces at such a vertex belong
+        to the neighborhood.
     mesh_vertices: (n,) the index of each vertex in the mesh."""
 
     vertices: FloatArray
@@ -151,8 +157,8 @@ class _Neighborhood:
 
     @classmethod
     def of(cls, vertices: FloatArray, faces: IntArray, movable: IntArray) -> _Neighborhood:
-        """The neighborhood of `faces`, given by vertices of the mesh. movable: the vertices that
-        may be removed."""
+        """The neighborhood that consists of `faces` (m, 3) of a mesh with `vertices` (n, 3).
+        movable: the indices of the vertices that may be removed."""
         names, index = np.unique(faces, return_inverse=True)
         return cls(vertices[names], index.reshape(-1, 3), np.isin(names, movable), names)
 
@@ -175,9 +181,9 @@ class _Neighborhood:
         )
 
     def collapse_edge(self, a: int, b: int) -> tuple[IntArray, IntArray] | None:
-        """Move vertex a to its neighbor b. Returns the indices of the faces that are removed, and
-        the faces that replace them; None if sheets would touch, or if the vertices may not be
-        removed."""
+        """Contract the edge between the vertices a and b, by moving a to b. Returns the indices of
+        the faces around a, and the faces (k, 3) that replace them. Returns None if sheets of the
+        surface would touch, or if one of the two vertices may not be changed."""
         if not (self.is_movable[a] and self.is_movable[b]):
             return None
         if len(self.neighbors(a) & self.neighbors(b)) != 2:
@@ -187,9 +193,10 @@ class _Neighborhood:
         return removed, new[(new != np.roll(new, 1, axis=1)).all(axis=1)]
 
     def flip_edge(self, a: int, b: int) -> tuple[IntArray, IntArray] | None:
-        """Replace the edge between a and b by one between the corners opposite to it. Returns the
-        indices of the two faces that are removed, and the two that replace them; None if there
-        already is such an edge, or if vertices may not be moved."""
+        """Replace the edge between the vertices a and b by the edge between the two corners
+        opposite to it. Returns the indices of the two faces at the old edge, and the two faces
+        (2, 3) that replace them. Returns None if the new edge exists already, or if a vertex may
+        not be changed."""
         if not (self.is_movable[a] and self.is_movable[b]):
             return None
         removed = np.intersect1d(self.around(a), self.around(b))
@@ -207,10 +214,13 @@ class _Neighborhood:
 
 
 def _reduce_crossings(patch: _Neighborhood, length: float) -> tuple[IntArray, int]:
-    """Change edges of a neighborhood, one after the other, as long as that lets fewer faces cross.
+    """Contract and flip edges of a neighborhood, one after the other, as long as each change
+    reduces the number of crossing faces.
+
+    length: the largest distance by which one change may move the surface.
 
     Returns:
-        The faces, given by vertices of the mesh, and the number of those that still cross.
+        The faces (m, 3), with vertices of the mesh; and the number of faces that still cross.
     """
     crossing = patch.crossing()
     for _ in range(_MAX_CHANGES):
@@ -224,13 +234,15 @@ def _reduce_crossings(patch: _Neighborhood, length: float) -> tuple[IntArray, in
 def _best_change(
     patch: _Neighborhood, crossing: IntArray, length: float
 ) -> tuple[_Neighborhood, IntArray] | None:
-    """The neighborhood after one change that lets fewer faces cross, and the indices of those that
-    still cross; None if no change does.
+    """Find one change of an edge that reduces the number of crossing faces. Returns the
+    neighborhood after it, and the indices of the faces that still cross; None if there is no such
+    change.
 
     crossing: the indices of the faces that cross now.
+    length: the largest distance by which the change may move the surface.
 
-    Edges of crossing faces are tried first, then all edges at their corners; of each, the changes
-    that move the surface least come first."""
+    Edges of crossing faces are tried first, then all edges at their corners. In both groups, the
+    changes that move the surface least are tried first."""
     for rows in (crossing, _faces_at_corners(patch.faces, patch.faces[crossing])):
         for _, removed, new in sorted(_changes(patch, rows, length), key=lambda change: change[0])[
             :_MAX_ATTEMPTS
@@ -245,11 +257,11 @@ def _best_change(
 def _changes(
     patch: _Neighborhood, rows: IntArray, length: float
 ) -> Iterator[tuple[float, IntArray, IntArray]]:
-    """The possible changes of the edges of the faces `rows` that move the surface by at most
+    """All contractions and flips of the edges of the faces `rows` that move the surface by at most
     `length`.
 
-    Yields: How far a change moves the surface; the indices of the faces that it removes; and the
-        faces that replace them."""
+    Yields: For each change, how far it moves the surface; the indices of the faces that it removes;
+        and the faces (k, 3) that replace them."""
     count = len(patch.vertices)
     keys = sorted_unique(edge_keys(half_edges(patch.faces[rows]), count))
     for a, b in np.stack(np.divmod(keys, count), axis=1).tolist():
@@ -268,12 +280,13 @@ def _changes(
 
 
 def _keeps_orientation(patch: _Neighborhood, rows: IntArray, new: IntArray, length: float) -> bool:
-    """Whether faces `rows` may be replaced by the faces `new` (k, 3).
+    """Whether the faces `rows` of a neighborhood may be replaced by the faces `new` (k, 3), without
+    a fold and without a large change of the surface.
 
-    No new face, except slivers, may face against the mean normal of the old faces. And the volume
-    between new and old faces may be at most what the old ones would sweep if they moved by
-    `length`. That a moved vertex is near the new faces would not be enough: it tells nothing about
-    old faces that are folded, as at a thin spike."""
+    Two conditions: no new face, except slivers, faces against the mean normal of the old faces; and
+    the volume between old and new faces is at most the volume that the old faces would sweep if
+    they moved by `length`. To test only the distance of the removed vertex from the new faces would
+    miss old faces that are folded, as at a thin spike."""
     before, after = patch.vertices[patch.faces[rows]], patch.vertices[new]
     old, new_area = area_normals(before), area_normals(after)
     mean = old.sum(axis=0)

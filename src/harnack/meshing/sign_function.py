@@ -61,17 +61,18 @@ _MOST_PROBES, _MIN_VALUE_SHARE = 2000, 0.1
 
 
 def uses_sign_meshing(field: Field) -> bool:
-    """Whether a field is meshed by its signs. These are sums over meshes, points and blobs: their
-    values cost little, and their promises hold no farther than to the next point."""
+    """Whether the level sets of a field are meshed by the signs of its values on a lattice. It is
+    so for sums over meshes, points and blobs. Their values cost little, and their promises (proved
+    bounds of f near a point) are useful only up to the next triangle or point."""
     return isinstance(field, BatchedField | Blobs | HRBF)
 
 
 def cell_size_for_smoothing(field: Field, spacing: float, most: float, least: float) -> float:
-    """The size of cells: `spacing`, or less for a cloud with noise.
+    """The size of the lattice's cells, a length: `spacing`, or less for a point cloud with noise.
 
-    Its surface is likely to have details too small for these cells if its smoothing length is less
-    than 0.3 of them. Then the size is multiplied by a factor from `least` to `most`, so that cells
-    are about 4.8 smoothing lengths wide."""
+    The surface of such a cloud is likely to have details too small for cells of size `spacing` if
+    the cloud's smoothing length is less than 0.3 `spacing`. Then the size is `spacing` times a
+    factor from `least` to `most`, so that cells are about 4.8 smoothing lengths wide."""
     if (
         not isinstance(field, DipolePotential)
         or not 0 < field.smoothing < _UNRESOLVED_SMOOTHING * spacing
@@ -97,10 +98,12 @@ def empty_surface_hint(field: Field) -> str:
 
 @dataclass
 class SignFunction(LevelFunction):
-    """The function side * (f - level) of a real-valued field f, by its values at points.
+    """The function side * (f - level) of a real-valued field f, which need not be continuous. Its
+    level set is found by the signs of values, not by Newton's method.
 
     side: 1; or -1 for a function that is negative where f is above the level.
-    precision: of values. Crossings of facets are computed in double precision."""
+    precision: the precision in which values are computed. Intersections of segments with jump
+        surfaces are computed in double precision."""
 
     side: float = dataclasses.field(default=1.0, kw_only=True)
     precision: Precision = dataclasses.field(default="double", kw_only=True)
@@ -119,14 +122,17 @@ class SignFunction(LevelFunction):
         side: float = 1.0,
         most_faces: int,
     ) -> SignFunction:
-        """Make the function side * (f - level) of a field, to be evaluated in a box.
+        """Make the function side * (f - level) of the field's function f.
 
-        Single precision is used if it resolves cells of size `spacing` everywhere in the box,
-        otherwise double precision.
+        box: the lower and the upper corner (3,) of the box in which it will be evaluated.
+        spacing: the size of the cells of the lattice, a length. Values are computed in single
+            precision if that resolves such cells everywhere in the box, else in double precision.
+        side: 1, or -1 to reverse the sign.
+        most_faces: the largest number of triangles of a mesh of the function.
 
         Raises:
-            MeshingError: the field is a cloud whose normals do not face outwards, or which encloses
-                nothing.
+            MeshingError: the field is that of a point cloud, and the normals of its points do not
+                face outwards, or its points enclose nothing.
         """
         if isinstance(field, DipolePotential):
             _check_encloses(field, level)
@@ -143,8 +149,8 @@ class SignFunction(LevelFunction):
         return self.relative_to_level(self.field.value(points, precision=self.precision))
 
     def sample(self, points: FloatArray) -> LevelSamples:
-        """The samples of the function at points (n, 3). The gradient of a field that jumps is set
-        to 0, since it does not tell the distance to the level set."""
+        """The values and gradients of the function at points (n, 3). For a field that jumps,
+        gradients are set to 0, since they tell nothing about the distance to the level set."""
         none = np.zeros(len(points))
         if self.field.has_jumps:
             return LevelSamples(self.values(points), np.zeros((len(points), 3)), none)
@@ -166,8 +172,9 @@ class SignFunction(LevelFunction):
         )
 
     def count_undecided(self, points: FloatArray, value: FloatArray) -> int:
-        """The number of points whose sign is not certain: the error bound is at least the value's
-            magnitude.
+        """The number of points at which the sign of the function is not certain, because the bound
+        of the value's error is at least |value|.
+
         value: (n,) the values of the function at points (n, 3)."""
         if not isinstance(self.field, BatchedField):
             return 0
@@ -179,11 +186,11 @@ class SignFunction(LevelFunction):
         return int((np.abs(value[near]) <= error).sum())
 
     def clearance(self, points: FloatArray) -> FloatArray:
-        """(n,) a proved lower bound of the distance to the level set
-        (`level_distance_lower_bound`).
+        """(n,) a proved lower bound of the distance of points (n, 3) from the level set, computed
+        by `level_distance_lower_bound`.
 
-        For a winding number it is the smaller of two: the bound for the winding number modulo 1,
-        which has no jumps and needs coarse samples only, and the distance from the triangles."""
+        For a winding number it is the smaller of two lengths: the bound for the winding number
+        modulo 1, which is smooth across the triangles; and the distance from the triangles."""
         self.evaluations += len(points)
         if not self._clearances:
             self._clearances = _clearances(self.field, self.level, self.precision)
@@ -221,8 +228,8 @@ class SignFunction(LevelFunction):
     def _slopes(self, x: FloatArray, direction: FloatArray) -> FloatArray:
         """(n, 3) gradients of the function at points x (n, 3).
 
-        direction: (n, 3) replaces the gradient where it is 0 or not finite. It is that of the
-            segment through the point, along which the function grows."""
+        direction: (n, 3) for each point, the vector along a segment through it on which the
+            function grows. It is returned where the gradient is 0 or not finite."""
         if not len(x):
             return x
         self.evaluations += len(x)
@@ -241,7 +248,8 @@ class SignFunction(LevelFunction):
         start, direction: (n, 3) one end of each segment, and the vector to the other. The function
             is not positive at the first end and positive at the other.
 
-        Returns the ends (n,) and (n,) of what is left, as fractions of the segments."""
+        Returns the fractions (n,) and (n,) of the segments at which what is left of them begins and
+        ends."""
         first, last = np.zeros(len(start)), np.ones(len(start))
         for _ in range(_HALVINGS):
             t = 0.5 * (first + last)
@@ -259,8 +267,8 @@ class SignFunction(LevelFunction):
         steps: the largest number of evaluations.
 
         The root of the secant and the middle of the interval are tried in turn, so that every
-        second step at least halves the interval. A search ends early where the value is small
-        relative to those at the ends; then one more secant is as good as exact."""
+        second step at least halves the interval. A search ends early if the value is small compared
+        with the values at both ends: then the root of one more secant is accurate enough."""
         if not len(start):
             return first
         first, last = first.copy(), last.copy()
@@ -300,8 +308,8 @@ class SignFunction(LevelFunction):
         max_t = (last - first + 2 * extension) * length
 
         def next_jump(o: Vec3, d: Vec3, limit: Vec3) -> tuple[Real, Vec3]:
-            """The t and the normal of the first crossing along rays o + t d; limit.x is the largest
-            t."""
+            """The t and the normal of the first crossing of a jump surface along rays o + t d, for
+            t up to limit.x; t is infinite if there is none."""
             none = backend.Array3f(0)
             after = JumpCrossing(backend.Float(0), backend.UInt32(NO_FACET), backend.Float(0), none)
             crossing = field.next_jump(o, d, after, limit.x, backend.Bool(True))
@@ -315,13 +323,13 @@ class SignFunction(LevelFunction):
 
 
 def _check_encloses(field: DipolePotential, level: float) -> None:
-    """Raise unless the points of a cloud bound something, as far as the field's values at the
-    points show.
+    """Raise an error unless the points of a cloud seem to enclose a solid, judged by the field's
+    values at the points.
 
-    At a point of a closed surface, f without the point's own term is 2 pi, half the level that is
-    inside; it is -2 pi if normals face inwards. So the median over the points has to be more than a
-    tenth of the level. If areas are given, points need not represent a surface, and nothing is
-    checked.
+    f is 4 pi inside of a closed surface and 0 outside. At a point of the surface, f without that
+    point's own term is 2 pi; or -2 pi if normals face inwards. So the median of these values over
+    the points has to be more than a tenth of the level. If areas of the points were given, the
+    points need not represent a surface, and nothing is checked.
 
     Raises:
         MeshingError: normals face inwards, cancel each other, or the points lie in a plane.
@@ -343,10 +351,11 @@ def _check_encloses(field: DipolePotential, level: float) -> None:
 
 
 def _secant(first: FloatArray, last: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
-    """Where the line through two values of different signs is 0; the middle where that is not
-    finite.
+    """(n,) in each interval, the root of the linear function with given values at both ends; the
+    middle of the interval if that root is not finite.
 
-    first, last: (n,) the ends of intervals. low, high: (n,) the values there."""
+    first, last: (n,) the ends of intervals. low, high: (n,) the values at these ends, of different
+        signs."""
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         fraction = low / (low - high)
     fraction = np.where(np.isfinite(fraction), np.clip(fraction, 0.0, 1.0), 0.5)
@@ -356,36 +365,40 @@ def _secant(first: FloatArray, last: FloatArray, low: FloatArray, high: FloatArr
 def _clearances(
     field: Field, level: float, precision: Precision
 ) -> list[Callable[[FloatArray], FloatArray]]:
-    """Functions from points (n, 3) to lengths (n,). The smallest of these lengths is a proved lower
-    bound of the distance to the level set. (A winding number has two functions, other fields have
-    one.)"""
+    """A list of functions, each of which takes points (n, 3) and returns lengths (n,). At each
+    point the smallest length is a proved lower bound of the distance to the level set. A winding
+    number has two such functions, another field has one."""
     backend = choose_backend(precision)
 
     def bound(smooth: Field) -> Callable[[FloatArray], FloatArray]:
-        """The function with the lower bound of the distance to the level set of a field without
-        jumps."""
+        """A function of points (n, 3) that returns lower bounds (n,) of the distance to the level
+        set of `smooth`, a field without jumps."""
         prepared = smooth.prepare(backend)
         levels = Levels((dr.opaque(backend.Float, level),), smooth.period)
 
         def kernel(p: Vec3) -> tuple[Real]:
-            """The bound at p."""
+            """The lower bound of the distance from p to the level set."""
             return (level_distance_lower_bound(backend, prepared, levels, p, prepared.evaluate(p)),)
 
-        return lambda points: _numbers(backend, kernel, points)
+        return lambda points: _evaluate_in_batches(backend, kernel, points)
 
     if not isinstance(field, WindingNumber):
         return [bound(field)]
     sheets = field.prepare(backend)
 
     def distance(p: Vec3) -> tuple[Real]:
-        """The distance from the triangles of the mesh."""
+        """The distance of p from the triangles of the mesh."""
         return (sheets.distance_to_jumps(p),)
 
-    return [bound(WindingModuloOne(field)), lambda points: _numbers(backend, distance, points)]
+    return [
+        bound(WindingModuloOne(field)),
+        lambda points: _evaluate_in_batches(backend, distance, points),
+    ]
 
 
-def _numbers(
+def _evaluate_in_batches(
     backend: Backend, kernel: Callable[[Vec3], tuple[Any, ...]], points: FloatArray
 ) -> FloatArray:
-    """The first result (n,) of a kernel at points (n, 3), in double precision, batch by batch."""
+    """The first result (n,) of `kernel` at points (n, 3), computed in double precision for a batch
+    of points at a time, as a NumPy array."""
     return np.asarray(map_batches(backend, kernel, points, at_once=1 << 18)[0], np.float64)

@@ -105,13 +105,14 @@ _MAX_GROWTH_ROUNDS = 20
 
 @dataclass(frozen=True)
 class SignIsosurface:
-    """A mesh extracted from signs.
+    """A mesh that was extracted from the signs of f - level at the points of a lattice.
 
     surface: the mesh.
     points: the number of lattice points.
     undecided: the number of lattice points whose sign is not certain, because the error bound of f
         is not smaller than |f - level|.
-    unfitted: the number of triangles that were moved back from creases.
+    unfitted: the number of triangles whose vertices had been moved onto creases, and were moved
+        back because triangles folded over or intersected.
     is_intersection_free: whether it was checked exactly that no triangles intersect."""
 
     surface: TriangleMesh
@@ -135,14 +136,17 @@ def mesh_from_signs(
     """Extract a mesh from signs in cells of a box (`extract_from_signs`), in smaller cells if these
     do not suffice.
 
-    box: its lower and its upper corner. spacing: the size of the first cells. tolerance: a length.
+    box: the lower and the upper corner (3,) of the box.
+    spacing: the size of the cells that are tried first, a length.
+    tolerance: the largest distance of triangles from the level set, a length.
     attempts: the largest number of extractions.
-    closed: whether the mesh is closed at the box's faces.
-    volume: only parts that are lost within it count.
+    closed: whether the surface is closed by parts of the box's faces, rather than ending there.
+    volume: parts of the level set that the mesh lacks are counted only if they lie in this volume;
+        None for all.
 
-    It is extracted again, from cells 0.6 times as large, if more than one in a hundred vertices and
-    centers of triangles are farther than the tolerance from the level set, or if smaller cells may
-    show lost parts.
+    The mesh is extracted again, from cells 0.6 times as large, if more than one in a hundred
+    vertices and centers of triangles are farther than the tolerance from the level set, or if
+    smaller cells may show parts that the mesh lacks.
 
     Returns:
         The mesh; the parts of the level set that it lost; and facts for the metadata, among them
@@ -150,7 +154,7 @@ def mesh_from_signs(
         which all of them are.
 
     Raises:
-        MeshingError: as `extract_from_signs`.
+        MeshingError: there is no surface, there are too many cells, or values are not finite.
     """
     level_points = PointsOnLevel.of(function, tolerance).within(*box, volume)
     while True:
@@ -203,10 +207,11 @@ def _distances(
     lattice: BccLattice,
     closed: bool,
 ) -> tuple[int, int, float]:
-    """How many vertices and centers of faces are off the level set.
+    """Measure how far the vertices and the centers of faces of a mesh are from the level set.
 
-    Of large meshes every second face is tested, or every third and so on. If the mesh is `closed`,
-    faces in the two outermost layers of cells are left out: they are to be cut away.
+    Of large meshes only every second face is tested, or every third and so on. If the mesh is
+    `closed` at the box of the lattice, faces in the two outermost layers of cells are not tested,
+    because they will be cut away.
 
     Returns:
         The number of these points that are farther than `tolerance` from the level set; the number
@@ -238,12 +243,13 @@ def extract_from_signs(
     *,
     closed: bool = False,
 ) -> SignIsosurface:
-    """The boundary of the points of a lattice's box at which a function is not positive.
+    """Extract the boundary of the set of points, in the box of a lattice, at which a function is
+    not positive.
 
-    tolerance: a length. Edges are split that are farther from the surface, judged by the normals at
-        their ends.
-    closed: whether the function counts as positive outside of the box, so that the surface is
-        closed; otherwise it ends on the box.
+    tolerance: a length. An edge is split if it is farther than this from the surface, estimated
+        from the normals at its ends.
+    closed: whether the function counts as positive outside of the box. Then the surface is closed
+        by parts of the box's faces; otherwise it ends there.
 
     Raises:
         MeshingError: there is no surface, there are too many cells, or values are not finite.
@@ -283,9 +289,11 @@ def extract_from_signs(
 
 @dataclass(frozen=True)
 class _RawIsosurface:
-    """A mesh as tetrahedra cut it.
+    """The mesh that consists of the triangles in which the level set cuts tetrahedra, before it is
+    improved.
 
-    vertices: (n, 3), on the level set. normals: (n, 3) of the level set there. faces: (m, 3).
+    vertices: (n, 3), on the level set. normals: (n, 3) unit normals of the level set there.
+    faces: (m, 3).
     points: the number of points of the lattice.
     undecided: the number of these points whose sign is not certain."""
 
@@ -299,13 +307,13 @@ class _RawIsosurface:
 def _march(
     function: SignFunction, lattice: BccLattice, closed: bool, report: Callable[[str], None]
 ) -> _RawIsosurface:
-    """The mesh of all tetrahedra with corners of both signs.
+    """Cut all tetrahedra of a lattice that have corners of both signs, by marching tetrahedra.
 
     closed: whether the function counts as positive on the box's faces, so that the mesh is closed.
 
-    Cells that are proved empty are left out. Where values have errors, or proofs depend on
-    rounding, signs may nevertheless differ at the corners of such a cell, and the surface would end
-    there. Then the cells around the open edges are added, until the surface ends on the box only.
+    Cells that are proved to contain no level are left out. Values and proofs are subject to
+    rounding, so signs may nevertheless differ at the corners of such a cell. Then the surface has
+    open edges there; the cells around these are added, until the surface ends only on the box.
 
     Raises:
         EmptySurfaceError: there is no surface.
@@ -331,8 +339,9 @@ def _march(
         normals: list[FloatArray] = []
 
         def roots(low: FloatArray, high: FloatArray, normals: Any = normals) -> FloatArray:
-            """Where edges from `low` to `high` (k, 3) meet the level set, not too near to their
-            ends. The normals there are appended to `normals`."""
+            """(k, 3) the points where the edges from `low` to `high` (k, 3) meet the level set,
+            moved a little if they are too near to an end. The unit normals (k, 3) there are
+            appended to the list `normals`."""
             x, normal = function.crossings(low, high)
             normals.append(normal)
             edge = high - low
@@ -366,14 +375,15 @@ def _march(
 def _collapse_slivers(
     raw: _RawIsosurface, tolerance: float
 ) -> tuple[FloatArray, IntArray, FloatArray, bool]:
-    """Simplify a mesh, by at most `tolerance` (a length): short edges are contracted, and vertices
-    whose faces lie in a plane are removed.
+    """Simplify a mesh: contract short edges, and remove vertices whose faces lie in a plane, so
+    that the surface moves by at most `tolerance` (a length).
 
-    It is unchanged if the surface is open, or if triangles would pass through each other.
+    The mesh stays unchanged if it is open, or if triangles of the simplified mesh would intersect.
 
     Returns:
-        Vertices, faces and normals of vertices; and whether it was checked that no triangles
-        intersect. Triangles as the tetrahedra cut them do not intersect, up to rounding.
+        The vertices (n, 3); the faces (m, 3); the normals (n, 3) at the vertices; and whether it
+        was checked that no triangles intersect. (Triangles of an unchanged mesh do not intersect,
+        up to rounding, since they lie in different tetrahedra.)
     """
     import scipy.spatial  # imported here: it takes half a second
 
@@ -391,8 +401,10 @@ def _collapse_slivers(
 
 
 def _finite_values(function: SignFunction, points: FloatArray, size: FloatArray) -> FloatArray:
-    """The values (n,) of the function at points (n, 3). Where a value is not finite, as at a
-    dipole, the function is evaluated a little beside the point. size: (3,) of a cell.
+    """The values (n,) of the function at points (n, 3). If a value is not finite, as at a dipole,
+    the function is evaluated a small fraction of a cell beside the point instead.
+
+    size: (3,) the edge lengths of a cell.
 
     Raises:
         MeshingError: some values are still not finite.
@@ -420,11 +432,13 @@ def _triangles(
     corners: IntArray,
     roots: Callable[[FloatArray, FloatArray], FloatArray],
 ) -> tuple[FloatArray, IntArray]:
-    """The triangles of tetrahedra with corners of both signs.
+    """The triangles in which the level set cuts tetrahedra: one triangle or two in each tetrahedron
+    whose corners have both signs.
 
-    points, value: (n, 3), (n,) points and the function there; 0 counts as negative.
-    corners: (m, 4) of the tetrahedra. roots: from the two ends of edges to where they meet the
-        level.
+    points, value: (n, 3), (n,) points, and the values of the function there; 0 counts as negative.
+    corners: (m, 4) the corners of the tetrahedra, as indices of points.
+    roots: a function that takes the ends (k, 3) and (k, 3) of edges, and returns the points (k, 3)
+        where the edges meet the level set.
 
     Returns:
         The vertices (k, 3), which lie within edges of tetrahedra, and the faces (j, 3).
@@ -445,15 +459,18 @@ def _triangles(
 
 @dataclass(frozen=True)
 class _CreaseRefinement:
-    """The places at which edges and faces are split to follow creases.
+    """The new vertices of a mesh whose edges and faces are split, so that it follows creases. The
+    mesh has m faces and k edges; c edges are split, and d faces get a vertex in their interior.
 
-    edges: (m, 3) the edges of all faces, by index.
+    edges: (m, 3) the indices of the edges of each face.
     vertex_of_edge: (k,) the index of the new vertex of each edge; -1 for edges that are not split.
-    ends: (c, 2) the ends of the edges that are split.
+    ends: (c, 2) the vertices at the ends of the edges that are split.
     share: (c,) the fraction of each of these edges at which it is split.
-    corner_faces: (d, 3) the faces that also get a new vertex within. rows: (d,) their indices.
-    points, normals: (c + d, 3) of the new vertices, those of edges first.
-    is_on_crease: (c + d,) which new vertices are on a crease."""
+    corner_faces, rows: (d, 3), (d,) the faces that get a vertex in their interior, and their
+        indices.
+    points, normals: (c + d, 3) the positions of the new vertices and the unit normals there; the
+        new vertices on edges come first.
+    is_on_crease: (c + d,) the mask of the new vertices that lie on a crease."""
 
     edges: IntArray
     vertex_of_edge: IntArray
@@ -475,14 +492,16 @@ class _CreaseRefinement:
         faces: IntArray,
         tolerance: float,
     ) -> _CreaseRefinement:
-        """Choose the edges and faces to split.
+        """Choose the edges and faces of a mesh to be split, and find their new vertices.
 
-        bent: (n,) which vertices are on a crease. They have two tangent planes, and their edges
-            stay.
+        x, normals: (n, 3) the vertices, and the unit normals of the level set there.
+        bent: (n,) the mask of the vertices that lie on a crease. Since the surface has two tangent
+            planes there, edges at these vertices are not split.
+        faces: (m, 3). tolerance: a length.
 
-        An edge is split if the line in which the tangent planes of its ends meet is farther from it
-        than `tolerance`, and if the level set is found in that direction. A face gets a vertex
-        within if all of its edges are split at a crease."""
+        An edge is split if it is farther than `tolerance` from the line in which the tangent planes
+        at both ends meet, and if the level set is found between the edge and that line. A face gets
+        a vertex in its interior if all of its edges are split at a crease."""
         every = Edges.of(half_edges(faces))
         edges = every.edge_of_pair.reshape(3, -1).T
         rows = np.flatnonzero((every.multiplicity == 2) & ~bent[every.vertices].any(axis=1))
@@ -520,7 +539,10 @@ class _CreaseRefinement:
         )  # fmt: skip
 
     def applied(self, x: FloatArray, faces: IntArray) -> tuple[FloatArray, IntArray]:
-        """The vertices and faces of the finer mesh."""
+        """Split the edges and faces. Returns the vertices, those of the mesh first, and the faces
+        of the finer mesh.
+
+        x, faces: (n, 3), (m, 3) the mesh."""
         vertices = np.concatenate([x, self.points])
         middle = self.vertex_of_edge[self.edges]
         is_other = np.ones(len(faces), np.bool_)
@@ -537,17 +559,20 @@ class _CreaseRefinement:
 def _toward_tangent_planes(
     a: FloatArray, b: FloatArray, n_a: FloatArray, n_b: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """From where on an edge, and how far, a point has to move to reach the intersection of the
-    tangent planes at its ends.
+    """For each edge, the segment from the edge to the line in which the tangent planes at both of
+    its ends meet.
 
     a, b: (k, 3) the ends of edges.
-    n_a, n_b: (k, 3) unit normals of the planes through these ends. The two planes meet in a line.
+    n_a, n_b: (k, 3) unit normals of the tangent planes through a and through b.
 
     Returns:
-        The fraction (k,) of the edge at which it is nearest to the line; the displacement (k, 3)
-        from there to the line; and the squared sine (k,) of the angle between the normals.
+        The point of the edge that is nearest to the line, as a fraction (k,) of the edge, kept away
+        from both ends; the displacement (k, 3) from this point to the line; and the squared sine
+        (k,) of the angle between the two normals. If the planes are parallel, the point is the
+        middle of the edge, and the displacement 0.
 
-    Edges of a plane triangulation pass over such a line in order, and so do these points.
+    If many edges of a flat triangulation cross the same line, then the points of the line that
+    belong to them come in the order in which the edges cross it. So the new triangles do not fold.
     """
     edge, line = b - a, np.cross(n_a, n_b)
     cosine, sine2 = row_dots(n_a, n_b), row_dots(line, line)
@@ -568,15 +593,16 @@ def _toward_tangent_planes(
 def _level_along(
     function: SignFunction, start: FloatArray, along: FloatArray, limit: FloatArray
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Search for the level set along segments from `start` (k, 3).
+    """Search for the level set along segments.
 
-    along: (k, 3) the displacements from start to end, which are shortened to at most `limit` (k,),
-        a length. The search begins a little before the start and ends a little beyond the end.
+    start, along: (k, 3) the start of each segment, and the vector to its end. A vector longer than
+        `limit` (k,) is shortened to that length. The search begins a little before the start and
+        ends a little beyond the end.
 
     Returns:
-        The points (k, 3) where segments meet the level set, and normals (k, 3) there; and the mask
-        (k,) of segments at whose ends the function has different signs. Other points have no
-        meaning.
+        A point (k, 3) of the level set on each segment; the unit normal (k, 3) there; and the mask
+        (k,) of the segments that have such a point: the function has different signs at the two
+        ends of the search. For other segments, point and normal have no meaning.
     """
     along = along * np.minimum(1, limit / np.maximum(row_norms(along), 1e-300))[:, None]
     begin, end = start - _BEFORE * along, start + _AFTER * along
@@ -593,12 +619,15 @@ def _level_along(
 def _crease_corners(
     function: SignFunction, x: FloatArray, normals: FloatArray, faces: IntArray, rows: IntArray
 ) -> tuple[FloatArray, FloatArray, IntArray]:
-    """New vertices within faces that cut off a corner of the level set.
+    """New vertices in the interior of faces that cut off a corner of the level set.
 
-    x, normals: (n, 3) the vertices, and the normals there. rows: (k,) the indices of the faces.
+    x, normals: (n, 3) the vertices of the mesh, and the unit normals there. faces: (m, 3).
+    rows: (k,) the indices of the faces that may get a new vertex.
 
-    Where the normals at the vertices of a face are independent, the tangent planes there meet in a
-    point. The new vertex is where the line from the face's center to that point passes the level.
+    If the three normals at the corners of a face are linearly independent, the tangent planes there
+    meet in a point. The line from the face's center to this point is followed, and the new vertex
+    is where it passes the level set. A face has no new vertex if the normals are dependent, or if
+    the line does not pass the level set near the face.
 
     Returns:
         The new vertices (j, 3); the normals (j, 3) there; and the indices (j,) of the faces that
@@ -618,13 +647,14 @@ def _crease_corners(
 
 
 def _undo_until_valid(x: FloatArray, flat: FloatArray, faces: IntArray) -> tuple[FloatArray, int]:
-    """Move vertices back to their places on the triangles as tetrahedra cut them, until no face is
-    turned over and no two faces intersect. Pairs of faces without a moved vertex are not tested.
+    """Undo moves of vertices onto creases, until no face is folded over and no two faces intersect.
+    Pairs of faces that have no moved vertex are not tested.
 
-    x: (n, 3) the vertices. flat: (n, 3) their places on the triangles of tetrahedra.
+    x: (n, 3) the vertices after the moves.
+    flat: (n, 3) the vertices before, on the triangles in which the level set cuts tetrahedra.
 
     Returns:
-        The vertices, and the number of faces whose vertices were moved back.
+        The vertices (n, 3), and the number of faces whose vertices were moved back.
 
     Raises:
         LocalizedMeshingError: triangles still intersect.
@@ -660,8 +690,8 @@ def _undo_until_valid(x: FloatArray, flat: FloatArray, faces: IntArray) -> tuple
 
 
 def _folded_faces(x: FloatArray, faces: IntArray, among: BoolArray) -> IntArray:
-    """The indices of the faces that lie on a neighbor, up to rounding. Pairs of neighbors count if
-    the mask `among` (m,) is set for either."""
+    """The indices of the faces that are folded onto a neighbor, up to rounding. A pair of neighbors
+    is tested if the mask `among` (m,) is set for at least one of the two."""
     normal = area_normals(x[faces])
     normal /= np.maximum(row_norms(normal), 1e-300)[:, None]
     pairs = Edges.of(half_edges(faces)).paired_half_edges() % len(faces)

@@ -31,7 +31,8 @@ _OPPOSITE = -0.5
 
 @dataclass(frozen=True, eq=False)
 class WallThickness:
-    """The thickness of a closed mesh at its faces, from `wall_thickness`.
+    """The thickness of the material behind each face of a closed mesh; the result of
+    `wall_thickness`.
 
     vertices, faces: (n, 3), (m, 3) the mesh.
     values: (m,) the thickness at the centers of faces, a length; nan for faces without an area."""
@@ -60,8 +61,9 @@ class WallThickness:
         return np.asarray(np.nan_to_num(self.values, nan=np.inf) < than)
 
     def to_colored_mesh(self, low: float, high: float) -> trimesh.Trimesh:
-        """The mesh with a color for each face. It is red where the thickness is at most `low`,
-        changes over yellow to gray, and is gray from `high` on. PLY and GLB files hold such colors.
+        """The mesh with a color for each face, by its thickness: red up to the thickness `low`,
+        gray from `high` on, and between them a gradient from red over yellow to gray. PLY and GLB
+        files hold such colors.
         """
         import trimesh  # imported here: it takes half a second
 
@@ -81,7 +83,7 @@ def wall_thickness(part: Any, **options: Any) -> WallThickness:
 
     part: a closed mesh (a trimesh.Trimesh, (vertices, faces), or the name of a file); or a solid,
         which is meshed first.
-    options: of `mesh`, for a solid.
+    options: for a solid, the options of `mesh`.
 
     At the center of a face a ray goes into the part, against the normal, and ends at the other
     side, at a distance t. A ball of diameter t touches the center from inside. It shrinks until it
@@ -119,12 +121,14 @@ def wall_thickness(part: Any, **options: Any) -> WallThickness:
 
 
 def _medial_diameters(solid: MeshSolid, start: FloatArray, normal: FloatArray) -> FloatArray:
-    """(k,) the thickness at points `start` (k, 3) of the surface of a solid, with outward unit
-    normals (k, 3): see `wall_thickness`.
+    """(k,) the thickness of a solid at points `start` (k, 3) of its surface, with the outward unit
+    normals `normal` (k, 3) there: the diameters of balls that touch the surface from inside at
+    these points (`wall_thickness`).
 
-    A ball that touches the start begins as wide as the ray inwards is long. As long as the nearest
-    point of the surface to its center is inside of the ball and faces the start, the ball shrinks
-    to the one that touches this point as well."""
+    A ball's first diameter is the length of the ray from the point into the solid, up to the
+    surface. Then the point of the surface nearest to the ball's center is computed. If it is inside
+    of the ball and faces the start, the ball is replaced by the smaller one that touches both. This
+    is repeated until it is not."""
     size = solid.surface.size
     below = _START_DEPTH * size
     # Not a fixed tolerance: rays into a small mesh would end where they start.
@@ -163,10 +167,11 @@ def _is_within(solid: MeshSolid, points: FloatArray) -> BoolArray:
 
 
 def _nearest(solid: MeshSolid, points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """The points of the surface that are nearest to points (k, 3) inside of it.
+    """For points (k, 3) inside of a solid, the nearest points of its surface.
 
     Returns:
-        Their distances (k,); the points (k, 3); and the unit vectors (k, 3) towards them.
+        The distances (k,) of these; the nearest points (k, 3) themselves; and the unit vectors
+        (k, 3) towards them.
     """
     backend = choose_backend("double")
     sample = solid.prepare(backend).evaluate(to_vector3(backend, points))

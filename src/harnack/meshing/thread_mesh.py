@@ -22,14 +22,16 @@ _MAX_VERTICES = 4_000_000
 
 
 def thread_manifold(thread: Thread, lower: float, upper: float, tolerance: float) -> Manifold:
-    """The mesh of a thread for lower <= z <= upper. Below and above that range it has no meaning.
+    """The closed mesh of a screw thread, which is the thread for lower <= z <= upper (z along its
+    axis). Below and above that range it has no meaning.
 
-    tolerance: a length, the largest distance of faces from the surface.
+    tolerance: a length, the largest distance of faces from the thread's surface.
 
-    Vertices lie on the surface, so the edges of the thread's profile are edges of the mesh. With n
-    vertices around and the largest radius r, faces are within 2 r (pi/n)^2 of the surface. Their
-    corners differ by at most 2 pi/n in angle. So a chord has a sagitta of r (pi/n)^2/2, and the
-    departure of the diagonal of a face, which is turned by 2 pi/n, is less than three times that.
+    Vertices lie on helical lines through the corners of the thread's profile, so the edges of the
+    profile are edges of the mesh. Let n be the number of vertices around, and r the largest radius.
+    Faces are within 2 r (pi/n)^2 of the surface. Proof. The corners of a face differ by at most
+    2 pi/n in angle. So a chord has a sagitta of r (pi/n)^2/2, and the departure of the diagonal of
+    a face, which is turned by 2 pi/n, is less than three times that.
 
     Raises:
         MeshingError: the mesh would have millions of faces.
@@ -68,9 +70,10 @@ def thread_manifold(thread: Thread, lower: float, upper: float, tolerance: float
 def _vertices(
     height: FloatArray, radii: FloatArray, segments: int, lead: float, shift: int
 ) -> FloatArray:
-    """The vertices of all helical lines.
+    """The vertices of the mesh of a screw thread, which lie on helical lines about the z axis.
 
-    height, radii: (lines,) each line at angle 0. segments: the number of angles.
+    height, radii: (lines,) the z of each line at angle 0, and its radius.
+    segments: the number of vertices of a line in one turn.
     lead: the height that a line gains in a turn.
     shift: after a turn, a line is where the line `shift` places further was at angle 0.
 
@@ -85,16 +88,23 @@ def _vertices(
 
 
 def _index(line: IntArray, step: IntArray, lines: int, segments: int, shift: int) -> IntArray:
-    """The index in `_vertices` of the vertex of a line at an angle. step: the index of the angle,
-    from 0 to `segments`; after a full turn it is the vertex of the line `shift` places further at
-    angle 0."""
+    """The indices, in the order of `_vertices`, of vertices that are given by a helical line and an
+    angle.
+
+    line: the numbers of the lines, from 0 to `lines` - 1.
+    step: the angles, as numbers from 0 to `segments` (a full turn). After a full turn, a line
+        continues in the line `shift` places further, at angle 0."""
     line, step = np.where(step == segments, line + shift, line), np.where(step == segments, 0, step)
     return np.where(line < lines, line * segments + step, lines * segments + line - lines)
 
 
 def _faces(lines: int, segments: int, shift: int) -> IntArray:
-    """Two triangles between neighboring vertices of neighboring lines, and fans of triangles around
-    two points of the axis (`_middles`), which close both ends."""
+    """The faces (m, 3) of the closed mesh of a screw thread: two triangles for each quadrilateral
+    between neighboring vertices of neighboring helical lines; and at both ends of the thread a fan
+    of triangles around a point of the axis (`_middles`).
+
+    lines, segments: the number of helical lines, and of the vertices of a line in one turn.
+    shift: after a turn, a line is where the line `shift` places further was at angle 0."""
     line, step = (grid.ravel() for grid in np.mgrid[: lines - 1, :segments])
 
     def at(i: IntArray, j: IntArray) -> IntArray:
@@ -116,7 +126,8 @@ def _faces(lines: int, segments: int, shift: int) -> IntArray:
 
 
 def _middles(vertices: FloatArray, lines: int, segments: int) -> FloatArray:
-    """(2, 3) the points of the axis at the mean heights of the first and of the last line."""
+    """(2, 3) two points of the axis that close the ends of a thread's mesh: at the mean height of
+    the first helical line, and at that of the last."""
     low = vertices[:segments, 2].mean()
     high = vertices[(lines - 1) * segments : lines * segments, 2].mean()
     return np.array([[0.0, 0.0, low], [0.0, 0.0, high]])

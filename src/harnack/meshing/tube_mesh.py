@@ -33,8 +33,8 @@ _REVERSAL = 1e-9
 
 
 def tube_manifold(tube: Tube, level: float, tolerance: float) -> Manifold:
-    """The mesh of the points within radius + level of a tube's polylines. Vertices lie on the
-    surface, and faces are within `tolerance` (a length) of it.
+    """The mesh of the points whose distance from a tube's polylines is at most its radius +
+    `level`. Vertices lie on the surface, and faces are within `tolerance` (a length) of it.
 
     First, vertices of a polyline are removed as long as the polyline stays within a quarter of the
     tolerance. Then each polyline is swept as a whole. If its mesh would pass through itself, as at
@@ -88,12 +88,13 @@ def _is_apart(surface: TriangleMesh) -> bool:
 
 
 def _simpler(points: FloatArray, length: float) -> FloatArray:
-    """A polyline (n, 3) without the vertices that are within `length` of the edges that replace
-    them (Douglas and Peucker 1973).
+    """A polyline with fewer vertices than the polyline `points` (n, 3). It leaves out vertices that
+    are within `length` of the edges that replace them (Douglas and Peucker 1973).
 
-    Conversely, all points of these edges are within `length` of the old polyline. Proof. The point
-    of an edge that is nearest to a point of the replaced part moves from one end of the edge to the
-    other as the point runs along that part. So it passes every point of the edge."""
+    Conversely, all points of the new edges are within `length` of the old polyline. Proof. Let a
+    point p run along the part of the old polyline that an edge replaces. The point of the edge
+    nearest to p, at a distance of at most `length`, moves continuously from one end of the edge to
+    the other. So every point of the edge is nearest to some p."""
     is_kept = np.zeros(len(points), np.bool_)
     is_kept[[0, -1]] = True
     waiting = [(0, len(points) - 1)]
@@ -113,17 +114,19 @@ def _simpler(points: FloatArray, length: float) -> FloatArray:
 
 @dataclass(frozen=True)
 class _Sweep:
-    """A polyline that a ring of points is swept along.
+    """A tube around a single polyline, made by sweeping a ring of points along it.
 
-    radius: of the tube. around: the number of points of each ring. points: (n, 3) the polyline."""
+    radius: of the tube, a length. around: the number of points of each ring.
+    points: (n, 3) the polyline; it is closed if the last point equals the first."""
 
     radius: float
     around: int
     points: FloatArray
 
     def surface(self) -> TriangleMesh | None:
-        """The surface through the rings of points. None if an edge leads back along the edge
-        before, or is too short for its corners: some line along it would end before it begins."""
+        """The triangles between the rings of points along the polyline. None if an edge leads back
+        along the edge before it, or is too short for its corners: then a line along the tube
+        between corresponding points of two rings would run backwards."""
         points, sides = self.points, np.diff(self.points, axis=0)
         edges = sides / np.abs(sides).max(axis=1)[:, None]  # squares of small ones underflow
         edges /= row_norms(edges)[:, None]
@@ -149,22 +152,25 @@ class _Sweep:
         return self._joined(np.concatenate(rings), shift if is_closed else None)
 
     def _directions(self, frame: FloatArray) -> FloatArray:
-        """(around, 3) unit vectors at equal angles in the plane of a frame, two orthonormal vectors
-        (2, 3)."""
+        """(around, 3) unit vectors at equal angles in the plane that is spanned by `frame`, two
+        orthonormal vectors (2, 3)."""
         angle = 2 * math.pi * np.arange(self.around) / self.around
         return np.cos(angle)[:, None] * frame[0] + np.sin(angle)[:, None] * frame[1]
 
     def _corner(
         self, point: FloatArray, turn: tuple[FloatArray, FloatArray], directions: FloatArray
     ) -> FloatArray:
-        """Rings (k, around, 3) of points where two edges meet.
+        """Rings (k, around, 3) of points on the tube at a corner of the polyline, where two edges
+        meet at `point`.
 
-        turn: the unit vectors of the edge before and of the edge after. directions: those of the
-            ring before the corner.
+        turn: the unit vectors of the edge before and of the edge after the corner.
+        directions: (around, 3) unit vectors from the polyline to the points of a ring on the edge
+            before the corner.
 
-        On the inner side, lines along the edges meet in the plane between them, in a single point.
-        On the outer side, arcs of the ball around the point lead from one edge to the other; k is
-        the number of points of these arcs."""
+        A ring has points on the inner and on the outer side of the corner. On the inner side, the
+        line along one edge and the line along the other meet in a single point, in the plane that
+        bisects the corner; it is repeated in all k rings. On the outer side, the k rings are the
+        points of an arc on the ball around the corner."""
         before, after = turn
         cosine, across = float(before @ after), after - (before @ after) * before
         sine = float(np.linalg.norm(across))
@@ -183,9 +189,10 @@ class _Sweep:
         return point + self.radius * np.where((component > 0)[:, None], inner, turned)
 
     def _end(self, point: FloatArray, axis: FloatArray, frame: FloatArray, sign: int) -> FloatArray:
-        """Rings (k, around, 3) of the half ball that closes an end of the tube.
+        """Rings (k, around, 3) of points on the half ball that closes an end of the tube.
 
-        axis: the unit vector of the edge. frame: orthonormal vectors across it.
+        point: the end of the polyline. axis: the unit vector of its edge there.
+        frame: (2, 3) two orthonormal vectors at right angles to the edge.
         sign: -1 at the first point, where rings go from the pole to the rim; 1 at the last point,
             where they go from the rim to the pole."""
         count = math.ceil(0.25 * self.around)
@@ -194,10 +201,12 @@ class _Sweep:
         return point + self.radius * (rings if sign > 0 else rings[::-1])
 
     def _joined(self, rings: FloatArray, shift: int | None) -> TriangleMesh:
-        """The mesh with faces between neighboring rings. rings: (k, around, 3).
+        """The mesh that joins each ring to the next by triangles.
 
-        shift: for a closed polyline, by how much the index around grows from the last ring to the
-            first; None for a polyline with two ends, whose first and last rings are single points.
+        rings: (k, around, 3) the points of all rings along the polyline.
+        shift: for a closed polyline, point i of the last ring is joined to point i + shift of the
+            first ring. None for a polyline with two ends; all points of its first ring are equal,
+            and so are those of its last ring.
 
         Corners that are equal in neighboring rings are one vertex, and faces without three
         different vertices are left out."""
@@ -221,16 +230,18 @@ class _Sweep:
     def _transported(
         self, edges: FloatArray, *, is_closed: bool
     ) -> tuple[list[tuple[FloatArray, FloatArray]], int] | None:
-        """Two orthonormal vectors across each edge, turned from edge to edge as the edges turn.
+        """A frame for each edge of a polyline: two orthonormal vectors (2, 3) at right angles to
+        the edge. From each edge to the next, the frame turns by the rotation that takes one edge's
+        direction to the next one's.
 
-        edges: (n, 3) unit vectors.
+        edges: (n, 3) the unit vectors of the edges.
 
         Returns:
-            For each edge the vectors (2, 3) at its start and at its end; and a shift. For a closed
-            polyline, the vectors also turn a little about the edges, so that the rings of the last
-            and the first edge coincide if the index around grows by the shift. Otherwise they are
-            the same at both ends, and the shift is 0. None if an edge leads back along the edge
-            before.
+            For each edge the frames at its start and at its end; and a shift. For a polyline with
+            two ends, both frames of an edge are the same, and the shift is 0. For a closed
+            polyline, frames also turn a little about the edges, so that point i of the last ring
+            coincides with point i + shift of the first. None if an edge leads back along the edge
+            before it.
         """
         start = np.cross(edges[0], np.eye(3)[np.abs(edges[0]).argmin()])
         start /= np.linalg.norm(start)
@@ -257,6 +268,6 @@ class _Sweep:
 
 
 def _spun(frame: FloatArray, angle: float) -> FloatArray:
-    """A frame, two orthonormal vectors (2, 3), turned by an angle in its plane."""
+    """A frame of two orthonormal vectors (2, 3), turned by an angle (in radians) in their plane."""
     c, s = math.cos(angle), math.sin(angle)
     return np.stack([c * frame[0] + s * frame[1], c * frame[1] - s * frame[0]])

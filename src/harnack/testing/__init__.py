@@ -1,8 +1,9 @@
 """Tests of fields and enclosures, of the library and of users.
 
-`check_field(MyField())` samples every promise of a field; `check_enclosure(MyEnclosure)` tries an
-enclosure on random functions of every kind, among them the extremal ones. Both raise
-`BrokenPromiseError`.
+A field promises (states as proved) bounds of its function near a point; an enclosure derives from a
+promise a length of a ray that contains no level. `check_field(MyField())` tests every promise of a
+field by samples. `check_enclosure(MyEnclosure)` tests an enclosure on random functions of every
+kind, including the extremal ones. Both raise `BrokenPromiseError` if a test fails.
 """
 
 from __future__ import annotations

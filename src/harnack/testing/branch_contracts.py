@@ -1,4 +1,5 @@
-"""Contracts of the branches of a Riemann surface, tested by sampling."""
+"""Tests, by sampling, of the bounds that a field of a Riemann surface states near its branch
+points."""
 
 from __future__ import annotations
 
@@ -26,11 +27,13 @@ _ROUNDING = 1e-6
 def check_branch_points(field: RiemannSurface, size: float, rng: np.random.Generator) -> None:
     """Check the bounds that a Riemann surface states for its branch points.
 
-    For each branch point `at` they are |g(z) - value| <= constant |z - at|^power within its radius,
-    where g is the drawn part (real or imaginary) of any branch, up to its period. Enclosures near a
-    branch point are derived from this, and few rays come so near by chance.
+    The bound for a branch point with the attributes at, value, constant and power is
+    |g(z) - value| <= constant |z - at|^power for complex z within its radius. g is the real or
+    imaginary part of the multivalued function, on any branch, modulo its period. Bounds along rays
+    near a branch point are derived from this. It needs a test of its own, because few random rays
+    come so near.
 
-    size: of the domain; it limits an infinite radius.
+    size: the size of the domain, to which an infinite radius is reduced.
 
     Raises:
         BrokenPromiseError: the message names the branch point, and a point where the bound does not
@@ -44,8 +47,9 @@ def check_branch_points(field: RiemannSurface, size: float, rng: np.random.Gener
 def _check_branch_point(
     field: RiemannSurface, point: BranchPoint, radius: float, rng: np.random.Generator
 ) -> None:
-    """Check the bound of one branch point at random points within `radius` of it
-    (`check_branch_points`)."""
+    """Check the bound that a Riemann surface states for one branch point (`check_branch_points`),
+    at random complex points within `radius` of it. Raises a BrokenPromiseError if it does not
+    hold."""
     backend = choose_backend("double")
     assert point.power is not None
     # Half of the points are near the branch point, half are spread evenly over the disc.

@@ -45,7 +45,10 @@ _MIN_FRACTION_OFF_CREASES = 0.9
 
 
 def check_derivatives(field: Field, points: FloatArray, look: FieldSamples) -> None:
-    """Check gradient, Laplacian and Hessian at points (n, 3). look: the samples of the field there.
+    """Check that the gradient, Laplacian and Hessian of a field at points (n, 3) agree with finite
+    differences.
+
+    look: the samples of the field at the points.
 
     Differences are taken within the field's domain; points too close to its border for that are
     left out.
@@ -78,8 +81,10 @@ def check_derivatives(field: Field, points: FloatArray, look: FieldSamples) -> N
 def _spacing_within(
     field: Field, points: FloatArray, h: FloatArray
 ) -> tuple[FloatArray, BoolArray]:
-    """Spacings (n,), halved from h until all nodes lie in the domain; and a mask (n,) of the points
-    at which such a spacing was found."""
+    """Spacings of finite differences whose nodes lie in the field's domain. For each of the points
+    (n, 3), the spacing h (n,) is halved until that is so.
+
+    Returns the spacings (n,); and the mask (n,) of the points for which one was found."""
     is_inside = np.ones(len(points), dtype=np.bool_)
     if field.domain is None:
         return h, is_inside
@@ -98,15 +103,16 @@ def _spacing_within(
 
 @dataclass(frozen=True)
 class _StencilSample:
-    """The samples of the field at points + node h along an axis, for a node of the differences.
+    """The samples of a field at one node of finite differences around n points: at the position
+    node * h along an axis from each point.
 
     axis: 0, 1 or 2.
     node: one of `_NODES`.
     h: (n,) the spacing.
-    weight: (n,) the weight of the node for the spacing h, divided by h.
-    wide: (n,) the same for the spacing 2h.
+    weight: (n,) the weight of the node in the difference with the spacing h, divided by h.
+    wide: (n,) its weight in the difference with the spacing 2h, divided by h.
     move: (n,) the value at the node less the value at the point, without jumps and periods.
-    gradient: (n, 3) at the node.
+    gradient: (n, 3) the gradient at the node.
     error: (n,) a bound of the error of `move`: the errors of both values.
     gradient_error: (n,) the sum of the errors of both gradients.
     """
@@ -125,10 +131,11 @@ class _StencilSample:
 def _stencil_samples(
     field: Field, points: FloatArray, samples: FieldSamples, h: FloatArray
 ) -> Iterator[_StencilSample]:
-    """The samples at all nodes of the differences around points (n, 3).
+    """The samples of the field at all nodes of finite differences around points (n, 3), one node
+    after the other.
 
-    samples: at the points.
-    h: (n,) the spacing.
+    samples: the samples at the points themselves.
+    h: (n,) the spacing of the nodes.
     """
     for axis in range(3):
         for node, weight, wide in zip(_NODES, _WEIGHTS, _WIDE_WEIGHTS, strict=True):
@@ -150,8 +157,9 @@ def _stencil_samples(
 def _without_truncation(
     field: Field, points: FloatArray, stencil: list[_StencilSample]
 ) -> list[_StencilSample]:
-    """The same samples with gradients without truncation error (`Field.exact`). The Hessian of a
-    field with variable accuracy may be the derivative of either gradient."""
+    """The same samples, but with gradients of the exact field, without the truncation error of a
+    treecode (`Field.exact`). It is needed because the Hessian that a treecode computes may be the
+    derivative of its own gradient or of the exact one."""
     error = sample_field(field, points, closely=True).gradient_error
     exact: list[_StencilSample] = []
     for node_sample in stencil:
@@ -167,7 +175,10 @@ def _without_truncation(
 def _pick_spacing(
     trials: list[list[_StencilSample]], choice: npt.NDArray[np.intp]
 ) -> list[_StencilSample]:
-    """The samples at one spacing for each point: that with index `choice` (n,) among the trials."""
+    """For each of n points, the samples of finite differences with one of several spacings.
+
+    trials: for each spacing, the samples at all nodes.
+    choice: (n,) for each point, the index of the spacing in `trials`."""
     if len(trials) == 1:
         return trials[0]
     rows = np.arange(len(choice))
@@ -183,7 +194,7 @@ def _pick_spacing(
 
 
 def _first_spacing(points: FloatArray, samples: FieldSamples) -> FloatArray:
-    """The spacing (n,) that is tried first."""
+    """The spacings (n,) of finite differences at points (n, 3) that are tried first, lengths."""
     return 2e-3 * _scale(points, samples)
 
 
@@ -204,7 +215,10 @@ def _max_coordinates(points: FloatArray) -> FloatArray:
 def _check_gradient(
     field: Field, points: FloatArray, samples: FieldSamples, stencil: list[_StencilSample]
 ) -> None:
-    """Compare the gradient with central differences of the value."""
+    """Compare the gradients at points (n, 3) with central differences of the value.
+
+    samples: the samples at the points. stencil: those at the nodes of the differences.
+    Raises a BrokenPromiseError where they do not agree."""
     tolerance, allowance = _limits(field, points, samples, stencil)
     error = np.linalg.norm(_difference(stencil)[0] - samples.gradient, axis=1)
     message = "the gradient is not that of the value"
@@ -212,7 +226,8 @@ def _check_gradient(
 
 
 def _difference(stencil: list[_StencilSample]) -> tuple[FloatArray, FloatArray]:
-    """The gradients (n, 3) by differences of the value: with the spacing h, and with 2h."""
+    """Gradients (n, 3) from central differences of the value: those with the spacing h, and those
+    with the spacing 2h. stencil: the samples at the nodes."""
     fine, wide = (np.zeros((len(stencil[0].h), 3)) for _ in range(2))
     for neighbor in stencil:
         fine[:, neighbor.axis] += neighbor.weight * neighbor.move
@@ -223,9 +238,11 @@ def _difference(stencil: list[_StencilSample]) -> tuple[FloatArray, FloatArray]:
 def _limits(
     field: Field, points: FloatArray, samples: FieldSamples, nodes: list[_StencilSample]
 ) -> tuple[FloatArray, FloatArray]:
-    """Two bounds (n,) that add up to one of the error of the gradient by differences of the value:
-    the truncation and rounding error of the differences; and the contribution of the errors of
-    value and gradient."""
+    """The allowed difference between the gradient and central differences of the value, in two
+    parts (n,) and (n,): a bound of the truncation and rounding error of the differences; and the
+    contribution of the errors that the field states for value and gradient.
+
+    nodes: the samples at the nodes of the differences."""
     h = nodes[0].h
     allowance = samples.gradient_error.copy()
     for neighbor in nodes:
@@ -248,7 +265,8 @@ def _limits(
 
 
 def _second_derivatives(stencil: list[_StencilSample]) -> FloatArray:
-    """(n,) sums of the absolute second derivatives along the axes."""
+    """(n,) for each point, the sum of the absolute values of the three second derivatives along the
+    coordinate axes, from central differences of the value."""
     return np.sum(
         [np.abs(neighbor.weight * neighbor.gradient[:, neighbor.axis]) for neighbor in stencil],
         axis=0,
@@ -258,14 +276,20 @@ def _second_derivatives(stencil: list[_StencilSample]) -> FloatArray:
 def _check_laplacian(
     points: FloatArray, samples: FieldSamples, trials: list[list[_StencilSample]]
 ) -> None:
-    """Compare the Laplacian with central differences of the gradient."""
+    """Compare the Laplacians at points (n, 3) with central differences of the gradient.
+
+    samples: the samples at the points.
+    trials: for each of several spacings, the samples at the nodes of the differences.
+    Raises a BrokenPromiseError where they do not agree."""
     bounds = [promise for promise in samples.promises if isinstance(promise, BoundedLaplacian)]
     if not _is_harmonic(samples) and not bounds:
         return
     length = np.linalg.norm(samples.gradient, axis=1)
 
     def compare(stencil: list[_StencilSample]) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """The Laplacian by differences, and two bounds of its error, as `_limits` gives them."""
+        """The difference between the field's Laplacian and the one by central differences with one
+        spacing, and the two parts of its allowance: a bound of the error of the differences, and
+        the contribution of the field's own errors; (n,) each."""
         h = stencil[0].h
         laplacian = np.sum(
             [neighbor.weight * neighbor.gradient[:, neighbor.axis] for neighbor in stencil], axis=0
@@ -303,13 +327,16 @@ def _check_laplacian(
 def _best_agreement(
     results: list[tuple[FloatArray, ...]],
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """The difference, the tolerance and the allowance (n,) at the spacing that is compared.
+    """Choose the spacing of finite differences by which each point is judged. Returns three arrays
+    (n,) at that spacing: how far the field's derivative is from the differences; the bound of the
+    error of the differences (tolerance); and the contribution of the field's own errors
+    (allowance).
 
-    results: these three for each spacing.
+    results: these three arrays for each spacing.
 
-    At each point, the two spacings with the smallest bounds are considered, and of these the one at
-    which the difference exceeds its bounds less. Differences across a crease may have small bounds
-    at one spacing by accident, and be wrong.
+    At each point, the two spacings with the smallest bounds are considered, and the one at which
+    the bounds are exceeded less is chosen. A single spacing would not be enough: differences across
+    a crease are wrong, and may have a small bound by accident.
     """
     error, tolerance, allowance = (np.stack(values) for values in zip(*results, strict=True))
     limit = tolerance + allowance
@@ -336,11 +363,13 @@ def _require_agreement(
     *,
     has_creases: bool = False,
 ) -> None:
-    """Raise unless `error` is at most tolerance + allowance at all points, and at most `tolerance`
-    at more than half of them; all are (n,).
+    """Raise a BrokenPromiseError unless `error` is at most tolerance + allowance at all points, and
+    at most `tolerance` at more than half of them.
 
-    has_creases: the field has creases; then the former may fail at a few points, whose differences
-        cross a crease.
+    error, tolerance, allowance: (n,) each.
+    message: the message of the error. points: (n, 3).
+    has_creases: whether the field has creases. Then the first condition may fail at a few points,
+        because finite differences are wrong if they cross a crease.
     """
     agrees = error <= tolerance + allowance
     if has_creases and agrees.mean() >= _MIN_FRACTION_OFF_CREASES:
@@ -353,9 +382,14 @@ def _require_agreement(
 def _check_hessian(
     field: Field, points: FloatArray, samples: FieldSamples, trials: list[list[_StencilSample]]
 ) -> None:
-    """Compare the Hessian with central differences of the gradient, of two orders; the difference
-    of the two is a measure of their error. Where f may have creases, the spacing that suits the
-    gradient is far too small for second derivatives: so each quantity has its own spacing.
+    """Compare the Hessians at points (n, 3) with central differences of the gradient.
+
+    samples: the samples at the points.
+    trials: for each of several spacings, the samples at the nodes of the differences.
+
+    The differences are computed in two orders of accuracy; the difference of both is a measure of
+    their error. Each tested quantity uses the spacing that suits it best. If f may have creases,
+    the spacing for the gradient is far too small for second derivatives.
     """
     backend = choose_backend("double")
     try:
@@ -378,8 +412,9 @@ def _check_hessian(
         hessian_error = field.hessian_error_bound(points, precision="double")
 
     def compare(stencil: list[_StencilSample]) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """The difference between the Hessian and the differences of the gradient, and two bounds of
-        its error, as `_limits` gives them."""
+        """The largest difference between the field's Hessian and central differences of the
+        gradient with one spacing, and the two parts of its allowance: a bound of the error of the
+        differences, and the contribution of the field's own errors; (n,) each."""
         h = stencil[0].h
         fine, coarse = np.zeros_like(hessian), np.zeros_like(hessian)
         for neighbor in stencil:

@@ -1,9 +1,11 @@
 """`check_enclosure`: tests of enclosures on random functions that keep a promise and reach a level.
 
-An enclosure is right if no function that the promise allows meets a level within the free length.
-The random functions include those for which the inequalities in the proofs of `harnack.enclosures`
-are equalities; so an enclosure whose lengths are a thousandth too long is detected. A `PromiseCase`
-is a promise together with levels, for which every enclosure can be tested.
+A promise is a proved bound of a function f near a point. An enclosure (an interval that contains
+the change of f along a ray) is derived from it, and gives a free length: a length of the ray that
+contains no level. The enclosure is right if no function that the promise allows meets a level
+within the free length. The random functions include those for which the inequalities in the proofs
+of `harnack.enclosures` are equalities. So the test detects an enclosure whose lengths are too long
+by a thousandth.
 """
 
 from __future__ import annotations
@@ -45,9 +47,10 @@ __all__ = [
 
 @dataclass(frozen=True)
 class PromiseCase:
-    """A promise about a function f at a point p with f(p) = 0, together with levels.
+    """A promise (a proved bound) about a function f near a point p with f(p) = 0, together with
+    levels, by which an enclosure can be tested.
 
-    gap_below, gap_above: the differences between f(p) and the levels below and above, positive.
+    gap_below, gap_above: the differences of f(p) to the next level below and above, both positive.
     """
 
     promise: Promise
@@ -55,12 +58,15 @@ class PromiseCase:
     gap_above: Real
 
     def map_numbers(self, change: Callable[[Any], Any]) -> PromiseCase:
-        """The case with `change` applied to all its numbers, of Python, NumPy or Dr.Jit."""
+        """A copy of the case, in which each number x is replaced by change(x). The numbers may be
+        Python numbers, or arrays of NumPy or Dr.Jit."""
         promise = self.promise.map_numbers(lambda number, _, __: change(number))
         return PromiseCase(promise, change(self.gap_below), change(self.gap_above))
 
     def enclosure(self, kind: type[Enclosure], slopes: SlopeRange) -> Enclosure | None:
-        """The enclosure of a class for this promise; None if the class does not apply."""
+        """The enclosure of the class `kind` that follows from the promise; None if the class does
+        not apply to such promises. slopes: an interval that contains the derivative of f along the
+        ray at p."""
         promise: Any = self.promise
         # Without the allowance for rounding, so that steps can be compared exactly.
         if isinstance(promise, HarmonicBall) and issubclass(kind, HarmonicBallEnclosure):
@@ -76,7 +82,7 @@ class PromiseCase:
         return kind.from_promise(promise, type(slopes.lower)(0), 0.0, slopes)
 
     def accepts(self, kind: type[Enclosure]) -> bool:
-        """Whether a class of enclosures applies to this promise."""
+        """Whether an enclosure of the class `kind` can be made from this kind of promise."""
         lower_names = [lower for lower, _ in self.promise.interval_pairs]
         values = {
             name: -1.0 if name in lower_names else 1.0
@@ -87,20 +93,22 @@ class PromiseCase:
         return case.enclosure(kind, SlopeRange(0.0, 0.0)) is not None
 
     def step(self, kind: type[Enclosure], slope: Real, error: Real = 0.0) -> Real:
-        """The free length along a direction in which f has a slope, known up to an error."""
+        """The free length that an enclosure of the class `kind` proves: no level is met within it
+        along a ray from p. slope: the derivative of f along the ray at p, known up to `error`."""
         enclosure = self.enclosure(kind, SlopeRange.around(slope, error))
         assert enclosure is not None
         return enclosure.free_length(LevelGaps(self.gap_below, self.gap_above))
 
     def covers(self, kind: type[Enclosure], slope: Real, length: Real, error: Real = 0.0) -> Mask:
-        """Whether a length along such a direction is proved free."""
+        """Whether an enclosure of the class `kind` proves that no level is met within `length`
+        along a ray from p. slope: the derivative of f along the ray at p, known up to `error`."""
         enclosure = self.enclosure(kind, SlopeRange.around(slope, error))
         assert enclosure is not None
         return enclosure.is_free(LevelGaps(self.gap_below, self.gap_above), length)
 
 
 def _is_infinite(end: Any) -> bool:
-    """Whether an end of a range is infinite."""
+    """Whether an end of a range is the Python number inf or -inf (an array counts as finite)."""
     return isinstance(end, float) and math.isinf(end)
 
 
@@ -112,13 +120,14 @@ _SAMPLES = 48
 
 @dataclass(frozen=True)
 class RandomFunctions:
-    """Random functions f of t along rays, one per row, that keep a promise made at t = 0.
+    """Random functions f(t) of the position t on a ray, one function per row, all of which satisfy
+    a promise (a bound of f on a ball about t = 0).
 
-    name: of the kind of functions, for messages.
+    name: the name of the kind of functions, for messages.
     case: the promise, and levels such that most of the functions meet one.
-    slope: (rows,) f'(0).
-    reach: (rows,) the radius of the promise.
-    movement: gives f(t) - f(0) for t (rows, m) with 0 <= t < reach.
+    slope: (rows,) the derivatives f'(0).
+    reach: (rows,) the radius of the ball for which the promise is made.
+    movement: a function that returns f(t) - f(0) for t (rows, m) with 0 <= t < reach.
     """
 
     name: str
@@ -138,7 +147,8 @@ def check_enclosure(
     """Test a class of enclosures against random functions of every kind of promise that it applies
     to.
 
-    rng: a generator or a seed.
+    kind: the class to be tested.
+    rng: a generator of random numbers, or a seed.
     rows: the number of functions of each kind.
 
     Checked: free lengths are numbers from 0 to the radius of the promise; no level is met within a
@@ -164,8 +174,9 @@ def check_enclosure(
 
 
 def random_functions(rng: np.random.Generator, rows: int) -> Iterator[RandomFunctions]:
-    """A set of functions of each kind: harmonic in 2, 3 and 4 dimensions, of bounded Laplacian,
-    Lipschitz, and of bounded second derivative."""
+    """Yield sets of `rows` random functions, one set for each kind of promise: functions that are
+    harmonic in 2, 3 or 4 dimensions, that have a bounded Laplacian, that are Lipschitz, or that
+    have a bounded second derivative."""
     with np.errstate(all="ignore"):
         for dimension in (2, 3, 4):
             yield _positive_harmonic(rng, rows, dimension, mirrored=False)
@@ -180,8 +191,9 @@ def random_functions(rng: np.random.Generator, rows: int) -> Iterator[RandomFunc
 def _positive_harmonic(
     rng: np.random.Generator, rows: int, n: int, *, mirrored: bool
 ) -> RandomFunctions:
-    """Harmonic functions f in n dimensions for which f - lower (mirrored: upper - f) is positive:
-    the Poisson integral of one, two or three rings of mass."""
+    """Random harmonic functions f on a ball in n dimensions that are bounded on one side only:
+    f > lower or, if `mirrored`, f < upper. f - lower (or upper - f) is the Poisson integral of one,
+    two or three rings of mass on the sphere."""
     radius, mass = _log_uniform(rng, rows, -3, 3), _log_uniform(rng, rows, -3, 3)
     latitudes = rng.uniform(-1, 1, (rows, 3))
     near_poles = rng.choice([-1.0, 1.0], (rows, 3)) * (1 - 10 ** rng.uniform(-8, 0, (rows, 3)))
@@ -208,8 +220,8 @@ def _positive_harmonic(
 
 
 def _bounded_harmonic(rng: np.random.Generator, rows: int, n: int) -> RandomFunctions:
-    """Harmonic functions in n dimensions with values in [lower, upper]: their boundary values are
-    steps at random heights, among them those of two caps."""
+    """Random harmonic functions on a ball in n dimensions with values in [lower, upper]. Their
+    values on the sphere are steps between these two numbers at random heights along the axis."""
     radius, span = _log_uniform(rng, rows, -3, 3), _log_uniform(rng, rows, -3, 3)
     heights = np.sort(rng.uniform(0, 2, (rows, 3)), axis=1)
     is_thin = rng.random(rows) < 0.2
@@ -234,8 +246,9 @@ def _bounded_harmonic(rng: np.random.Generator, rows: int, n: int) -> RandomFunc
 
 
 def _bounded_laplacian(rng: np.random.Generator, rows: int, *, mirrored: bool) -> RandomFunctions:
-    """Functions of bounded Laplacian: Poisson integrals of rings of mass, plus potentials of
-    sources.
+    """Random functions of bounded Laplacian on a ball, which are also bounded below or, if
+    `mirrored`, above. They are Poisson integrals of rings of mass on the sphere, plus potentials of
+    sources in the ball.
 
     The sources are a constant density in the unit ball, two balls of constant density, and a
     multiple of the Legendre polynomial P_2 of the latitude. The latter has the potential
@@ -298,7 +311,8 @@ def _bounded_laplacian(rng: np.random.Generator, rows: int, *, mirrored: bool) -
 
 
 def _zigzag_lines(rng: np.random.Generator, rows: int) -> RandomFunctions:
-    """Lipschitz functions: straight and zigzag lines whose slopes are at most the constant."""
+    """Random Lipschitz functions: straight lines and zigzag lines, the absolute values of whose
+    slopes are at most the Lipschitz constant."""
     radius, constant = _log_uniform(rng, rows, -3, 3), _log_uniform(rng, rows, -3, 3)
     knots = np.sort(rng.uniform(0, 1, (rows, 2)), axis=1) * radius[:, None]
     slopes = rng.uniform(-1, 1, (rows, 3)) * constant[:, None]
@@ -322,8 +336,8 @@ def _zigzag_lines(rng: np.random.Generator, rows: int) -> RandomFunctions:
 
 
 def _parabolas(rng: np.random.Generator, rows: int) -> RandomFunctions:
-    """Functions of bounded second derivative: parabolas whose second derivative jumps once, and is
-    at most the constant in absolute value."""
+    """Random functions of bounded second derivative: two parabolas joined with equal slopes. The
+    absolute value of the second derivative is at most the promised constant."""
     radius, constant = _log_uniform(rng, rows, -3, 3), _log_uniform(rng, rows, -3, 3)
     curvatures = rng.uniform(-1, 1, (rows, 2)) * constant[:, None]
     is_extremal = rng.random(rows) < 0.5
@@ -361,10 +375,13 @@ def _with_random_levels(
     movement: Callable[[FloatArray], FloatArray],
     promise: Promise,
 ) -> RandomFunctions:
-    """The functions with random levels: most of them with a level that the function reaches at a
-    random point, and other levels at random distances.
+    """Choose random levels for functions f. For most functions, one level is the value at a random
+    point, so that it is met; all other levels are at random differences from f(0).
 
+    name: the name of the kind of functions. promise: the promise that they keep.
     scale: (rows,) a typical size of f - f(0).
+    reach: (rows,) the radius of the promise. slope: (rows,) the derivatives f'(0).
+    movement: a function that returns f(t) - f(0) for t (rows, m).
     """
     rows = len(scale)
     below, above = scale * _log_uniform(rng, rows, -9, 2), scale * _log_uniform(rng, rows, -9, 2)
@@ -385,7 +402,8 @@ def _log_uniform(rng: np.random.Generator, rows: int, lower: float, upper: float
 
 
 def _upload(trial: RandomFunctions, precision: Precision) -> tuple[PromiseCase, Any]:
-    """The case and the slopes of a trial as Dr.Jit arrays."""
+    """The promise with its levels, and the slopes (rows,), of some random functions, as Dr.Jit
+    arrays of the given precision."""
     real = choose_backend(precision).Float
     case = trial.case.map_numbers(lambda n: real(n) if isinstance(n, np.ndarray) else n)
     return case, real(trial.slope)
@@ -399,9 +417,9 @@ def _check_trial(
     rng: np.random.Generator,
     precision: Precision,
 ) -> None:
-    """Check a class of enclosures on the random functions of a trial.
+    """Check the enclosures of the class `kind` on a set of random functions, the trial.
 
-    case, slope: of the trial, as Dr.Jit arrays.
+    case, slope: the promise with its levels, and the slopes, of the trial as Dr.Jit arrays.
 
     Raises:
         BrokenPromiseError: a free length is wrong for one of the functions.
@@ -431,7 +449,8 @@ def _check_trial(
 
 
 def _meets_level(trial: RandomFunctions, length: FloatArray, precision: Precision) -> BoolArray:
-    """Whether the functions are seen to meet a level strictly within the length, (rows,)."""
+    """(rows,) for each function of the trial, whether it meets a level strictly within `length`
+    (rows,), as far as samples of the function show."""
     tolerance = 1e-9 if precision == "double" else 1e-5
     fractions = np.concatenate([np.linspace(0, 1, _SAMPLES // 2), 1 - np.geomspace(1e-7, 0.5, 24)])
     t = (1 - tolerance) * length[:, None] * fractions
@@ -450,7 +469,8 @@ def _meets_level(trial: RandomFunctions, length: FloatArray, precision: Precisio
 
 
 def _value_scale(trial: RandomFunctions) -> FloatArray:
-    """(rows,) the size of the numbers whose rounding changes the functions."""
+    """(rows,) for each function of the trial, the size of the numbers in its evaluation, to which
+    the rounding errors of its values are proportional."""
     promise, size = trial.case.promise, np.abs(trial.slope) * trial.reach
     for low, high in promise.interval_pairs[
         :1
@@ -466,8 +486,12 @@ def _require(
     message_format: str,
     length: FloatArray,
 ) -> None:
-    """Raise a BrokenPromiseError for the first function for which `holds` (rows,) is false.
-    message_format: the message, with {length} and {reach} in place of numbers.
+    """Raise a BrokenPromiseError if `holds` (rows,) is False for a function of the trial. The
+    message describes the first such function.
+
+    kind: the class of enclosures that is tested.
+    message_format: the message; {length} stands for the function's entry of `length` (rows,), and
+        {reach} for the radius of its promise.
     """
     failures = np.flatnonzero(~holds)
     if not failures.size:

@@ -1,5 +1,6 @@
-"""`check_field` and `check_ray_samples`: tests, by sampling, of the promises of a field and of its
-enclosures along paths."""
+"""`check_field` and `check_ray_samples`: tests of a field by sampling. They test its promises
+(proved bounds of the field's function f near a point), and its enclosures (intervals proved to
+contain the change of f along a ray)."""
 
 from __future__ import annotations
 
@@ -59,11 +60,14 @@ def check_ray_samples(
     enclosures: EnclosureChoice = None,
     precision: Precision = "double",
 ) -> None:
-    """Test the enclosures that a field gives along random directions from points (n, 3).
+    """Test the enclosures that a field gives along rays from points (n, 3) in random directions. An
+    enclosure proves, for levels at given differences (gaps) above and below f, a free length: a
+    length of the ray within which f meets none of the levels.
 
-    Lengths range from a thousandth of the extent of the points to twice that extent, and gaps from
-    far below to far above the movement of f on the way. Within the free length proved for a gap, f
-    must not pass the gap by more than `Sample.value_error` and the rounding of value and position.
+    Rays have lengths from a thousandth of the extent of the points to twice that extent. Gaps range
+    from far less to far more than the change of f along the ray. Within the free length proved for
+    a gap, f must not change by more than the gap plus `Sample.value_error` and the rounding of
+    value and position.
 
     Raises:
         BrokenPromiseError: naming the point, and where f is too large or too small.
@@ -111,13 +115,15 @@ def proved_free_lengths(
     precision: Precision = "double",
     forwards: bool = True,
 ) -> FloatArray:
-    """The free lengths (n,) that a field's enclosures prove from points (n, 3) along unit
-    directions.
+    """The free lengths (n,) that a field's enclosures prove along rays: lengths within which f
+    meets no level.
 
+    points, directions: (n, 3) the starts of the rays, and their unit directions.
     ahead: (n,) the length of the ray for which enclosures are requested.
-    gaps: (n, 2) the differences in value to the levels below and above.
-    forwards: whether the enclosures are those ahead of the points; False for those behind them, of
-        rays that came along `directions`.
+    gaps: (n, 2) the differences of f at the start to the next level below and above.
+    enclosures: the classes of enclosures that may be used; None for the default.
+    forwards: True for the free length of the ray ahead of its start. False for a ray that ends at
+        the point: the free length of its part before the end.
     """
     backend = choose_backend(precision)
     ray = Ray(
@@ -153,8 +159,9 @@ def check_field(
     Checked: values and gradients are numbers, alike in both precisions within `Sample.value_error`;
     the gradient is that of the value; f is harmonic where a ball of dimension 2 or 3 promises it;
     `differentiable_value` is the value and has this gradient; `hessian`, where there is one, is
-    symmetric, the derivative of the gradient and, of a harmonic f, without trace; the lift of f
-    keeps each promise (`HarmonicBall`, `Lipschitz`, `TaylorRemainder`) on the path to random points
+    symmetric, the derivative of the gradient and, of a harmonic f, without trace; the continuous
+    change of f keeps each promise (`HarmonicBall`, `Lipschitz`, `TaylorRemainder`: a bound of f on
+    a ball about the point) on the path to random points
     of its ball, or for the last two to the point where the path leaves the domain, and at the end
     of a search for the worst pairs of points in these balls (`search_violations`: about 14,000
     pairs for each promise); enclosures along paths, of a field that gives its own
@@ -212,14 +219,16 @@ def check_field(
 
 
 def _overrides_sample_ray(field: Field) -> bool:
-    """Whether the field gives its own enclosures along rays, which do not follow from its
-    promises."""
+    """Whether the field computes the enclosures of its change along a ray by a method of its own,
+    and not from its promises (proved bounds near a point) as other fields do."""
     return type(field).sample_ray is not Field.sample_ray and not field.has_jumps
 
 
 def _check_numbers(field: Field, points: FloatArray, samples: FieldSamples) -> None:
-    """Check that values, gradients and the numbers of the promises are valid, and that a step is
-    possible at most points.
+    """Check that the values, gradients and promised bounds at points (n, 3) are valid numbers, and
+    that at most points the bounds allow a ray to make a step of positive length.
+
+    samples: the samples of the field at the points.
 
     Raises:
         BrokenPromiseError: they are not.
@@ -263,8 +272,9 @@ def _check_numbers(field: Field, points: FloatArray, samples: FieldSamples) -> N
 
 
 def _check_rounding(field: Field, points: FloatArray) -> None:
-    """Check the error of the value in single precision: it is at most `Sample.value_error` plus
-    eight units in the last place plus the effect of rounding the point."""
+    """Check that the values at points (n, 3) in single precision differ from those in double
+    precision by at most `Sample.value_error`, plus eight units in the last place, plus the change
+    of the value by rounding the point. Raises a BrokenPromiseError if they differ by more."""
     single = points.astype(np.float32).astype(np.float64)
     if field.domain is not None:
         single = single[field.domain.contains_points(single)]
@@ -286,8 +296,11 @@ def _check_rounding(field: Field, points: FloatArray) -> None:
 
 
 def _check_differentiable_value(field: Field, points: FloatArray, samples: FieldSamples) -> None:
-    """Check that `differentiable_value` is the value, and that its derivative in reverse mode is
-    the gradient."""
+    """Check the field's method `differentiable_value` at points (n, 3): it has to return the value,
+    and its derivative by the automatic differentiation of Dr.Jit, in reverse mode, has to be the
+    gradient. Raises a BrokenPromiseError if not.
+
+    samples: the samples of the field at the points."""
     backend = choose_backend("double")
     prepared = field.prepare(backend)
     x = to_vector3(backend, points, "points")
@@ -322,11 +335,17 @@ def _check_promise(
     rng: np.random.Generator,
     directions: int,
 ) -> None:
-    """Test a promise along random directions from each point, up to its radius, which counts as at
-    most twice the extent of the points.
+    """Test one promise of a field: a bound of its function f on a ball about each of `points` (n,
+    3). f is sampled on rays in random directions from each point, up to the radius of the ball, or
+    up to twice the extent of the points if that is less.
 
-    Promises that also hold outside of the field's domain, such as harmonic balls, are tested there
-    as well.
+    samples: the samples of the field at the points. directions: the number of rays from each.
+
+    Promises that also hold outside of the field's domain, such as those of harmonic balls, are
+    tested there as well; others only on the part of a ray in the domain.
+
+    Raises:
+        BrokenPromiseError: f breaks the bound.
     """
     name = type(promise).__name__
     radius = np.minimum(promise.radius, 2 * float(np.ptp(points, axis=0).max()) + 1e-300)
@@ -363,8 +382,8 @@ def _check_promise(
 
 
 def _distance_to_exit(field: Field, points: FloatArray, d: FloatArray) -> FloatArray:
-    """The lengths (n,) for which rays from points (n, 3) in directions d stay in the domain, which
-    is convex; infinite without a domain."""
+    """For rays from points (n, 3) in the unit directions d (n, 3), the lengths (n,) at which they
+    leave the field's domain, which is convex; infinite if the field has no domain."""
     if field.domain is None:
         return np.full(len(points), np.inf)
     backend = choose_backend("double")
@@ -377,12 +396,14 @@ def _distance_to_exit(field: Field, points: FloatArray, d: FloatArray) -> FloatA
 def _harnack_excess(
     ball: HarmonicBall, value: FloatArray, movement: FloatArray, fraction: FloatArray
 ) -> FloatArray:
-    """How far (n, m) the movement of f along a ray exceeds the bounds of Harnack's inequality and
-    of the ball's range; if it is positive, f is not harmonic on the ball.
+    """(n, m) by how much the change of f along rays exceeds what is possible for a harmonic
+    function on a ball, by Harnack's inequality and by the range of its values there. If it is
+    positive, f is not harmonic on the ball or leaves the range.
 
-    value: (n,) f at the center.
-    movement: (n, m) f minus its value at the center.
-    fraction: (m,) the distances from the center, as fractions of the radius.
+    ball: n balls on which f is promised to be harmonic, with the ranges of f.
+    value: (n,) f at the centers of the balls.
+    movement: (n, m) f at m points of a ray from each center, minus its value at the center.
+    fraction: (m,) the distances of these points from the center, as fractions of the radius.
     """
     n = ball.dimension
     growth = (1 + fraction) / (1 - fraction) ** (n - 1) - 1
@@ -396,7 +417,9 @@ def _harnack_excess(
 
 
 def _check_extent(field: Field, level: float, rng: np.random.Generator, count: int) -> None:
-    """Check that the level is not crossed on segments outside the extent."""
+    """Check that the level set stays within its extent, the region that is stated to contain it: f
+    must not cross the level on `count` random segments outside of the extent. Raises a
+    BrokenPromiseError if it does."""
     volume = field.extent((level,))
     if volume is None:
         return
@@ -441,7 +464,8 @@ def _check_extent(field: Field, level: float, rng: np.random.Generator, count: i
 
 
 def _level_interval(field: Field, offset: FloatArray) -> FloatArray:
-    """A number for the interval between levels in which f lies. offset: f - level."""
+    """The number of the interval between neighboring levels in which f lies. It is the same for two
+    values of f if no level separates them. offset: f - level for one of the levels."""
     return np.sign(offset) if field.period is None else np.floor(offset / field.period)
 
 

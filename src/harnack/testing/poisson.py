@@ -32,7 +32,8 @@ def kernel_difference(q: npt.ArrayLike, s: npt.ArrayLike, dimension: int) -> Flo
 
 
 def cap_mass(height: npt.ArrayLike, dimension: int) -> FloatArray:
-    """The fraction of the sphere in the cap s >= 1 - height, 0 <= height <= 2."""
+    """The fraction of the unit sphere of R^n, n = `dimension`, that lies in the cap s >= 1 -
+    height, for 0 <= height <= 2. s is the cosine of the angle to the axis."""
     b = np.asarray(height, np.float64)
     if dimension == 3:
         return 0.5 * b
@@ -43,7 +44,8 @@ def cap_mass(height: npt.ArrayLike, dimension: int) -> FloatArray:
 
 
 def cap_slope(height: npt.ArrayLike, dimension: int) -> FloatArray:
-    """The derivative of `cap_movement` at q = 0."""
+    """The derivative at q = 0, by the position q on the axis, of the Poisson integral of the
+    indicator of the cap s >= 1 - height of the unit sphere (`cap_movement`)."""
     b = np.asarray(height, np.float64)
     if dimension == 3:
         return 0.75 * b * (2 - b)
@@ -52,9 +54,10 @@ def cap_slope(height: npt.ArrayLike, dimension: int) -> FloatArray:
 
 
 def cap_movement(q: npt.ArrayLike, height: npt.ArrayLike, dimension: int) -> FloatArray:
-    """The Poisson integral at q of the cap's indicator, minus `cap_mass`; -1 < q < 1.
+    """The Poisson integral of the indicator of the cap s >= 1 - height of the unit sphere, at the
+    position q on the axis, -1 < q < 1, minus its value at the center (`cap_mass`).
 
-    A cap behind is a cap ahead with -q.
+    For the opposite cap, s <= -(1 - height), evaluate at -q.
     """
     q, b = np.broadcast_arrays(np.asarray(q, np.float64), np.asarray(height, np.float64))
     is_small = np.abs(q) < _SERIES_BELOW
@@ -71,9 +74,11 @@ def _cap_angle(height: FloatArray) -> FloatArray:
 
 
 def _cap_series(q: FloatArray, b: FloatArray, dimension: int) -> FloatArray:
-    """The movement of the cap of height b at small q, as the sum of c_l q^l over l >= 1.
+    """The Poisson integral of the indicator of the cap of height b, at the position q on the axis,
+    minus its value at q = 0. It is computed as the sum of c_l q^l over l >= 1, for small q.
 
-    It is the expansion of the Poisson kernel in Gegenbauer polynomials, integrated over the cap.
+    The series is the expansion of the Poisson kernel in Gegenbauer polynomials, integrated over the
+    cap s >= 1 - b, which begins at the latitude s = 1 - b.
     For n = 3 these are the Legendre polynomials P_l: the integral of P_l over [s, 1] is
     (1-s^2) P_l'(s)/(l(l+1)), and P_{l+1}' = P_{l-1}' + (2l+1) P_l.
     """
@@ -98,8 +103,8 @@ def _cap_series(q: FloatArray, b: FloatArray, dimension: int) -> FloatArray:
 
 
 def _cap_closed_form(q: FloatArray, b: FloatArray, dimension: int) -> FloatArray:
-    """The Poisson integral at q of the indicator of a cap of height b, in closed form; it loses
-    digits at small q."""
+    """The Poisson integral of the indicator of a cap of height b, at the position q on the axis, by
+    a formula in closed form. If its value at q = 0 is subtracted, digits are lost at small q."""
     if dimension == 3:  # the integral of (1-q^2)/2 (1+q^2-2qs)^(-3/2) over [1-b, 1]
         s = np.sqrt((1 - q) ** 2 + 2 * q * b)
         return b * (1 + q) / (s * (s + 1 - q))
@@ -153,8 +158,8 @@ class AxialFunctions:
 
 @dataclass(frozen=True)
 class GreenPotentials:
-    """Potentials of balls of constant density, on an axis through the centers of the balls and of
-    the unit ball of R^3. The potentials vanish on the unit sphere.
+    """Potentials of balls of constant density inside of the unit ball of R^3, evaluated on an axis
+    through the centers of all balls. The potentials vanish on the unit sphere.
 
     centers, sizes: (rows, k) the positions of the balls on the axis, and their radii;
         |center| + size <= 1.
@@ -168,7 +173,8 @@ class GreenPotentials:
     sizes: FloatArray
 
     def at_center(self, density: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Value and derivative along the axis (rows,) at the center of the unit ball."""
+        """The potentials (rows,) at the center of the unit ball, and their derivatives (rows,)
+        along the axis there. density: (rows, k) the densities of the balls."""
         y, size = self.centers, self.sizes
         distance = np.abs(y)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -179,7 +185,8 @@ class GreenPotentials:
         return (density * value).sum(axis=1), (density * slope).sum(axis=1)
 
     def movement(self, q: FloatArray, density: FloatArray) -> FloatArray:
-        """w(q) - w(0) at points q (rows, m) on the axis, 0 <= q < 1: (rows, m)."""
+        """(rows, m) w(q) - w(0) at the positions q (rows, m) on the axis, 0 <= q < 1, where w is
+        the potential. density: (rows, k) the densities of the balls."""
         total = np.zeros_like(q)
         for j in range(self.centers.shape[1]):
             y, size = self.centers[:, j, None], self.sizes[:, j, None]
@@ -188,7 +195,8 @@ class GreenPotentials:
 
 
 def _newton(q: FloatArray, y: FloatArray, size: FloatArray) -> FloatArray:
-    """Newton's potential at q, minus that at 0, of a ball of density 1 with its center at y."""
+    """Newton's potential of a ball of density 1, at the position q on the axis, minus its value at
+    0. y, size: the position of the ball's center on the axis, and its radius."""
     distance0, distance = np.abs(y), np.abs(q - y)
     values: list[FloatArray] = []
     with np.errstate(divide="ignore", invalid="ignore"):

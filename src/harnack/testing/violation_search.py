@@ -1,5 +1,5 @@
-"""Fields sampled as NumPy arrays, the search for violations of promises, and the errors that report
-them."""
+"""Fields sampled as NumPy arrays; the search for points at which a field violates a promise (a
+bound of its function that it states as proved); and the error that reports them."""
 
 from __future__ import annotations
 
@@ -150,10 +150,11 @@ def sample_field(
 
 @dataclass(frozen=True)
 class RayLift:
-    """The continuous lift of f at m points along each of n rays; all arrays are (n, m).
+    """The continuous change of f at m points along each of n rays; all arrays are (n, m).
 
-    moved: the movement of the lift since the ray's first point.
-    jumped: the sum of the jumps of f since then, across jump surfaces.
+    moved: the change of f since the ray's first point, without jumps across facets and without
+        jumps by the period of f.
+    jumped: the sum of the jumps of f across facets since the first point.
     gradient_norm: |grad f| at the points.
     error: `Sample.value_error` at the points.
     """
@@ -167,12 +168,14 @@ class RayLift:
 def lift_along_rays(
     field: Field, start: FloatArray, direction: FloatArray, lengths: FloatArray
 ) -> RayLift:
-    """The movement of the continuous lift of f along rays: f(start + t direction) - f(start).
+    """The continuous change of f along rays, f(start + t direction) - f(start), without its jumps
+    across facets.
 
-    start, direction: (n, 3), unit directions. lengths: t (n, m), each row ascending from 0.
+    start, direction: (n, 3) the starts of the rays, and unit vectors.
+    lengths: (n, m) the values of t for each ray, ascending from 0.
 
-    A value that is known modulo the period is continued to the value that the mean of the gradients
-    at both ends of an interval predicts; jumps are taken out.
+    If f is known modulo a period, whole periods are added at each point, so that the change since
+    the point before is nearest to the one that the mean of the gradients at both points predicts.
     """
     n, m = lengths.shape
     points = start[:, None] + lengths[..., None] * direction[:, None]
@@ -196,8 +199,9 @@ def lift_along_rays(
 def accumulated_jumps(
     field: Field, start: FloatArray, direction: FloatArray, lengths: FloatArray
 ) -> FloatArray:
-    """The sum (n, m) of the jumps of f since the first of the lengths (n, m) along rays, as
-    `next_jump` reports them."""
+    """(n, m) the sums of the jumps of f across facets between the first and each other point of
+    rays. The points are start + t direction for each t of `lengths` (n, m). The field's method
+    `next_jump` reports the jumps."""
     total = np.zeros_like(lengths)
     if not field.has_jumps:
         return total
@@ -278,12 +282,14 @@ _DIFFERENCE_SPACING = 1e-3
 
 @dataclass(frozen=True)
 class _Candidates:
-    """Pairs of points, at which a promise is tested.
+    """Pairs of points (p, y) at which a promise is tested: p is the point where the promise is
+    made, a bound of f on a ball about p; y is a point of the ball.
 
-    p: (n, 3) the points where the promise is made.
-    w: (n, 3) the vectors from p to the points y = p + reach * w where it is tested, |w| < 1.
-    reach: (n,) the radius of the promise at p.
-    violation_ratio: (n,) above 1 if the promise is violated.
+    p: (n, 3) the first points.
+    w: (n, 3) the second points are y = p + reach * w, with |w| < 1.
+    reach: (n,) the radii of the balls.
+    violation_ratio: (n,) the change of f from p to y relative to its bound. The promise is violated
+        if it is above 1.
     """
 
     p: FloatArray
@@ -292,8 +298,12 @@ class _Candidates:
     violation_ratio: FloatArray
 
     def best_of(self, alternatives: _Candidates) -> tuple[_Candidates, BoolArray]:
-        """The best of these n pairs and their alternatives, m for each pair, n * m in all. Returns
-        n pairs, and a mask (n,) of those that are alternatives."""
+        """Choose between each of these n pairs and its m alternatives: the one with the largest
+        violation ratio is best.
+
+        alternatives: n * m pairs, the m alternatives of the first pair first.
+
+        Returns the n best pairs, and the mask (n,) of those that are alternatives."""
         n = len(self.p)
         m = len(alternatives.p) // n
         best = np.arange(n) * m + alternatives.violation_ratio.reshape(n, m).argmax(axis=1)
@@ -384,13 +394,17 @@ class _ViolationSearch:
 
     @property
     def needs_path(self) -> bool:
-        """Whether the change of f between two points has to be added up along a path, without jumps
-        and periods."""
+        """Whether the change of f between two points has to be followed along a path between them,
+        because f jumps or is known modulo a period only. Otherwise it is the difference of the
+        values."""
         return self.field.period is not None or self.field.has_jumps
 
     def pairs(self, p: FloatArray, w: FloatArray, samples: int = _PATH_SAMPLES) -> _Candidates:
-        """The pairs of points p (n, 3) and vectors w (n, 3), with their ratios. Vectors of length 1
-        or more are shortened, to stay in the ball; samples: on each path."""
+        """Evaluate pairs of points: make the pairs of p (n, 3) and p + reach * w, where reach is
+        the radius of the promise at p, with their violation ratios.
+
+        w: (n, 3). Vectors of length 1 or more are shortened, so that the second point lies in the
+            ball. samples: the number of samples on each path between two points."""
         length = np.linalg.norm(w, axis=1, keepdims=True)
         w = w * np.minimum(1, _MAX_RADIUS_FRACTION / np.maximum(length, 1e-300))
         ratios, radii = np.full(len(p), -np.inf), np.full(len(p), 1.0)
@@ -418,11 +432,12 @@ class _ViolationSearch:
     def _ratio(
         self, at_p: FieldSamples, p: FloatArray, w: FloatArray, reach: FloatArray, samples: int
     ) -> FloatArray:
-        """The violation ratio (n,) of pairs: the movement of f from p to y, less its error,
-        relative to the bounds of the promise.
+        """The violation ratios (n,) of pairs of points p (n, 3) and y = p + reach * w: the change
+        of f from p to y, less the error of this change, relative to the bounds of the promise made
+        at p. Above 1 the promise is violated.
 
         at_p: the samples at p.
-        reach: (n,) the radius of the promise.
+        w: (n, 3), |w| < 1. reach: (n,) the radius of the promise.
         samples: the number of samples on a path from p to y.
         """
         promise, y = at_p.promises[self.promise_index], p + reach[:, None] * w
@@ -451,20 +466,25 @@ class _ViolationSearch:
             return ratio
 
     def _lift(self, p: FloatArray, y: FloatArray, samples: int) -> FloatArray:
-        """The change (n,) of the continuous lift of f from points p to points y, sampled on the
-        segments between them."""
+        """The change (n,) of f along the segments from points p to points y (n, 3), without jumps
+        at facets and without jumps by the period of f. f is followed through `samples` samples on
+        each segment. They are denser toward y, which is often near the border of the promise's
+        ball, because singularities may lie there."""
         offset = y - p
         length = np.linalg.norm(offset, axis=1)
         d = offset / np.maximum(length, 1e-300)[:, None]
-        # Denser towards the border, where singularities may lie.
+        # Denser toward y.
         fractions = 1 - np.linspace(1, 0, samples) ** 2
         return lift_along_rays(self.field, p, d, length[:, None] * fractions).moved[:, -1]
 
     def _laplacian_ratio(
         self, bound: BoundedLaplacian, y: FloatArray, at_y: FieldSamples, h: FloatArray
     ) -> FloatArray:
-        """1 plus the amount by which the Laplacian at y (n, 3) is outside of its bounds, relative
-        to their size. It is computed by differences of the gradient, with the spacings h and 2h."""
+        """(n,) the violation ratios of a promised bound of the Laplacian, at points y (n, 3): 1
+        plus the amount by which the Laplacian is outside of its bounds, relative to their size.
+
+        at_y: the samples at y. h: (n,) the spacing of central differences of the gradient, from
+            which the Laplacian is computed; their error is estimated from the spacing 2h."""
         fine, wide = np.zeros(len(y)), np.zeros(len(y))
         rounding = 4 * at_y.gradient_error / h
         for axis in range(3):
