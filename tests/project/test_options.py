@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import harnack as hk
-from harnack.cli.arguments import parsers
+from harnack.cli.arguments import parse, parsers
 from harnack.geometry.example_meshes import bumpy_sphere
 from harnack.rendering.option_table import (
     BY_NAME,
@@ -252,3 +252,19 @@ def test_defaults_follow_the_size_of_the_surface(scale: float) -> None:
     both = unit.is_hit & scaled.is_hit
     apart = np.abs(scaled.t[both] / scale - unit.t[both])
     assert np.quantile(apart, 0.98) < 4e-4
+
+
+def test_options_that_are_given_twice_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        parse(["render", "x^2 = 1", "--clip", "ball:0,0,0,1", "--clip", "ball:0,0,0,2"])
+    assert "--clip is given twice" in capsys.readouterr().err
+    lines = parse(["render", "x^2 = 1", "--isolines", "z:0.2", "--isolines", "x:0.5"]).isolines
+    assert [line.function for line in lines] == ["z", "x"]
+
+
+def test_scenes_say_which_settings_a_verb_has(tmp_path: Path) -> None:
+    path = tmp_path / "a.json"
+    hk.write_scene(path, SPHERE, show="value", color_by="z", size=(64, 48), material="gold")
+    scene = hk.read_scene(path)
+    assert set(scene.settings_of("render")) == {"show", "color_by", "size", "material"}
+    assert set(scene.settings_of("page")) == {"material"}

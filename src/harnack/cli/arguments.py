@@ -49,6 +49,21 @@ class _Parser(argparse.ArgumentParser):
         return [name for action in self._actions for name in action.option_strings]
 
 
+class _Once(argparse.Action):
+    """Stores the value of an option, which may be given once: argparse would take the last."""
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: Any,
+        option_string: str | None = None,
+    ) -> None:
+        if getattr(namespace, self.dest, None) is not None:
+            parser.error(f"{option_string} is given twice")
+        setattr(namespace, self.dest, values)
+
+
 def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
     """Parse the arguments of a command, by default those of this process. The result has an
     attribute for each option, and the name of the command in `command`.
@@ -270,10 +285,13 @@ def _add_option(group: Any, option: Option, verb: str) -> None:
     form: dict[str, Any] = {"type": _argument(cast("Any", option.parse)), "metavar": option.value}
     if option.value.startswith("["):
         form |= {"nargs": "?", "const": True, "metavar": option.value[1:-1]}
+    help_text = option.help
     if option.name == "show" and verb in ("page", "view"):
         names = "{" + ",".join(LIVE_MODES) + "}"
         form |= {"type": _argument(text.parse_choice(*LIVE_MODES)), "metavar": names}
-    group.add_argument(option.flag, dest=option.name, help=option.help, **form)
+        help_text = "picture at first (shaded)"
+    action = "append" if option.name == "isolines" else _Once
+    group.add_argument(option.flag, dest=option.name, help=help_text, action=action, **form)
 
 
 def _add_isolines_style(group: Any) -> None:

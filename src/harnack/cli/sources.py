@@ -19,7 +19,7 @@ from harnack.fields.expressions import expression, looks_like_formula
 from harnack.files.geometry_files import GEOMETRY_SUFFIXES
 from harnack.gallery import SCENES, Scene
 from harnack.live import SceneFile, read_scene
-from harnack.live.live_scene import live_options
+from harnack.live.live_scene import LIVE_MODES, STILL_OPTIONS, live_options
 from harnack.live.scene_file import FieldSources
 from harnack.name_suggestions import did_you_mean
 from harnack.rendering import Camera
@@ -50,7 +50,8 @@ def options_set(verb: str, arguments: Any) -> dict[str, Any]:
     if style and "isolines" not in given_options:
         raise ValueError(f"--isolines-{next(iter(style))} without isolines: give --isolines too")
     if style:
-        given_options["isolines"] = replace(given_options["isolines"], **style)
+        lines = given_options["isolines"]
+        given_options["isolines"] = [replace(line, **style) for line in lines]
     return given_options
 
 
@@ -154,6 +155,14 @@ def load_live_content(verb: str, arguments: Any, path: Path) -> Content:
     starts = {name: cast("float", sliders[name].start) for name in of_formula}
     surfaces, settings, sources = load_content(verb, arguments, path, starts)
     show = getattr(arguments, "show", None)
+    if path.suffix.lower() == ".json" and arguments.source not in SCENES:
+        left_out = sorted(
+            name
+            for name, value in settings.items()
+            if name in STILL_OPTIONS or (name == "show" and value not in LIVE_MODES)
+        )
+        if left_out:
+            print_line(f"left out, as a {verb} does not have them: {', '.join(left_out)}")
     settings = live_options(settings) | ({} if show is None else {"show": show})
     if any(name in SURFACE_OPTIONS for name in sliders):
         surfaces, settings = _unpacked(surfaces, settings)

@@ -33,7 +33,13 @@ from harnack.rendering.camera import Camera
 from harnack.rendering.framing import NothingVisibleError, bounding_box, visible_points
 from harnack.rendering.isolines import parse_isolines
 from harnack.rendering.mitsuba_plugins import register
-from harnack.rendering.option_table import names_of, refuse_others, refuse_unknown, shorthand_among
+from harnack.rendering.option_table import (
+    LIVE_MODES,
+    names_of,
+    refuse_others,
+    refuse_unknown,
+    shorthand_among,
+)
 from harnack.rendering.placed_surface import PlacedSurface
 from harnack.rendering.render_options import check_camera
 from harnack.rendering.scales import linear_from_srgb
@@ -88,8 +94,6 @@ STILL_OPTIONS = (
     "size", "spp", *names_of("render", "color", "quality", "run"),
 )  # fmt: skip
 """Options that `render` has for still pictures alone."""
-LIVE_MODES = ("shaded", "normal", "depth", "evaluations", "status")
-"""The values of `show` that pages and views have."""
 
 
 LIVE_OPTIONS = ("material", "boundary_radius")

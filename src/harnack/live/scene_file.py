@@ -52,7 +52,7 @@ from harnack.live.type_checks import check_types
 from harnack.name_suggestions import did_you_mean
 from harnack.rendering import Camera, Isolines
 from harnack.rendering.framing import rotation_to_z_up
-from harnack.rendering.option_table import BY_NAME, options_of
+from harnack.rendering.option_table import BY_NAME, LIVE, LIVE_MODES, options_of
 from harnack.rendering.stage import parse_material
 from harnack.tracer import HitTolerance, Surface, TracedSurface, TraceOptions
 from harnack.tracer.trace_options import (
@@ -144,6 +144,14 @@ class SceneFile:
             surface_and_options("a scene", surface, None, shorthand, SURFACE_OPTIONS)[0]
             for surface in self.surfaces
         )
+
+    def settings_of(self, verb: str) -> dict[str, Any]:
+        """The settings that a verb, such as "page", has; `show` only if the verb draws it."""
+        names = {option.name for option in options_of(verb)}
+        settings = {name: value for name, value in self.settings.items() if name in names}
+        if verb in LIVE and settings.get("show") not in (None, *LIVE_MODES):
+            del settings["show"]
+        return settings
 
     @property
     def trace_options(self) -> TraceOptions:
@@ -238,7 +246,10 @@ def to_scene_text(surfaces: Any, settings: Mapping[str, Any], sources: FieldSour
     sliders = {name: value for name, value in settings.items() if isinstance(value, Slider)}
     for name in sliders:
         if name not in SLIDER_OPTIONS:
-            raise SceneFileError(f"a slider of {name} cannot be written: it is no number")
+            raise SceneFileError(
+                f"a slider of {name} cannot be written: a file holds those of options that are "
+                "numbers, such as level"
+            )
     settings_json = {
         name: _setting_to_json(name, value, sources)
         for name, value in settings.items()

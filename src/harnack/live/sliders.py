@@ -127,7 +127,8 @@ class SlidingContent:
             if name not in used:
                 raise TypeError(
                     f"nothing depends on the slider {name!r}: it is no option that is a number, "
-                    "and no function has an argument of that name"
+                    "and no function has an argument of that name; a formula with this parameter "
+                    f"is a function of it as lambda {name}: harnack.expression(...)"
                     f"{did_you_mean(name, SLIDER_OPTIONS)}"
                 )
         return cls(content, settings, sliders)

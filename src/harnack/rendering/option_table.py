@@ -47,6 +47,9 @@ VERBS = RAYS | DRAWN | DISTANCES | CURVATURES | {"mesh", "repair"}
 COMMANDS = DRAWN | {"mesh", "repair"}
 """Those that are commands of the command line as well."""
 
+LIVE_MODES = ("shaded", "normal", "depth", "evaluations", "status")
+"""The values of `show` that pages and views have."""
+
 _PLACED = RAYS | DRAWN | DISTANCES | {"mesh", "curvature_lines"}
 
 Parse = Callable[[str], Any]

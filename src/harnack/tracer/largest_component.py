@@ -61,9 +61,7 @@ def largest_component_cells(
     """
     ends = None if volume is None else np.array(volume.bounds(), np.float64)
     if volume is None or ends is None or not np.isfinite(ends).all():
-        raise ValueError(
-            "largest needs a surface with bounds: give it a clip, such as a ball"
-        )
+        raise ValueError("largest needs a surface with bounds: give it a clip, such as a ball")
 
     def build() -> OccupancyGrid:
         """The cells, computed anew."""
