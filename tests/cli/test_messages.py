@@ -182,9 +182,7 @@ def test_messages_of_the_library_name_arguments_of_python(tmp_path: Path) -> Non
 
 @pytest.mark.parametrize("level", [0.0, 4 * math.pi, -8 * math.pi, 1e-300])
 def test_a_level_without_bounds_names_one_that_has_them(level: float) -> None:
-    with pytest.raises(
-        UnboundedSurfaceError, match=r"such as a ball \(harnack.Ball\), or choose .* 6.28319"
-    ) as e:
+    with pytest.raises(UnboundedSurfaceError, match=r"such as a ball, or choose .* 6.28319") as e:
         draw(level=level)
     assert "multiples of its period" in str(e.value)
     assert e.value.bounded_level == 2 * math.pi

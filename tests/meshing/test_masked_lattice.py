@@ -73,7 +73,7 @@ def test_a_surface_is_closed_where_nothing_matters_and_as_it_was_elsewhere() -> 
 
     def made(elsewhere: IrrelevantRegion | None) -> tuple[np.ndarray, np.ndarray]:
         function = LevelFunction(hk.Sphere(1.0), 0.0)
-        one = mesh_closed_surface(function, lattice, 5e-3, lambda _: None, irrelevant=elsewhere)
+        one = mesh_closed_surface(function, lattice, 5e-3, lambda _: None, elsewhere=elsewhere)
         return one.vertices, one.faces
 
     vertices, faces = made(IrrelevantRegion(lambda p: np.maximum(p[:, 2], 0.0)))
