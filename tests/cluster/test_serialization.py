@@ -264,9 +264,9 @@ def test_opening_leaves_the_classes_of_this_process_alone(monkeypatch: pytest.Mo
 def test_installed_packages_count_by_their_versions() -> None:
     scipy = importlib.import_module("scipy")
     packed = SerializedObject.serialize(lambda: scipy.special.j0(1.0), "test")
-    assert packed.others == (("scipy", scipy.__version__),)
+    assert packed.other_versions == (("scipy", scipy.__version__),)
     with pytest.raises(RuntimeError, match=r"sent by harnack .*scipy 0\.1, and here is .*scipy 1"):
-        replace(packed, others=(("scipy", "0.1"),)).deserialize()
+        replace(packed, other_versions=(("scipy", "0.1"),)).deserialize()
 
 
 def test_files_count_by_what_is_in_them(tmp_path: Path) -> None:

@@ -61,15 +61,15 @@ _GENERATED_ID = re.compile(r"[0-9a-f]{32}")
 # cloudpickle's list of modules is one for all threads.
 _REGISTRY_LOCK = threading.RLock()
 _MISSING_MESSAGE = (
-    "{what} needs Dask, which is not installed: pip install 'harnack[cluster]', on each machine of "
-    "the cluster in the same version"
+    "{feature} needs Dask, which is not installed: pip install 'harnack[cluster]', on each machine "
+    "of the cluster in the same version"
 )
 
 
-def import_optional(name: str, what: str) -> Any:
+def import_optional(name: str, feature: str) -> Any:
     """Import a module that the extra `cluster` installs.
 
-    what: the feature that needs it, for the message.
+    feature: the feature that needs it, for the message.
 
     Raises:
         ModuleNotFoundError: it is not installed.
@@ -77,7 +77,7 @@ def import_optional(name: str, what: str) -> Any:
     try:
         return importlib.import_module(name)
     except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(_MISSING_MESSAGE.format(what=what)) from error
+        raise ModuleNotFoundError(_MISSING_MESSAGE.format(feature=feature)) from error
 
 
 @functools.cache
@@ -101,32 +101,35 @@ class SerializedObject:
     """A pickled object.
 
     content_hash: 32 hexadecimal digits, equal for equal contents and equal versions of this
-        library, of `package_versions` and of `others`.
+        library, of `package_versions` and of `other_versions`.
     data: the pickle.
     file_digests: (path, hash of the contents) of each file that the object names.
     package_versions: the versions in the process that pickled the object; `deserialize` refuses
         others.
-    others: (name, version) of the other installed packages that the object uses.
+    other_versions: (name, version) of the other installed packages that the object uses.
     """
 
     content_hash: str
     data: bytes
     file_digests: tuple[tuple[str, str], ...] = ()
     package_versions: str = ""
-    others: tuple[tuple[str, str], ...] = ()
+    other_versions: tuple[tuple[str, str], ...] = ()
 
     @classmethod
-    def serialize(cls, thing: Any, what: str) -> SerializedObject:
-        """Pickle an object. what: what the object is, the first word of messages.
+    def serialize(cls, thing: Any, label: str) -> SerializedObject:
+        """Pickle an object. label: what the object is, the first word of messages.
 
         Raises:
             ModuleNotFoundError: the extra `cluster` is not installed.
             TypeError: the object cannot be pickled.
         """
-        name, pickler = _hash_and_files(thing, what)
-        data = _pickle(_make_cacheless_pickler, thing, what).file.getvalue()
-        files, others = sorted(pickler.files.items()), sorted(pickler.others.items())
-        return cls(name, data, tuple(files), package_versions(), tuple(others))
+        name, pickler = _hash_and_files(thing, label)
+        data = _pickle(_make_cacheless_pickler, thing, label).file.getvalue()
+        files, other_versions = (
+            sorted(pickler.files.items()),
+            sorted(pickler.other_versions.items()),
+        )
+        return cls(name, data, tuple(files), package_versions(), tuple(other_versions))
 
     def deserialize(self) -> Any:
         """Unpickle the object. The four objects that were deserialized last in this process are
@@ -150,11 +153,11 @@ def _deserialize_cached(packed: SerializedObject) -> Any:
     the cache holds the four objects that were deserialized last."""
     sent = [
         packed.package_versions,
-        *(f"{name} {version}" for name, version in packed.others),
+        *(f"{name} {version}" for name, version in packed.other_versions),
     ]
     local = [
         package_versions(),
-        *(f"{name} {installed_version(name)}" for name, _ in packed.others),
+        *(f"{name} {installed_version(name)}" for name, _ in packed.other_versions),
     ]
     if sent != local:
         raise RuntimeError(
@@ -171,9 +174,9 @@ def _deserialize_cached(packed: SerializedObject) -> Any:
     return pickle.loads(packed.data)
 
 
-def content_hash(thing: Any, what: str) -> str:
+def content_hash(thing: Any, label: str) -> str:
     """A hash of 32 hexadecimal digits that depends on everything an object contains, on the
-    contents of the files that it names, and on `package_versions`. what: what the object is, for
+    contents of the files that it names, and on `package_versions`. label: what the object is, for
     messages.
 
     Equal parts of the object are written out at each place, so that the hash does not depend on
@@ -183,37 +186,38 @@ def content_hash(thing: Any, what: str) -> str:
         ModuleNotFoundError: the extra `cluster` is not installed.
         TypeError: the object cannot be pickled.
     """
-    return _hash_and_files(thing, what)[0]
+    return _hash_and_files(thing, label)[0]
 
 
 def _hash_and_files(
-    value: Any, what: str, identifiers: frozenset[str] = frozenset()
+    value: Any, label: str, identifiers: frozenset[str] = frozenset()
 ) -> tuple[str, Any]:
     """The content hash of a value, and the pickler that wrote it. The pickler has noted the hashes
-    of the files (`files`) and the versions of the packages (`others`) that the value uses.
+    of the files (`files`) and the versions of the packages (`other_versions`) that the value uses.
 
-    what: what the value is, for messages.
+    label: what the value is, for messages.
     identifiers: identifiers in users' code that are known already; they select the attributes of
         users' modules that are written.
     """
     try:
-        pickler = _pickle(_make_hashing_pickler, value, what, identifiers, fast=True)
+        pickler = _pickle(_make_hashing_pickler, value, label, identifiers, fast=True)
     except (RecursionError, TypeError, ValueError):  # an object that contains itself
-        pickler = _pickle(_make_hashing_pickler, value, what, identifiers)
+        pickler = _pickle(_make_hashing_pickler, value, label, identifiers)
     data = (
-        f"{package_versions()} {sorted(pickler.others.items())}".encode() + pickler.file.getvalue()
+        f"{package_versions()} {sorted(pickler.other_versions.items())}".encode()
+        + pickler.file.getvalue()
     )
     return hashlib.blake2b(data, digest_size=16).hexdigest(), pickler
 
 
 def _pickle(
-    make_class: Callable[[Any], Any], value: Any, what: str,
+    make_class: Callable[[Any], Any], value: Any, label: str,
     identifiers: frozenset[str] = frozenset(), *, fast: bool = False,
 ) -> Any:  # fmt: skip
     """Write a value into the attribute `file` of a new pickler, and return the pickler.
 
     make_class: makes the class of the pickler from cloudpickle's class `Pickler`.
-    what: what the value is, for messages.
+    label: what the value is, for messages.
     identifiers: identifiers in users' code that are known already.
     fast: whether to write equal parts of the value at each place, without references between them.
 
@@ -224,15 +228,15 @@ def _pickle(
     Raises:
         TypeError: the value cannot be pickled.
     """
-    cloudpickle = import_optional("cloudpickle", what)
+    cloudpickle = import_optional("cloudpickle", label)
     while True:
-        pickler = make_class(cloudpickle.Pickler)(what, identifiers)
+        pickler = make_class(cloudpickle.Pickler)(label, identifiers)
         pickler.fast = fast
         try:
             pickler.dump(value)
         except (pickle.PicklingError, TypeError, AttributeError) as error:
             raise TypeError(
-                f"{what}: it cannot be sent to another process or written down ({error}); make it "
+                f"{label}: it cannot be sent to another process or written down ({error}); make it "
                 "of arrays, numbers and the classes of this library"
             ) from error
         identifiers = frozenset(pickler.words)
@@ -297,7 +301,7 @@ def _make_cacheless_pickler(base: Any) -> Callable[..., Any]:
     Attributes of its instances:
 
     file: the buffer to which it writes.
-    what: what the pickled object is, for messages.
+    label: what the pickled object is, for messages.
     words: identifiers and strings that occur in the users' code pickled so far.
     modules: for each user's module pickled so far, the module and the words known when it was
         pickled, which decided which of its attributes were written.
@@ -306,12 +310,12 @@ def _make_cacheless_pickler(base: Any) -> Callable[..., Any]:
     """
 
     class CachelessPickler(base):
-        """The pickler class; `context` becomes its attribute `what`."""
+        """The pickler class; `context` becomes its attribute `label`."""
 
         def __init__(self, context: str, words: frozenset[str]) -> None:
             self.file = io.BytesIO()
             super().__init__(self.file, protocol=_PROTOCOL)
-            self.what = context
+            self.label = context
             self.words = set(words)
             self.modules: list[tuple[ModuleType, frozenset[str]]] = []
             self.spaces: dict[int, Namespace] = {}
@@ -418,19 +422,19 @@ def _make_hashing_pickler(base: Any) -> Callable[..., Any]:
     Attributes of its instances besides those of `_make_cacheless_pickler`:
 
     files: the hash of each file by its path.
-    others: the versions of the installed packages that are used, by name.
+    other_versions: the versions of the installed packages that are used, by name.
     begun: for each function, class and module whose writing has begun, by id: the object and its
         number.
     """
     base_pickler: Any = _make_cacheless_pickler(base)
 
     class HashingPickler(base_pickler):
-        """The pickler class; `context` becomes its attribute `what`."""
+        """The pickler class; `context` becomes its attribute `label`."""
 
         def __init__(self, context: str, words: frozenset[str]) -> None:
             super().__init__(context, words)
             self.files: dict[str, str] = {}
-            self.others: dict[str, str] = {}
+            self.other_versions: dict[str, str] = {}
             self.begun: dict[int, tuple[Any, int]] = {}
 
         def persistent_id(self, obj: Any) -> Any:
@@ -447,12 +451,12 @@ def _make_hashing_pickler(base: Any) -> Callable[..., Any]:
             if obj_type is set or obj_type is frozenset:  # whose order differs
                 members = cast("set[Any] | frozenset[Any]", obj)
                 words = frozenset(cast("set[str]", self.words))
-                hashed = [_hash_and_files(member, self.what, words) for member in members]
+                hashed = [_hash_and_files(member, self.label, words) for member in members]
                 for _, pickler in hashed:
                     self.words |= pickler.words
                     self.modules += pickler.modules
                     self.files |= pickler.files
-                    self.others |= pickler.others
+                    self.other_versions |= pickler.other_versions
                 return obj_type.__name__, sorted(name for name, _ in hashed)
             return self.of_file(obj) if isinstance(obj, str | os.PathLike) else None
 
@@ -505,7 +509,7 @@ def _make_hashing_pickler(base: Any) -> Callable[..., Any]:
                 root not in (*_PACKAGES, "cloudpickle")
                 and (version := installed_version(root)) is not None
             ):
-                self.others[root] = version
+                self.other_versions[root] = version
             elif module is not None and (path := compiled_file(module)) is not None:
                 self.files[path] = str(_file_digest(path))
 

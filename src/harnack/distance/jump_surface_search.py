@@ -52,12 +52,12 @@ class JumpSurfaceSearch:
 
     scale: an upper bound of the coordinates that the field computes with, for bounds of rounding
         errors.
-    most: the largest number of facets that are examined for each point.
+    max_facets: the largest number of facets that are examined for each point.
     """
 
     surface: SurfaceTracer
     scale: float
-    most: int
+    max_facets: int
 
     def closest(self, x: Vec3, limit: Real) -> tuple[Vec3, Vec3]:
         """Search for the point closest to x of the part of the surface that lies on facets.
@@ -82,7 +82,7 @@ class JumpSurfaceSearch:
         backend = self.surface.backend
         real, index, vector = backend.Float, backend.UInt32, backend.Array3f
         next_facet = self._next_jump(x)
-        max_count = dr.opaque(index, self.most)
+        max_count = dr.opaque(index, self.max_facets)
         length = (
             _PROBE_HALF_LENGTH * backend.machine_epsilon * fmax(real(self.scale), dr.max(dr.abs(x)))
         )

@@ -85,12 +85,12 @@ class SymmetricEigen2:
             dr.fma(self.cosine, v, -self.sine * u),
         )
 
-    def combination(self, most: Real, least: Real) -> tuple[Real, Real]:
-        """The vector (u, v) whose coordinates in the basis of unit eigenvectors are `most`, for the
-        eigenvector of the larger eigenvalue, and `least`, for the other."""
+    def combination(self, along_larger: Real, along_smaller: Real) -> tuple[Real, Real]:
+        """The vector (u, v) whose coordinates in the basis of unit eigenvectors are `along_larger`,
+        for the eigenvector of the larger eigenvalue, and `along_smaller`, for the other."""
         return (
-            dr.fma(self.cosine, most, -self.sine * least),
-            dr.fma(self.sine, most, self.cosine * least),
+            dr.fma(self.cosine, along_larger, -self.sine * along_smaller),
+            dr.fma(self.sine, along_larger, self.cosine * along_smaller),
         )
 
 
@@ -162,14 +162,14 @@ def in_batches(
     backend: Backend,
     compute: Callable[..., tuple[Real | Vec3, ...]],
     points: Any,
-    *others: FloatArray,
+    *extra_vectors: FloatArray,
 ) -> tuple[Any, ...]:
     """Evaluate a function of Dr.Jit vectors at points (n, 3), for one batch after the other.
     Returns its results as a tuple of float64 arrays, (n,) for numbers and (n, 3) for vectors.
 
-    compute: the function. It takes the points, and one vector for each of `others`, and returns a
-        tuple of numbers and vectors.
-    others: further arguments of `compute`, arrays (n, 3) each, whose values are not checked.
+    compute: the function. It takes the points, and one vector for each of `extra_vectors`, and
+        returns a tuple of numbers and vectors.
+    extra_vectors: further arguments of `compute`, arrays (n, 3) each, whose values are not checked.
 
     Raises:
         TypeError, ValueError: points that are not an (n, 3) array of finite numbers of at most
@@ -177,7 +177,7 @@ def in_batches(
     """
     _check_size(points)
     with np.errstate(over="ignore"):
-        rounded = (values.astype(backend.dtype, copy=False) for values in others)
+        rounded = (values.astype(backend.dtype, copy=False) for values in extra_vectors)
         results = field_points.map_batches(backend, compute, points, *rounded, at_once=_BATCH_SIZE)
     return tuple(values.astype(np.float64, copy=False) for values in results)
 

@@ -94,17 +94,18 @@ def map_batches(
     backend: Backend,
     compute: Callable[..., tuple[Any, ...]],
     points: Any,
-    *others: npt.NDArray[Any],
+    *extra_vectors: npt.NDArray[Any],
     at_once: int = _BATCH_SIZE,
 ) -> tuple[npt.NDArray[Any], ...]:
     """The results of `compute` for points (n, 3), as NumPy arrays (n,) or (n, 3), computed batch by
     batch.
 
     backend: tells the precision of the arrays.
-    compute: a function that takes the Dr.Jit points of a batch and its rows of `others`, and
+    compute: a function that takes the Dr.Jit points of a batch and its rows of `extra_vectors`, and
         returns a tuple of Dr.Jit arrays and vectors.
     points: an array-like, or a Dr.Jit 3-vector.
-    others: further arguments of `compute`, vectors (n, 3) of any values, one row for each point.
+    extra_vectors: further arguments of `compute`, vectors (n, 3) of any values, one row for each
+        point.
     at_once: the number of points of a batch.
 
     Raises:
@@ -123,7 +124,7 @@ def map_batches(
             results = compute(
                 *(
                     _slice_vectors(backend, array, start, lanes) if n else backend.Array3f(0)
-                    for array in (vectors, *others)
+                    for array in (vectors, *extra_vectors)
                 )
             )
             dr.eval(*results)

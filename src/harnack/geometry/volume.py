@@ -136,12 +136,12 @@ def as_point(value: Iterable[float], name: str, *, finite: bool = True) -> Point
     return numbers
 
 
-def check_volume(given: object, name: str) -> None:
+def check_volume(value: object, name: str) -> None:
     """Raise TypeError for a value that is neither a volume nor None."""
-    if given is not None and not isinstance(given, Volume):
+    if value is not None and not isinstance(value, Volume):
         raise TypeError(
             f"{name} must be a volume: a harnack.Ball, harnack.Box or harnack.HalfSpace, or an "
-            f"intersection of these, not {given!r}"
+            f"intersection of these, not {value!r}"
         )
 
 

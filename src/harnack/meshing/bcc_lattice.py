@@ -248,17 +248,17 @@ def distinct_rows(rows: IntArray) -> IntArray:
     return _lattice_coordinates(sorted_unique(_flat_indices(rows, shape)), shape)
 
 
-def triangle_limit_error(cells: float, most: int) -> TriangleLimitError:
+def triangle_limit_error(cells: float, max_cells: int) -> TriangleLimitError:
     """The error to raise if a mesh would need too many cells; its message names the limit and
     remedies.
 
     cells: about how many cells hold the surface.
-    most: the largest number of cells.
+    max_cells: the largest number of cells.
     """
     return TriangleLimitError(
         f"about {cells:.1e} cells hold the surface, which makes some {3 * cells:.0e} triangles; "
-        f"at most {most:,} cells are made (max_triangles, and never more than {MOST_CELLS:,}): "
-        "choose a larger `cell_size` or `tolerance`, or a smaller `clip`"
+        f"at most {max_cells:,} cells are made (max_triangles, and never more than {MOST_CELLS:,}"
+        "): choose a larger `cell_size` or `tolerance`, or a smaller `clip`"
     )
 
 

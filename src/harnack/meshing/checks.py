@@ -598,13 +598,14 @@ def check_no_self_intersection(vertices: FloatArray, faces: IntArray) -> None:
         )
 
 
-def check_triangle_limit(expected: float, most: int) -> None:
-    """Raise TriangleLimitError if the number `expected` of triangles is larger than `most`, the
-    limit `max_triangles`."""
-    if expected > most:
+def check_triangle_limit(expected: float, max_triangles: int) -> None:
+    """Raise TriangleLimitError if the number `expected` of triangles is larger than
+    `max_triangles`."""
+    if expected > max_triangles:
         raise TriangleLimitError(
-            f"the mesh takes about {expected:.2g} triangles, and max_triangles is {most:,}: choose "
-            "a larger `tolerance` or `cell_size`, a smaller `clip`, or a larger `max_triangles`"
+            f"the mesh takes about {expected:.2g} triangles, and max_triangles is "
+            f"{max_triangles:,}: choose a larger `tolerance` or `cell_size`, a smaller `clip`, "
+            "or a larger `max_triangles`"
         )
 
 

@@ -149,11 +149,11 @@ class Shells:
         np.maximum.at(upper, number, corners.max(axis=1))
         return cls(number, volumes, lower, upper, corners)
 
-    def winding_number(self, around: Any, part: Any) -> float:
-        """The winding number of the component with index `around` at a point of the component with
-        index `part`."""
+    def winding_number(self, component: Any, part: Any) -> float:
+        """The winding number of the component with index `component` at a point of the component
+        with index `part`."""
         point = self.corners[np.argmax(self.component_of_face == part)].mean(axis=0)
-        return winding_around(self.corners[self.component_of_face == around], point)
+        return winding_around(self.corners[self.component_of_face == component], point)
 
     def nesting_depths(self) -> IntArray:
         """(k,) for each component, the winding number of all other components together around a

@@ -57,7 +57,7 @@ def restore_curve_edges(
     function: LevelFunction,
     vertices: FloatArray,
     faces: IntArray,
-    kept: int,
+    curve_count: int,
     cut: int,
     height: float,
 ) -> tuple[FloatArray, IntArray]:
@@ -72,19 +72,19 @@ def restore_curve_edges(
     side is within the tolerance only if its height is about the tolerance.
 
     vertices, faces: (n, 3), (m, 3) the mesh.
-    kept, cut: vertices 0 to kept - 1 are those of the curve; vertices kept to cut - 1 are the extra
-        points on its edges.
+    curve_count, cut: vertices 0 to curve_count - 1 are those of the curve; vertices curve_count to
+        cut - 1 are the extra points on its edges.
     height: the largest distance by which extra points are moved.
     """
-    if cut == kept:
+    if cut == curve_count:
         return vertices, faces
     successor = dict(boundary_edges(faces).tolist())
     chains: list[list[int]] = []
-    for start in range(kept):
+    for start in range(curve_count):
         chain = [start]
         while (vertex := successor.get(chain[-1])) is not None:
             chain.append(vertex)
-            if vertex < kept:
+            if vertex < curve_count:
                 break
         if len(chain) > 2:
             chains.append(chain)

@@ -188,7 +188,7 @@ _CREASE_COSINE = math.cos(math.radians(30))
 _SIMPLIFIED_WITHIN, _MENDED_WITHIN = (0.4, 0.2, 0.1), 0.05
 
 
-def check_options(spacing: Any, thickness: Any, seed: Any, most: Any) -> None:
+def check_options(spacing: Any, thickness: Any, seed: Any, max_triangles: Any) -> None:
     """Raise ValueError or TypeError unless options of `mesh` are in their ranges: `cell_size` and
     `thickness` positive or None, `seed` a nonnegative integer, `max_triangles` a positive
     integer."""
@@ -196,7 +196,7 @@ def check_options(spacing: Any, thickness: Any, seed: Any, most: Any) -> None:
         if value is not None and not 0 < as_real(value, name) < math.inf:
             raise ValueError(f"{name} must be a positive length, not {value!r}")
     as_integer_in_range(seed, "seed", 0, 2**63 - 1)
-    as_integer_in_range(most, "max_triangles", 1, 2**63 - 1)
+    as_integer_in_range(max_triangles, "max_triangles", 1, 2**63 - 1)
 
 
 def vertex_normals(function: LevelFunction, surface: TriangleMesh) -> FloatArray:

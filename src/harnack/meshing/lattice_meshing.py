@@ -377,18 +377,24 @@ class IrrelevantRegion:
         default_factory=dict[tuple[float, ...], IntArray]
     )
 
-    def relevant_cells(self, lattice: BccLattice, most: int) -> IntArray:
+    def relevant_cells(self, lattice: BccLattice, max_triangles: int) -> IntArray:
         """The indices (n, 3) of the cells that are not proved to lie in the region, and of cells
-        around them, in a border two cells wide. most: the largest number of triangles.
+        around them, in a border two cells wide. max_triangles: the largest number of triangles.
 
         Raises:
-            TriangleLimitError: there are more such cells than a mesh of `most` triangles may have.
+            TriangleLimitError: there are more such cells than a mesh of `max_triangles` triangles
+                may have.
         """
-        key = (*lattice.lower.tolist(), *lattice.size.tolist(), *lattice.counts.tolist(), most)
+        key = (
+            *lattice.lower.tolist(),
+            *lattice.size.tolist(),
+            *lattice.counts.tolist(),
+            max_triangles,
+        )
         if key not in self.cached_cells:
             border = _BORDER * float(lattice.size.max())
             self.cached_cells[key] = lattice.nonempty_cells(
-                lambda points: self.clearance(points) - border, most
+                lambda points: self.clearance(points) - border, max_triangles
             )
         return self.cached_cells[key]
 

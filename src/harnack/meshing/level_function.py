@@ -54,17 +54,17 @@ class LevelSamples:
         """The samples of the selected points. rows: their indices, or a mask."""
         return LevelSamples(self.value[rows], self.gradient[rows], self.quarter_period_radius[rows])
 
-    def replaced(self, rows: Any, others: LevelSamples) -> LevelSamples:
-        """A copy in which the samples at points `rows` (indices or a mask) are `others`."""
+    def replaced(self, rows: Any, replacements: LevelSamples) -> LevelSamples:
+        """A copy in which the samples at points `rows` (indices or a mask) are `replacements`."""
         value, gradient, radius = (
             self.value.copy(),
             self.gradient.copy(),
             self.quarter_period_radius.copy(),
         )
         value[rows], gradient[rows], radius[rows] = (
-            others.value,
-            others.gradient,
-            others.quarter_period_radius,
+            replacements.value,
+            replacements.gradient,
+            replacements.quarter_period_radius,
         )
         return LevelSamples(value, gradient, radius)
 

@@ -145,7 +145,7 @@ class LostParts:
     within: an upper bound of the distance of all points from the mesh; inf if it has no triangles.
     missing, filled: (k, 3), (j, 3) some of the far points: on parts that the mesh misses, and in
         gaps that it fills.
-    others: (i, 3) more far points, of which it is not known which of the two is the case.
+    undecided: (i, 3) more far points, of which it is not known which of the two is the case.
     thickness: the median thickness of these parts and gaps, a length; inf if they are wider than
         cells, or if no thickness is known.
     spacing: the size of cells.
@@ -158,7 +158,7 @@ class LostParts:
     within: float
     missing: FloatArray
     filled: FloatArray
-    others: FloatArray
+    undecided: FloatArray
     thickness: float
     spacing: float
     advice: str
@@ -234,7 +234,7 @@ class LostParts:
         )
         if shown:
             return f"{text}; they are about {self.thickness:.2g} thick"
-        return f"{text}such as {point_text(self.others[0])}"
+        return f"{text}such as {point_text(self.undecided[0])}"
 
 
 def _advice(field: Field) -> str:

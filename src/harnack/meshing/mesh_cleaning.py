@@ -56,14 +56,15 @@ class CleanedMesh:
     damaged mesh (the input), with unchanged coordinates; fillings follow.
 
     surface: the mesh.
-    kept: (k,) the indices of the input faces that were kept, ascending. Face i < k of the mesh is
-        input face kept[i].
-    turned: those of the indices in `kept` whose faces have the reverse orientation in the mesh.
+    kept_faces: (k,) the indices of the input faces that were kept, ascending. Face i < k of the
+        mesh is input face kept_faces[i].
+    turned: those of the indices in `kept_faces` whose faces have the reverse orientation in the
+        mesh.
     left_out: for each reason, the number of input faces that were removed for it.
     holes: the number of filled holes."""
 
     surface: TriangleMesh
-    kept: IntArray
+    kept_faces: IntArray
     turned: IntArray
     left_out: dict[str, int]
     holes: int
@@ -174,13 +175,17 @@ class _WorkingMesh:
         rows = np.delete(rows, crossing)
         return cls(vertices, joined[rows], rows, np.zeros(len(rows), np.bool_), counts)
 
-    def keep_faces(self, kept: BoolArray, reason: str) -> _WorkingMesh:
-        """The mesh with only the faces where the mask `kept` (m,) is set. Input faces that are
+    def keep_faces(self, is_kept: BoolArray, reason: str) -> _WorkingMesh:
+        """The mesh with only the faces where the mask `is_kept` (m,) is set. Input faces that are
         removed are counted under `reason`."""
-        removed = int((~kept & (self.source_face >= 0)).sum())
+        removed = int((~is_kept & (self.source_face >= 0)).sum())
         counts = self.counts | {reason: self.counts[reason] + removed}
         return _WorkingMesh(
-            self.vertices, self.faces[kept], self.source_face[kept], self.is_turned[kept], counts
+            self.vertices,
+            self.faces[is_kept],
+            self.source_face[is_kept],
+            self.is_turned[is_kept],
+            counts,
         )
 
     def without_nonmanifold_edges(self) -> _WorkingMesh:

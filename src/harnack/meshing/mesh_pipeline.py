@@ -236,12 +236,12 @@ def mesh(
     if largest and is_closed:
         triangles = largest_body(triangles)
 
-    def check(one: TriangleMesh) -> None:
-        """Raise a MeshingError unless the mesh `one`, which was changed, is still a manifold and,
-        for a solid, within the tolerance of the level set."""
+    def check(surface: TriangleMesh) -> None:
+        """Raise a MeshingError unless the mesh `surface`, which was changed, is still a manifold
+        and, for a solid, within the tolerance of the level set."""
         if solid:
-            made.check_level(one)
-        check_manifold(one.faces)
+            made.check_level(surface)
+        check_manifold(surface.faces)
 
     if not made.is_checked:
         report("checking")
@@ -323,14 +323,14 @@ def _mesh_from_signs(
     facts: list[dict[str, Any]] = []
     losses: list[LostParts] = []
 
-    def function(one: float, side: float) -> SignFunction:
-        """The function side * (f - one), whose level set 0 is the level set `one` of f."""
-        return SignFunction.of(field, one, filled, cells, side=side, most_faces=asked.most_faces)
+    def function(value: float, side: float) -> SignFunction:
+        """The function side * (f - value), whose level set 0 is the level set `value` of f."""
+        return SignFunction.of(field, value, filled, cells, side=side, most_faces=asked.most_faces)
 
     is_apart = False
 
-    def signed(one: float, side: float, closed: bool) -> TriangleMesh:
-        """The mesh of the level set `one` of f. side: 1; or -1 to reverse all faces. closed:
+    def signed(value: float, side: float, closed: bool) -> TriangleMesh:
+        """The mesh of the level set `value` of f. side: 1; or -1 to reverse all faces. closed:
         whether the mesh is closed by parts of the box's faces, rather than ending there.
 
         Its entries for the metadata are appended to the list of facts; the parts of the level set
@@ -338,7 +338,7 @@ def _mesh_from_signs(
         nonlocal is_apart
         try:
             made, lost, more = mesh_from_signs(
-                function(one, side),
+                function(value, side),
                 filled,
                 cells,
                 asked.tolerance.at(size),
@@ -640,14 +640,14 @@ def _mesh_solid(
 
         return mesh_angle
 
-    def check_level(made: TriangleMesh, size: float) -> None:
-        _check_level(region, made, asked.tolerance.at(size), asked.volume)
+    def check_level(surface: TriangleMesh, size: float) -> None:
+        _check_level(region, surface, asked.tolerance.at(size), asked.volume)
 
-    def check(made: TriangleMesh, size: float) -> None:
+    def check(surface: TriangleMesh, size: float) -> None:
         """Raise a MeshingError unless the mesh is a manifold within the tolerance of the level set.
         size: the longest side of its box."""
-        check_manifold(made.faces, made.vertices)
-        check_level(made, size)
+        check_manifold(surface.faces, surface.vertices)
+        check_level(surface, size)
 
     made = mesh_solid(
         cast("Solid", region.field),
@@ -697,8 +697,8 @@ def _mesh_level_set(field: Field, level: float | None, asked: _MeshOptions) -> _
         if not len(made.faces):
             raise MeshingError("the level set is empty: it lies outside of the clip")
 
-    def check_level(one: TriangleMesh) -> None:
-        _check_level(function, one, asked.tolerance.at(size), volume)
+    def check_level(surface: TriangleMesh) -> None:
+        _check_level(function, surface, asked.tolerance.at(size), volume)
 
     return _RawMesh(made, size, {"level": level, **facts}, function, check_level, False)
 

@@ -485,11 +485,11 @@ def _keep_valid(
     flat = {"flat": cleaned.left_out["flat"] + flat_count}
     return cleaned.surface, {
         "stage": "cleaned",
-        "kept": len(cleaned.kept),
+        "kept": len(cleaned.kept_faces),
         "turned": _count_turned(intended, cleaned),
         "left_out": cleaned.left_out | flat,
         "holes": cleaned.holes,
-        "patches": len(cleaned.surface.faces) - len(cleaned.kept),
+        "patches": len(cleaned.surface.faces) - len(cleaned.kept_faces),
         "harmonic": 0,
     }
 
@@ -503,7 +503,7 @@ def _count_turned(intended: IntendedSolid, cleaned: CleanedMesh) -> int:
     )
     is_turned = np.zeros(len(turned_before), np.bool_)
     is_turned[cleaned.turned] = True
-    return int((is_turned ^ turned_before)[cleaned.kept].sum())
+    return int((is_turned ^ turned_before)[cleaned.kept_faces].sum())
 
 
 # Loose triangles joined.
@@ -524,7 +524,7 @@ def _weld_loose(
     corners = without_zero_area_faces(intended.vertices, intended.faces)
     vertices, faces, moved = weld_near_corners(*corners)
     made = clean_and_fill(vertices, faces, settings.report)
-    count = len(made.kept)
+    count = len(made.kept_faces)
     return made.surface, {
         "stage": "welded",
         "kept": 0,

@@ -67,18 +67,24 @@ def uses_sign_meshing(field: Field) -> bool:
     return isinstance(field, BatchedField | Blobs | HRBF)
 
 
-def cell_size_for_smoothing(field: Field, spacing: float, most: float, least: float) -> float:
+def cell_size_for_smoothing(
+    field: Field, spacing: float, largest_factor: float, smallest_factor: float
+) -> float:
     """The size of the lattice's cells, a length: `spacing`, or less for a point cloud with noise.
 
     The surface of such a cloud is likely to have details too small for cells of size `spacing` if
     the cloud's smoothing length is less than 0.3 `spacing`. Then the size is `spacing` times a
-    factor from `least` to `most`, so that cells are about 4.8 smoothing lengths wide."""
+    factor from `smallest_factor` to `largest_factor`, so that cells are about 4.8
+    smoothing lengths wide."""
     if (
         not isinstance(field, DipolePotential)
         or not 0 < field.smoothing < _UNRESOLVED_SMOOTHING * spacing
     ):
         return spacing
-    return min(max(_RESOLVED_SMOOTHING_LENGTHS * field.smoothing, least * spacing), most * spacing)
+    return min(
+        max(_RESOLVED_SMOOTHING_LENGTHS * field.smoothing, smallest_factor * spacing),
+        largest_factor * spacing,
+    )
 
 
 def empty_surface_hint(field: Field) -> str:

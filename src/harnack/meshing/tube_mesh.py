@@ -116,11 +116,11 @@ def _simpler(points: FloatArray, length: float) -> FloatArray:
 class _Sweep:
     """A tube around a single polyline, made by sweeping a ring of points along it.
 
-    radius: of the tube, a length. around: the number of points of each ring.
+    radius: of the tube, a length. ring_size: the number of points of each ring.
     points: (n, 3) the polyline; it is closed if the last point equals the first."""
 
     radius: float
-    around: int
+    ring_size: int
     points: FloatArray
 
     def surface(self) -> TriangleMesh | None:
@@ -152,20 +152,20 @@ class _Sweep:
         return self._joined(np.concatenate(rings), shift if is_closed else None)
 
     def _directions(self, frame: FloatArray) -> FloatArray:
-        """(around, 3) unit vectors at equal angles in the plane that is spanned by `frame`, two
+        """(ring_size, 3) unit vectors at equal angles in the plane that is spanned by `frame`, two
         orthonormal vectors (2, 3)."""
-        angle = 2 * math.pi * np.arange(self.around) / self.around
+        angle = 2 * math.pi * np.arange(self.ring_size) / self.ring_size
         return np.cos(angle)[:, None] * frame[0] + np.sin(angle)[:, None] * frame[1]
 
     def _corner(
         self, point: FloatArray, turn: tuple[FloatArray, FloatArray], directions: FloatArray
     ) -> FloatArray:
-        """Rings (k, around, 3) of points on the tube at a corner of the polyline, where two edges
-        meet at `point`.
+        """Rings (k, ring_size, 3) of points on the tube at a corner of the polyline, where two
+        edges meet at `point`.
 
         turn: the unit vectors of the edge before and of the edge after the corner.
-        directions: (around, 3) unit vectors from the polyline to the points of a ring on the edge
-            before the corner.
+        directions: (ring_size, 3) unit vectors from the polyline to the points of a ring on the
+            edge before the corner.
 
         A ring has points on the inner and on the outer side of the corner. On the inner side, the
         line along one edge and the line along the other meet in a single point, in the plane that
@@ -179,7 +179,7 @@ class _Sweep:
         across = across / sine
         angle = math.atan2(sine, cosine)
         component = directions @ across
-        step = 2 * math.pi / self.around
+        step = 2 * math.pi / self.ring_size
         count = math.ceil(angle / step)
         angles = np.array([0.5 * angle]) if count <= 1 else np.linspace(0.0, angle, count + 1)
         turned = directions + component[:, None] * (
@@ -189,13 +189,13 @@ class _Sweep:
         return point + self.radius * np.where((component > 0)[:, None], inner, turned)
 
     def _end(self, point: FloatArray, axis: FloatArray, frame: FloatArray, sign: int) -> FloatArray:
-        """Rings (k, around, 3) of points on the half ball that closes an end of the tube.
+        """Rings (k, ring_size, 3) of points on the half ball that closes an end of the tube.
 
         point: the end of the polyline. axis: the unit vector of its edge there.
         frame: (2, 3) two orthonormal vectors at right angles to the edge.
         sign: -1 at the first point, where rings go from the pole to the rim; 1 at the last point,
             where they go from the rim to the pole."""
-        count = math.ceil(0.25 * self.around)
+        count = math.ceil(0.25 * self.ring_size)
         angle = 0.5 * math.pi * np.arange(count + 1)[:, None, None] / count
         rings = np.cos(angle) * self._directions(frame) + sign * np.sin(angle) * axis
         return point + self.radius * (rings if sign > 0 else rings[::-1])
@@ -203,14 +203,14 @@ class _Sweep:
     def _joined(self, rings: FloatArray, shift: int | None) -> TriangleMesh:
         """The mesh that joins each ring to the next by triangles.
 
-        rings: (k, around, 3) the points of all rings along the polyline.
+        rings: (k, ring_size, 3) the points of all rings along the polyline.
         shift: for a closed polyline, point i of the last ring is joined to point i + shift of the
             first ring. None for a polyline with two ends; all points of its first ring are equal,
             and so are those of its last ring.
 
         Corners that are equal in neighboring rings are one vertex, and faces without three
         different vertices are left out."""
-        count, n = len(rings), self.around
+        count, n = len(rings), self.ring_size
         row, column = np.mgrid[: count - 1 if shift is None else count, :n].reshape(2, -1)
         turn = np.where(row == count - 1, shift or 0, 0)
         next_row = (row + 1) % count * n
@@ -258,7 +258,7 @@ class _Sweep:
         shift, twist = 0, 0.0
         if is_closed:
             mismatch = math.atan2(vectors[-1] @ np.cross(edges[0], start), vectors[-1] @ start)
-            step = 2 * math.pi / self.around
+            step = 2 * math.pi / self.ring_size
             shift = round(mismatch / step)
             twist = (mismatch - shift * step) / len(edges)
         frames = [np.stack([u, np.cross(edge, u)]) for u, edge in zip(vectors, edges, strict=False)]

@@ -74,9 +74,9 @@ class _NoDerivative(dr.CustomOp):
     Forward mode goes from parameters to all that depends on them, needed or not, so the derivative
     is NaN there."""
 
-    def eval(self, value: Any, what: str, sources: list[Any]) -> Any:
+    def eval(self, value: Any, result_name: str, sources: list[Any]) -> Any:
         del sources
-        self._what = what
+        self._result_name = result_name
         return value
 
     def forward(self) -> None:
@@ -85,19 +85,22 @@ class _NoDerivative(dr.CustomOp):
     def backward(self) -> None:
         if dr.any(self.grad_out() != 0, axis=None):  # it is zero for a result that is not used
             raise NotImplementedError(
-                f"{self._what} of hits cannot be differentiated, only t and position can: detach "
-                "it where it is used (drjit.detach)"
+                f"{self._result_name} of hits cannot be differentiated, only t and position can: "
+                "detach it where it is used (drjit.detach)"
             )
 
 
-def refuse_derivative(prepared: SurfaceTracer, o: Vec3, d: Vec3, what: str, value: Any) -> Any:
+def refuse_derivative(
+    prepared: SurfaceTracer, o: Vec3, d: Vec3, result_name: str, value: Any
+) -> Any:
     """The array `value`, with an error if its derivative is requested: its derivative is not known,
     and zero would be wrong. In forward mode the derivative is NaN.
 
-    o, d: (3,) origins and directions of the rays. what: the name of the result, for the message.
+    o, d: (3,) origins and directions of the rays. result_name: the name of the result, for
+        the message.
     """
     sources = [o, d, *prepared.levels.values, *prepared.field.parameters()]
-    return dr.custom(_NoDerivative, value, what, sources)
+    return dr.custom(_NoDerivative, value, result_name, sources)
 
 
 def attach_derivatives(

@@ -59,8 +59,8 @@ class _SearchState:
         the level, and the slopes of f there.
     searches: whether the point at which f turns back is being searched for.
     may_turn: whether such a point may still be found.
-    looks: the number of samples so far.
-    seen: whether the surface was found.
+    sample_count: the number of samples so far.
+    is_found: whether the surface was found.
     active: whether the search goes on.
     """
 
@@ -75,7 +75,7 @@ class _SearchState:
     searches: Mask
     may_turn: Mask
     sample_count: Any
-    seen: Mask
+    is_found: Mask
     active: Mask
 
 
@@ -151,7 +151,7 @@ def seen_distance(backend: Backend, field: Field, levels: Levels, hits: Doubtful
             searches=stays,
             may_turn=now.may_turn & ~(now.searches & ~goes_on),
             sample_count=now.sample_count + 1,
-            seen=is_seen,
+            is_found=is_seen,
             active=now.active & ~is_seen & (distance <= farthest),
         )
 
@@ -161,7 +161,7 @@ def seen_distance(backend: Backend, field: Field, levels: Levels, hits: Doubtful
         zero, no, yes, backend.UInt32(0), no, yes,
     )  # fmt: skip
     end = loop_while_active(begin, sample_once, "harnack doubtful hits")
-    return dr.select(end.seen, end.distance, dr.inf)
+    return dr.select(end.is_found, end.distance, dr.inf)
 
 
 def _turning_point(now: _SearchState) -> Real:

@@ -314,7 +314,7 @@ class _SearchedHits:
     """Hits around which the surface is searched for, and as `part` the index of the patch that each
     ray hit."""
 
-    around: Doubtful
+    doubtful: Doubtful
     part: Any
 
 
@@ -343,7 +343,7 @@ def _with_searched_distances(prepared: SurfaceTracer, hits: Hits, doubt: _Distan
         sampled = field
         if field.has_patches:
             sampled = field.patch(dr.reinterpret_array(backend.UInt32, hit.part))
-        return _SearchDistance(seen_distance(backend, sampled, prepared.levels, hit.around))
+        return _SearchDistance(seen_distance(backend, sampled, prepared.levels, hit.doubtful))
 
     doubtful = Doubtful(hits.position, hits.normal, doubt.size, doubt.distance)
     searched = compute_on_active(

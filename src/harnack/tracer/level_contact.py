@@ -375,37 +375,41 @@ class Hysteresis:
             dr.select(contact.is_touching, fmax(above - x, 0), gaps.above),
         )
 
-    def update(self, now: Contact, active: Mask, seen: AcceptedPoint) -> tuple[Contact, Mask]:
+    def update(self, now: Contact, active: Mask, accepted: AcceptedPoint) -> tuple[Contact, Mask]:
         """The contact behind an accepted point, and the mask of rays that have crossed the level.
 
-        now: the contact before. active: mask of rays with an accepted point. seen: that point.
+        now: the contact before. active: mask of rays with an accepted point. accepted: that point.
         """
-        x = -self.levels.offset_to_nearest(seen.value)
+        x = -self.levels.offset_to_nearest(accepted.value)
         touching = now.is_touching
-        side = dr.select(touching, now.side, self._side(now, seen, x))
+        side = dr.select(touching, now.side, self._side(now, accepted, x))
 
         # The root, if f has changed sides since the last point.
-        t, value, slope, gradient = seen.before
+        t, value, slope, gradient = accepted.before
         x_before = -self.levels.offset_to_nearest(value)
         passes = active & touching & (side * x_before > 0) & (side * x <= 0)
-        fraction = cubic_root(x_before, x, (seen.t - t) * slope, (seen.t - t) * seen.slope)
-        begins = active & ~touching & seen.is_near
-        root = dr.select(passes, t + fraction * (seen.t - t), dr.select(begins, seen.t, now.root))
-        at_root = dr.select(begins, seen.gradient, now.gradient)
-        at_root = dr.select(passes, dr.lerp(gradient, seen.gradient, fraction), at_root)
-        excess = dr.select(passes | begins, seen.excess, now.tolerance_excess)
-        before = dr.select(passes, t, dr.select(begins, seen.t, now.before))
-        behind = dr.select(passes | begins, seen.t, now.after)
+        fraction = cubic_root(
+            x_before, x, (accepted.t - t) * slope, (accepted.t - t) * accepted.slope
+        )
+        begins = active & ~touching & accepted.is_near
+        root = dr.select(
+            passes, t + fraction * (accepted.t - t), dr.select(begins, accepted.t, now.root)
+        )
+        at_root = dr.select(begins, accepted.gradient, now.gradient)
+        at_root = dr.select(passes, dr.lerp(gradient, accepted.gradient, fraction), at_root)
+        excess = dr.select(passes | begins, accepted.excess, now.tolerance_excess)
+        before = dr.select(passes, t, dr.select(begins, accepted.t, now.before))
+        behind = dr.select(passes | begins, accepted.t, now.after)
 
         # Is f far enough beyond the level to have crossed it, or has it left the band?
         is_first = (now.side == 0) & ~touching
-        stays = (is_first & self.is_free_before) | (seen.is_end & self.is_free_after)
-        least_offset = dr.select(stays, 0, _CROSSED_FRACTION * seen.band)
-        is_off = dr.abs(x) > fmax(least_offset, seen.total_error)
+        stays = (is_first & self.is_free_before) | (accepted.is_end & self.is_free_after)
+        least_offset = dr.select(stays, 0, _CROSSED_FRACTION * accepted.band)
+        is_off = dr.abs(x) > fmax(least_offset, accepted.total_error)
         crosses = active & touching & is_off & (side * x < 0)
         settles = active & is_off & (side == 0)
         side = dr.select(settles | crosses, dr.select(x > 0, type(x)(1), -1), side)
-        is_touching = dr.select(touching, dr.abs(x) <= seen.band, seen.is_near)
+        is_touching = dr.select(touching, dr.abs(x) <= accepted.band, accepted.is_near)
         return Contact(
             dr.select(active, side, now.side),
             dr.select(active, is_touching, touching),
@@ -414,43 +418,43 @@ class Hysteresis:
             excess,
             before,
             behind,
-            dr.select(active, seen.band, now.band),
+            dr.select(active, accepted.band, now.band),
         ), crosses
 
     def update_at_jump(
-        self, now: Contact, active: Mask, seen: AcceptedPoint, ahead: JumpCrossing, d: Vec3
+        self, now: Contact, active: Mask, accepted: AcceptedPoint, ahead: JumpCrossing, d: Vec3
     ) -> tuple[Contact, Mask]:
         """The contact behind the facet `ahead`, at which f jumps, and the mask of rays that cross
         the level by this jump.
 
-        now, seen: the contact and the sample at an accepted point just before the facet.
+        now, accepted: the contact and the sample at an accepted point just before the facet.
         active: mask of the rays that pass a facet.
         d: (3,) the unit direction of the ray.
 
         A field with jumps has a single level here. A ray that starts on a facet is on neither side
         of the level.
         """
-        x = -self.levels.offset_to_nearest(seen.value)
+        x = -self.levels.offset_to_nearest(accepted.value)
         one = type(x)(1)
         side = dr.select(now.is_touching, now.side, dr.select(x > 0, one, -1))
-        starts = dr.abs(dr.dot(ahead.normal, d)) * (seen.t - self.start) <= self.rounding
+        starts = dr.abs(dr.dot(ahead.normal, d)) * (accepted.t - self.start) <= self.rounding
         side = dr.select(starts, 0, side)
         behind = x + ahead.jump
         passes = active & (side * x > 0) & (side * behind <= 0)
-        begins = active & ~now.is_touching & (dr.abs(behind) <= seen.band)
-        is_off = dr.abs(behind) > fmax(_CROSSED_FRACTION * seen.band, seen.total_error)
+        begins = active & ~now.is_touching & (dr.abs(behind) <= accepted.band)
+        is_off = dr.abs(behind) > fmax(_CROSSED_FRACTION * accepted.band, accepted.total_error)
         crosses = active & is_off & (side * behind < 0)
         side = dr.select(is_off, dr.select(behind > 0, one, -1), side)
         at_facet = passes | begins
         return Contact(
             dr.select(active, side, now.side),
-            dr.select(active, dr.abs(behind) <= seen.band, now.is_touching),
-            dr.select(at_facet, seen.t, now.root),
+            dr.select(active, dr.abs(behind) <= accepted.band, now.is_touching),
+            dr.select(at_facet, accepted.t, now.root),
             dr.select(at_facet, ahead.normal, now.gradient),
             dr.select(at_facet, 0, now.tolerance_excess),
-            dr.select(at_facet, seen.t, now.before),
-            dr.select(at_facet, seen.t, now.after),
-            dr.select(active, seen.band, now.band),
+            dr.select(at_facet, accepted.t, now.before),
+            dr.select(at_facet, accepted.t, now.after),
+            dr.select(active, accepted.band, now.band),
         ), crosses
 
     def _side(self, now: Contact, point: AcceptedPoint, x: Real) -> Real:
@@ -492,7 +496,7 @@ class _Bisection:
 
 
 def refine_crossing(
-    field: Field, levels: Levels, tolerance: PreparedHitTolerance, path: Ray, found: Contact,
+    field: Field, levels: Levels, tolerance: PreparedHitTolerance, path: Ray, contact: Contact,
     active: Mask,
 ) -> tuple[Real, Vec3, Any]:  # fmt: skip
     """Refine crossings of rays with a level by bisection.
@@ -500,16 +504,16 @@ def refine_crossing(
     Returns the roots (ray parameters), the gradients (3,) of f there, and the number of
     evaluations.
 
-    found: the crossings. Each has two points on different sides of the level, and as root that of
+    contact: the crossings. Each has two points on different sides of the level, and as root that of
         the cubic through their values and slopes.
 
     The cubic is a bad approximation of f if f has a crease between the two points. So f is
     evaluated at its root. If f differs from the level there by more than the tolerance and its
     error, bisection narrows the interval, with f on different sides of the level at its ends.
     """
-    side = -found.side
-    count = dr.uint32_array_t(type(found.root))
-    smallest = 4 * float(dr.epsilon(type(found.root)))
+    side = -contact.side
+    count = dr.uint32_array_t(type(contact.root))
+    smallest = 4 * float(dr.epsilon(type(contact.root)))
 
     def bisect(now: _Bisection) -> _Bisection:
         """One sample at the point t, and the half of the interval in which the level lies."""
@@ -532,7 +536,9 @@ def refine_crossing(
             now.active & goes_on,
         )
 
-    begin = _Bisection(found.before, found.after, found.root, found.gradient, count(0), active)
+    begin = _Bisection(
+        contact.before, contact.after, contact.root, contact.gradient, count(0), active
+    )
     end = loop_while_active(begin, bisect, "harnack roots")
     return end.t, end.gradient, end.sample_count
 

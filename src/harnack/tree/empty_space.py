@@ -113,14 +113,14 @@ def kdop_of_points(points: FloatArray, slack: float) -> ConvexHull:
     return _kdop_of_boxes(points, np.full(3, slack))
 
 
-def merge_kdops(one: ConvexHull, other: ConvexHull) -> ConvexHull:
+def merge_kdops(hull: ConvexHull, other: ConvexHull) -> ConvexHull:
     """The smallest convex polytope with the 26 face normals of `BoxCells.bounding_kdop` that
     contains two polytopes with these normals."""
     return ConvexHull(
-        one.normals,
-        np.maximum(one.offsets, other.offsets),
-        np.minimum(one.lower, other.lower),
-        np.maximum(one.upper, other.upper),
+        hull.normals,
+        np.maximum(hull.offsets, other.offsets),
+        np.minimum(hull.lower, other.lower),
+        np.maximum(hull.upper, other.upper),
     )
 
 
@@ -174,17 +174,17 @@ def refine_cells(
 
 
 def nonempty_cells(
-    lower: FloatArray, upper: FloatArray, clearance: Clearance, most: int, finest: int
+    lower: FloatArray, upper: FloatArray, clearance: Clearance, max_cells: int, finest: int
 ) -> BoxCells:
     """The leaves of the octree of a box that are not proved to be free of a set, of equal size.
     There are none if all of the box is proved empty.
 
     lower, upper: the corners (3,) of the box.
     clearance: gives proved lower bounds of the distances of points from the set.
-    most: refinement stops before a round that would test more cells than this.
+    max_cells: refinement stops before a round that would test more cells than this.
     finest: the largest number of rounds; each halves the edges."""
     root = BoxCells(np.array(lower)[None], np.array(upper) - np.array(lower))
-    return refine_cells(root, clearance, most, finest).occupied
+    return refine_cells(root, clearance, max_cells, finest).occupied
 
 
 # The part of the margin around an empty cell that is reserved for rounding, in cells.
@@ -328,11 +328,11 @@ class GridCell:
         (`GridData`)."""
         return dr.gather(self.grid.backend.UInt32, self.grid.empty_distance, self.index)
 
-    def exit_distance(self, d: Vec3, around: Real = 1.0) -> Real:
+    def exit_distance(self, d: Vec3, reach: Real = 1.0) -> Real:
         """The length up to which the path from the point in direction d stays within a cube of
         cells.
 
-        around: the cube consists of the cells less than `around` cells away from the point's cell,
+        reach: the cube consists of the cells less than `reach` cells away from the point's cell,
             and of the margin around them.
 
         The path may leave the cube through a face on which the grid ends, since points outside of
@@ -340,7 +340,7 @@ class GridCell:
         length: Real = self.grid.backend.Float(dr.inf)
         margin = self.grid.margin - _ROUNDING_SHARE
         for k in range(3):
-            upper, lower = self.corner[k] + around, self.corner[k] + 1 - around
+            upper, lower = self.corner[k] + reach, self.corner[k] + 1 - reach
             rising = d[k] > 0
             gap = dr.select(
                 rising, upper - self.cell_coordinates[k], self.cell_coordinates[k] - lower

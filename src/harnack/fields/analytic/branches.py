@@ -114,15 +114,18 @@ class PreparedBranchPoint:
 
     @classmethod
     def of(
-        cls, point: BranchPoint, number: Callable[[float], Real], made: Any
+        cls, point: BranchPoint, make_real: Callable[[float], Real], make_complex: Any
     ) -> PreparedBranchPoint:
         """Convert a branch point to numbers of a backend.
 
-        number: makes a real number of the backend from a Python float.
-        made: makes a complex number of the backend from its real and its imaginary part.
+        make_real: makes a real number of the backend from a Python float.
+        make_complex: makes a complex number of the backend from its real and its imaginary part.
         """
-        at, value = (made(number(z.real), number(z.imag)) for z in (point.location, point.value))
-        return cls(at, point.power, number(point.constant), number(point.radius), value)
+        at, value = (
+            make_complex(make_real(z.real), make_real(z.imag))
+            for z in (point.location, point.value)
+        )
+        return cls(at, point.power, make_real(point.constant), make_real(point.radius), value)
 
 
 @dataclass(frozen=True)

@@ -175,12 +175,12 @@ class CurveCells:
         return CurveCellSums(sums, *details), active
 
     def change_from_center(
-        self, found: CurveCellSums, frame: RayFrame, x: Vec3, unit: Real, active: Mask
+        self, cell_sums: CurveCellSums, frame: RayFrame, x: Vec3, unit: Real, active: Mask
     ) -> tuple[Real, Mask]:
         """The change of the solid angle from the cell's center to x, followed continuously along
         the line between them; and the mask of the lanes on which this change is certain.
 
-        found: the result of `sums` at x.
+        cell_sums: the result of `sums` at x.
         frame: the frame of the rays from the center to x.
         unit: a bound of the rounding of a coordinate.
 
@@ -193,7 +193,7 @@ class CurveCells:
         negative axis it is then open in which direction they turn.
         """
         real, vector, index = self.backend.Float, self.backend.Array3f, self.backend.UInt32
-        count, center = dr.select(active, found.count, 0), found.center
+        count, center = dr.select(active, cell_sums.count, 0), cell_sums.center
 
         def runs(i: Any, *_: Any) -> Mask:
             """The mask of the lanes that have further records of near edges."""
@@ -209,7 +209,7 @@ class CurveCells:
 
             Returns the state of the loop.
             """
-            row = self.near.read_record(found.near_first + i, i < count)
+            row = self.near.read_record(cell_sums.near_first + i, i < count)
             at_x, at_center = LiftedProduct(*products[:3]), LiftedProduct(*products[3:])
             a, a_center = view_vertex(p, frame, x), view_vertex(p, frame, center)
             for k in range(VERTICES_PER_RECORD):
@@ -230,15 +230,15 @@ class CurveCells:
         start = index(0), vector(0), self.backend.Bool(active), *identity, *identity
         _, _, is_certain, *products = dr.while_loop(start, runs, body, label="from the center")
         at_x, at_center = LiftedProduct(*products[:3]), LiftedProduct(*products[3:])
-        return at_x.angle() - at_center.angle() + found.expansion_change, is_certain
+        return at_x.angle() - at_center.angle() + cell_sums.expansion_change, is_certain
 
     def rates_along(
-        self, found: CurveCellSums, line: RayLine, lengths: tuple[Real, ...], active: Mask
+        self, cell_sums: CurveCellSums, line: RayLine, lengths: tuple[Real, ...], active: Mask
     ) -> tuple[Real, ...]:
         """For each length T, a bound of the size of the derivative of the solid angle along a line,
         at all points of the line within T of x in both directions.
 
-        found: the result of `sums` at x.
+        cell_sums: the result of `sums` at x.
         line: the line through x = line.x, with the unit direction v = line.v.
         lengths: the lengths T.
 
@@ -253,7 +253,7 @@ class CurveCells:
         `curve_queries.remainder_promises` for q = 1/2, which is 3/2 (I3 + d I4), at most 3 I3.
         """
         vector, x = self.backend.Array3f, line.x
-        count = dr.select(active, found.count, 0)
+        count = dr.select(active, cell_sums.count, 0)
 
         def runs(i: Any, *_: Any) -> Mask:
             """The mask of the lanes that have further records of near edges."""
@@ -267,7 +267,7 @@ class CurveCells:
 
             Returns the state of the loop.
             """
-            row = self.near.read_record(found.near_first + i, i < count)
+            row = self.near.read_record(cell_sums.near_first + i, i < count)
             for k in range(VERTICES_PER_RECORD):
                 q, inverse = vector(*row[4 * k : 4 * k + 3]), row[4 * k + 3]
                 edge = Edge.between(p, q, dr.select(inverse > 0, inverse, 1), x)
@@ -279,13 +279,13 @@ class CurveCells:
                 p = q
             return i + 1, p, field, *rates
 
-        start = (self.backend.UInt32(0), vector(0), found.expansion_gradient)
+        start = (self.backend.UInt32(0), vector(0), cell_sums.expansion_gradient)
         start = (*start, *(self.backend.Float(0) for _ in lengths))
         _, _, field, *rates = dr.while_loop(start, runs, body, label="near edges along")
-        slope = dr.abs(dr.dot(field, line.v)) + found.slope_error
-        slope = slope + SUM_MARGIN * found.sums.inverse_squares
-        half_k = (1 + SUM_MARGIN) * 1.5 * found.far_i3  # K/2
-        valid_length = _LINE_FRACTION * found.far_distance
+        slope = dr.abs(dr.dot(field, line.v)) + cell_sums.slope_error
+        slope = slope + SUM_MARGIN * cell_sums.sums.inverse_squares
+        half_k = (1 + SUM_MARGIN) * 1.5 * cell_sums.far_i3  # K/2
+        valid_length = _LINE_FRACTION * cell_sums.far_distance
         return tuple(
             dr.select(
                 active & (length <= valid_length), rate + dr.fma(length, half_k, slope), dr.inf

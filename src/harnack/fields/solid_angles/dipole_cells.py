@@ -113,13 +113,13 @@ class DipoleCells:
     size: int
 
     def sums(
-        self, x: Vec3, active: Mask, add: AddPrimitive, own: tuple[Any, ...]
+        self, x: Vec3, active: Mask, add: AddPrimitive, extra_state: tuple[Any, ...]
     ) -> tuple[SourceSums, tuple[Any, ...], Mask]:
         """The sums over all primitives at points x, with gradients: from the near list and the
         local expansion of the cell that contains x.
 
         add: a function that adds a near primitive to the sums (`treecode.AddPrimitive`).
-        own: a further state of the caller, which `add` updates.
+        extra_state: a further state of the caller, which `add` updates.
 
         Returns the sums, the caller's own state, and the mask of the lanes on which the sums hold.
         These are the active lanes whose point lies in the cube.
@@ -167,26 +167,28 @@ class DipoleCells:
             """The mask of the lanes that have further near primitives."""
             return i < count
 
-        def step(i: Any, sums: Any, own: Any) -> tuple[Any, ...]:
+        def step(i: Any, sums: Any, extra_state: Any) -> tuple[Any, ...]:
             """Add primitive i of the near list to the state of the sums and to the caller's own
             state."""
             in_list = i < count
             primitive = self.primitives.read_record(
                 dr.gather(index, self.near, first + i, in_list), in_list
             )
-            new_sums, own = add(primitive, in_list, SourceSums.from_state(sums), own)
-            return i + 1, new_sums.to_state(), own
+            new_sums, extra_state = add(
+                primitive, in_list, SourceSums.from_state(sums), extra_state
+            )
+            return i + 1, new_sums.to_state(), extra_state
 
-        start = (index(0), far.to_state(), own)
-        _, state, own = dr.while_loop(start, runs, step, label="near primitives")
+        start = (index(0), far.to_state(), extra_state)
+        _, state, extra_state = dr.while_loop(start, runs, step, label="near primitives")
         sums, n = SourceSums.from_state(state), self.backend.Float(count)
         added = (_NEAR + 1) * self.backend.machine_epsilon * n * sums.s4 / inverse
         sums = dataclasses.replace(sums, gradient_truncation=sums.gradient_truncation + added)
-        return sums, own, active
+        return sums, extra_state, active
 
     def sums_with_tree(
         self, tree: Treecode, x: Vec3, detail: Real, add: tuple[AddPrimitive, AddPrimitive],
-        own: tuple[Any, ...], active_lanes: Mask = True,
+        extra_state: tuple[Any, ...], active_lanes: Mask = True,
     ) -> tuple[SourceSums, tuple[Any, ...]]:  # fmt: skip
         """The sums over all primitives at points x, with gradients, and the caller's own state. On
         lanes on which `detail` is at most 1 and x is in the cube they come from the cells. On the
@@ -195,13 +197,13 @@ class DipoleCells:
         detail: the accuracy scale.
         add: two functions that add a near primitive (`treecode.AddPrimitive`): the first to the
             sums of a cell, the second to the sums of the tree.
-        own: a further state of the caller, which `add` updates.
+        extra_state: a further state of the caller, which `add` updates.
         active_lanes: the mask of the active lanes.
         """
         in_cell, in_tree = add
         lanes, tree_detail = self.backend.Bool(active_lanes), fmax(detail, self.backend.Float(1))
-        sums, state, is_valid = self.sums(x, lanes & (detail <= 1), in_cell, own)
-        tree_sums, tree_state = tree.sums(x, tree_detail, in_tree, own, lanes & ~is_valid)
+        sums, state, is_valid = self.sums(x, lanes & (detail <= 1), in_cell, extra_state)
+        tree_sums, tree_state = tree.sums(x, tree_detail, in_tree, extra_state, lanes & ~is_valid)
         pairs = zip(state, tree_state, strict=True)
         state = tuple(dr.select(is_valid, ours, theirs) for ours, theirs in pairs)
         return sums.select(~is_valid, tree_sums), state

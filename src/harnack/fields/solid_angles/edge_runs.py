@@ -220,7 +220,7 @@ def _unit(vectors: FloatArray) -> FloatArray:
 def subtract_runs(
     before: EdgeRuns,
     edges: tuple[IntArray, IntArray],
-    kept: BoolArray,
+    is_in_after: BoolArray,
     after: EdgeRuns,
     vertices: int,
 ) -> CellEdges:
@@ -229,13 +229,13 @@ def subtract_runs(
     edges of `before`, and the reversed closing edges of `after`.
 
     edges: the edges of the runs `before`, as `EdgeRuns.edges` returns them.
-    kept: (k,) for each of these edges, whether it is in a run of `after`.
+    is_in_after: (k,) for each of these edges, whether it is in a run of `after`.
     vertices: the number of vertices in the table.
 
     The resulting edges refer to a table of points that has the vertices first, then the apexes of
     `before`, then the apexes of `after`.
     """
-    remaining = np.flatnonzero(~kept)
+    remaining = np.flatnonzero(~is_in_after)
     run, vertex = (part[remaining] for part in edges)
     closing = after.closing_edges(vertices + len(before.cell))
     return _merged(

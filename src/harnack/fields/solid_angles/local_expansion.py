@@ -71,13 +71,13 @@ def _signed(values: Pairs, l: int, m: int) -> tuple[Any, Any]:
     return (re, -im) if m % 2 == 0 else (-re, im)
 
 
-def multipole_to_local(moments: Pairs, seen: Pairs, degree: int) -> list[Any]:
+def multipole_to_local(moments: Pairs, harmonics: Pairs, degree: int) -> list[Any]:
     """The coefficients L_jk of the local expansion about a point c, up to `degree` and in the order
     of `coefficient_keys`, of the field f of dipoles with given multipole moments.
 
     moments: the moments M_lm of the dipoles about a point y; moments of other degrees count as 0.
-    seen: I_lm (`irregular_harmonics`) at c - y, up to the degree `degree` plus the largest degree
-        of the moments.
+    harmonics: I_lm (`irregular_harmonics`) at c - y, up to the degree `degree` plus the largest
+        degree of the moments.
 
     Proof. f(x) = -sum conj(M_lm) I_lm(x - y). The addition theorem of R, applied to both arguments
     of 1/|r + u - y| = sum conj(R_lm(y)) I_lm(r + u) = sum conj(R_lm(y - u)) I_lm(r), gives
@@ -92,7 +92,7 @@ def multipole_to_local(moments: Pairs, seen: Pairs, degree: int) -> list[Any]:
             for l in degrees:
                 for m in range(-l, l + 1):
                     a, b = _signed(moments, l, m)
-                    u, v = _signed(seen, l + j, m + k)
+                    u, v = _signed(harmonics, l + j, m + k)
                     re = re + (a * u + b * v)
                     if k:
                         im = im + (a * v - b * u)

@@ -311,12 +311,12 @@ class _FaceCells:
         steps = np.tile(_CORNERS, (len(self.face), 1))
         return _FaceCells(face, np.repeat(self.corner, 8, axis=0) + steps * half, depth)
 
-    def joined(self, others: _FaceCells) -> _FaceCells:
+    def joined(self, other: _FaceCells) -> _FaceCells:
         """The cells of both operands, sorted by face."""
-        face = np.concatenate([self.face, others.face])
+        face = np.concatenate([self.face, other.face])
         order = np.argsort(face, kind="stable")
-        corner = np.concatenate([self.corner, others.corner])
-        return _FaceCells(face[order], corner[order], np.append(self.depth, others.depth)[order])
+        corner = np.concatenate([self.corner, other.corner])
+        return _FaceCells(face[order], corner[order], np.append(self.depth, other.depth)[order])
 
 
 def _are_empty(

@@ -180,16 +180,16 @@ class RadialSums:
         return (1 + SUM_MARGIN) * growth * self.sums.remainder(share, r)
 
     def curvatures(
-        self, growth: Callable[[Real], Real], most: Real, size: Real
+        self, growth: Callable[[Real], Real], least_distance: Real, size: Real
     ) -> tuple[TaylorRemainder, ...]:
         """Promises for several radii: on a ball around x, a bound of the difference between f and
         its linear Taylor polynomial at x, from `remainder`.
 
         growth: the function `RadialKernel.growth`.
-        most: a lower bound of the distance to the nearest dipole.
+        least_distance: a lower bound of the distance to the nearest dipole.
         size: the length, in the user's unit, that is 1 in the coordinates of the sums.
         """
-        radii = [(fraction, fraction * most) for fraction in _RADIUS_FRACTIONS]
+        radii = [(fraction, fraction * least_distance) for fraction in _RADIUS_FRACTIONS]
         return tuple(
             TaylorRemainder(2 * self.remainder(fraction, r, growth(r)) / (size * size), r * size)
             for fraction, r in radii

@@ -349,15 +349,15 @@ class Treecode:
         return fmax(self.accuracy * detail, self.backend.Float(self.coarse_ratio))
 
     def sums(
-        self, x: Vec3, detail: Real, add: AddPrimitive, own: ExtraState = (), active: Mask = True,
-        derivatives: int = 1,
+        self, x: Vec3, detail: Real, add: AddPrimitive, extra_state: ExtraState = (),
+        active: Mask = True, derivatives: int = 1,
     ) -> tuple[SourceSums, ExtraState]:  # fmt: skip
         """The sums over all sources at points x, and the caller's own state.
 
         detail: the accuracy scale of `Field.at_accuracy`. The larger it is, the farther away nodes
             must be to count as one source; infinity gives the direct sum.
         add: a function that adds a primitive of a near leaf (`AddPrimitive`).
-        own: a further state of the caller, which `add` updates.
+        extra_state: a further state of the caller, which `add` updates.
         derivatives: 0 for the value only, 1 with the gradient, 2 with the Hessian.
         """
         free_fraction, closer = (
@@ -385,11 +385,11 @@ class Treecode:
 
         def add_primitive(row: list[Real], active: Mask, state: ExtraState) -> ExtraState:
             """Add the primitive of a near leaf to the state, on active lanes."""
-            sums, own = add(row, active, SourceSums.from_state(state[0]), state[1])
-            return sums.to_state(), own
+            sums, extra_state = add(row, active, SourceSums.from_state(state[0]), state[1])
+            return sums.to_state(), extra_state
 
         no_source = _NO_SOURCE_DISTANCE * (1 + dr.max(dr.abs(x)))
-        start = (SourceSums.zero(self.backend, no_source, derivatives).to_state(), own)
+        start = (SourceSums.zero(self.backend, no_source, derivatives).to_state(), extra_state)
         state = traverse_clusters(self.tree, x, closer, add_cluster, add_primitive, start, active)
         sums, error_ratio = (
             SourceSums.from_state(state[0]),

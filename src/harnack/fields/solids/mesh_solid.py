@@ -78,10 +78,10 @@ _MAX_POINT_ROUNDINGS = 256.0
 _CLEAR_MULTIPLE = 8.0
 
 
-def solid_of_mesh(given: Any) -> MeshSolid:
+def solid_of_mesh(source: Any) -> MeshSolid:
     """The solid that a mesh bounds, as a `MeshSolid`.
 
-    given: anything with `vertices` and `faces`, a pair (vertices, faces), or the path of a surface
+    source: anything with `vertices` and `faces`, a pair (vertices, faces), or the path of a surface
         file.
 
     Raises:
@@ -89,17 +89,17 @@ def solid_of_mesh(given: Any) -> MeshSolid:
         FileFormatError: a file that cannot be read.
         TypeError: the argument is not a mesh.
     """
-    if isinstance(given, str | os.PathLike):
-        surface = read_geometry(cast("Any", given), "winding")
+    if isinstance(source, str | os.PathLike):
+        surface = read_geometry(cast("Any", source), "winding")
         if not isinstance(surface, LoadedMesh):
-            raise MeshError(f"{given}: it holds no faces, so it bounds no solid")
+            raise MeshError(f"{source}: it holds no faces, so it bounds no solid")
         faces = np.concatenate([surface.faces, surface.zero_area_faces])
         return MeshSolid(surface.vertices, faces)
-    mesh: Any = given
+    mesh: Any = source
     if hasattr(mesh, "vertices") and hasattr(mesh, "faces"):
         return MeshSolid(mesh.vertices, mesh.faces)
-    if isinstance(given, tuple | list) and len(cast("Any", given)) == 2:
-        vertices, faces = cast("Any", given)
+    if isinstance(source, tuple | list) and len(cast("Any", source)) == 2:
+        vertices, faces = cast("Any", source)
         return MeshSolid(vertices, faces)
     raise TypeError(
         "a mesh is a trimesh.Trimesh, a pair (vertices, faces), or the path of a file, not of type "
@@ -107,14 +107,14 @@ def solid_of_mesh(given: Any) -> MeshSolid:
     )
 
 
-def looks_like_mesh(given: Any) -> bool:
+def looks_like_mesh(candidate: Any) -> bool:
     """Whether an argument is meant as a mesh: it has the attributes of a mesh, is a pair, or is the
     name of a surface file."""
-    if isinstance(given, str | os.PathLike):
-        return Path(cast("Any", given)).suffix.lower() in GEOMETRY_SUFFIXES
-    if hasattr(given, "vertices") and hasattr(given, "faces"):
+    if isinstance(candidate, str | os.PathLike):
+        return Path(cast("Any", candidate)).suffix.lower() in GEOMETRY_SUFFIXES
+    if hasattr(candidate, "vertices") and hasattr(candidate, "faces"):
         return True
-    return isinstance(given, tuple | list) and len(cast("Any", given)) == 2
+    return isinstance(candidate, tuple | list) and len(cast("Any", candidate)) == 2
 
 
 @dataclass(frozen=True, eq=False)
