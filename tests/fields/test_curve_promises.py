@@ -69,11 +69,11 @@ def test_integrals_over_edges(name: str, precision: str) -> None:
     sums = sum_over_edges(LoopEdges.upload(backend, tuple(loops)), to_vector3(backend, x))
     rough = 3e-3 if precision == "single" else 1e-6
     cubes, fourths, squares = (integrals(loops, x, power) for power in (3, 4, 2))
-    np.testing.assert_allclose(to_numpy(sums.cubes), cubes, rtol=rough)
-    share = to_numpy(sums.fourths) / fourths
+    np.testing.assert_allclose(to_numpy(sums.inverse_cubes), cubes, rtol=rough)
+    share = to_numpy(sums.inverse_fourths) / fourths
     assert 1 - rough < share.min()
     assert share.max() < 2.2
-    share = to_numpy(sums.squares) / squares
+    share = to_numpy(sums.inverse_squares) / squares
     assert 1 - rough < share.min()
     assert share.max() <= 2 + rough
 
@@ -83,7 +83,7 @@ def test_the_bound_of_squares_is_attained_far_off_and_nearly_at_a_mere_half() ->
     edge = [np.array([[0.0, 0, 0], [1e-3, 0, 0], [0, 1e-3, 0]])]
     x, backend = np.array([[0.0, 0, 1.0]]), choose_backend("double")
     sums = sum_over_edges(LoopEdges.upload(backend, tuple(edge)), to_vector3(backend, x))
-    share = to_numpy(sums.squares) / integrals(edge, x, 2)
+    share = to_numpy(sums.inverse_squares) / integrals(edge, x, 2)
     np.testing.assert_allclose(share, 2, rtol=1e-5)
 
 
