@@ -420,11 +420,11 @@ class ParabolaBounds(FormulaNumber):
         Proof. If f is concave, f > 0 on at most one interval [s0, s1] of [0, h] (`start`, `end`).
         There f^n is a product, computed as one on that interval. Elsewhere the derivative is 0.
 
-        If bounds are lines, the product has a derivative between two numbers, and if they are
-        parabolas, between two lines. Raise the upper number or line, where necessary, to at least 0
-        at both ends of [0, h]. It is then at least 0 on all of [0, h], and still above the
-        derivative on [s0, s1]. So its integral is an upper bound; the lower bound is found likewise
-        (`_extend_lines`, `_extend_parabolas`).
+        If the bounds are parabolas, the derivative of the product lies between two lines. Raise the
+        upper line, if necessary, to at least 0 at both ends of [0, h]. It is then at least 0 on all
+        of [0, h], and still above the derivative on [s0, s1]. So its integral is an upper bound;
+        the lower bound is found likewise (`_extend_parabolas`). If the bounds are lines,
+        `_extend_lines` has the proof.
 
         Because of rounding, f may be positive outside of the computed [s0, s1], but is at most
         r = 2 `value_error` there. The derivative of f^n is then at most `outer_slope`,

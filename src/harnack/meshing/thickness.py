@@ -86,14 +86,15 @@ def wall_thickness(part: Any, **options: Any) -> WallThickness:
     options: for a solid, the options of `mesh`.
 
     At the center of a face a ray goes into the part, against the normal, and ends at the other
-    side, at a distance t. A ball of diameter t touches the center from inside. It shrinks
-    as long as the surface point nearest to the ball's center lies inside of the ball and on an
-    opposite wall: the normals there and at the face differ by more than 120 degrees. In each round
-    it is replaced by the ball that touches the face and that point (Ma, Bae and Choi 2012, 3D medial axis point approximation using nearest neighbors
-    and the normal field). Its diameter is the thickness. Where walls are parallel it is their
-    distance, and it is never more than the length of the ray. Beside an edge of the part the
-    adjacent wall is near, but not opposite. It does not count: the ball stops shrinking there, and
-    the value is an upper bound of the thickness. The value of a face without an area is NaN.
+    side, at a distance t. A ball of diameter t touches the center from inside. It shrinks as long
+    as the surface point nearest to the ball's center lies inside of the ball and on an opposite
+    wall: the normals there and at the face differ by more than 120 degrees. In each round it is
+    replaced by the ball that touches the face and that point (Ma, Bae and Choi 2012, 3D medial axis
+    point approximation using nearest neighbors and the normal field). Its diameter is the
+    thickness. Where walls are parallel it is their distance, and it is never more than the length
+    of the ray. Beside an edge of the part the adjacent wall is near, but not opposite. It does not
+    count: the ball stops shrinking there, and the value is an upper bound of the thickness. The
+    value of a face without an area is NaN.
 
     Error: distances are those of the triangles, up to 1e-6 of the mesh's size. The thickness is
     measured only at the centers of faces: divide large faces first to measure it more densely

@@ -43,7 +43,8 @@ if TYPE_CHECKING:
 DEGREE = 6
 COEFFICIENTS = (DEGREE + 1) ** 2
 # Edges are cut into pieces with half lengths of at most `_MAX_PIECE` times the distance of their
-# middle from the ball (the last piece of an edge may be 1.3 times as long); on each piece, Gauss's rule has `_NODES` nodes.
+# middle from the ball (the last piece of an edge may be 1.3 times as long); on each piece, Gauss's
+# rule has `_NODES` nodes.
 _MAX_PIECE, _NODES = 1 / 6, 4
 # Rounding of an edge's term of the angle at the center, and of its polynomial: see
 # `EdgeExpansions.of` and `_EdgePiece.sums`.
