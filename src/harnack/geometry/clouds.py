@@ -224,12 +224,12 @@ def nearest_neighbors(tree: Any, points: FloatArray, count: int) -> tuple[IntArr
     """For each of m points of a tree, its k nearest neighbors among the points of the tree: their
     indices (m, k) and distances (m, k), nearest first.
 
-    tree: a search tree (`build_point_tree`).
+    tree: a search tree (`build_point_tree`) of points that are all different.
     points: (m, 3), all of which must be points of the tree.
     count: the number of neighbors, k; k is less if the tree has fewer other points.
 
-    The nearest point that the tree finds is taken to be the point itself, and left out. If points
-    coincide, it may be another one at the same position, and a point may be its own neighbor.
+    As all points are different, the nearest one that the tree finds is the point itself. It is left
+    out.
 
     Raises:
         CloudError: a point and all its neighbors lie within 1e-100.

@@ -382,8 +382,8 @@ def _unite_bodies(
         surface by at most a fraction of `settings.tolerance`.
 
     Returns:
-        The boundary; and its entries in `metadata["harnack"]`. The entry "kept" is 0, the number of
-        faces known to be unchanged.
+        The boundary; and its entries in `metadata["harnack"]`. The entry "kept", how many of the
+        first faces are faces of the given mesh, is 0.
 
     Raises:
         MeshError, MeshingError: nothing of the mesh overlaps, or the union cannot be computed.
