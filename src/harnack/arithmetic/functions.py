@@ -90,7 +90,7 @@ def _twice(x: Interval) -> Interval:
     return x + x
 
 
-def _unbounded_where_undefined(defined: Mask, ranges: DerivativeRanges) -> DerivativeRanges:
+def _unbounded_unless_defined(defined: Mask, ranges: DerivativeRanges) -> DerivativeRanges:
     """The three ranges of a function and of its derivatives; on lanes where `defined` is False, the
     ranges of the derivatives are replaced by all numbers.
 
@@ -138,13 +138,17 @@ def _log(x: Interval) -> DerivativeRanges:
     inverse = x.reciprocal()
     # Near 1 the error of a logarithm is four units of 1 on CUDA.
     value = _increasing_range(dr.log, x).widened(0.0, 4 * machine_epsilon(x.lower))
-    return _unbounded_where_undefined(x.lower > 0, (value, inverse, -inverse.square()))
+    return _unbounded_unless_defined(x.lower > 0, (value, inverse, -inverse.square()))
 
 
 def _sqrt(x: Interval) -> DerivativeRanges:
-    """The ranges of the square root and of its derivatives on the numbers >= 0 of the interval
-    x."""
+    """The ranges of the square root and of its first two derivatives, for the interval x.
+
+    The range of the square root is that for the numbers >= 0 of x; NaN if there are none. If x
+    contains a number below 0, the ranges of the derivatives are all numbers.
+    """
     low = fmax(x.lower, 0)
+    # A point has one number as both ends: then the root of it is computed once.
     high = low if x.lower is x.upper else x.upper
     root = _increasing_range(dr.sqrt, Interval(low, high))
     # Ends that rounding took below 0 count as 0; where both are below, there is no root.
@@ -156,7 +160,7 @@ def _sqrt(x: Interval) -> DerivativeRanges:
     )
     slope = _half(_positive_reciprocal(root))
     second = -_half(slope * _positive_reciprocal(Interval(low, high)))
-    return _unbounded_where_undefined(x.lower >= 0, (root, slope, second))
+    return _unbounded_unless_defined(x.lower >= 0, (root, slope, second))
 
 
 def _half(x: Interval) -> Interval:
@@ -175,7 +179,7 @@ def _reciprocal(x: Interval) -> DerivativeRanges:
     """The ranges of 1/x and of its derivatives."""
     inverse = x.reciprocal()
     slope = -inverse.square()
-    return _unbounded_where_undefined(
+    return _unbounded_unless_defined(
         (x.lower > 0) | (x.upper < 0), (inverse, slope, _twice(-slope * inverse))
     )
 
@@ -264,7 +268,7 @@ def _tan(x: Interval) -> DerivativeRanges:
         dr.select(no_pole, ends[0].lower, t.lower), dr.select(no_pole, ends[1].upper, t.upper)
     )
     slope = ONE + t.square()
-    return _unbounded_where_undefined(no_pole, (t, slope, _twice(t * slope)))
+    return _unbounded_unless_defined(no_pole, (t, slope, _twice(t * slope)))
 
 
 def _hyperbolic_tangent(x: Real) -> Real:
@@ -300,7 +304,7 @@ def _asin(x: Interval) -> DerivativeRanges:
     inside = Interval(fmax(x.lower, -1), fmin(x.upper, 1))
     slope = _positive_reciprocal(_sqrt(ONE - inside.square())[0])
     second = inside * slope * slope.square()
-    return _unbounded_where_undefined(
+    return _unbounded_unless_defined(
         (x.lower >= -1) & (x.upper <= 1), (_increasing_range(dr.asin, inside), slope, second)
     )
 
@@ -384,7 +388,7 @@ def power(n: float) -> ElementaryFunction:
                 slope = Interval.enclosing(k, type(x.lower)) * integer_power(inv, 1 - k)
                 second = Interval.enclosing(k * (k - 1), type(x.lower)) * integer_power(inv, 2 - k)
                 defined = (x.lower > 0) | (x.upper < 0)
-                return _unbounded_where_undefined(defined, (integer_power(inv, -k), slope, second))
+                return _unbounded_unless_defined(defined, (integer_power(inv, -k), slope, second))
 
             def plain(x: Any) -> Any:
                 return 1 / _power_by_squaring(x, -k)
@@ -420,7 +424,7 @@ def power(n: float) -> ElementaryFunction:
             typed_select(is_none, dr.nan, value.lower, x.lower),
             typed_select(is_none, dr.nan, value.upper, x.lower),
         )
-        return _unbounded_where_undefined(defined, (value, slope, second))
+        return _unbounded_unless_defined(defined, (value, slope, second))
 
     def of_positive(x: Any) -> Any:
         return dr.power(fmax(x, 0), n)

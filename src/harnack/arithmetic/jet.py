@@ -420,11 +420,14 @@ class Jet(FormulaNumber):
 def wronskian_range(x: Jet, y: Jet, u: Interval, v: Interval, i: int) -> Interval:
     """The range of w = x y_i - y x_i, where y_i and x_i are derivatives by the variable i.
 
-    x, y: the two functions.
-    u, v: the ranges of their values, as numbers of the backend.
+    x, y: the two functions, as jets (ranges of value and derivatives).
+    u, v: the ranges of the values of x and of y, with Dr.Jit numbers as ends.
+    i: the index of the variable.
 
-    On a piece of a path, the derivative x y_ii - y x_ii of w is 0 along straight lines. So the
-    range of w is narrowed from its value at the start of the piece.
+    If the jets are on a piece of a path, with the variable i as its parameter, w has the derivative
+    w_i = x y_ii - y x_ii. The range of w is then cut to the value of w at the start of the piece
+    plus the range of w_i times the length. On a straight line the coordinates x and y are linear
+    functions of the parameter, so w_i = 0, and w is known as well as at the start.
     """
     w = u * y.first_derivatives[i] - v * x.first_derivatives[i]
     if x.jet_at_start is None or y.jet_at_start is None:

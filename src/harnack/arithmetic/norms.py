@@ -286,9 +286,9 @@ def blend_union(a: Any, b: Any, radius: Any, power: float = 2.0) -> Any:
         larger powers make it sharper.
 
     Let r be the radius, p the power, g_a = max(0, 1 - a/r), and g_b the same for b. Where a or b is
-    less than r, the function is r (1 - |(g_a, g_b)|_p); Hart (1996, equation 43) prints the root
-    around everything. Where both are at least r, it is their minimum. It is continuous: where the
-    smaller one is r, both formulas give r.
+    less than r, the function is r (1 - |(g_a, g_b)|_p); Hart (1996, equation 43) prints the p-th
+    root around the whole expression instead of the sum of powers. Where both are at least r, it is
+    their minimum. It is continuous: where the smaller one is r, both formulas give r.
 
     Proof of its Lipschitz constant, for a and b with constants of at most 1. The gradient is
     u_a^(p-1) grad a + u_b^(p-1) grad b with u = g/|g|_p. By Hoelder's inequality

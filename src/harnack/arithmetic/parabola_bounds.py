@@ -411,15 +411,25 @@ class ParabolaBounds(FormulaNumber):
         )
 
     def _clipped_power(self, function: ClippedPower) -> ParabolaBounds:
-        """Bounds of max(f, 0)^n for a polynomial f = v + a s + b s^2.
+        """Bounds of max(f, 0)^n on [0, h] for a polynomial f of degree at most 2.
 
-        Proof. If f is concave, f > 0 on at most one interval [s0, s1] of [0, h]. There f^n is a
-        product, whose derivative lies between two lines. Elsewhere the derivative is 0. Take the
-        upper line and raise it to at least 0 at both ends of [0, h]: it is then above the
-        derivative everywhere, and its integral is the bound. The lower bound is found likewise. By
-        rounding, s0 and s1 may be put where f is as large as r, a few units in the last place of
-        |v| + |a| h + |b| h^2; there the derivative is at most n r^(n-1) (|a| + 2 |b| h). If f is
-        convex, the general bounds of `apply` are used.
+        f = v + a s + b s^2 is known up to rounding: v, a and b below are the middles of narrow
+        ranges with the half widths rv, ra and rb. `value_error` bounds |f - (v + a s + b s^2)| on
+        [0, h], and also the rounding of this sum.
+
+        Proof. If f is concave, f > 0 on at most one interval [s0, s1] of [0, h] (`start`, `end`).
+        There f^n is a product, computed as one on that interval. Elsewhere the derivative is 0.
+
+        If the bounds are parabolas, the derivative of the product lies between two lines. Raise the
+        upper line, if necessary, to at least 0 at both ends of [0, h]. It is then at least 0 on all
+        of [0, h], and still above the derivative on [s0, s1]. So its integral is an upper bound;
+        the lower bound is found likewise (`_extend_parabolas`). If the bounds are lines,
+        `_extend_lines` has the proof.
+
+        Because of rounding, f may be positive outside of the computed [s0, s1], but is at most
+        r = 2 `value_error` there. The derivative of f^n is then at most `outer_slope`,
+        n r^(n-1) (|a| + 2 |b| h), which is used in place of 0. If there is no interval at all, it
+        is the bound on [0, h]. If f is convex, the general bounds of `apply` are used.
 
         Source: Aydinlilar and Zanni 2023, section 6.2.1, with a corrected extension to [0, h].
         """
@@ -442,12 +452,18 @@ class ParabolaBounds(FormulaNumber):
         start, end = dr.select(is_empty, 0, start), dr.select(is_empty, h, end)
 
         n = function.exponent
-        inner = fmax(v + start * (a + b * start), 0)
-        slope = a + 2 * b * start
+        start_value = fmax(v + start * (a + b * start), 0)
+        start_slope = a + 2 * b * start
         inner_power = ParabolaBounds(
-            Interval(fmax(inner - value_error, 0), inner + value_error),
-            (slope - _rounding_bound(dr.abs(a) + 2 * dr.abs(b) * h) - ra - 2 * rb * h, b - rb),
-            (slope + _rounding_bound(dr.abs(a) + 2 * dr.abs(b) * h) + ra + 2 * rb * h, b + rb),
+            Interval(fmax(start_value - value_error, 0), start_value + value_error),
+            (
+                start_slope - _rounding_bound(dr.abs(a) + 2 * dr.abs(b) * h) - ra - 2 * rb * h,
+                b - rb,
+            ),
+            (
+                start_slope + _rounding_bound(dr.abs(a) + 2 * dr.abs(b) * h) + ra + 2 * rb * h,
+                b + rb,
+            ),
             end - start,
             self.bound_degree,
             2,

@@ -371,8 +371,12 @@ def _make_cacheless_pickler(base: Any) -> Callable[..., Any]:
             return function_in, (self.space(function.__globals__), code, closure), *rest
 
         def space(self, names: dict[str, Any]) -> Namespace:
-            """The namespace of a module's dictionary `names`; always the same object for the same
-            dictionary."""
+            """The object that stands for the global names of a module in the pickle. It is always
+            the same one for the same dictionary, so that all functions of a module share their
+            globals after unpickling.
+
+            names: the dictionary of the module, `vars(module)`.
+            """
             return self.spaces.setdefault(id(names), Namespace.of(names))
 
     return CachelessPickler

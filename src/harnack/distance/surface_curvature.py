@@ -375,17 +375,17 @@ def curvature_lines(
 
 @dataclass(frozen=True)
 class _LineState:
-    """The state of the lines, one in each lane.
+    """The state of lines of curvature while they are followed on a surface, one line in each lane.
 
-    x: the current point.
-    direction: the unit tangent with which the line came to it.
-    index: the number of steps so far.
+    x: the current point of the line, on the surface.
+    direction: the unit principal direction at x, along which the line goes on.
+    step_count: the number of steps so far.
     active: whether the line continues.
     """
 
     x: Vec3
     direction: Vec3
-    index: Any
+    step_count: Any
     active: Mask
 
 
@@ -420,9 +420,11 @@ class _CurvatureLineTracer:
         def body(state: _LineState) -> _LineState:
             """Advance all lines by a step, and store their points."""
             x, direction, is_valid = self._advance(state)
-            index = state.index + 1
-            dr.scatter(points, x, index * (2 * n) + lane, state.active & is_valid)
-            return _LineState(x, direction, index, state.active & is_valid & (index < max_steps))
+            step_count = state.step_count + 1
+            dr.scatter(points, x, step_count * (2 * n) + lane, state.active & is_valid)
+            return _LineState(
+                x, direction, step_count, state.active & is_valid & (step_count < max_steps)
+            )
 
         index = dr.zeros(integer, 2 * n)
         loop_while_active(_LineState(x, direction, index, is_known & True), body, "curvature lines")

@@ -53,9 +53,11 @@ class FreeRadiusCondition(Protocol):
 
 
 def condition_rounding(real: Any) -> float:
-    """The number that is added to k to cover its rounding.
+    """A bound of the rounding error of the function k in a condition q k(q) <= gap
+    (`FreeRadiusCondition`), which proves a ball's radius times q to be free of levels. It is added
+    to the computed k.
 
-    real: the type of numbers, which tells the precision.
+    real: the Dr.Jit type of the numbers, single or double precision.
     """
     return _ROUNDINGS * float(dr.epsilon(real))
 

@@ -46,8 +46,14 @@ class BottomUpQuadraticEnclosure(ParabolaEnclosure):
     def from_restriction(
         cls, function: PathRestriction, slopes: SlopeRange, length: Real
     ) -> Self | None:
-        """The enclosure from evaluating the formula in bottom-up arithmetic; None if f is no
-        formula."""
+        """The enclosure of f along a piece of a path, from two parabolas that bound f. They are
+        computed by evaluating the formula of f in the arithmetic of `ParabolaBounds`, operation by
+        operation. None if f has no formula.
+
+        function: f as a function of the length along the path.
+        slopes: the range of the derivative at the start of the path; not used.
+        length: the length of the piece.
+        """
         if not isinstance(function, EvaluableRestriction):
             return None
         parabolas = _parabolas(function, length, cls.degree)

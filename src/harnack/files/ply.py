@@ -140,7 +140,8 @@ class TextValues:
         return np.clip(values, -(2.0**53), 2.0**53).astype(np.int64)
 
     def width(self, code: str) -> int:
-        """The number of words of a number in a text file, 1 for every type `code`."""
+        """The number of positions that a number of the type `code` takes. Positions in a text file
+        are counted in words, and a number of any type is one word, so it is 1."""
         return 1
 
 

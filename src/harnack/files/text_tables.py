@@ -208,7 +208,10 @@ def _parse_with_numpy(lines: TextLines, columns: Sequence[int] | None = None) ->
 
 
 def _row_lengths(table: FloatArray) -> IntArray:
-    """(n,) the lengths of the rows of a table (n, k), an array in which each entry is k."""
+    """The number of words of each of the n lines of a table (n, k): an array (n,) filled with k.
+
+    All rows have the same length. `read_integers` returns such an array for lines of any lengths.
+    """
     return np.full(len(table), table.shape[1], dtype=np.int64)
 
 

@@ -221,9 +221,15 @@ def build_point_tree(points: FloatArray) -> Any:
 
 
 def nearest_neighbors(tree: Any, points: FloatArray, count: int) -> tuple[IntArray, FloatArray]:
-    """The nearest neighbors of points (m, 3) that belong to a tree: their indices (m, k) and
-    distances (m, k), nearest first. A point is not its own neighbor. k = count, or less if the tree
-    has fewer points.
+    """For each of m points of a tree, its k nearest neighbors among the points of the tree: their
+    indices (m, k) and distances (m, k), nearest first.
+
+    tree: a search tree (`build_point_tree`) of points that are all different.
+    points: (m, 3), all of which must be points of the tree.
+    count: the number of neighbors, k; k is less if the tree has fewer other points.
+
+    As all points are different, the nearest one that the tree finds is the point itself. It is left
+    out.
 
     Raises:
         CloudError: a point and all its neighbors lie within 1e-100.
@@ -348,13 +354,15 @@ def _choose_neighborhood(x: FloatArray) -> tuple[int, IntArray]:
 def _transfer_normals(
     x: FloatArray, tree: Any, known_normals: FloatArray, neighbors: int
 ) -> FloatArray:
-    """Unit normals (n, 3) of the points x (n, 3), from a part of the points whose normals are
-    known. Each normal is that of the plane that fits the nearest points of the tree, with the sign
-    on which their known normals agree.
+    """Unit normals (n, 3) of the points x (n, 3), from k points with known normals.
 
-    tree: the search tree of the k points with known normals.
-    known_normals: (k, 3) of these points.
-    neighbors: the number of points to which a plane is fitted.
+    A plane is fitted to the known points nearest to each point of x. The normal of x is the normal
+    of this plane, with the sign for which the inner products with the known normals of the nearest
+    of these points have a sum >= 0.
+
+    tree: the search tree of the k points with known normals, a subset of x.
+    known_normals: (k, 3) the unit normals of the points of the tree.
+    neighbors: the number of known points to which a plane is fitted.
     """
     normals = np.empty_like(x)
 

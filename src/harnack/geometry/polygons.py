@@ -138,8 +138,14 @@ def triangulate(vertices: FloatArray, corners: IntArray, sizes: IntArray) -> Int
 
 
 def _group_by_size(sizes: IntArray) -> list[IntArray]:
-    """Groups of indices of polygons that have the same number of corners, at least three. The size
-    of the groups is limited."""
+    """Group polygons by their numbers of corners. Polygons with fewer than three corners are left
+    out.
+
+    sizes: (n,) the number of corners of each polygon.
+
+    Returns a list of arrays of indices of polygons. All polygons of an array have the same number
+    of corners, and together at most two million corners, which limits memory.
+    """
     order = np.argsort(sizes, kind="stable")
     order = order[sizes[order] >= 3]
     distinct, first = np.unique(sizes[order], return_index=True)

@@ -369,11 +369,21 @@ def _check_encloses(mesh: Any) -> None:
 def _unite_bodies(
     intended: IntendedSolid, settings: _RepairOptions
 ) -> tuple[TriangleMesh, dict[str, Any]]:
-    """Stage "boolean_union": the boundary of the solid that a closed mesh describes, which passes
-    through itself, or whose components overlap or touch.
+    """Stage "boolean_union" of the repair. It is for a closed mesh that passes through itself or
+    whose components overlap or touch: compute the boundary of the solid that the mesh describes,
+    the points around which it winds at least once.
+
+    Three methods are tried, each if the one before fails: the union of the closed parts of the
+    mesh, if there are several; cutting all faces along each other; and meshing the solid anew by
+    cells.
+
+    intended: the mesh, with faces that agree in orientation.
+    settings: the options of the repair. Slivers that arise from cuts are removed by moving the
+        surface by at most a fraction of `settings.tolerance`.
 
     Returns:
-        The boundary; and its entries in `metadata["harnack"]`.
+        The boundary; and its entries in `metadata["harnack"]`. The entry "kept", how many of the
+        first faces are faces of the given mesh, is 0.
 
     Raises:
         MeshError, MeshingError: nothing of the mesh overlaps, or the union cannot be computed.
@@ -384,16 +394,17 @@ def _unite_bodies(
     if _bounds_a_solid(vertices, faces):
         raise MeshError("nothing of it passes through or lies in itself")
     facts = {"stage": "boolean_union", "kept": 0}
-    slivers = 0.5 * settings.tolerance.at(intended.size)
+    sliver_width = 0.5 * settings.tolerance.at(intended.size)
+    # Several parts, and every face is in one of them:
     if len(intended.parts) > 1 and sum(map(len, intended.parts)) == len(faces):
         settings.report(f"uniting {len(intended.parts):,} parts")
         try:
-            return united_parts(vertices, faces, intended.parts, slivers), facts
+            return united_parts(vertices, faces, intended.parts, sliver_width), facts
         except (MeshError, MeshingError) as error:
             settings.report(f"{error}; so all at once")
     settings.report("cutting faces along each other")
     try:
-        return mended_by_cuts(vertices, faces, slivers), facts
+        return mended_by_cuts(vertices, faces, sliver_width), facts
     except MeshingError as error:
         settings.report(f"{error}; so by cells")
     made = mesh_of(MeshSolid(vertices, faces), progress=settings.report)

@@ -267,37 +267,47 @@ def _changes(
     for a, b in np.stack(np.divmod(keys, count), axis=1).tolist():
         for source, target in ((a, b), (b, a)):
             change = patch.collapse_edge(source, target)
-            if change is not None and _keeps_orientation(patch, *change, length):
+            if change is not None and _is_small_change(patch, *change, length):
                 moved = distance_from_triangles(patch.vertices[source], patch.vertices[change[1]])
                 if moved <= length:
                     yield moved, *change
         change = patch.flip_edge(a, b)
-        if change is not None and _keeps_orientation(patch, *change, length):
+        if change is not None and _is_small_change(patch, *change, length):
             c, d = (patch.vertices[change[1][0, k]] for k in (2, 1))
             moved = _line_distance(patch.vertices[a], patch.vertices[b], c, d)
             if moved <= length:
                 yield moved, *change
 
 
-def _keeps_orientation(patch: _Neighborhood, rows: IntArray, new: IntArray, length: float) -> bool:
-    """Whether the faces `rows` of a neighborhood may be replaced by the faces `new` (k, 3), without
-    a fold and without a large change of the surface.
+def _is_small_change(
+    patch: _Neighborhood, old_rows: IntArray, new_faces: IntArray, max_shift: float
+) -> bool:
+    """Whether some faces of a neighborhood may be replaced by new ones, without a fold and without
+    a large change of the surface.
 
-    Two conditions: no new face, except slivers, faces against the mean normal of the old faces; and
-    the volume between old and new faces is at most the volume that the old faces would sweep if
-    they moved by `length`. To test only the distance of the removed vertex from the new faces would
-    miss old faces that are folded, as at a thin spike."""
-    before, after = patch.vertices[patch.faces[rows]], patch.vertices[new]
-    old, new_area = area_normals(before), area_normals(after)
-    mean = old.sum(axis=0)
-    total = float(row_norms(old).sum())
+    old_rows: the indices of the faces that are replaced.
+    new_faces: (k, 3) the faces that replace them, with vertices of the neighborhood.
+    max_shift: a length.
+
+    Two conditions must hold. The normal of each new face, slivers excepted, is less than 90 degrees
+    from the mean normal of the old faces. And the volume between old and new faces is at most
+    `max_shift` times the area of the old faces. (The distance of a removed vertex from the new
+    faces would not do instead: it misses old faces that are folded, as at a thin spike.)
+    """
+    before, after = patch.vertices[patch.faces[old_rows]], patch.vertices[new_faces]
+    old_normals, new_normals = area_normals(before), area_normals(after)
+    mean = old_normals.sum(axis=0)
+    double_area = float(row_norms(old_normals).sum())
     origin = before[0, 0]
     volume = (
-        row_dots(after[:, 0] - origin, new_area).sum() - row_dots(before[:, 0] - origin, old).sum()
+        row_dots(after[:, 0] - origin, new_normals).sum()
+        - row_dots(before[:, 0] - origin, old_normals).sum()
     )
-    if abs(float(volume)) / 6 > length * total / 2:
+    if abs(float(volume)) / 6 > max_shift * double_area / 2:
         return False
-    return bool(((new_area @ mean > 0) | (row_norms(new_area) <= _NO_AREA * total)).all())
+    return bool(
+        ((new_normals @ mean > 0) | (row_norms(new_normals) <= _NO_AREA * double_area)).all()
+    )
 
 
 def _line_distance(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> float:

@@ -86,20 +86,22 @@ def wall_thickness(part: Any, **options: Any) -> WallThickness:
     options: for a solid, the options of `mesh`.
 
     At the center of a face a ray goes into the part, against the normal, and ends at the other
-    side, at a distance t. A ball of diameter t touches the center from inside. It shrinks until it
-    holds no point of the surface that faces the center (whose normal differs by more than 120
-    degrees): again and again, it is replaced by the ball that touches the center and the nearest
-    such point (Ma, Bae and Choi 2012, 3D medial axis point approximation using nearest neighbors
-    and the normal field). Its diameter is the thickness. Where walls are parallel it is their
-    distance, and it is never more than the length of the ray. A place beside an edge of the part,
-    where the nearest wall is not opposite, does not count as thin for that: there the ball shrinks
-    no further, so that the value is an upper bound.
+    side, at a distance t. A ball of diameter t touches the center from inside. It shrinks as long
+    as the surface point nearest to the ball's center lies inside of the ball and on an opposite
+    wall: the normals there and at the face differ by more than 120 degrees. In each round it is
+    replaced by the ball that touches the face and that point (Ma, Bae and Choi 2012, 3D medial axis
+    point approximation using nearest neighbors and the normal field). Its diameter is the
+    thickness. Where walls are parallel it is their distance, and it is never more than the length
+    of the ray. Beside an edge of the part the adjacent wall is near, but not opposite. It does not
+    count: the ball stops shrinking there, and the value is an upper bound of the thickness. The
+    value of a face without an area is NaN.
 
-    Error: rays and nearest points are exact on the triangles, in double precision, to 1e-6 of the
-    mesh's size. Between centers nothing is measured: make large faces smaller for that
+    Error: distances are those of the triangles, up to 1e-6 of the mesh's size. The thickness is
+    measured only at the centers of faces: divide large faces first to measure it more densely
     (`mesh.subdivide_to_size`).
 
     Raises:
+        TypeError: options are given with a mesh.
         MeshError: a mesh that bounds no solid.
         MeshingError: a solid that cannot be meshed.
     """

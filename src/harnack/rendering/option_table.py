@@ -319,7 +319,11 @@ def complete_options(verb: str, keywords: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def refuse_unknown(verb: str, keywords: Mapping[str, Any]) -> None:
-    """Raise TypeError for keywords that are not options of a verb. The message suggests a name."""
+    """Raise TypeError for keywords that are not options of a function of the library. The message
+    suggests the most similar name.
+
+    verb: the name of the function, such as "render" or "trace".
+    """
     refuse_others(verb, keywords)
     for name in keywords:
         if name not in BY_NAME:

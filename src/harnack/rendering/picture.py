@@ -295,11 +295,15 @@ def _warn_of(lost: int, kind: str) -> None:
 def _composite_over_backdrop(
     mi: Any, sensor: Any, image: Image, stage: StudioScene | None, show: str
 ) -> tuple[Image, npt.NDArray[np.uint8]]:
-    """The numbers of a picture and its pixels, with the backdrop behind the surfaces.
+    """Put the backdrop behind the surfaces of a rendered picture. Returns the picture as linear
+    light (floating-point numbers) and as 8-bit sRGB pixels.
 
     image: (h, w, 4) linear sRGB light and the covered fraction of each pixel.
-    stage: the studio; None for a Mitsuba scene, which is left as it is.
-    show: "path" or "shaded".
+    stage: the studio; None for a Mitsuba scene, which has no backdrop.
+    show: the kind of picture, "path" for path tracing or "shaded"; the ground backdrop needs it.
+
+    Tone mapping compresses bright light in the pixels. A ground backdrop is tone mapped together
+    with the surfaces; all other backdrops keep their colors.
     """
     if stage is None:
         has_alpha = mi.has_flag(sensor.film().flags(), mi.FilmFlags.Alpha)

@@ -262,7 +262,9 @@ class CappedSolid:
     includes the section (a volume that cuts the solid open). A cap lies on the section if the ray
     enters or leaves the section there.
 
-    prepared: the level set of the finite ones of `low` and `high`.
+    prepared: the tracer of the level sets f = low and f = high. There is no level set for a bound
+        that is infinite.
+    low, high: the bounds of f, of which one may be infinite.
     """
 
     prepared: SurfaceTracer
@@ -303,7 +305,7 @@ class CappedSolid:
         enters = active & (start < end)
         start = dr.select(enters, start, 0)
         resolved = self.prepared.is_resolved(o, end)  # others run out of steps in `_meet_levels`
-        starts_inside = enters & resolved & self._contains(self._at(o, d, start))
+        starts_inside = enters & resolved & self._contains(self._point_on_ray(o, d, start))
         inside = starts_inside & (start <= 0)
         slipped = active & resolved & (((side < 0) & ~inside) | ((side > 0) & inside))
         entering = starts_inside & ~inside & ~slipped
@@ -314,7 +316,7 @@ class CappedSolid:
         leaving = inside & ~slipped & ~hit.is_hit & ~hit.is_out_of_steps & (end < t_max)
         capped = entering | leaving | slipped
         t = dr.select(capped & ~slipped, dr.select(leaving, end, start), 0)
-        position = self._at(o, d, t)
+        position = self._point_on_ray(o, d, t)
         outwards = dr.select(leaving | (side < 0), zero + 1, -1)
         normal = outwards * d
         if self.prepared.volume is not None:
@@ -343,7 +345,7 @@ class CappedSolid:
         enters = active & (start < end)
         start = dr.select(enters, start, 0)
         resolved = self.prepared.is_resolved(o, end)
-        starts_inside = enters & resolved & self._contains(self._at(o, d, start))
+        starts_inside = enters & resolved & self._contains(self._point_on_ray(o, d, start))
         capped = starts_inside & ((start > 0) | (end < t_max))
         return capped | self.prepared.occluded(o, d, 0, t_max, active & ~capped)
 
@@ -355,7 +357,8 @@ class CappedSolid:
         normal = dr.select(at_low, -hit.normal, hit.normal)
         return replace(hit, normal=normal)
 
-    def _at(self, o: Vec3, d: Vec3, t: Real) -> Vec3:
-        """The points (3,) at parameters t of rays; the origin where t is not finite."""
+    def _point_on_ray(self, o: Vec3, d: Vec3, t: Real) -> Vec3:
+        """The points o + t d (3,) of rays with the origins o and directions d; o if t is not
+        finite."""
         t = dr.select(dr.isfinite(t), t, 0)
         return dr.fma(self.prepared.backend.Array3f(t), d, o)

@@ -220,8 +220,16 @@ def _positive_harmonic(
 
 
 def _bounded_harmonic(rng: np.random.Generator, rows: int, n: int) -> RandomFunctions:
-    """Random harmonic functions on a ball in n dimensions with values in [lower, upper]. Their
-    values on the sphere are steps between these two numbers at random heights along the axis."""
+    """Random harmonic functions on a ball in n dimensions, each with the promise of a range of its
+    values on the ball.
+
+    rows: the number of functions.
+
+    The ray runs from the center of the ball to a pole of its sphere. On the sphere a function is
+    symmetric about this axis and constant on four zones, which end at random heights on the axis.
+    The four values lie in the promised range, which has a random length; for two thirds of the
+    functions they are its two ends.
+    """
     radius, span = _log_uniform(rng, rows, -3, 3), _log_uniform(rng, rows, -3, 3)
     heights = np.sort(rng.uniform(0, 2, (rows, 3)), axis=1)
     is_thin = rng.random(rows) < 0.2
@@ -375,25 +383,33 @@ def _with_random_levels(
     movement: Callable[[FloatArray], FloatArray],
     promise: Promise,
 ) -> RandomFunctions:
-    """Choose random levels for functions f. For most functions, one level is the value at a random
-    point, so that it is met; all other levels are at random differences from f(0).
+    """Choose random levels for random functions f(t) of the position t on a ray.
 
-    name: the name of the kind of functions. promise: the promise that they keep.
+    For most functions, one level is the value at a random point, so that it is met. For half of
+    these functions it is the only level, since of two levels the other one is often met first. All
+    other levels are at random differences from f(0).
+
+    name: the name of the kind of functions, for messages.
     scale: (rows,) a typical size of f - f(0).
-    reach: (rows,) the radius of the promise. slope: (rows,) the derivatives f'(0).
-    movement: a function that returns f(t) - f(0) for t (rows, m).
+    reach: (rows,) the radius of the ball about t = 0 on which the promise holds.
+    slope: (rows,) the derivatives f'(0).
+    movement: a function that returns f(t) - f(0) for t (rows, m), 0 <= t < reach.
+    promise: the promise (a proved bound of f on that ball) that all functions satisfy.
     """
     rows = len(scale)
-    below, above = scale * _log_uniform(rng, rows, -9, 2), scale * _log_uniform(rng, rows, -9, 2)
+    gap_below, gap_above = (
+        scale * _log_uniform(rng, rows, -9, 2),
+        scale * _log_uniform(rng, rows, -9, 2),
+    )
     fraction = np.where(rng.random(rows) < 0.5, rng.random(rows), _log_uniform(rng, rows, -8, 0))
-    value = movement((fraction * reach)[:, None])[:, 0]
-    is_reached = (rng.random(rows) < 0.8) & (value != 0) & np.isfinite(value)
-    above = np.where(is_reached & (value > 0), value, above)
-    below = np.where(is_reached & (value < 0), -value, below)
-    is_single = rng.random(rows) < 0.5  # else the other level is often met first
-    above = np.where(is_reached & is_single & (value < 0), np.inf, above)
-    below = np.where(is_reached & is_single & (value > 0), np.inf, below)
-    return RandomFunctions(name, PromiseCase(promise, below, above), slope, reach, movement)
+    difference = movement((fraction * reach)[:, None])[:, 0]
+    is_reached = (rng.random(rows) < 0.8) & (difference != 0) & np.isfinite(difference)
+    gap_above = np.where(is_reached & (difference > 0), difference, gap_above)
+    gap_below = np.where(is_reached & (difference < 0), -difference, gap_below)
+    is_single = rng.random(rows) < 0.5
+    gap_above = np.where(is_reached & is_single & (difference < 0), np.inf, gap_above)
+    gap_below = np.where(is_reached & is_single & (difference > 0), np.inf, gap_below)
+    return RandomFunctions(name, PromiseCase(promise, gap_below, gap_above), slope, reach, movement)
 
 
 def _log_uniform(rng: np.random.Generator, rows: int, lower: float, upper: float) -> FloatArray:

@@ -127,7 +127,11 @@ class JumpTracer:
         return self.finish(loop_while_active(self.begin(state), self.advance, "harnack intervals"))
 
     def begin(self, state: MarchState) -> JumpTraceState:
-        """The state of rays at their start. state: the start of the march."""
+        """The state of this tracer for rays that have not moved yet. No facet (a piece of a surface
+        at which f jumps) has been crossed.
+
+        state: the `MarchState` of the same rays, before their first sample.
+        """
         real, vector, count = self.backend.Float, self.backend.Array3f, self.backend.UInt32
         o, d = self.path.origin, self.path.direction
         before = real(self.start * (1 - self.backend.machine_epsilon) - 1e-30)

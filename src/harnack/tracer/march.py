@@ -82,8 +82,9 @@ _RETRY_FRACTION = 0.125
 class MarchState:
     """The state of rays during the march, with one entry for each ray.
 
-    proved_to: the ray parameter of the last accepted point; no level lies on the ray up to there.
-    proved_step: a length from there on which no level lies, either.
+    proved_to: the ray parameter of the last accepted point; f takes no level on the ray up
+        to there.
+    proved_step: a length from there on which f takes no level, either.
     trial_step: the length from there to the next trial point.
     enclosure_reach: the length on which the next sample should enclose the change of f.
     value, gradient: f and its gradient (3,) at `proved_to`; behind the jump, if f jumps there.
@@ -95,8 +96,9 @@ class MarchState:
         state in it never changes).
     status: the `RayStatus` of rays that have ended.
     active: whether the ray goes on.
-    contact: for rays that look for crossings, the state of their contact with the level that they
-        reached last; None for rays that end where they reach a level.
+    contact: for rays that end only where they cross a level, the level that they reached last: from
+        which side they reached it, and whether f is still within the tolerance of it. None for rays
+        that end where they reach a level.
     """
 
     proved_to: Real

@@ -166,9 +166,13 @@ class _ArrayLabels:
             module.gather = original
 
     def _label_gathered(self, gathered: Any, source: Any) -> None:
-        """Label the components of a value that was read from the array `source`: by the label of
-        `source`, or, if a component is evaluated already (it was read at known indices), by a label
-        of its own."""
+        """Label the components of a value that `drjit.gather` read from the array `source`, so
+        that the inputs of the recorded kernel can be identified.
+
+        A component that the kernel itself reads gets the label of `source`. If the indices were
+        constants, Dr.Jit has read the component at once: it is an evaluated array, and so an input
+        of its own, which gets the next label.
+        """
         for _, leaf in labeled_leaves("", gathered):
             if leaf.state == dr.VarState.Evaluated:  # gathered at known indices
                 self.label_array(leaf)

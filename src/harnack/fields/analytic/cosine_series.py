@@ -310,8 +310,9 @@ class CosineSums:
         """The series with these coefficients (K_x, K_y, K_z) on a backend.
 
         lower, size: (3,) the lower corner and the sides of the box.
-        bounds: the bounds of the series.
-        rounding: of value and gradient, as the attribute.
+        bounds: bounds of the directional second derivatives of the series, on the box and on cells.
+        rounding: two numbers, bounds of the rounding errors of the value and of the gradient, as
+            multiples of the unit roundoff u.
         """
         count, along_y, along_z = coefficients.shape
         first = np.arange(count, dtype=np.float64)[:, None]

@@ -194,7 +194,17 @@ class HypersphereRange:
 
     @classmethod
     def of(cls, l: int, weights: SphereWeights) -> HypersphereRange:  # noqa: E741
-        """The ranges of the sum of P_ljm of degree l with the weights (j, m) -> coefficient."""
+        """Proved ranges of a sum P of the P_ljm of degree l on the unit sphere S^3 and on its
+        zones, from samples.
+
+        weights: the mapping (j, m) -> coefficient of P_ljm.
+
+        P is sampled on the sphere in the middle of each zone, at points that are within the angle
+        `covering` of all others. With e = (l covering)^2/2 and H half the length of the range of
+        the samples, P exceeds this range by at most H e/(1 - e) on that sphere (`proved_range`).
+        Within the zone it exceeds it by at most l A step/2 more (Bernstein), with A half the length
+        of the range on S^3 and `step` the angle from the start of a zone to its end.
+        """
         covering = _RESOLUTION / max(1, l)
         sphere = unit_sphere(covering)
         step = math.pi / _SLICES
@@ -202,6 +212,7 @@ class HypersphereRange:
         values = np.zeros((_SLICES, sphere.shape[1]))
         pole = 0.0
         for j, sums in weights_by_order(l, weights).items():
+            # A constant becomes an array.
             harmonic = evaluate(sums, *sphere)[0] + 0.0 * sphere[0]
             values += (np.sin(a) ** j * gegenbauer(l - j, j + 1, np.cos(a)))[:, None] * harmonic
             if j == 0:
@@ -210,6 +221,7 @@ class HypersphereRange:
         low, high = float(lower.min()), float(upper.max())
         low, high = proved_range(low, high, l, covering + 0.5 * step)
         e = 0.5 * (l * covering) ** 2
+        # The last term of the margin is for rounding.
         margin = 0.5 * (upper - lower) * e / (1 - e)
         margin = margin + 0.5 * (high - low) * (0.5 * step * l) + 1e-11 * (high - low)
         return cls(l, low, high, lower - margin, upper + margin, pole)

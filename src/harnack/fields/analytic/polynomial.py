@@ -364,8 +364,9 @@ class HarmonicPolynomial(_SolidHarmonics):
         domain = Ball() if domain is None else domain
         size = _enclosing_radius(domain)
         scaled = {powers: c * size ** sum(powers) for powers, c in self.coefficients.items()}
-        # The z axis of the solid harmonics is the axis along which the polynomial vanishes to the
-        # highest order.
+        # The axis along which the polynomial vanishes to the highest order becomes the z axis of
+        # the solid harmonics, since `HarmonicPromises` has sharper bounds near a z axis of high
+        # order. Of axes of the same order z comes first: it needs no rotation.
         by_axis = [
             from_monomials({_rotate_axes(k, axis + 1): c for k, c in scaled.items()})
             for axis in range(3)

@@ -5,17 +5,23 @@ Each sum is one loop over the blobs. Positions are relative to each blob and in 
 support, so that the same bounds hold for blobs of every size. Jets allow blobs to be deformed and
 blended.
 
-Rounding. Let u be the unit roundoff, v the vector from the point to a center in units of the
-support, d the direction of the path and t = v.d. Centers are stored as the sum of two numbers, so
-that the error of v is at most 4u|v|. Then t, the distance h of the line from the center (as a
-length) and the positions x = s - t on the line have errors of at most 8u(2 + |t|), wherever the
-blob is not 0. That is a displacement of the blob relative to the path. It also covers that |d| is 1
-only up to 2u. A displacement by e changes f' by at most e times `KernelLipschitz.slope`, and f'' by
-at most e times `KernelLipschitz.bend`. (The jumps of f'' at the end of the support are tested for
-within a margin.) Where `BlobKernel.lipschitz_fraction` is less than 1, both bounds are multiplied
-by it. A sum of n terms adds n u times the sum of their largest absolute values. Both errors are
-added to the ranges, outwards. The error of the value at the point is at most 8u |dk/dq| by the
-rounding of q, plus (16 + n)u m, with m as in `BlobKernel.profile`.
+Rounding. Let u be the unit roundoff and f the function of one blob along the path. The path has
+the direction d, and s is the position on it. Let v be the vector from the start of the path to the
+blob's center, in units of the support's radius, and k(q) the kernel, with q = |v|^2 at the start.
+
+- Centers are stored as the sum of two numbers, so that the error of v is at most 4u|v|.
+- Let t = v.d, h the distance of the line from the center (h, not its square), and x = s - t the
+  position on the line. Wherever the blob is not 0, t, h and x have errors of at most 8u(2 + |t|).
+  That is a displacement of the blob relative to the path. It also covers that |d| differs from 1 by
+  up to 2u.
+- A displacement by e changes f' by at most e times `KernelLipschitz.slope`, and f'' by at most e
+  times `KernelLipschitz.bend`. If `BlobKernel.lipschitz_fraction` is less than 1, both bounds are
+  multiplied by it. (At the end of the support f'' may jump; there the test whether a point is in
+  the support has a margin.)
+- A sum of n terms adds an error of n u times the sum of their largest absolute values. This error
+  and that of the displacement are added to the ranges of derivatives, outwards.
+- The error of the value at the start is at most 8u |dk/dq| by the rounding of q, plus (16 + n)u m,
+  with m as in `BlobKernel.profile`.
 """
 
 from __future__ import annotations

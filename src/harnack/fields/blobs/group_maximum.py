@@ -66,11 +66,13 @@ class GroupedList:
         return dr.gather(kind, self.group_of_record, self.record(i), i < self.end)
 
     def each_group(self, body: Any, state: State, label: str) -> tuple[Any, State]:
-        """Apply `body` to each group that has blobs in the list, one group after another.
+        """Apply `body` to each group that has a blob in this list of blobs near a lane's point or
+        ray, one group after another.
 
-        body: a function (for_each, state) that returns the next state. Its argument `for_each` is
-            the loop over the group's blobs, which the body must run.
-        state: the first state.
+        body: a function; body(for_each, state) returns the state after one more group. It must call
+            for_each(add_blob, blob_state) once, which calls `add_blob` for each blob of the group
+            and returns the last `blob_state`.
+        state: the first state, a tuple of arrays.
         label: the name of the recorded loop.
 
         Returns the number of groups that have blobs in the list, and the last state.
@@ -229,9 +231,16 @@ class GroupMaximumEnclosure(Enclosure):
         real = backend.Float
 
         def add_group(for_each: ForEach, state: State) -> State:
-            """The state with another group included. It consists of the shortest length before a
-            sum rises to the level above, and the longest length before a sum falls to the level
-            below."""
+            """Return the state (up, down) after one more group. A group's sum is the sum of all
+            blobs of the group.
+
+            up: the shortest length before the sum of any group rises to the level above. The
+                largest sum reaches that level when the first of the sums does.
+            down: the longest length before the sum of any group falls to the level below. The
+                largest sum falls to that level only when the last of the sums has.
+            for_each: the loop over the blobs of the group; for_each(body, state) returns the last
+                state.
+            """
             up, down = state
             sums = sum_along(
                 self.kernel, backend, self.p, self.path.direction, self.knots, for_each,

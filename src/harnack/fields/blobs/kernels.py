@@ -335,12 +335,14 @@ class CubicKernel(BlobKernel):
 
     support: where a blob ends, in units of its radius.
 
-    Along a line at the distance h from the center, with r^2 = h^2 + x^2,
+    Lengths are in units of the support's radius. Let f(x) be the kernel on a line at the distance h
+    from the center, at the position x from the point nearest to the center. With r^2 = h^2 + x^2,
 
         f' = -6 x (1 - r),    f'' = -6 (1 - r - x^2/r),    f''' = 6 x/r (3 - x^2/r^2).
 
-    So f'' rises from x = 0 until S. f'' = 0 where r + x^2/r = 1. This gives a quadratic equation
-    for x^2, whose solution is x^2 = (1 - 4h^2 + sqrt(1 + 8h^2))/8.
+    As |x| <= r, the third derivative is >= 0 for x >= 0. So f'' rises from x = 0 to the end of the
+    support on the line. |f'| is largest at the zero of f'', which has r + x^2/r = 1. This gives a
+    quadratic equation for x^2, whose solution is x^2 = (1 - 4h^2 + sqrt(1 + 8h^2))/8.
     """
 
     support: float = 2.0  # pyright: ignore[reportIncompatibleMethodOverride]

@@ -73,8 +73,15 @@ class FieldWithCells(Field):
     _batches: Any
 
     def configure_cells(self, cells: Any) -> None:
-        """Store the argument `cells`, and clear the caches of cells. Raises ValueError if `cells`
-        is neither a bool, None nor a number of megabytes."""
+        """Set whether the field uses FMM cells (octree cells, each with a polynomial for all far
+        sources), and forget all cells that have been built.
+
+        cells: True to build them in any case, False for none, None to build them if the number of
+            rays is large enough, or a number of megabytes that limits their memory.
+
+        Raises:
+            ValueError: `cells` is none of these.
+        """
         kind = cast("Any", type(cells))
         if issubclass(kind, np.bool_):  # True is no megabyte
             cells = bool(cells)
@@ -105,11 +112,15 @@ class FieldWithCells(Field):
 
     @abc.abstractmethod
     def cells_pay_from(self) -> float:
-        """The smallest number of rays for which cells pay; infinite if they never pay."""
+        """The smallest number of rays for which cells save more time than it takes to build them;
+        infinite if they never do."""
 
     def finer_cells_pay_from(self) -> float:
-        """The smallest number of rays for which smaller cells pay. By default it is 0, for fields
-        whose cells have only one size."""
+        """The smallest number of rays for which smaller cells (octree cells with local expansions)
+        save more time than their longer construction takes.
+
+        By default it is 0: fields whose cells have only one size take no account of the choice.
+        """
         return 0.0
 
     def for_ray_count(self, count: int) -> Self:

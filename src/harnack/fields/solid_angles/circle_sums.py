@@ -311,31 +311,35 @@ class CircleSet:
         Returns a tuple with one bound for each length. A bound is infinite where a circle may be
         within T, and on lanes that are not active.
 
-        Let the circle have the radius a, and let d and P be the distances of its nearest and its
-        farthest point. Then Biot and Savart's integrals are bounded by
+        For one circle, let a be its radius, r and z the distance of the point from the axis and the
+        height above the circle's plane, and d and P the distances of the nearest and the farthest
+        point of the circle. D is the distance from the point to a point p of the circle. E is the
+        complete elliptic integral of the second kind with the complementary modulus kc = d/P.
+        Biot and Savart's integrals have closed forms:
 
-            |grad Omega| <= integral of |dp|/D^2 = 2 pi a/(P d)
+            |grad Omega| <= integral of |dp|/D^2 = 2 pi a/(P d),
 
-        (D is the distance from the point to p on the circle; with D^2 = A - 2r cos(phi) the
-        integral is exact, and the bound is attained at the center), and
+            integral of |dp|/D^3 = 4 a E/(P d^2) <= 2 pi a B,   B = sqrt((1/d^2 + 1/P^2)/2)/(P d).
 
-            integral of |dp|/D^3 = 4 a E/(P d^2) <= 2 pi a B,   B = sqrt((1/d^2 + 1/P^2)/2)/(P d),
+        The first bound is attained at the center. The second one holds since
+        E <= (pi/2) sqrt((1 + kc^2)/2), by Jensen's inequality for the square root.
 
-        as E <= (pi/2) sqrt((1 + kc^2)/2) by Jensen's inequality for the square root; A, E and kc
-        are those of `UnitCircle`. If the point moves by t, both distances fall by at most t, and
-        both bounds fall as the distances grow. Points at the distance r from the axis are at least
-        |r - a| from the circle. For a line that passes by the circle, this is a better bound than
-        the distance of a single point of the line. At height z above the circle's plane the
-        component of the gradient along the plane is at most |z| times the integral of |dp|/D^3. So
-        for a line whose direction has the component w along the normal, the derivative is at most
-        |w| 2 pi a/(P d) + sqrt(1-w^2) |z| 2 pi a B, which is small if the line runs along the
-        plane.
+        Both bounds fall as d and P grow. If the point moves by t, d and P fall by at most t. And
+        d >= |r - a|: for a line that passes by the circle, this is a better bound than the distance
+        of a single point of the line. So both bounds hold on the whole part of the line, with the
+        smallest possible d and P.
+
+        The component of the gradient along the circle's plane is at most |z| times the integral of
+        |dp|/D^3. So for a line whose direction has the component w along the circle's normal, the
+        derivative is at most |w| 2 pi a/(P d) + sqrt(1-w^2) |z| 2 pi a B, which is small if the
+        line runs along the plane.
         """
         real, vector = self._types
 
         def add(row: list[Real], rates: tuple[Any, ...]) -> tuple[Any, ...]:
             """Add the circle in the record `row` to the bounds `rates`, one for each length."""
             relative = self._relative(row, line.x)
+            # slack: the rounding of distances. axial: |w| of the proof.
             slack, axial = line.slack, fmin(dr.abs(dr.dot(relative.normal, line.v)), 1)
             across = dr.sqrt(fmax(1 - axial * axial, 0))
             # `axial` is a sum of numbers of order one: its rounding may be large relative to it.
@@ -345,21 +349,22 @@ class CircleSet:
             # distance from the axis is |outward + s flat_v|.
             flat_v = dr.fma(vector(-dr.dot(relative.normal, line.v)), relative.normal, line.v)
             square = dr.squared_norm(flat_v)
-            closest = dr.select(square > 0, -dr.dot(relative.outward, flat_v) / square, 0)
+            closest_position = dr.select(square > 0, -dr.dot(relative.outward, flat_v) / square, 0)
             new_rates: list[Real] = []
             for length, rate in zip(lengths, rates, strict=True):
-                positions = (clamp(closest, -length, length), -length, length)
+                positions = (clamp(closest_position, -length, length), -length, length)
                 lowest, first, last = (
                     dr.norm(dr.fma(vector(s), flat_v, relative.outward)) for s in positions
                 )
-                passing = fmax(lowest - relative.a, relative.a - fmax(first, last))
+                # A lower bound of |r - a| on the part of the line.
+                plane_distance = fmax(lowest - relative.a, relative.a - fmax(first, last))
                 # near and far: the distances d and P at all points of the line within `length`.
-                near = fmax(relative.distance - length, passing) - slack
+                near = fmax(relative.distance - length, plane_distance) - slack
                 far = fmax(relative.farthest - length, near + slack) - slack
                 bound = 2 * math.pi * relative.a / (near * far)
-                mean = dr.sqrt(0.5 * (dr.rcp(near * near) + dr.rcp(far * far)))
+                mean_inverse = dr.sqrt(0.5 * (dr.rcp(near * near) + dr.rcp(far * far)))
                 max_height = dr.fma(length, axial, height)
-                term = bound * dr.fma(across * max_height, mean, axial)
+                term = bound * dr.fma(across * max_height, mean_inverse, axial)
                 new_rates.append(rate + dr.select(near > 0, term, dr.inf))
             return tuple(new_rates)
 

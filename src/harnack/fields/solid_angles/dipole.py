@@ -115,13 +115,18 @@ class DipoleTree:
 
     @property
     def coarsest_accuracy(self) -> float:
-        """The accuracy scale of coarse samples (`Field.coarsest_accuracy`)."""
+        """The accuracy scale of the coarsest samples that `_sums` can give
+        (`Field.coarsest_accuracy`). A smaller accuracy scale has the same effect. It is 1 if there
+        are cells, which have a single accuracy."""
         return self.clusters.coarsest_accuracy if self.cells is None else 1.0
 
     def values(self, x: Vec3, derivatives: int, closer: Real) -> PointValues:
         """Value and derivatives of the sum at points x, up to order `derivatives`, with error
         bounds.
-        closer: the accuracy scale, at least 1."""
+
+        closer: the accuracy scale (`Field.at_accuracy`); larger is more accurate. A number below 1
+            counts as 1.
+        """
         unit, detail = (
             coordinate_rounding(x),
             fmax(self.backend.Float(closer), self.backend.Float(1)),
@@ -541,13 +546,14 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
         return 1.001 * (float(np.abs(unit).max()) + margin)
 
     def cells_pay_from(self) -> float:
-        """The smallest number of rays for which cells pay; infinite for large clouds and for
-        smoothed sums."""
+        """The smallest number of rays for which cells save more time than it takes to build them;
+        infinite for large clouds and for smoothed sums, which never get cells by default."""
         is_small = len(self.points) <= _MAX_POINTS and not self.smoothing
         return max(_LEAST_RAYS, _PAYS * len(self.points)) if is_small else math.inf
 
     def finer_cells_pay_from(self) -> float:
-        """The smallest number of rays for which smaller cells pay."""
+        """The smallest number of rays for which smaller cells save more time than the longer
+        construction takes."""
         return _FINER_PAYS_PER_POINT * len(self.points)
 
     def prepare(self, backend: Backend) -> Self:

@@ -42,8 +42,9 @@ if TYPE_CHECKING:
 
 DEGREE = 6
 COEFFICIENTS = (DEGREE + 1) ** 2
-# Edges are cut into pieces with half lengths of at most `_MAX_PIECE` times their distance from the
-# ball; on each piece, Gauss's rule has `_NODES` nodes.
+# Edges are cut into pieces with half lengths of at most `_MAX_PIECE` times the distance of their
+# middle from the ball (the last piece of an edge may be 1.3 times as long); on each piece, Gauss's
+# rule has `_NODES` nodes.
 _MAX_PIECE, _NODES = 1 / 6, 4
 # Rounding of an edge's term of the angle at the center, and of its polynomial: see
 # `EdgeExpansions.of` and `_EdgePiece.sums`.
@@ -190,14 +191,24 @@ class _EdgePiece:
 
     @classmethod
     def of(cls, a: Vec3, b: Vec3, t: Real, radius: Real) -> _EdgePiece:
-        """The piece that begins at the parameter t of the edge from a to b, both relative to the
-        center of the ball. Its half length is at most `_MAX_PIECE` times its distance from the ball
-        of this radius."""
+        """The piece that begins at the parameter t of the edge from a to b.
+
+        a, b: the ends of the edge, relative to the center of a ball.
+        t: from 0 to 1.
+        radius: the radius of the ball.
+
+        Half the length of the piece is at most `_MAX_PIECE` times the distance of its middle from
+        the ball. But a remainder of the edge that would be shorter than 0.3 times the piece is
+        joined to it: then the piece is up to 1.3 times as long. If the piece begins in the ball, it
+        is the whole remainder of the edge. The error bounds (`_quadrature_errors`) hold for pieces
+        of any length, and are infinite for a piece that is too long for them.
+        """
         vector, e = cast("Any", type(a)), b - a
         start = dr.fma(vector(t), e, a)
         max_length = (2 * _MAX_PIECE / (1 + _MAX_PIECE)) * (dr.norm(start) - radius)
         step = max_length * dr.rsqrt(dr.squared_norm(e))
         stop = dr.select(step > 0, fmin(t + step, type(t)(1)), 1)
+        # No short remainder is left for another piece.
         stop = dr.select(1 - stop < 0.3 * (stop - t), 1, stop)
         return cls(dr.fma(vector(0.5 * (t + stop)), e, a), (stop - t) * e, stop)
 

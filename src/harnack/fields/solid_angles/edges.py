@@ -154,10 +154,13 @@ class LoopEdges:
 
 
 def vertex_rounding(epsilon: float, x: Vec3, inverse_squares: Real) -> Real:
-    """A bound of the rounding of the solid angle at x that grows near the curve. It has to be added
-    to the bound `LoopEdges.rounding`.
+    """A bound of one part of the rounding error of the solid angle at x: the part that grows as x
+    nears the curve. It comes from the rounding of vertices, and from edges that subtend more than a
+    right angle. `LoopEdges.rounding` bounds all other rounding errors, and has the proof of both
+    bounds. The error is at most their sum.
 
     epsilon: the machine epsilon of the backend.
+    x: the point in unit coordinates (the curve lies within a distance of 1 of the origin).
     inverse_squares: an upper bound of the integral of |dp|/D^2 along the curve, with D the distance
         from x to the point p (`EdgeSums.inverse_squares`).
     """

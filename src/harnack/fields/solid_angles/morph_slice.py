@@ -188,9 +188,12 @@ class QuadraturePoints:
     farthest: the largest distance, in all groups, between a point of a triangle and the quadrature
         point that stands for it.
     second_moment_ratio: the largest ratio, over all groups, of the integral of |d|^2 over the
-        triangles to the length of the moment, with d the offset from the quadrature point.
-    first_moment_ratio: the same ratio for the Frobenius norm of the sum of the products of moment
-        and d.
+        triangles of the group to |m|. Here d is the offset from the quadrature point, and m is the
+        moment of the group.
+    first_moment_ratio: the largest ratio, over all groups, of |T|_F to |m|. Here T (3, 3) is the
+        sum of m_i d_i^T over the triangles i of the group, with m_i the triangle's area times
+        normal, d_i the offset of its centroid from the quadrature point, and |T|_F the Frobenius
+        norm.
     """
 
     points: FloatArray
@@ -320,7 +323,9 @@ _CELLS_ACROSS = 128
 
 
 class MorphSlice(VariableAccuracyField["_SliceBuffers"]):
-    """The field f(x) = (U_a(x, w) + U_b(x, gap - w))/(2 pi^2) with 0 < w < gap.
+    """A shape between two closed meshes a and b, as the level set f = 1/2 of the field
+    f(x) = (U_a(x, w) + U_b(x, gap - w))/(2 pi^2) with 0 < w < gap. For small w the shape is near
+    mesh a, for w near gap it is near mesh b.
 
     U_a(x, w) is the solid angle that the flat solid inside mesh a subtends in four dimensions, seen
     from the point x at the height w above it (see `Morph`). It is computed as a sum over oriented
@@ -333,10 +338,11 @@ class MorphSlice(VariableAccuracyField["_SliceBuffers"]):
     accuracy: the moments of a cluster of points are used beyond this many times its radius.
 
     Promises (proved bounds of f near a point). Let d be the smallest distance, in four dimensions,
-    of a quadrature point from x. The promises are `TaylorRemainder` within 0.45 d, and a
-    `HarmonicBall` of dimension 4 and radius 0.35 d, which proves shorter steps. `SlicedKernel` has
-    the proof that second derivatives are no larger than those of dipoles at the distances in four
-    dimensions.
+    of a quadrature point from x. The promises are a bound of the second derivatives within
+    0.45 d (`TaylorRemainder`), and a range of f on a ball in four dimensions of radius 0.35 d
+    (`HarmonicBall`). The steps that the latter proves are shorter. `SlicedKernel` has the proof of
+    the former: the second derivatives of a point's part of f are at most those of a dipole in three
+    dimensions, at a distance equal to the distance of x from the point in four dimensions.
     """
 
     default_level = 0.5

@@ -112,17 +112,18 @@ class FaceLoops:
 
 @dataclass(frozen=True)
 class FaceData(UnitFrame):
-    """The data of a face of a polygon mesh: its unit coordinates, its edges, and bounds of
-    rounding. The face may differ from lane to lane.
+    """One face of a polygon mesh, in coordinates that are relative to a center near the face and
+    divided by a size of it (unit coordinates). The face may differ from lane to lane.
 
-    edges: the records of its edges.
-    trips: the number of these records, negative if the face is in convex position.
-    rounding, value_rounding: bounds of the rounding of a point, in units of the face, and of the
-        rounding of the value.
+    edges: the records of its boundary edges; a record holds several edges.
+    signed_record_count: the number of these records, with a minus sign as a mark that the vertices
+        of the face are in convex position (on the boundary of their convex hull).
+    rounding: a bound of the rounding error of a point in unit coordinates.
+    value_rounding: a bound of the rounding error of the solid angle of the face.
     """
 
     edges: LoopEdges
-    trips: Real
+    signed_record_count: Real
     rounding: Real
     value_rounding: Real
 
@@ -159,7 +160,7 @@ class FaceSolidAngle(Field):
         distance = sums.distance * (1 - SUM_MARGIN) - rounding
         promises = remainder_promises(sums.inverse_cubes, sums.inverse_fourths, distance)
         lift = lift_ball(sums.angle, sums.gradient, sums.inverse_squares, promises)
-        is_convex = face.trips < 0
+        is_convex = face.signed_record_count < 0
         ball = HarmonicBall(
             dr.select(is_convex, distance, lift.radius),
             dr.select(is_convex, -1.5 * PERIOD, lift.lower),
@@ -440,9 +441,11 @@ class PolygonMesh(PatchField["_MeshBuffers"]):
         return SolidAngle(self.faces.loops(index))
 
     def boxes(self, levels: tuple[float, ...] | None = None) -> tuple[FloatArray, FloatArray]:
-        """Lower and upper corners (m, 3) of boxes proved to contain the surface of each face.
+        """Boxes proved to contain the surfaces of the m polygons: their lower and upper corners,
+        both (m, 3). The surface of a polygon consists of the level sets of the solid angle of its
+        boundary. The boxes are computed once for the same levels.
 
-        levels: the levels of the surfaces; None for the default.
+        levels: values of the solid angle; None for the levels of this mesh.
         """
         levels = self.levels if levels is None else levels
         if levels not in self._boxes:

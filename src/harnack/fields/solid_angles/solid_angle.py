@@ -322,8 +322,13 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         return self._sample(p, None)
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
-        """The sample at the position t on a ray, with promises along the ray. These prove long
-        steps if the ray runs along an edge."""
+        """The sample of f at the ray parameter t, with proved bounds of how f changes along the
+        ray, ahead of that point and behind it. If the ray runs along an edge of the curve, bounds
+        for the line of the ray prove much longer steps than bounds for a ball around the point.
+
+        path: the ray.
+        ahead, back: the lengths for which bounds are wanted; not used.
+        """
         del ahead, back
         has_line_promises = not self._all_cancel and self.lift_bound_option != "paper"
         direction = path.direction if has_line_promises else None
@@ -374,7 +379,7 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
             gradient_error = gradient_error + slope
         gradient_error = dr.select(on_curve, 0, gradient_error)
         error = dr.select(on_curve, 8 * _PERIOD, error)  # the steep gradient times 2 rounding
-        ray_promises = _ray_promises(data, x, sums, errors, direction)
+        ray_promises = _line_bounds(data, x, sums, errors, direction)
         if self.lift_bound_option == "paper":
             promises = (ball,)
         value = dr.select(on_curve, 0, sums.angle)
@@ -763,15 +768,16 @@ def _convex_ball(angle: Real, distance: Real, error: Real) -> HarmonicBall:
     return HarmonicBall(distance, branch - 1.5 * _PERIOD - below, branch + 1.5 * _PERIOD + above)
 
 
-def _ray_promises(
+def _line_bounds(
     data: _CurveData, x: Vec3, sums: CurveSums, errors: CellErrors, direction: Vec3 | None
 ) -> tuple[Lipschitz, ...]:
-    """Promises of the change of f along a line: Lipschitz constants on lengths of the line through
-    each point x in a direction. Lengths are in unit coordinates.
+    """Proved bounds of how fast f changes along a line through each point x. For each of several
+    lengths s there is a Lipschitz constant of f on the part of the line within s of x. Lengths are
+    in unit coordinates.
 
     data: the curves on a backend.
     sums, errors: the sums at x, and their errors.
-    direction: (3,) a unit vector; None for no promises.
+    direction: (3,) the unit direction of the line; None to get no bounds, an empty tuple.
     """
     if direction is None:
         return ()

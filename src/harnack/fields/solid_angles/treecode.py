@@ -254,18 +254,22 @@ AddPrimitive: TypeAlias = (
 )
 
 
-def node_records(level: NodeMoments, order: int, rough: float, error: FloatArray) -> FloatArray:
+def node_records(
+    level: NodeMoments, order: int, acceptance_ratio: float, error: FloatArray
+) -> FloatArray:
     """The records of the k nodes of one level of a tree, as `Treecode` reads them.
 
-    A record holds center, accepting distance (`rough` times the radius), remainder constants A and
-    K (`remainder_constants`), 15 coefficients of moments up to the order, and the error bound E.
+    A record holds the center, the smallest accepting distance, remainder constants A and K
+    (`remainder_constants`), 15 coefficients of the moments, and the error bound E. A point that is
+    farther from the center than the accepting distance may use the moments of the node instead of
+    its children. Coefficients of moments above the order are 0.
 
     level: the moments of the nodes.
     order: 0, 1 or 2, the order of the multipole moments that are used.
-    rough: the accepting distance of a node, in radii of the node.
+    acceptance_ratio: the accepting distance of a node, in radii of the node.
     error: (k,) E, the bound of the truncation error of the value.
     """
-    head = [rough * level.radius, *remainder_constants(level, rough)]
+    head = [acceptance_ratio * level.radius, *remainder_constants(level, acceptance_ratio)]
     parts = (level.center, *head, cartesian_coefficients(level.moments, order), error)
     return np.column_stack(parts)
 
@@ -340,7 +344,8 @@ class Treecode:
 
     @property
     def coarsest_accuracy(self) -> float:
-        """The accuracy scale of coarse evaluations (`Field.coarsest_accuracy`)."""
+        """The accuracy scale of the coarsest evaluations, as a fraction of that of an ordinary one,
+        1. Smaller accuracy scales have the same effect (`acceptance_ratio`)."""
         return self.coarse_ratio / self.accuracy
 
     def acceptance_ratio(self, detail: Real) -> Real:

@@ -76,19 +76,23 @@ class NearEdge:
     is_singular: Mask
 
     def is_open(self, reach: Real) -> Mask:
-        """Whether the edge may be part of the boundary of the set of near triangles, those that are
-        not in a far node of the tree. It is an edge at which the near triangles do not cancel.
+        """Mask of the lanes on which the edge may be part of the boundary of the set of near
+        triangles. These are the triangles that are not in a far node of the tree, as seen from the
+        point x. The boundary consists of the edges at which near triangles do not cancel.
 
-        reach: nodes are far beyond `reach` times their radius.
+        reach: a node is far if its distance from x is more than `reach` times its radius.
 
-        The edge is not part of that boundary if it is not singular, and is nearer to x than
-        (reach - 1)/2 times its length L. Proof: a far node that has a triangle at this edge has a
-        radius R >= L/2 and is farther than reach R, and so the edge is farther than (reach - 1) R.
-        Hence all triangles at a nearer edge are near, and cancel there.
+        The edge is not part of that boundary if it is not singular (all triangles at it, near and
+        far ones, cancel), and is nearer to x than (reach - 1)/2 times its length L. Proof: a far
+        node that has a triangle at this edge has a radius R >= L/2 and is farther than reach R, and
+        so the edge is farther than (reach - 1) R. Hence all triangles at a nearer edge are near,
+        and cancel there.
 
-        In a cell the same holds for a triangle that is far from the cell, with `TRIANGLE_RATIO` for
-        `reach`, because x is nearer to the cell's center than the k > 1 radii of
-        `dipole_expansion`. Far nodes are even farther.
+        If the far triangles are summed by the polynomial of an octree cell that contains x,
+        `reach` is `TRIANGLE_RATIO`. The polynomial holds in a ball around the cell, and a triangle
+        is far if it is farther from the ball's center than k > 1 radii of the ball plus a multiple
+        of its size (`dipole_expansion`). As x is in the ball, the same proof holds. Far nodes are
+        even farther.
         """
         square, inverse = self.edge.edge.squared_distance, self.edge.edge.inverse_square_length
         is_closed = ~self.is_singular & (square * inverse < dr.square(0.5 * (reach - 1)))

@@ -347,6 +347,8 @@ class Noise(FractalNoise):
         seed: int = 0,
         fade: Fade = "quintic",
     ) -> None:
+        """Noise of one octave: it needs no exponent `beta`, by which amplitudes fall from octave to
+        octave."""
         super().__init__(1, 0.0, frequency, amplitude, seed, fade)
 
 

@@ -466,20 +466,25 @@ class FoldedEnclosure(Enclosure):
     period: float | None
 
     def free_length(self, gaps: LevelGaps) -> Real:
-        return self.inner.free_length(self._inner_gaps(gaps))
+        return self.inner.free_length(self._gaps_of_offset(gaps))
 
     def is_free(self, gaps: LevelGaps, length: Real) -> Mask:
-        return self.inner.is_free(self._inner_gaps(gaps), length)
+        return self.inner.is_free(self._gaps_of_offset(gaps), length)
 
-    def _inner_gaps(self, gaps: LevelGaps) -> LevelGaps:
+    def _gaps_of_offset(self, gaps: LevelGaps) -> LevelGaps:
         """The gaps of r: how far r must rise, and how far it must fall, for |r| to reach one of its
         next levels.
 
+        r begins at `self.offset`. If there is a period P, then |r| <= P/2 at the start, and |r|
+        stands for the distance of r from the nearest multiple of P.
+
         gaps: the differences between |r| and its next level below and above.
 
-        Let s = |r| and P the period. |r| reaches a level if it is A = s + gaps.above or B = s -
-        gaps.below. For r >= 0, upwards r first reaches A or P - B, and downwards B or -A. For r < 0
-        this is mirrored.
+        Let s = |r| at the start. The levels of |r| are B = s - gaps.below and A = s + gaps.above. B
+        is reached only if B >= 0, and A, if there is a period, only if A <= P/2. Let r >= 0. If r
+        rises, |r| can be A at r = A, and B at r = P - B, which is at the distance B from the
+        multiple P. If r falls, |r| can be B at r = B, and A at r = -A. If r < 0, the two directions
+        are exchanged.
         """
         size, inf = dr.abs(self.offset), type(self.offset)(dr.inf)
         has_below = gaps.below <= size * _ROUNDING_FACTOR

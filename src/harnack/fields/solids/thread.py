@@ -160,8 +160,16 @@ class Thread(Solid):
         return Sample(value, gradient, (Lipschitz(constant),), error, gradient_error)
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
-        """The ray sample, with the enclosures of the Lipschitz constant and, ahead, an
-        `OutsideCylinderEnclosure` of the cylinder around the thread."""
+        """The sample of f at the ray parameter t, with enclosures: proved bounds of how f changes
+        along the ray, before and behind that point.
+
+        Both directions have the bounds that follow from the Lipschitz constant. The direction of
+        the ray also has an `OutsideCylinderEnclosure`: outside of the cylinder around the thread, f
+        is at least the distance from the cylinder.
+
+        path: the ray.
+        ahead, back: the lengths for which bounds are wanted; not used, as these hold everywhere.
+        """
         del ahead, back
         p, d = path.point(t), path.direction
         ray_sample = path.enclose(self.evaluate(p))
