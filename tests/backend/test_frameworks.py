@@ -330,7 +330,7 @@ def test_code_of_the_page_runs(block: str, tmp_path: Path) -> None:
 
 
 def test_the_page_has_code() -> None:
-    assert len(PAGE) == 4
+    assert len(PAGE) == 5
 
 
 @pytest.mark.parametrize("framework", ["torch", "jax"])

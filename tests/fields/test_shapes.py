@@ -414,7 +414,7 @@ def test_sphere_tracing_finds_the_same(name: str) -> None:
     d = rng.uniform(-0.9, 0.9, (300, 3)) - o
     d /= norm(d)[:, None]
     one, two = (
-        hk.trace(shape, o, d, t_max=6.0, precision="double", enclosures=b)
+        hk.trace(shape, o, d, t_max=6.0, precision="double", tolerance=1e-4, enclosures=b)
         for b in (None, "lipschitz")
     )
     a, b = np.array(one.t), np.array(two.t)

@@ -23,6 +23,7 @@ from harnack.meshing.harmonic_filling import (
     triangle_fills,
 )
 from harnack.meshing.hole_filling import hole_loops
+from harnack.meshing.mesh_tolerance import MeshTolerance
 from tests.oracles.mesh_files import read_closed
 from tests.oracles.triangle_pairs import intersecting_pairs
 
@@ -290,8 +291,8 @@ def test_rough_surfaces_are_made_of_larger_cells(monkeypatch: pytest.MonkeyPatch
     noisy = vertices + np.random.default_rng(0).normal(0, 0.1, vertices.shape)
     given = trimesh.Trimesh(noisy, faces, process=False)
     module = importlib.import_module("harnack.meshing.repair_stages")
-    monkeypatch.setattr(module, "_REMESH_CELLS_ACROSS", 16)
-    monkeypatch.setattr(module, "_MAX_REMESHED_FACES", 4_000)
+    monkeypatch.setattr(module, "_CELLS_ACROSS", 16)
+    monkeypatch.setattr(module, "_MAX_TRIANGLES", 4_000)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # rough, and so not within the tolerance
         made = hk.repair(given, keep="none")
@@ -544,7 +545,7 @@ def test_harmonic_patches_get_the_triangles_of_holes_of_three_edges() -> None:
     vertices, faces = torus_mesh(1.0, 0.35, 24, 24)
     given = trimesh.Trimesh(vertices, remove_faces(faces, 0.1, seed=1), process=False)
     edges = checked_boundary_edges(np.asarray(given.faces, np.int64))
-    how = HoleFillingOptions(1e-3, None, 0, 1, lambda _: None)
+    how = HoleFillingOptions(MeshTolerance(), None, 0, 1, lambda _: None)
     made = harmonic_patches(vertices, np.asarray(given.faces, np.int64), edges, how)
     assert made.triangle_fill_count > 50
     assert made.is_refined

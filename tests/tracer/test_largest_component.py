@@ -200,7 +200,7 @@ def test_what_has_no_largest_component_is_refused():
     ray = [[3.0, 0, 0]], [[-1.0, 0, 0]]
     with pytest.raises(ValueError, match="first hits alone"):
         hk.trace(FIELDS["solids"], *ray, largest=True, require_crossing=True)
-    with pytest.raises(ValueError, match="first hits alone"):
+    with pytest.raises(TypeError, match="crossings has no largest"):
         hk.crossings(FIELDS["solids"], *ray, largest=True, max_crossings=2)
     with pytest.raises(ValueError, match="with bounds"):
         hk.trace(hk.solids.Plane(), *ray, largest=True)
