@@ -12,11 +12,14 @@ import inspect
 import math
 import operator
 from collections.abc import Callable, Sequence
-from typing import Any, TypeAlias, TypeVar, cast
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar, cast
 
 import drjit as dr
 import numpy as np
 import numpy.typing as npt
+
+if TYPE_CHECKING:
+    from harnack.backend.arrays import Precision
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -32,6 +35,10 @@ _MAX_ENTRIES, _MAX_TEXT_LENGTH = 4, 60
 
 MAX_COORDINATE = 1e100
 """Larger coordinates are refused: products of their squares would overflow."""
+
+LENGTH_RANGE = {"single": (1e-18, 1e18), "double": (1e-150, 1e150)}
+"""The smallest size of a surface, and the largest coordinate of surfaces and rays, by precision.
+Squares of distances between them neither overflow nor underflow, as proofs of steps need."""
 
 
 def as_real_array(
@@ -105,6 +112,41 @@ def check_coordinate_size(x: FloatArray, error: type[Exception]) -> None:
     """Raise `error` if a coordinate is larger than `MAX_COORDINATE`."""
     if (size := float(np.abs(x).max(initial=0.0))) > MAX_COORDINATE:
         raise error(f"coordinates up to {size:g} are too large: choose units nearer to 1")
+
+
+def check_length_range(box: tuple[Any, Any], precision: Precision, subject: str) -> None:
+    """Check that the sizes of objects fit a precision (see `LENGTH_RANGE`).
+
+    box: the lower and the upper corner (3,) of a box around the objects. Coordinates may be
+        infinite, and the box may be empty.
+    subject: the beginning of the message, with its verb, such as "the surface has".
+
+    Raises:
+        ValueError: a finite coordinate is too large, or the longest side is too short.
+    """
+    corners = np.array(box, np.float64)
+    if not (corners[0] <= corners[1]).all():
+        return
+    check_largest_coordinate(
+        float(np.abs(corners[np.isfinite(corners)]).max(initial=0.0)), precision, subject
+    )
+    smallest = LENGTH_RANGE[precision][0]
+    if np.isfinite(corners).all() and 0 < (side := float(np.ptp(corners, axis=0).max())) < smallest:
+        raise ValueError(
+            f"{subject} a size of {side:g}: too small for {precision} precision, in which "
+            f"it must be at least {smallest:g}; choose units nearer to 1"
+        )
+
+
+def check_largest_coordinate(size: float, precision: Precision, subject: str) -> None:
+    """Raise ValueError if the largest absolute coordinate `size` of objects is too large for a
+    precision (see `LENGTH_RANGE`). subject: as in `check_length_range`."""
+    largest = LENGTH_RANGE[precision][1]
+    if size > largest:
+        raise ValueError(
+            f"{subject} coordinates up to {size:g}: too large for {precision} precision, in "
+            f"which they must be at most {largest:g}; choose units nearer to 1"
+        )
 
 
 def format_vector(row: FloatArray) -> str:

@@ -12,6 +12,7 @@ from harnack.backend import backend_of, choose_backend, to_float, to_numpy, to_v
 from harnack.backend.arrays import as_kernel_parameters, precision_of_input
 from harnack.backend.elementary import max_norm, safe_normalize
 from harnack.backend.tensors import is_tensor, tensor_to_array, tensor_to_vectors
+from harnack.backend.validation import check_largest_coordinate
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, FloatArray, Precision, Real, Vec3
@@ -95,6 +96,9 @@ def _uploaded(
         return o, d, near, far
     if not dr.is_array_v(type(directions)):
         _check_numpy_rays(to_numpy(max_norm(d)), to_numpy(near), to_numpy(far))
+    if not dr.is_array_v(type(origins)):
+        size = float(np.abs(np.asarray(origins)).max())
+        check_largest_coordinate(size, backend.precision, "origins have")
     return o, safe_normalize(d), near, far
 
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from harnack.backend import to_float
 from harnack.backend.arrays import as_kernel_parameters
+from harnack.backend.validation import check_length_range
 from harnack.enclosures import EnclosureKinds, Levels, choose_enclosures
 from harnack.tracer.largest_component import largest_component_cells
 from harnack.tracer.level_contact import HitTolerance
@@ -230,6 +231,13 @@ class TracedSurface:
         key = "largest", self.clip, self.side, self.largest
         return self.memoize(key, lambda: largest_component_cells(*arguments))
 
+    def _check_size(self, backend: Backend) -> None:
+        """Raise ValueError if the surface is too large or too small for a backend's precision."""
+        around, volume = intersection_of([self.field.domain, self.extent]), self.volume
+        for box in (around, volume):
+            if box is not None:
+                check_length_range(box.bounds(), backend.precision, "the surface has")
+
     def prepare(
         self, backend: Backend, *, crosses: bool = False, many_rays: bool = True
     ) -> SurfaceTracer:
@@ -242,6 +250,7 @@ class TracedSurface:
         if self.largest and crosses:
             raise ValueError(_FIRST_HITS_ONLY)
         volume, region = self.volume, None
+        self._check_size(backend)
         occupied = self._occupied() if self.largest or (many_rays and not crosses) else None
         if crosses or self.require_crossing:
             region = intersection_of([self.field.domain, self.clip, self.section])

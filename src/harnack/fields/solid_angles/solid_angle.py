@@ -15,6 +15,7 @@ import numpy as np
 from harnack.backend import FloatArray, backend_of, choose_backend, to_numpy
 from harnack.backend.elementary import fmin
 from harnack.backend.tensors import is_tensor, tensor_to_vectors
+from harnack.backend.validation import check_length_range
 from harnack.cluster.serialization import TransientCache
 from harnack.enclosures import HarmonicBall, Lipschitz
 from harnack.fields.batch_evaluation import map_batches
@@ -241,9 +242,10 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         # backend's precision holds the center exactly, so that subtracting it near the curve is
         # exact.
         dtype = np.float64 if backend.precision == "double" else np.float32
-        if (size := float(np.abs(self._center).max()) + self._size) > 0.1 * float(
-            np.finfo(dtype).max
-        ):
+        box = self._center - self._size, self._center + self._size
+        if traced:
+            check_length_range(box, backend.precision, "the curve has")
+        elif (size := float(np.abs(box).max())) > 0.1 * float(np.finfo(dtype).max):
             raise ValueError(
                 f"coordinates up to {size:g} are too large for {backend.precision} precision: "
                 "choose units nearer to 1"
