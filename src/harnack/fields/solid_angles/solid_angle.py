@@ -404,10 +404,8 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
             # Measured: 15 units in the last place of a circle's angle and 60 of its gradient (near
             # it, 10 elsewhere). Its position is rounded by a few units too.
             point_error = epsilon * (4 + 4 * dr.max(dr.abs(x)))
-            circle_error = (
-                16 * epsilon * len(self._net_circles) + point_error * circles.inverse_squares
-            )
-            error = error + dr.select(on_curve, 0, circle_error)
+            value = 16 * epsilon * len(self._net_circles) + point_error * circles.inverse_squares
+            error = error + dr.select(on_curve, 0, value)
             circle_gradient_error = (
                 32 * epsilon * circles.inverse_squares + 1.5 * point_error * circles.inverse_cubes
             )
@@ -418,6 +416,7 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         if self.lift_bound_option == "paper":
             promises = (ball,)
         value = dr.select(on_curve, 0, sums.angle)
+        # All of this is in unit coordinates; `space_scaled` converts it to user coordinates.
         sample = Sample(
             value,
             gradient,
