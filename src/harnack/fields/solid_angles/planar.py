@@ -86,8 +86,8 @@ class PlanarRegion:
         ratio = height_bound / distance
         # Near the curve the rounding of positions moves f by up to about 2 slack/distance.
         tolerance = 1e-3 + 16 * slack / distance + error
-        # D is inside S if |f| is more than it could be otherwise, 2 pi h/d, or if it is more than
-        # pi and h < d/2. It is outside if |f| is less than 2 pi (1 - h/d) and pi.
+        # Outside |f| is at most 2 pi h/d, inside at least 2 pi (1 - h/d). So a larger |f| proves D
+        # inside, and a smaller one outside. If h < d/2, |f| = pi is between both numbers.
         is_inside = dr.abs(f) > turn * fmax(ratio, 0.5) + tolerance
         is_outside = dr.abs(f) < turn * fmin(1 - ratio, 0.5) - tolerance
         free_height = fmax(dr.abs(height) - slack, 0)
