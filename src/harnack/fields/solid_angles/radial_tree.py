@@ -170,7 +170,7 @@ class RadialTreecode(RadialSum):
         def near(row: list[Real], active: Mask, state: tuple[Any, ...]) -> tuple[Any, ...]:
             """Add the dipole in the record `row`, which is in a leaf that is not far, to the state
             of the sums."""
-            # A lane on which the leaf is far reads an empty record, which adds 0.
+            # Lanes on which the leaf is far do not take part in the loop over its dipoles.
             del active
             return self._with_dipole(row, x, derivatives, state)
 

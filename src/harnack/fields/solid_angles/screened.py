@@ -166,7 +166,7 @@ def screened_promises(
     nearest = fmax(sums.singularity_distance * (1 - SUM_MARGIN) - 8 * epsilon, 0)
     max_radius = fmin(nearest, MAX_LENGTHS / kappa)
     promises = radial.curvatures(kernel.growth, max_radius, size)
-    # The radius R of the ball with a range. S is the smaller of two bounds of the change of f in it.
+    # The radius R of the ball with a range. S is the smaller of two bounds of the change of f.
     r = BALL_FRACTION * max_radius / dr.fma(_BALL_SHRINKAGE * kappa, max_radius, 1)
     growth = kernel.growth(r)
     slope = dr.norm(gradient) + sums.gradient_truncation
