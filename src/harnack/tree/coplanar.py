@@ -52,8 +52,7 @@ def borders_of_overlaps(
 
     Returns:
         The indices of the covered faces (k,), repeated for each border edge; and knives (k, 3, 3):
-        triangles whose planes are perpendicular to the face and contain an edge of the border of
-        the covered part.
+        triangles that meet the plane of the face in an edge of the border of the covered part.
     """
     covered, covering = overlapping_faces(tree, vertices, faces)
     if not len(covered):
@@ -76,8 +75,8 @@ def borders_of_overlaps(
     face, edge = face[is_border], edge[is_border]
     p, q = np.moveaxis(vertices[unique_edges[edge]], 1, 0)
     normal, _ = _normals(vertices[faces[face]])
-    # The knife is a triangle that contains the edge from p to q, and has one corner on the other
-    # side of the face.
+    # Two corners of a knife are behind the face and one is in front of it. The face's plane cuts
+    # the knife halfway between them, in the edge from p to q.
     away = np.linalg.norm(q - p, axis=1, keepdims=True) * normal
     middle, side = 0.5 * (p + q), q - p
     return face, np.stack([middle - away - side, middle - away + side, middle + away], axis=1)
