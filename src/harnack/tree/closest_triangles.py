@@ -401,8 +401,11 @@ class ClosestPointOnTriangle:
             edges pq, qr and pr."""
             return dr.select(is_pr_longest, of_pr, dr.select(is_qr_longest, of_qr, of_pq))
 
-        a, e = chosen(p, q, p), chosen(pq, qr, pr)
-        inverse = chosen(inverse_pq, inverse_qr, inverse_pr)
+        a, e, inverse = (
+            chosen(p, q, p),
+            chosen(pq, qr, pr),
+            chosen(inverse_pq, inverse_qr, inverse_pr),
+        )
         # x is a + alpha e + away, and the corner opposite to the edge a + beta e + h.
         alpha, away = _project_on_edge(-a, e, inverse)
         beta, h = _project_on_edge(chosen(r, p, q) - a, e, inverse)
@@ -457,8 +460,7 @@ def jump_sum_within(triangles: TriangleTree, x: Vec3, distance: Real, active: Ma
     real, vector = triangles.tree.backend.Float, triangles.tree.backend.Array3f
     x, distance = vector(x), real(distance)
     # Boxes are enlarged by `distance` besides, which covers rounding.
-    square = distance * distance
-    may_be_within = _distance_test(triangles, x, distance)
+    square, may_be_within = distance * distance, _distance_test(triangles, x, distance)
 
     def visit(node: VisitedNode, state: LoopValues) -> tuple[Mask, LoopValues]:
         """Enter a node if its box comes within `distance` of x."""
