@@ -357,6 +357,7 @@ def traverse(tree: PackedTree, visit: Visit, state: LoopValues, active: Mask = T
         return i, *state
 
     def is_running(i: Any, *_: Any) -> Mask:
+        """Whether a lane has further nodes to visit."""
         return i < tree.node_count
 
     # Lanes that are not active begin behind the last node.
@@ -381,6 +382,7 @@ def for_each_primitive(
     index = tree.backend.UInt32
 
     def is_running(slot: Any, *_: Any) -> Mask:
+        """Whether an active lane has further slots to visit."""
         return active & (slot < tree.leaf_size)
 
     def step(slot: Any, *state: Any) -> LoopValues:

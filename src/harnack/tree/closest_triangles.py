@@ -83,6 +83,7 @@ class BoxTree:
         """
         real, index = self.tree.backend.Float, self.tree.backend.UInt32
         t_after, n_after = real(after[0]), index(after[1])
+        # A function from a box to the t where the ray enters it and leaves it.
         span = self._make_slab_test(o, d)
 
         def visit(node: VisitedNode, state: LoopValues) -> tuple[Mask, LoopValues]:
@@ -107,6 +108,7 @@ class BoxTree:
                 dr.select(chosen, n, number),
             )
 
+        # The best box so far: where the ray enters and leaves it, and its number.
         initial = (real(dr.inf), real(dr.inf), index(NO_BOX))
         near, far, number = traverse(self.tree, visit, initial, active)
         return near, far, number
@@ -191,6 +193,7 @@ def distance_lower_bound(triangles: TriangleTree, x: Vec3) -> Real:
         square = ClosestPointOnTriangle.of(row, x).squared_distance
         return (dr.select(active, fmin(square, state[0]), state[0]),)
 
+    # The state is the smallest squared distance so far.
     start = (initial_squared_distance(triangles, x),)
     return fmax(dr.sqrt(traverse(triangles.tree, visit, start)[0]) - pad, real(0))
 
@@ -246,6 +249,8 @@ def squared_distance_in_nearby_leaf(tree: PackedTree, x: Vec3, column: int) -> R
         return i, end, best, first, after, nearest_leaf
 
     def is_running(i: Any, end: Any, *state: Any) -> Mask:
+        """Whether a lane has not passed the last sibling, which happens only where that sibling is
+        a leaf."""
         return i != end
 
     start = (
@@ -260,6 +265,7 @@ def squared_distance_in_nearby_leaf(tree: PackedTree, x: Vec3, column: int) -> R
         return slot + 1, fmin(square, dr.squared_norm(point - x))
 
     def has_slots(slot: Any, square: Real) -> Mask:
+        """Whether the leaf has further slots."""
         del square
         return slot < tree.leaf_size
 
@@ -305,6 +311,7 @@ def next_closest_triangle(
             dr.select(chosen, point.is_inner, is_inner),
         )
 
+    # The best triangle so far: squared distance, number, offset, normal, and `is_inner`.
     start = (limit, index(NO_TRIANGLE), vector(0), vector(0), backend.Bool(False))
     square, number, offset, normal, is_inner = traverse(triangles.tree, visit, start, active)
     exists = number != NO_TRIANGLE
@@ -329,6 +336,7 @@ def _distance_test(triangles: TriangleTree, x: Vec3, pad: Real) -> Any:
     def may_be_within(node: VisitedNode, square: Real) -> Mask:
         """Whether the node's enlarged box and slab come within the distance sqrt(square) of x."""
         low, high = vector(*node.head[:3]) - pad, vector(*node.head[3:]) + pad
+        # The vector from x to the box, up to signs.
         gap = dr.select(x < low, low - x, dr.select(x > high, x - high, 0))
         is_box_near = dr.squared_norm(gap) <= square
         slab = node.payload(is_box_near)

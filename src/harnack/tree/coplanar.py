@@ -208,6 +208,7 @@ def _next_in_plane(
         chosen &= _in_plane(corners, other_corners) & _overlap(corners, other_corners)
         return (dr.select(chosen, number, state[0]),)
 
+    # The state is the lowest number so far.
     return traverse(tree.tree, visit, (index(NO_TRIANGLE),))[0]
 
 

@@ -305,6 +305,7 @@ class EmptySpaceGrid:
         active = dr.full(self.backend.Bool, True, 1) & (start == start) & (length > 0)
 
         def running(s: Real, active: Mask) -> Mask:
+            """Whether a lane is still in empty cells and shorter than `length`."""
             del s
             return active
 

@@ -97,6 +97,7 @@ def build_lists(backend: Backend, walk: Callable[[WriteEntry | None], Any]) -> L
     index = backend.UInt32
     count = walk(None)
     dr.eval(count)
+    # Where each list begins, and the number of all entries.
     start = np.concatenate([[0], np.cumsum(to_numpy(count).astype(np.int64))])
     if start[-1] >= 2**31:
         raise ValueError(_TOO_LONG)
@@ -138,6 +139,7 @@ def traverse_subtrees(
         return k + dr.select(i == end, index(1), index(0)), i, end, *state
 
     def is_running(k: Any, *_: Any) -> Mask:
+        """Whether a lane's list has further entries."""
         return k < lists.count
 
     start = (index(0), index(0), index(0), *state)
@@ -165,6 +167,7 @@ def for_each_entry(
         return k + 1, *body(entry, active, state)
 
     def is_running(k: Any, *_: Any) -> Mask:
+        """Whether a lane's list has further entries."""
         return k < lists.count
 
     return dr.while_loop((index(0), *state), is_running, step, label="entries")[1:]

@@ -228,6 +228,7 @@ def _next_foreign_crossing(
         return t, n, hit & dr.any([(vertex == ends[0]) | (vertex == ends[1]) for vertex in corners])
 
     def is_running(t: Any, n: Any, active: Any) -> Any:
+        """Whether a lane's crossing is with a face that has one of the two vertices."""
         del t, n
         return active
 

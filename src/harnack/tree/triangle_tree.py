@@ -291,6 +291,7 @@ class TriangleTree:
                 dr.select(chosen, normal_of(row, vector), normal),
             )
 
+        # The best crossing so far: t, number of the triangle, sign, and a normal of any length.
         start = (real(dr.inf), index(NO_TRIANGLE), real(0), vector(0))
         best, number, sign, normal = traverse(self.tree, visit, start, active)
         return best, number, sign, normal * dr.rsqrt(fmax(dr.squared_norm(normal), real(1e-37)))

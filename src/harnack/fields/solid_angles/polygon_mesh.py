@@ -151,6 +151,7 @@ class FaceSolidAngle(Field):
     default_level: float = 2 * math.pi
 
     def __init__(self, face: FaceData) -> None:
+        """Make the field. face: the face, on a backend."""
         self.face = face
 
     def evaluate(self, p: Vec3) -> Sample:
@@ -190,7 +191,8 @@ class FaceSolidAngle(Field):
             dr.select(is_convex, -1.5 * PERIOD, lift.lower),
             dr.select(is_convex, 1.5 * PERIOD, lift.upper),
         )
-        # On the curve itself, up to rounding: as in `SolidAngle`.
+        # At the curve itself, up to rounding, f has all values: the gradient is so steep that the
+        # point counts as close to any level.
         on_curve = sums.distance <= 2 * rounding
         steep_gradient = backend.Array3f(0, 0, 4 * PERIOD / rounding)
         gradient = dr.select(on_curve, steep_gradient, sums.gradient)
@@ -244,8 +246,10 @@ def face_boxes(faces: PolygonFaces, levels: tuple[float, ...]) -> tuple[FloatArr
     low, high = faces.face_boxes()
     # The least distance of a level from the multiples of 4 pi.
     nearest = min(abs(math.remainder(level, PERIOD)) for level in levels)
+    # Half the diagonal of each face's box.
     size = 0.5 * np.linalg.norm(high - low, axis=1)[:, None]
     is_in_hull = faces.in_convex_position & (nearest > 2 * math.pi * (1 - 1e-9))
+    # The isoperimetric box: rho = L/sqrt(l (4 pi - l)) around the face.
     margin = 1.0001 * faces.face_perimeters()[:, None] / math.sqrt(nearest * (PERIOD - nearest))
     lower = np.where(is_in_hull[:, None], low, low - margin)
     upper = np.where(is_in_hull[:, None], high, high + margin)
@@ -287,6 +291,7 @@ def _carve_boxes(
             break
         octants = cells.subset(is_split).split(box_sizes)
         size = octants.sizes(box_sizes)
+        # The balls around the octants are tested.
         half = 0.5 * np.linalg.norm(size, axis=1)
         is_empty = _are_empty(curves, octants.face, octants.corner + 0.5 * size, half, levels)
         cells = cells.subset(~is_split).joined(octants.subset(~is_empty))
@@ -402,6 +407,7 @@ def _are_empty(
         scale = dr.rcp(dr.abs(zr) + dr.abs(zi))
         weight, c = edge.biot_savart()
         distance, a = dr.sqrt(edge.squared_distance), 0.5 * dr.rsqrt(inverse)
+        # The two sums of the proof, with gap = d_e - h.
         gap = distance - h
         change = change + 2 * (dr.asinh(a / gap) - dr.asinh(a / distance))
         second = second + 2 * a / (gap * gap * dr.sqrt(gap * gap + a * a))
@@ -453,6 +459,7 @@ class PolygonMesh(PatchField["_MeshBuffers"]):
     over_relaxation: float = 1.3  # as for `SolidAngle`
 
     def __init__(self, vertices: Any, faces: Any) -> None:
+        """Validate vertices and faces. The parameters are described at the class."""
         super().__init__()
         self.faces: PolygonFaces = validate_polygons(vertices, faces)
         if self.faces.face_count >= MAX_BOXES:

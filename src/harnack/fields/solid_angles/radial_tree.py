@@ -123,6 +123,7 @@ class DirectSum(RadialSum):
     """The sum over dipoles, one by one. It has no truncation error."""
 
     def __init__(self, backend: Backend, rows: FloatArray, kernel: RadialKernel) -> None:
+        """Upload the dipoles. rows: (n, 8) their records. kernel: the radial potential."""
         super().__init__(backend, rows, kernel)
         self._records = RecordTable.upload(backend, rows, empty_record(rows[0]), _DIPOLES_PER_TRIP)
 

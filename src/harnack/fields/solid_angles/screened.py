@@ -216,11 +216,13 @@ def mean_at_dipoles(rows: FloatArray, kappa: float) -> float:
     n = len(rows)
     count = min(n, max(_MIN_LEVEL_POINTS, min(_MAX_LEVEL_POINTS, _MAX_LEVEL_PAIRS // n)))
     probes = np.unique(np.linspace(0, n - 1, count).astype(np.int64))
+    # Some positions, evenly spaced in the order of the records; and all coordinates and moments.
     x, y, z, *moment = np.ascontiguousarray(rows[:, :6].T)
     values: list[float] = []
     for i in probes:
         d = (x - x[i], y - y[i], z - z[i])
         square = d[0] * d[0] + d[1] * d[1] + d[2] * d[2]
+        # Dipoles at the position itself, too, get weight 0.
         is_apart = square > 0
         rho = np.sqrt(np.where(is_apart, square, 1))
         weight = np.where(is_apart, (1 + kappa * rho) * np.exp(-kappa * rho) / rho**3, 0)
@@ -308,6 +310,8 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
         method: MethodName = "auto",
         accuracy: float = 6.0,
     ) -> None:
+        """Validate the points, choose the method, scale the points to unit coordinates, and compute
+        the default level. The parameters are described at the class."""
         super().__init__()
         length = as_positive(length, "length")
         if method not in ("auto", "sum", "tree"):
@@ -325,6 +329,7 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
         )
         self.has_variable_accuracy = self.method == "tree"
         low, high = self.points.min(axis=0), self.points.max(axis=0)
+        # Half the longest side of the box; more for few points that stand for large areas.
         extent = max(0.5 * float((high - low).max()), math.sqrt(float(self.areas.max())))
         self._center = round_to_single(0.5 * (low + high))
         # A power of two, so that lengths are scaled without rounding.

@@ -141,10 +141,12 @@ class SmoothedSum:
         derivatives near x. detail: the accuracy scale; larger is more accurate."""
         radial = self.dipoles.sums(x, detail, 1)
         sums = radial.sums
+        # The error of the gradient: of positions, and of truncation.
         slope_error = dr.fma(
             SLOPE_ROUNDINGS * coordinate_rounding(x), sums.s4, sums.gradient_truncation
         )
         epsilon = self.dipoles.backend.machine_epsilon
+        # A lower bound of the distance to the nearest dipole, also after rounding.
         nearest = fmax(sums.singularity_distance * (1 - SUM_MARGIN) - 8 * epsilon, 0)
         return Sample(
             sums.value,

@@ -152,8 +152,11 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         lift_bound: LiftBoundName = "auto",
         cells: bool | float | None = None,
     ) -> None:
+        """Validate the curve, remove edges that cancel each other, and decide how the range of the
+        lift is bounded. The parameters are described at the class."""
         super().__init__()
         self.circles: tuple[Circle, ...]
+        # Loops that are Dr.Jit arrays are kept besides, for derivatives by their vertices.
         curves, self._differentiable_loops = _movable_loops(loops)
         net, self.circles = validate_curves(curves)
         self._loops: Loops = tuple(_read_only(loop) for loop in net)
@@ -168,6 +171,7 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
             self._region = planar_region(self._net_loops, self._net_circles)
         self.lift_bound_option: LiftBoundName = lift_bound
         self.lift_bound = self._resolve_lift_bound(lift_bound)
+        # Unit coordinates: the center of the box around the curve, and the radius around it.
         points = self._points_around()
         self._center = 0.5 * (points.min(axis=0) + points.max(axis=0))
         self._size = float(np.linalg.norm(points - self._center, axis=1).max())
@@ -276,9 +280,11 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
             circles = CircleSet.upload(backend, self._net_circles, center, self._size)
         plane = None
         if self._region is not None:
+            # The plane n.x = offset in unit coordinates.
             height = (self._region.offset - float(self._region.normal @ center)) / self._size
             numbers = (*self._region.normal.tolist(), height)
             plane = tuple(dr.opaque(backend.Float, number) for number in numbers)
+        # The largest coordinate in units of the curve's size: by it positions are rounded.
         magnitude = float(np.abs(self._points_around()).max() / self._size)
         records = (
             0 if edges is None else sum(-(-len(loop) // edges.edges_per_record) for loop in unit)
@@ -432,9 +438,9 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
     def _planar_ball(
         self, data: _CurveData, x: Vec3, sums: CurveSums, distance: Real, error: Real
     ) -> HarmonicBall:
-        """The ball around each point x that reaches to the curve, and a range of the lift of f on
-        it, for `lift_bound="planar"`. The range comes from the region of a plane that the curve
-        bounds, or from the circles if there are only circles.
+        """A ball around each point x that meets no curve, and a range of the lift of f on it, for
+        `lift_bound="planar"`. The range comes from the region of a plane that the curve bounds, or
+        from the circles if there are only circles.
 
         data: the curve on a backend.
         x: the points, in unit coordinates.
@@ -521,12 +527,13 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         )
 
     def closest_boundary_point(self, p: Vec3) -> Vec3 | None:
-        """The closest point of the curve, without edges that cancel each other (`remaining_edges`);
-        None if no edge is left."""
+        """The point of the curve that is closest to p, in user coordinates. Edges that cancel each
+        other do not count (`remaining_edges`); None if no edge is left."""
         if self._all_cancel:
             return None
         data = self._data_for(p)
         x = data.to_unit(p)
+        # The closest point so far, in unit coordinates, and its squared distance.
         nearest, square = data.backend.Array3f(0), data.backend.Float(dr.inf)
         if self._net_loops:
             center = to_numpy(data.center).reshape(3).astype(np.float64)
@@ -539,11 +546,12 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         return nearest * data.size + data.center
 
     def parameters(self) -> tuple[Any, ...]:
+        """The loops that are Dr.Jit arrays, by whose vertices values can be differentiated."""
         return tuple(loop for loop in self._differentiable_loops if _is_drjit(loop))
 
     def differentiable_value(self, p: Vec3) -> Real:
-        """f at p as an expression that Dr.Jit can differentiate by p and by the vertices of
-        loops."""
+        """f at points p, modulo 4 pi, as an expression that Dr.Jit can differentiate by p and by
+        the vertices of loops."""
         backend = backend_of(p)
         # If vertices can move one by one, all edges are summed: after a move they may not cancel.
         loops = self._differentiable_loops or self._net_loops
@@ -551,15 +559,16 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         data = self._data_for(p)
         if data.circles is None:
             return angle
-        # To first order in p, as reverse mode cannot pass a recorded loop.
+        # The part of the circles, to first order in p: reverse mode cannot pass a recorded loop.
+        # Its value is right, as q has the coordinates of p.
         with dr.suspend_grad():
             q = dr.detach(p)
             sums = data.circles.sums(data.to_unit(q))
         return angle + sums.angle + dr.dot(sums.gradient / data.size, p - q)
 
     def continuous_change(self, p: FloatArray, q: FloatArray) -> FloatArray | None:
-        """The change (n,) of the solid angle, followed continuously along the segments from points
-        p (n, 3) to q (n, 3). None if there are circles."""
+        """The change (n,) of the solid angle along the segments from points p (n, 3) to q (n, 3),
+        followed continuously, so that it may exceed 4 pi. None if there are circles."""
         if self._net_circles:
             return None
         backend = choose_backend("double")
@@ -569,7 +578,8 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         edges = data.edges
 
         def changes(start: Vec3, end: Vec3) -> tuple[Real]:
-            """The change of the solid angle from start to end, in user coordinates."""
+            """The change of the solid angle along the segment from start to end, which are in user
+            coordinates."""
             return (continuous_change(edges, data.to_unit(start), data.to_unit(end)),)
 
         return map_batches(backend, changes, p, q)[0]

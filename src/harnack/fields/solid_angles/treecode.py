@@ -102,6 +102,7 @@ def traverse_clusters(
     def visit(node: VisitedNode, state: State) -> tuple[Mask, State]:
         """Add the node on lanes on which it is far; on other lanes, add its primitives if it is a
         leaf. Returns the mask of the lanes on which the walk enters the node, and the new state."""
+        # A record begins with the center and the accepting distance.
         r = x - vector(*node.head[:3])
         square = dr.squared_norm(r) + height_square
         is_far = square > dr.square(node.head[3] * closer)

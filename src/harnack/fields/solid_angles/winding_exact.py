@@ -80,6 +80,7 @@ class ExactWinding:
         if not len(mesh.singular_edges):
             return cls(backend, rays, None, None, None, None, final_rounding(backend))
         vertices, edges = mesh.unit_vertices, mesh.singular_edges
+        # The same edges in three forms: for values, fast values, and samples along rays.
         ray_trails, loops = None, None
         if traced:
             trails = closed_trails(edges)
@@ -161,10 +162,12 @@ class ExactWinding:
         """
         del behind, detail
         if self.edges is None:
+            # A closed mesh: w is constant on the interval.
             zero = self.backend.Array3f(0)
             return Sample(self.backend.Float(turns), zero, (Lipschitz(0.0),), 0.0)
         if self.ray_trails is None or self.loops is None:
             raise RuntimeError("uploaded for points and not for rays")
+        # 4 pi w: the solid angles of edges, and 4 pi for each crossing ahead.
         sums = self.ray_trails.sum(frame, x, active)
         sums = sums.add_term(SourceTerm(4 * math.pi * turns), True)
         unit = fmax(coordinate_rounding(frame.o), coordinate_rounding(x))

@@ -72,6 +72,7 @@ class WindingMesh:
         """
         x, f = validate_mesh(vertices, faces)
         welded = Welded.of(x, f)
+        # The faces that are left after copies and reversed copies have been added up.
         net = welded.net
         if len(net.faces) == 0:
             raise MeshError("faces: every face is canceled by its own copy turned round")

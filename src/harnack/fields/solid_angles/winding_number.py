@@ -110,6 +110,7 @@ class WindingModuloOne(Field):
     has_variable_accuracy = True
 
     def __init__(self, winding: ModuloOneEvaluable) -> None:
+        """The parameter is described at the class."""
         self._winding = winding
 
     def prepare(self, backend: Backend) -> Self:
@@ -284,6 +285,8 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         order: int = 2,
         cells: bool | float | None = None,
     ) -> None:
+        """Validate the mesh and the options, and choose the method. The parameters are described at
+        the class."""
         super().__init__()
         if not is_one_of(method, ("auto", "exact", "tree")):
             hint = did_you_mean(method, ("auto", "exact", "tree"))
@@ -298,6 +301,7 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         )
         self.accuracy, self.order = accuracy, order
         self.configure_cells(cells)
+        # What is computed once for a tuple of levels.
         self._extents: TransientCache[tuple[float, ...], Volume | None] = TransientCache()
         self._occupied: TransientCache[tuple[float, ...], OccupancyGrid] = TransientCache()
         self._own_levels: TransientCache[tuple[float, ...], bool] = TransientCache()
