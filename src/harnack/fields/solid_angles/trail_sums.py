@@ -412,7 +412,8 @@ class TrailValues:
         def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
             """The products and margins of all points, which `state` holds, with the edges of the
             record `row` added."""
-            # Column 15 is the number of edges of the record, behind five vertices. Edges that pad a record lead from a vertex to itself: they are never uncertain.
+            # Column 15, behind five vertices, is the number of edges that are no padding. Padding
+            # leads from a vertex to itself: it is never uncertain.
             slacks = [dr.select(row[15] > k, slack, 1) for k in range(_EDGES_PER_RECORD)]
             pairs = zip(points, state, strict=True)
             return tuple(
