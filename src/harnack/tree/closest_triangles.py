@@ -100,12 +100,14 @@ class BoxTree:
             t, n = fmax(near, start), index(fmax(row[_BOX_NUMBER_COLUMN], real(0)))
             is_after = (t > t_after) | ((t == t_after) & (n > n_after))
             is_before_best = (t < best) | ((t == best) & (n < number))
-            entered = (near <= far) & (far >= start) & (t <= end) & (row[_BOX_NUMBER_COLUMN] >= 0)
-            chosen = active & entered & is_after & is_before_best
+            is_entered = (
+                (near <= far) & (far >= start) & (t <= end) & (row[_BOX_NUMBER_COLUMN] >= 0)
+            )
+            is_chosen = active & is_entered & is_after & is_before_best
             return (
-                dr.select(chosen, t, best),
-                dr.select(chosen, far, leave),
-                dr.select(chosen, n, number),
+                dr.select(is_chosen, t, best),
+                dr.select(is_chosen, far, leave),
+                dr.select(is_chosen, n, number),
             )
 
         # The best box so far: where the ray enters and leaves it, and its number.
@@ -233,19 +235,19 @@ def squared_distance_in_nearby_leaf(tree: PackedTree, x: Vec3, column: int) -> R
         head = tree.head(i)
         middle = 0.5 * (vector(*head[:3]) + vector(*head[3:6]))
         square = dr.squared_norm(middle - x)
-        nearer, following = square < best, index(head[6])
-        best = dr.select(nearer, square, best)
+        is_nearer, following = square < best, index(head[6])
+        best = dr.select(is_nearer, square, best)
         # The index of the leaf, or of the first child.
         is_leaf, number = head[7] >= 0, index(dr.abs(head[7]))
         # For the nearest sibling so far: its leaf if it is a leaf, or its first child and the end
         # of its children.
-        nearest_leaf = dr.select(nearer, dr.select(is_leaf, number, NO_TRIANGLE), nearest_leaf)
-        first = dr.select(nearer, number, first)
-        after = dr.select(nearer, following, after)
+        nearest_leaf = dr.select(is_nearer, dr.select(is_leaf, number, NO_TRIANGLE), nearest_leaf)
+        first = dr.select(is_nearer, number, first)
+        after = dr.select(is_nearer, following, after)
         is_last = following == end
-        down = is_last & (nearest_leaf == NO_TRIANGLE)
-        i = dr.select(down, first, following)
-        end, best = dr.select(down, after, end), dr.select(down, dr.inf, best)
+        goes_down = is_last & (nearest_leaf == NO_TRIANGLE)
+        i = dr.select(goes_down, first, following)
+        end, best = dr.select(goes_down, after, end), dr.select(goes_down, dr.inf, best)
         return i, end, best, first, after, nearest_leaf
 
     def is_running(i: Any, end: Any, *state: Any) -> Mask:
@@ -302,13 +304,13 @@ def next_closest_triangle(
         square, n = point.squared_distance, index(fmax(row[NUMBER_COLUMN], real(0)))
         is_after = (square > square_after) | ((square == square_after) & (n > number_after))
         is_before_best = (square < best) | ((square == best) & (n < number))
-        chosen = active & is_after & is_before_best & (row[NUMBER_COLUMN] >= 0)
+        is_chosen = active & is_after & is_before_best & (row[NUMBER_COLUMN] >= 0)
         return (
-            dr.select(chosen, square, best),
-            dr.select(chosen, n, number),
-            dr.select(chosen, point.offset, offset),
-            dr.select(chosen, normal_of(row, vector), normal),
-            dr.select(chosen, point.is_inner, is_inner),
+            dr.select(is_chosen, square, best),
+            dr.select(is_chosen, n, number),
+            dr.select(is_chosen, point.offset, offset),
+            dr.select(is_chosen, normal_of(row, vector), normal),
+            dr.select(is_chosen, point.is_inner, is_inner),
         )
 
     # The best triangle so far: squared distance, number, offset, normal, and `is_inner`.
@@ -404,26 +406,28 @@ class ClosestPointOnTriangle:
         is_pr_longest = (squares[2] > squares[0]) & (squares[2] >= squares[1])
         is_qr_longest = ~is_pr_longest & (squares[1] > squares[0])
 
-        def chosen(of_pq: Any, of_qr: Any, of_pr: Any) -> Any:
+        def of_longest(of_pq: Any, of_qr: Any, of_pr: Any) -> Any:
             """Select the number or vector of the longest edge, from the three that belong to the
             edges pq, qr and pr."""
             return dr.select(is_pr_longest, of_pr, dr.select(is_qr_longest, of_qr, of_pq))
 
         a, e, inverse = (
-            chosen(p, q, p),
-            chosen(pq, qr, pr),
-            chosen(inverse_pq, inverse_qr, inverse_pr),
+            of_longest(p, q, p),
+            of_longest(pq, qr, pr),
+            of_longest(inverse_pq, inverse_qr, inverse_pr),
         )
         # x is a + alpha e + away, and the corner opposite to the edge a + beta e + h.
         alpha, away = _project_on_edge(-a, e, inverse)
-        beta, h = _project_on_edge(chosen(r, p, q) - a, e, inverse)
+        beta, h = _project_on_edge(of_longest(r, p, q) - a, e, inverse)
         s = dr.dot(away, h) / dr.squared_norm(h)  # NaN for a triangle without an area: not inside
-        inside = (s >= 0) & (s <= 1) & (alpha >= s * beta) & (1 - alpha >= s * (1 - beta))
+        is_inside = (s >= 0) & (s <= 1) & (alpha >= s * beta) & (1 - alpha >= s * (1 - beta))
         # From x to the closest point of the plane.
         across = dr.fma(vector(s), h, -away)
         square = dr.squared_norm(across)
-        inside &= square < best
-        return cls(dr.select(inside, square, best), dr.select(inside, across, offset), inside)
+        is_inside &= square < best
+        return cls(
+            dr.select(is_inside, square, best), dr.select(is_inside, across, offset), is_inside
+        )
 
 
 def _project_on_edge(v: Vec3, e: Vec3, inverse: Real) -> tuple[Real, Vec3]:
@@ -477,11 +481,11 @@ def jump_sum_within(triangles: TriangleTree, x: Vec3, distance: Real, active: Ma
 
     def add(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
         """Add the jump across the triangle in the record `row`, if it is within the distance."""
-        within = (
+        is_within = (
             active
             & (row[NUMBER_COLUMN] >= 0)
             & (ClosestPointOnTriangle.of(row, x).squared_distance <= square)
         )
-        return (state[0] + dr.select(within, dr.abs(row[PARITY_COLUMN]), 0),)
+        return (state[0] + dr.select(is_within, dr.abs(row[PARITY_COLUMN]), 0),)
 
     return traverse(triangles.tree, visit, (real(0),), active)[0]

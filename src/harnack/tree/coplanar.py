@@ -163,9 +163,9 @@ def overlapping_faces(
         ids = upload_integers(backend, searching)
         partners = _next_in_plane(tree, ends, ids, sizes, backend.Float(after))
         number = to_numpy(partners).astype(np.int64)
-        hit = number != NO_TRIANGLE
-        searching, after = searching[hit], number[hit].astype(np.float64)
-        batches.append(np.column_stack([searching, number[hit]]))
+        is_found = number != NO_TRIANGLE
+        searching, after = searching[is_found], number[is_found].astype(np.float64)
+        batches.append(np.column_stack([searching, number[is_found]]))
     if not batches:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
     pairs = np.concatenate(batches)
@@ -204,9 +204,9 @@ def _next_in_plane(
         other_corners = corners_of(row, vector)
         other_size = dr.gather(real, sizes, number, active)
         is_larger = (other_size > size) | ((other_size == size) & (number > face))
-        chosen = active & (row[NUMBER_COLUMN] > after) & (number < state[0]) & is_larger
-        chosen &= _in_plane(corners, other_corners) & _overlap(corners, other_corners)
-        return (dr.select(chosen, number, state[0]),)
+        is_chosen = active & (row[NUMBER_COLUMN] > after) & (number < state[0]) & is_larger
+        is_chosen &= _in_plane(corners, other_corners) & _overlap(corners, other_corners)
+        return (dr.select(is_chosen, number, state[0]),)
 
     # The state is the lowest number so far.
     return traverse(tree.tree, visit, (index(NO_TRIANGLE),))[0]
@@ -235,8 +235,8 @@ def _in_plane(ours: tuple[Vec3, ...], theirs: tuple[Vec3, ...]) -> Mask:
     def lies_in(corners: tuple[Vec3, ...], plane: tuple[Vec3, ...]) -> Mask:
         """Whether three corners lie in the plane of a triangle; False if that has no normal."""
         normal = _normal(plane)
-        near = [dr.abs(dr.dot(normal, p - plane[0])) <= _IN_PLANE for p in corners]
-        return near[0] & near[1] & near[2] & (dr.squared_norm(normal) > 0.5)
+        is_near = [dr.abs(dr.dot(normal, p - plane[0])) <= _IN_PLANE for p in corners]
+        return is_near[0] & is_near[1] & is_near[2] & (dr.squared_norm(normal) > 0.5)
 
     return lies_in(ours, theirs) | lies_in(theirs, ours)
 

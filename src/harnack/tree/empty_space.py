@@ -176,9 +176,9 @@ def refine_cells(
         if 8 * len(cells.corners) > max_cells_per_round:
             break
         split = cells.octants()
-        free = split.is_proved_empty(clearance, margin)
-        cells = split.subset(~free)
-        empty.append(split.subset(free))
+        is_empty = split.is_proved_empty(clearance, margin)
+        cells = split.subset(~is_empty)
+        empty.append(split.subset(is_empty))
     return RefinedCells(cells, tuple(empty))
 
 
@@ -290,10 +290,10 @@ class EmptySpaceGrid:
             """A length, at least s, up to which the path from p + s d on stays in empty cells; and
             a mask of whether the cell at p + s d is empty. If it is not, the length is s."""
             cell = self.cell(dr.fma(type(p)(s), d, p))
-            free = cell.empty_distance
+            free_cells = cell.empty_distance
             return dr.select(
-                free > 0, s + cell.exit_distance(d, self.backend.Float(free)), s
-            ), free > 0
+                free_cells > 0, s + cell.exit_distance(d, self.backend.Float(free_cells)), s
+            ), free_cells > 0
 
         def body(s: Real, active: Mask) -> tuple[Real, Mask]:
             """Extend s on active lanes; they stay active while cells are empty and s < length."""
@@ -366,11 +366,11 @@ class GridCell:
         for k in range(3):
             # The planes of the cube across this axis; the path leaves through one of them.
             upper, lower = self.corner[k] + reach, self.corner[k] + 1 - reach
-            rising = d[k] > 0
+            is_rising = d[k] > 0
             gap = dr.select(
-                rising, upper - self.cell_coordinates[k], self.cell_coordinates[k] - lower
+                is_rising, upper - self.cell_coordinates[k], self.cell_coordinates[k] - lower
             )
-            is_grid_end = dr.select(rising, upper >= self.grid.shape[k], lower <= 0)
+            is_grid_end = dr.select(is_rising, upper >= self.grid.shape[k], lower <= 0)
             distance = (gap + margin) / dr.abs(d[k])
             length = fmin(dr.select(is_grid_end | (d[k] == 0), dr.inf, distance), length)
         return length * self.grid.cell_size
@@ -438,10 +438,10 @@ class OccupancyGrid(GridData):
         roots = roots.subset(~roots.is_proved_empty(clearance, _MARGIN))
         cells = refine_cells(roots, clearance, np.iinfo(np.int64).max, _ROUNDS, _MARGIN).occupied
         nx, ny, nz = (count << _ROUNDS for count in (nx, ny, nz))
-        empty = np.ones((nz, ny, nx), np.bool_)
+        is_empty = np.ones((nz, ny, nx), np.bool_)
         x, y, z = np.round((cells.corners - origin) / cell).astype(np.int64).T
-        empty[z, y, x] = False
-        return cls(origin, cell, (nx, ny, nz), distance_to_occupied(empty))
+        is_empty[z, y, x] = False
+        return cls(origin, cell, (nx, ny, nz), distance_to_occupied(is_empty))
 
     @classmethod
     def empty(cls) -> OccupancyGrid:
@@ -461,14 +461,16 @@ class OccupancyGrid(GridData):
         clearance: gives proved lower bounds of the distances of points from the set.
         """
         x, y, z = self.shape
-        full = (self.empty_distance == 0).reshape(z, y, x)
-        indices = np.argwhere(full)[:, ::-1]
+        is_occupied = (self.empty_distance == 0).reshape(z, y, x)
+        indices = np.argwhere(is_occupied)[:, ::-1]
         halves = BoxCells(
             self.origin + self.cell_size * indices, np.full(3, self.cell_size)
         ).octants()
         # Margins are fractions of the size, here of half a cell.
-        full[full] = ~halves.is_proved_empty(clearance, 2 * _MARGIN).reshape(-1, 8).all(axis=1)
-        return replace(self, empty_distance=distance_to_occupied(~full))
+        is_occupied[is_occupied] = ~halves.is_proved_empty(clearance, 2 * _MARGIN).reshape(
+            -1, 8
+        ).all(axis=1)
+        return replace(self, empty_distance=distance_to_occupied(~is_occupied))
 
     def upload(self, backend: Backend) -> EmptySpaceGrid:
         """The grid on a backend, for rays."""
@@ -506,14 +508,14 @@ def largest_connected_component(cells: OccupancyGrid) -> OccupancyGrid:
     group. The margin of a cell that was empty before contains nothing of the set at all.
     """
     x, y, z = cells.shape
-    full = (cells.empty_distance == 0).reshape(z, y, x)
-    if not full.any():
+    is_occupied = (cells.empty_distance == 0).reshape(z, y, x)
+    if not is_occupied.any():
         return cells
     from scipy import ndimage  # imported here: it takes a third of a second
 
     # groups: 0 for empty cells, else the number of the group, from 1 on.
-    groups, count = cast("Any", ndimage).label(full, _NEIGHBOR_STENCIL)
-    group, indices = groups[full], np.argwhere(full)
+    groups, count = cast("Any", ndimage).label(is_occupied, _NEIGHBOR_STENCIL)
+    group, indices = groups[is_occupied], np.argwhere(is_occupied)
     sizes = sum(_projection_sizes(group, np.delete(indices, axis, 1), count) for axis in range(3))
     chosen = groups == 1 + int(np.argmax(sizes))
     return replace(cells, empty_distance=distance_to_occupied(~chosen))

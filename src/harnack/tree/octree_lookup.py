@@ -105,8 +105,8 @@ class OctreeLookup:
         """
         index, integer = self.backend.UInt32, self.backend.Int32
         position = (x - self.lower_corner) * self.cells_per_length
-        inside = dr.all((position >= 0) & (position < float(2**MAX_DEPTH)))
-        ix, iy, iz = (index(dr.select(inside, position[k], 0)) for k in range(3))
+        is_inside = dr.all((position >= 0) & (position < float(2**MAX_DEPTH)))
+        ix, iy, iz = (index(dr.select(is_inside, position[k], 0)) for k in range(3))
         # Integer coordinates in cells of the greatest depth. Their upper bits give the cell of the
         # uniform grid, the other `down` bits one octant for each further depth.
         down = MAX_DEPTH - _TOP_DEPTH
@@ -124,7 +124,7 @@ class OctreeLookup:
 
         node = dr.gather(integer, self.top_grid, first)
         node, _ = dr.while_loop((node, index(down - 1) + 0 * ix), is_inner, step, label="cell")
-        return index(-1 - node), inside
+        return index(-1 - node), is_inside
 
 
 def _build_top_grid(encoded_root: int, nodes: IntArray) -> IntArray:

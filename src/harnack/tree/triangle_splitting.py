@@ -64,17 +64,17 @@ def split_intersecting_faces(
     if not len(cut) + len(covered):
         return corners, np.arange(len(faces))
     cut, knives = np.concatenate([cut, covered]), np.concatenate([corners[by], borders])
-    uncut = np.ones(len(faces), np.bool_)
-    uncut[cut] = False
+    is_uncut = np.ones(len(faces), np.bool_)
+    is_uncut[cut] = False
     # The number of each face among those that are cut.
-    number = np.cumsum(~uncut) - 1
-    pieces, owner = _cut_up(corners[~uncut], number[cut], knives)
+    number = np.cumsum(~is_uncut) - 1
+    pieces, owner = _cut_up(corners[~is_uncut], number[cut], knives)
     edges = pieces - np.roll(pieces, 1, axis=1)
     longest = np.linalg.norm(edges, axis=2).max(axis=1)
     # Twice the area, against the is_thickness times the longest edge.
     is_thick = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) > _MIN_THICKNESS * longest
-    owner = np.concatenate([np.flatnonzero(uncut), np.flatnonzero(~uncut)[owner[is_thick]]])
-    return np.concatenate([corners[uncut], pieces[is_thick]]), owner
+    owner = np.concatenate([np.flatnonzero(is_uncut), np.flatnonzero(~is_uncut)[owner[is_thick]]])
+    return np.concatenate([corners[is_uncut], pieces[is_thick]]), owner
 
 
 def separates_levels(
@@ -195,9 +195,9 @@ def _crossings_of_edges(
         after = backend.Float(after_t[searching]), upload_integers(backend, after_n[searching])
         t, n = _next_foreign_crossing(tree, corner, frame, (p, q), end, after)
         number = to_numpy(n).astype(np.int64)
-        hit = number != NO_TRIANGLE
+        is_found = number != NO_TRIANGLE
         after_t[searching], after_n[searching] = to_numpy(t), number
-        searching, number = searching[hit], number[hit]
+        searching, number = searching[is_found], number[is_found]
         batches.append((searching, number))
     return np.concatenate([ids for ids, _ in batches]), np.concatenate([ids for _, ids in batches])
 
@@ -258,9 +258,11 @@ def _cut_up(pieces: FloatArray, rows: IntArray, knives: FloatArray) -> tuple[Flo
     while True:
         height = _heights(pieces[rows], knives[knife])
         height[np.abs(height) < _COINCIDENT] = 0
-        meets = (height.max(axis=1) > 0) & (height.min(axis=1) < 0)
-        meets[meets] = _cut_meets_triangle(pieces[rows[meets]], height[meets], knives[knife[meets]])
-        rows, knife, height = rows[meets], knife[meets], height[meets]
+        is_met = (height.max(axis=1) > 0) & (height.min(axis=1) < 0)
+        is_met[is_met] = _cut_meets_triangle(
+            pieces[rows[is_met]], height[is_met], knives[knife[is_met]]
+        )
+        rows, knife, height = rows[is_met], knife[is_met], height[is_met]
         # Pieces that no knife meets are done.
         is_cut = np.zeros(len(pieces), np.bool_)
         is_cut[rows] = True
@@ -273,13 +275,13 @@ def _cut_up(pieces: FloatArray, rows: IntArray, knives: FloatArray) -> tuple[Flo
         rows, knife, height = rows[order], knife[order], height[order]
         owner, first, count = np.unique(rows, return_index=True, return_counts=True)
         middle = first + count // 2
-        remaining = np.ones(len(rows), np.bool_)
-        remaining[middle] = False
+        is_left = np.ones(len(rows), np.bool_)
+        is_left[middle] = False
         pieces, source = _pieces_at_plane(pieces[owner], height[middle]), np.tile(source[owner], 3)
         # The other knives of a piece are tried on its three new pieces, which are len(owner) apart.
-        targets = np.searchsorted(owner, rows[remaining])
+        targets = np.searchsorted(owner, rows[is_left])
         rows = (targets[:, None] + len(owner) * np.arange(3)).ravel()
-        knife = np.repeat(knife[remaining], 3)
+        knife = np.repeat(knife[is_left], 3)
 
 
 def _pieces_at_plane(pieces: FloatArray, heights: FloatArray) -> FloatArray:
@@ -334,8 +336,8 @@ def _cut_meets_triangle(pieces: FloatArray, heights: FloatArray, knives: FloatAr
     ends: list[FloatArray] = []
     for i, j in ((0, 1), (1, 2), (2, 0)):
         hi, hj = heights[:, i], heights[:, j]
-        crosses = (hi * hj < 0) | ((hi == 0) ^ (hj == 0))
-        fraction = np.where(crosses, hi / np.where(crosses, hi - hj, 1), np.nan)
+        is_crossed = (hi * hj < 0) | ((hi == 0) ^ (hj == 0))
+        fraction = np.where(is_crossed, hi / np.where(is_crossed, hi - hj, 1), np.nan)
         ends.append(pieces[:, i] + fraction[:, None] * (pieces[:, j] - pieces[:, i]))
     low, high = np.zeros(len(pieces)), np.ones(len(pieces))
     points = np.stack(ends, axis=1)

@@ -59,11 +59,11 @@ def triangle_records(vertices: FloatArray, faces: IntArray) -> FloatArray:
     """
     order = np.argsort(faces, axis=1, kind="stable")
     corners = vertices[np.take_along_axis(faces, order, axis=1)]
-    even = np.isin(order @ np.array([9, 3, 1]), (5, 15, 19))  # 012, 120, 201 in base three
+    is_even = np.isin(order @ np.array([9, 3, 1]), (5, 15, 19))  # 012, 120, 201 in base three
     edges = corners[:, [1, 2, 2]] - corners[:, [0, 1, 0]]
     square = (edges * edges).sum(axis=2)
     inverse = np.where(square > 0, 1 / np.where(square > 0, square, 1), 0)
-    parity = np.where(even, 1.0, -1.0)[:, None]
+    parity = np.where(is_even, 1.0, -1.0)[:, None]
     number = np.arange(len(faces), dtype=np.float64)[:, None]
     return np.concatenate([corners.reshape(-1, 9), parity, number, inverse], axis=1)
 
@@ -72,12 +72,12 @@ def records_in_slots(tree: BalancedTree, records: FloatArray) -> FloatArray:
     """Arrange records (m, c) of triangles by the slots of a tree: (leaves, leaf_size, c). An empty
     slot gets a triangle without an area, at the first corner of the leaf, with the number -1."""
     placed = tree.values_in_slots(records)
-    empty = tree.leaf_slots < 0
+    is_empty = tree.leaf_slots < 0
     # Three times the first corner of each leaf's first triangle.
     first_corners = np.tile(placed[:, 0, :3], 3)
-    placed[empty, :9] = np.broadcast_to(first_corners[:, None], (*empty.shape, 9))[empty]
-    placed[empty, PARITY_COLUMN], placed[empty, NUMBER_COLUMN] = 1.0, -1.0
-    placed[empty, INVERSE_SQUARES_COLUMN : INVERSE_SQUARES_COLUMN + 3] = 0.0
+    placed[is_empty, :9] = np.broadcast_to(first_corners[:, None], (*is_empty.shape, 9))[is_empty]
+    placed[is_empty, PARITY_COLUMN], placed[is_empty, NUMBER_COLUMN] = 1.0, -1.0
+    placed[is_empty, INVERSE_SQUARES_COLUMN : INVERSE_SQUARES_COLUMN + 3] = 0.0
     return placed
 
 
@@ -279,16 +279,16 @@ class TriangleTree:
             n = index(fmax(row[NUMBER_COLUMN], real(0)))
             is_after = (t > t_after) | ((t == t_after) & (n > n_after) & (n_after != NO_TRIANGLE))
             is_before_best = (t < best) | ((t == best) & (n < number))
-            passed = new_sign != 0
+            is_crossed = new_sign != 0
             if reach > 0:
-                within = (t > 2 * reach) & (t < t_max - 2 * reach)
-                passed |= within & _is_beside(row, frame, reach)
-            chosen = active & passed & is_after & is_before_best & (t <= t_max)
+                is_off_ends = (t > 2 * reach) & (t < t_max - 2 * reach)
+                is_crossed |= is_off_ends & _is_beside(row, frame, reach)
+            is_chosen = active & is_crossed & is_after & is_before_best & (t <= t_max)
             return (
-                dr.select(chosen, t, best),
-                dr.select(chosen, n, number),
-                dr.select(chosen, new_sign, sign),
-                dr.select(chosen, normal_of(row, vector), normal),
+                dr.select(is_chosen, t, best),
+                dr.select(is_chosen, n, number),
+                dr.select(is_chosen, new_sign, sign),
+                dr.select(is_chosen, normal_of(row, vector), normal),
             )
 
         # The best crossing so far: t, number of the triangle, sign, and a normal of any length.
@@ -336,7 +336,7 @@ class TriangleTree:
         def add(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
             """Add the sign of the crossing with a record's triangle, if it is between 0 and `end`;
             and set the lane's mask to False if rounding may have decided whether it is."""
-            total, sure = state
+            total, is_sure = state
             t, sign = signed_crossing(row, frame)
             normal = normal_of(row, self.tree.backend.Array3f)
             # |normal| times the cosine, and times the error of t times the cosine.
@@ -345,12 +345,14 @@ class TriangleTree:
                 _UNCERTAIN_ROUNDINGS * unit * dr.norm(normal),
             )
             is_certain = (dr.abs(t) * steep > error) & (dr.abs(t - end) * steep > error)
-            between = active & (t > 0) & (t < end)
-            return total + dr.select(between, sign, 0), sure & (is_certain | (sign == 0) | ~active)
+            is_between = active & (t > 0) & (t < end)
+            return total + dr.select(is_between, sign, 0), is_sure & (
+                is_certain | (sign == 0) | ~active
+            )
 
         start = real(0), self.tree.backend.Bool(active)
-        total, sure = traverse(self.tree, visit, start, active)
-        return total, sure
+        total, is_sure = traverse(self.tree, visit, start, active)
+        return total, is_sure
 
     def signed_crossings_vertical(self, x: Vec3, way: Real, active: Mask = True) -> Real:
         """The sum of the signs of all crossings of rays from x along the z axis with triangles. The
@@ -362,7 +364,7 @@ class TriangleTree:
         Testing boxes takes less time than for other directions.
         """
         real = self.tree.backend.Float
-        up, height = way > 0, way * x.z
+        is_upward, height = way > 0, way * x.z
         pad = 4 * self.tree.backend.machine_epsilon * (1 + dr.max(dr.abs(x)))
         low_x, high_x, low_y, high_y = x.x - pad, x.x + pad, x.y - pad, x.y + pad
 
@@ -372,7 +374,7 @@ class TriangleTree:
             x0, y0, z0, x1, y1, z1 = node.head
             is_met = (
                 (high_x >= x0) & (low_x <= x1) & (high_y >= y0) & (low_y <= y1)
-                & (height - pad <= dr.select(up, z1, -z0))
+                & (height - pad <= dr.select(is_upward, z1, -z0))
             )  # fmt: skip
             return is_met, for_each_primitive(node, is_met & node.is_leaf, add, state)
 
@@ -451,7 +453,7 @@ def signed_crossing(row: list[Real], frame: RayFrame | VerticalRayFrame) -> tupl
     p, q, r = corners_of(row, vector)
     a, b, c = frame.transverse(p), frame.transverse(q), frame.transverse(r)
     ab, bc, ac = edge_function(a, b), edge_function(b, c), edge_function(a, c)
-    up_a, up_b, up_c = a[1] > 0, b[1] > 0, c[1] > 0
+    is_a_up, is_b_up, is_c_up = a[1] > 0, b[1] > 0, c[1] > 0
 
     def edge_sign(from_up: Mask, to_up: Mask, left: Real) -> Real:
         """How an edge crosses the half-line v = 0, u > 0: 1 upwards, -1 downwards, 0 if it does
@@ -466,7 +468,9 @@ def signed_crossing(row: list[Real], frame: RayFrame | VerticalRayFrame) -> tupl
 
     # The triangle runs a, b, c, a; its last edge is stored from a to c, hence the minus sign.
     sign = row[PARITY_COLUMN] * (
-        edge_sign(up_a, up_b, ab) + edge_sign(up_b, up_c, bc) - edge_sign(up_a, up_c, ac)
+        edge_sign(is_a_up, is_b_up, ab)
+        + edge_sign(is_b_up, is_c_up, bc)
+        - edge_sign(is_a_up, is_c_up, ac)
     )
     a, b, c = (*a, frame.depth(p)), (*b, frame.depth(q)), (*c, frame.depth(r))
     close = _EDGE_ROUNDINGS * float(dr.epsilon(frame.o)) * (1 + dr.max(dr.abs(frame.o)))

@@ -79,12 +79,12 @@ def lies_on_own_level(mesh: WindingMesh, level: float) -> bool:
     has_inner = is_inner.any()
     points = _spaced_rows(x[is_inner] if has_inner else corners.mean(axis=1), _MAX_TESTED)
     # In units in which the mesh has a size of one to two.
-    limit = 2 * _ON_SURFACE if has_inner else _ROUNDING
+    max_distance = 2 * _ON_SURFACE if has_inner else _ROUNDING
 
     def is_on(queries: FloatArray) -> BoolArray:
         """Whether points (k, 3) are on the surface: a mask (k,)."""
         gap, distance = _level_gaps(edges, queries, level)
-        return (distance if has_inner else gap) < limit
+        return (distance if has_inner else gap) < max_distance
 
     # One point alone rules out most meshes.
     if not is_on(points[:_TESTED_FIRST]).all() or np.mean(is_on(points)) < _REQUIRED_FRACTION:

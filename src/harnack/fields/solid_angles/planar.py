@@ -129,9 +129,9 @@ class _PlanarLoop:
         a, b = self.points - point, np.roll(self.points, -1, axis=0) - point
         # The numbers of edges that cross the ray from the point along the first axis upward and
         # downward differ if the point is inside.
-        upward, downward = (a[:, 1] <= 0) & (b[:, 1] > 0), (a[:, 1] > 0) & (b[:, 1] <= 0)
+        is_upward, is_downward = (a[:, 1] <= 0) & (b[:, 1] > 0), (a[:, 1] > 0) & (b[:, 1] <= 0)
         cross = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
-        return int((upward & (cross > 0)).sum()) != int((downward & (cross < 0)).sum())
+        return int((is_upward & (cross > 0)).sum()) != int((is_downward & (cross < 0)).sum())
 
     @property
     def some_point(self) -> FloatArray:

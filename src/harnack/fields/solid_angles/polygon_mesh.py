@@ -193,12 +193,12 @@ class FaceSolidAngle(Field):
         )
         # At the curve itself, up to rounding, f has all values: the gradient is so steep that the
         # point counts as close to any level.
-        on_curve = sums.distance <= 2 * rounding
+        is_on_curve = sums.distance <= 2 * rounding
         steep_gradient = backend.Array3f(0, 0, 4 * PERIOD / rounding)
-        gradient = dr.select(on_curve, steep_gradient, sums.gradient)
+        gradient = dr.select(is_on_curve, steep_gradient, sums.gradient)
         error = vertex_rounding(backend.machine_epsilon, x, sums.inverse_squares)
-        error = dr.select(on_curve, 0, error) + face.value_rounding
-        error = dr.select(on_curve, 8 * PERIOD, error)
+        error = dr.select(is_on_curve, 0, error) + face.value_rounding
+        error = dr.select(is_on_curve, 8 * PERIOD, error)
         ray_promises: tuple[Lipschitz, ...] = ()
         if direction is not None:
             line = RayLine(x, backend.Array3f(direction), rounding)
@@ -209,7 +209,7 @@ class FaceSolidAngle(Field):
                 return line_rates(face.edges, line, lengths, active)
 
             ray_promises = lipschitz_along(line, sums.gradient, sums.distance, rates)
-        value = dr.select(on_curve, 0, sums.angle)
+        value = dr.select(is_on_curve, 0, sums.angle)
         sample = Sample(
             value,
             gradient,

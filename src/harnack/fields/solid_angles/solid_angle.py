@@ -399,29 +399,29 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         # At the curve itself, up to rounding, f has all values (`remaining_edges`) and no gradient:
         # the sample has a gradient so steep that the point counts as close to any level. Anywhere
         # else NaN stays NaN, and the tracer accepts no such point.
-        on_curve = sums.distance <= 2 * rounding
+        is_on_curve = sums.distance <= 2 * rounding
         steep_gradient = data.backend.Array3f(0, 0, 4 * _PERIOD / rounding)
-        gradient = dr.select(on_curve, steep_gradient, sums.gradient)
+        gradient = dr.select(is_on_curve, steep_gradient, sums.gradient)
         gradient_error = errors.slope
-        truncation = dr.select(on_curve, 0, errors.value)
-        error = truncation + dr.select(on_curve, errors.rounding, value_rounding)
+        truncation = dr.select(is_on_curve, 0, errors.value)
+        error = truncation + dr.select(is_on_curve, errors.rounding, value_rounding)
         if sums.circles is not None:
             circles = sums.circles
             # Measured: 15 units in the last place of a circle's angle and 60 of its gradient (near
             # it, 10 elsewhere). Its position is rounded by a few units too.
             point_error = epsilon * (4 + 4 * dr.max(dr.abs(x)))
             value = 16 * epsilon * len(self._net_circles) + point_error * circles.inverse_squares
-            error = error + dr.select(on_curve, 0, value)
+            error = error + dr.select(is_on_curve, 0, value)
             circle_gradient_error = (
                 32 * epsilon * circles.inverse_squares + 1.5 * point_error * circles.inverse_cubes
             )
             gradient_error = gradient_error + circle_gradient_error
-        gradient_error = dr.select(on_curve, 0, gradient_error)
-        error = dr.select(on_curve, 8 * _PERIOD, error)  # the steep gradient times 2 rounding
+        gradient_error = dr.select(is_on_curve, 0, gradient_error)
+        error = dr.select(is_on_curve, 8 * _PERIOD, error)  # the steep gradient times 2 rounding
         ray_promises = _line_bounds(data, x, sums, errors, direction)
         if self.lift_bound_option == "paper":
             promises = (ball,)
-        value = dr.select(on_curve, 0, sums.angle)
+        value = dr.select(is_on_curve, 0, sums.angle)
         # All of this is in unit coordinates; `space_scaled` converts it to user coordinates.
         sample = Sample(
             value,
@@ -709,17 +709,17 @@ class _CurveData(UnitFrame):
         edges are summed. A larger accuracy scale is more accurate."""
         if self.cells is None or self.edges is None:
             return self.sums(x), CellErrors(0.0, 0.0, self.value_rounding)
-        cell_sums, in_cells = self.cells.sums(x, detail <= 1)
-        edge_sums = sum_over_edges(self.edges, x, ~in_cells)
+        cell_sums, is_in_cell = self.cells.sums(x, detail <= 1)
+        edge_sums = sum_over_edges(self.edges, x, ~is_in_cell)
         # Both objects have the same attributes, in the order of the parameters of `CurveSums`.
         pairs = zip(vars(cell_sums.sums).values(), vars(edge_sums).values(), strict=True)
-        sums = CurveSums(*(dr.select(in_cells, inner, outer) for inner, outer in pairs))
+        sums = CurveSums(*(dr.select(is_in_cell, inner, outer) for inner, outer in pairs))
         errors = CellErrors(
-            dr.select(in_cells, cell_sums.error, 0),
-            dr.select(in_cells, cell_sums.slope_error, 0),
-            dr.select(in_cells, cell_sums.rounding, self.value_rounding),
+            dr.select(is_in_cell, cell_sums.error, 0),
+            dr.select(is_in_cell, cell_sums.slope_error, 0),
+            dr.select(is_in_cell, cell_sums.rounding, self.value_rounding),
             cell_sums,
-            in_cells,
+            is_in_cell,
         )
         if self.circles is not None:
             circles = self.circles.sums(x)
@@ -744,10 +744,10 @@ class _CurveData(UnitFrame):
         assert self.edges is not None
         if self.cells is None or left_out.cell is None:
             return line_rates(self.edges, line, lengths, active)
-        inside = left_out.in_cells
+        is_in_cell = left_out.in_cells
         # Each call returns infinity on the lanes of the other one.
-        outside_rates = line_rates(self.edges, line, lengths, active & ~inside)
-        cell_rates = self.cells.rates_along(left_out.cell, line, lengths, active & inside)
+        outside_rates = line_rates(self.edges, line, lengths, active & ~is_in_cell)
+        cell_rates = self.cells.rates_along(left_out.cell, line, lengths, active & is_in_cell)
         return tuple(
             fmin(cell_rate, edge_rate)
             for cell_rate, edge_rate in zip(cell_rates, outside_rates, strict=True)
@@ -848,9 +848,14 @@ def _convex_ball(angle: Real, distance: Real, error: Real) -> HarmonicBall:
     branch = angle - principal
     # If rounding may have put the value on the wrong side of +-2 pi, its principal value may be one
     # period away, and the range grows by a period to that side.
-    extra = dr.select(dr.abs(principal) > 0.5 * _PERIOD - error, _PERIOD, 0)
-    below, above = (dr.select(principal < 0, extra, 0), dr.select(principal > 0, extra, 0))
-    return HarmonicBall(distance, branch - 1.5 * _PERIOD - below, branch + 1.5 * _PERIOD + above)
+    possible_shift = dr.select(dr.abs(principal) > 0.5 * _PERIOD - error, _PERIOD, 0)
+    shift_below, shift_above = (
+        dr.select(principal < 0, possible_shift, 0),
+        dr.select(principal > 0, possible_shift, 0),
+    )
+    return HarmonicBall(
+        distance, branch - 1.5 * _PERIOD - shift_below, branch + 1.5 * _PERIOD + shift_above
+    )
 
 
 def _line_bounds(

@@ -300,8 +300,8 @@ class _AngleProduct:
         y = dr.fma(self.x, factor[1], self.y * factor[0])
         # -1 if the sign of y changes, else 0. The number ANDed with it is -1 for a factor that
         # turns back, else 1.
-        changes = bits.sign(self.y) ^ bits.sign(y)
-        return _AngleProduct(x, y, self.half + (changes & (bits.sign(factor[1]) | 1)))
+        sign_change = bits.sign(self.y) ^ bits.sign(y)
+        return _AngleProduct(x, y, self.half + (sign_change & (bits.sign(factor[1]) | 1)))
 
     def times_product(self, bits: _FloatFormat, other: _AngleProduct) -> _AngleProduct:
         """The product of this product and another one. The sums theta of arguments are added. bits:

@@ -415,8 +415,8 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         values: w and its derivatives in unit coordinates, with error bounds.
         """
         # If a triangle is within rounding of x, it is not known on which side of it x is.
-        on_triangle = jump_sum_within(data.rays, x, _TRIANGLE_ROUNDINGS * coordinate_rounding(x))
-        values = dataclasses.replace(values, error=values.error + on_triangle)
+        possible_jump = jump_sum_within(data.rays, x, _TRIANGLE_ROUNDINGS * coordinate_rounding(x))
+        values = dataclasses.replace(values, error=values.error + possible_jump)
         weight = self.mesh.area / (4 * math.pi * self.mesh.size**2)
         return values.with_far_field_errors(x, 64 + len(self.mesh.singular_edges), weight).rescaled(
             data.size
