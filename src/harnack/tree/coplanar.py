@@ -67,11 +67,11 @@ def borders_of_overlaps(
     net = np.zeros(len(pair_keys), np.int64)
     np.add.at(net, pair_index.reshape(-1), sign)
     face, edge = np.divmod(pair_keys, len(unique_edges))
-    # How many faces of the mesh have the edge.
+    # How many faces of the mesh have the edge. Edges are looked up by a single integer each.
     ends, face_count = np.unique(_edges(faces)[0], axis=0, return_counts=True)
     width = len(vertices)
-    row = np.searchsorted(ends @ [width, 1], unique_edges[edge] @ [width, 1])
-    is_border = at_every_edge | (net != 0) | (count != face_count[row])
+    place_in_ends = np.searchsorted(ends @ [width, 1], unique_edges[edge] @ [width, 1])
+    is_border = at_every_edge | (net != 0) | (count != face_count[place_in_ends])
     face, edge = face[is_border], edge[is_border]
     p, q = np.moveaxis(vertices[unique_edges[edge]], 1, 0)
     normal, _ = _normals(vertices[faces[face]])

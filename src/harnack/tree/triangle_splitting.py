@@ -223,9 +223,13 @@ def _next_foreign_crossing(
         """Go to the next crossing; the lane stays active while its face has one of the two
         vertices."""
         t, n, _, _ = tree.next_crossing(frame, (t, n), end, active, _COINCIDENT)
-        hit = active & (n != NO_TRIANGLE)
-        corners = [dr.gather(index, vertex, n, hit) for vertex in corner]
-        return t, n, hit & dr.any([(vertex == ends[0]) | (vertex == ends[1]) for vertex in corners])
+        is_found = active & (n != NO_TRIANGLE)
+        corners = [dr.gather(index, vertex, n, is_found) for vertex in corner]
+        return (
+            t,
+            n,
+            is_found & dr.any([(vertex == ends[0]) | (vertex == ends[1]) for vertex in corners]),
+        )
 
     def is_running(t: Any, n: Any, active: Any) -> Any:
         """Whether a lane's crossing is with a face that has one of the two vertices."""

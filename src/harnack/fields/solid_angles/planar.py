@@ -80,6 +80,7 @@ class PlanarRegion:
         error: a bound of the error of the angle, in addition to its rounding.
         """
         turn = 2 * math.pi
+        # The principal value of f, in [-2 pi, 2 pi].
         f = angle - 2 * turn * dr.round(angle / (2 * turn))
         # Upper bounds of h and of h/d in the module's notation.
         height_bound = dr.abs(height) + slack

@@ -202,7 +202,7 @@ class RadialSums:
             are in the user's unit.
         """
         radii = [(fraction, fraction * least_distance) for fraction in _RADIUS_FRACTIONS]
-        # The remainder is at most half the bound of second derivatives times |y-x|^2.
+        # The constant of a `TaylorRemainder` is twice the bound of the remainder over |y-x|^2.
         return tuple(
             TaylorRemainder(2 * self.remainder(fraction, r, growth(r)) / (size * size), r * size)
             for fraction, r in radii
@@ -260,45 +260,44 @@ def combine_terms(
     radial: the numbers psi_0 to psi_(len(parts) + derivatives) at the distance D.
     derivatives: 0 for the value, 1 with the gradient, 2 with the Hessian.
 
-    Powers of 1/D are spread over the factors, so that no factor overflows. The module has the
-    formulas. In the code, `radial_part` is the sum of P_k psi_(k+1), `second_part` that of P_k
-    psi_(k+2), `gradient` that of grad P_k psi_k, `gradients` that of grad P_k psi_(k+1), and
-    `matrix` that of the Hessians times psi_k; all without the factor `scale` and without powers of
-    D.
+    The module has the formulas. They contain the same sums over k with psi_k, psi_(k+1) and
+    psi_(k+2); the latter two are called `next` and `after_next` in the code. The common factor
+    `scale` and powers of 1/D, which `parts` and `radial` leave out, are multiplied at the end, so
+    that no factor overflows.
     """
     vector = _type_of(z)
     theta, scale, u2 = radial.thetas, radial.scale, inverse * inverse
-    value, radial_part, second_part = 0.0, 0.0, 0.0
-    gradient, gradients, matrix = vector(0), vector(0), [0.0] * 6
+    value, next_value, after_next_value = 0.0, 0.0, 0.0
+    gradient, next_gradient, matrix = vector(0), vector(0), [0.0] * 6
     for k, part in enumerate(parts, start=1):
         value = dr.fma(theta[k], part.value, value)
         if derivatives == 0:
             continue
-        radial_part = dr.fma(theta[k + 1], part.value, radial_part)
+        next_value = dr.fma(theta[k + 1], part.value, next_value)
         gradient = dr.fma(vector(theta[k]), part.gradient, gradient)
         if derivatives == 2:
-            second_part = dr.fma(theta[k + 2], part.value, second_part)
-            gradients = dr.fma(vector(theta[k + 1]), part.gradient, gradients)
+            after_next_value = dr.fma(theta[k + 2], part.value, after_next_value)
+            next_gradient = dr.fma(vector(theta[k + 1]), part.gradient, next_gradient)
             if part.hessian is not None:
                 matrix = [dr.fma(theta[k], h, m) for h, m in zip(part.hessian, matrix, strict=True)]
     if derivatives == 0:
         return SourceTerm(scale * value)
-    radial_part = radial_part * u2
-    slope = scale * dr.fma(vector(radial_part), z, -gradient)
+    next_value = next_value * u2
+    slope = scale * dr.fma(vector(next_value), z, -gradient)
     if derivatives < 2:
         return SourceTerm(scale * value, slope, None)
     hessian = SymmetricMatrix(*(scale * m for m in matrix))
     # The outer product of this vector with z, made symmetric, gives the terms with z z^T and with
     # grad P z^T.
-    row = dr.fma(vector(second_part * u2), z, -2 * gradients)
-    hessian = hessian.add_outer_product((scale * u2) * row, z)
-    radial_part = scale * radial_part
+    left_factor = dr.fma(vector(after_next_value * u2), z, -2 * next_gradient)
+    hessian = hessian.add_outer_product((scale * u2) * left_factor, z)
+    next_value = scale * next_value
     # The term -P psi_(k+1) I.
     total = dataclasses.replace(
         hessian,
-        xx=hessian.xx - radial_part,
-        yy=hessian.yy - radial_part,
-        zz=hessian.zz - radial_part,
+        xx=hessian.xx - next_value,
+        yy=hessian.yy - next_value,
+        zz=hessian.zz - next_value,
     )
     return SourceTerm(scale * value, slope, total)
 

@@ -410,6 +410,9 @@ class Treecode:
             c, inverse = node.payload, node.inverse
             error = c[15] * self._decay(inverse)
             slope = error * inverse
+            # Its terms; where it is far; 1/r; the factor A + K/r^2 of the remainder; truncation
+            # errors of value, gradient and Hessian, the latter two without their constant ratios;
+            # the radius of a ball around x that is free of its sources; the rounding.
             sums = SourceSums.from_state(state[0]).add_far_node(
                 multipole_terms(c, node.r, inverse, derivatives),
                 node.far,
@@ -427,6 +430,7 @@ class Treecode:
             sums, extra_state = add(row, active, SourceSums.from_state(state[0]), state[1])
             return sums.to_state(), extra_state
 
+        # The distance that is taken to be free of sources if no node bounds it.
         no_source = _NO_SOURCE_DISTANCE * (1 + dr.max(dr.abs(x)))
         start = (SourceSums.zero(self.backend, no_source, derivatives).to_state(), extra_state)
         state = traverse_clusters(self.tree, x, closer, add_cluster, add_primitive, start, active)

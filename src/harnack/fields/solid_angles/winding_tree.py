@@ -312,6 +312,7 @@ class TreeWinding:
         them; `LiftedEdge.bounds` has their terms of the remainder.
         """
         del turns
+        # `unit` is the rounding of a coordinate.
         index, unit = (
             self.backend.UInt32,
             fmax(coordinate_rounding(frame.o), coordinate_rounding(x)),
