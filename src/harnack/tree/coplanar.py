@@ -1,6 +1,7 @@
 """Triangles of a mesh that overlap in the same plane, as where parts of a mesh touch; and the
 borders of the overlaps. A face is *covered* where other faces in its plane lie on it. To *cut* a
-face, it is divided by the plane of another triangle, a *knife*.
+face, it is divided by the plane of another triangle, a *knife*. A *lane* is one entry of Dr.Jit's
+arrays, here a face.
 
 Two such triangles do not pass through each other: no edge of either crosses the other. Yet the
 winding number beside one triangle changes along the border of the other.

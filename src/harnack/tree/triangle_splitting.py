@@ -1,7 +1,8 @@
 """Triangles of a mesh cut where they pass through each other, and the winding numbers of the mesh
 on both sides of a triangle. A *piece* is a triangle that remains of a cut face. A *knife* is a
 triangle along whose plane another one is cut. The *jump* across a triangle is the difference of the
-winding numbers on its two sides.
+winding numbers on its two sides. A *lane* is one entry of Dr.Jit's arrays, here an edge that is
+traced as a ray.
 
 The set of points whose winding number is above 1/2, for a closed mesh that crosses itself, is
 bounded by parts of the mesh's triangles. If each triangle is cut along all other triangles, every

@@ -2,7 +2,7 @@
 that kernels read; `row` is the record of one triangle: its corners, the *parity* (1, or -1 if the
 record reverses the face), the number of the triangle, and 1/length^2 of its edges. The *sign* of a
 crossing is 1 if the triangle's normal points along the ray, else -1. A ray is o + t d with |d| = 1,
-and t is the *depth* along it.
+and t is the *depth* along it. A *lane* is one entry of Dr.Jit's arrays, such as a ray.
 
 A record (16 numbers with padding) contains the corners in the order of their vertices' indices, so
 that an edge shared by two triangles has the same two ends in the same order in both: every decision

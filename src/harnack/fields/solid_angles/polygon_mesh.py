@@ -1,7 +1,8 @@
 """Meshes of polygons that need not be flat. A *face* is a polygon, perhaps with holes; f is the
 solid angle of its boundary curve, with period 4 pi. The *surface of a face* is the level set f = 2
 pi, which spans this curve. Faces are traced one by one; which face is meant may differ from lane to
-lane. *Unit coordinates* of a face have their origin at its center, and its radius is 1.
+lane. *Unit coordinates* of a face have their origin at its center, and its radius is 1. A *lane* is
+one entry of Dr.Jit's arrays, such as a point or a ray.
 
 - `PolygonMesh`: the field, with a patch for each face.
 - `FaceLoops`: the boundary curves of all faces on a backend; `FaceSolidAngle`: the solid angle of a

@@ -3,7 +3,11 @@ enclose on the unit sphere around a point, modulo 4 pi. "The curve" means all cl
 field together: polygons that need not be plane, and circles. They may have holes, knots, links or
 many turns. The *lift* of f is the continuous function near a point that equals f modulo 4 pi.
 *Promises* are proved bounds of the lift near a point, by which rays take steps that cannot miss a
-level set. In unit coordinates the curve has its center at 0 and a radius of 1."""
+level set. In unit coordinates the curve has its center at 0 and a radius of 1. In an *FMM cell*
+(fast multipole method) near edges are summed directly, and all others are replaced by one
+polynomial. A sample's *accuracy scale* is a number: larger is more accurate. A *lane* is one entry
+of Dr.Jit's arrays, such as a point or a ray; a *backend* is what Dr.Jit computes on, and in which
+precision."""
 
 from __future__ import annotations
 

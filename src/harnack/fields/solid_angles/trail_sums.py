@@ -4,7 +4,8 @@ the end of the one before, that ends at the vertex where it begins. The solid an
 together is known modulo 4 pi; the *factor* F_e of an edge is a complex number whose argument is
 half the solid angle Omega_e of the triangle from the edge to an apex at infinity (`edge_lift`). The
 sum of all Omega_e is a real number, not only known modulo 4 pi. A *record* is a row of numbers that
-kernels read, here of a few consecutive edges.
+kernels read, here of a few consecutive edges. A *lane* is one entry of Dr.Jit's arrays, such as a
+point or a ray.
 
 - `line_rates`: bounds of the change of a solid angle along a line, also along an edge.
 - `TrailValues`: the sum of all Omega_e at many points; values only, fast.

@@ -3,7 +3,8 @@ summed directly. A *source* is a dipole (an oriented point) or a triangle, one o
 primitives. A *node* of the tree stands for the cluster of all sources below it. Where a node is far
 from the point x, it counts as a single source, given by its moments. A *record* is a row of numbers
 that kernels read, for a node or a source. In a leaf every source has a *slot*; some slots are
-empty.
+empty. A *lane* is one entry of Dr.Jit's arrays, such as a point; each lane walks through the tree
+by itself.
 
 - `traverse_clusters`: a traversal of a tree that visits its far clusters.
 - `Treecode`: the sums over such a tree, shared by triangles and points. The caller adds the

@@ -2,7 +2,8 @@
 triangles, and from the boundary edges, at which triangles do not cancel. The signs of all crossings
 of the ray add up to an integer, and the solid angles of edges add the rest (`edge_lift` has the
 formula). A value at a point takes as long as one ray through a tree of boxes plus one pass over the
-boundary edges, whatever the number of triangles.
+boundary edges, whatever the number of triangles. A *lane* is one entry of Dr.Jit's arrays, such as
+a point or a ray.
 
 Winding numbers have two evaluators. `winding_exact` adds the crossings of one ray and the boundary
 edges (the antipodal method), without truncation. `winding_tree` uses multipoles, for triangle

@@ -3,7 +3,10 @@ Its level set w = 1/2 is the mesh where the mesh is sound; it closes holes, and 
 soups and overlaps. w jumps by an integer across each triangle. So w *modulo 1* (w minus an unknown
 integer) is smooth across triangles. It is determined by the *singular edges*, the edges at which
 triangles do not cancel. *Promises* are proved bounds of w near a point. In unit coordinates the
-mesh has a size of about one.
+mesh has a size of about one. A sample's *accuracy scale* is a number: larger is more accurate. In
+an *FMM cell* (fast multipole method) near edges or triangles are summed directly, and all others
+are replaced by one polynomial. A *lane* is one entry of Dr.Jit's arrays, such as a point or a ray;
+a *backend* is what Dr.Jit computes on, and in which precision.
 
 - `WindingNumber`: the field.
 - `winding_extent`, `winding_cells`: the volume and the cells that are proved to contain its level

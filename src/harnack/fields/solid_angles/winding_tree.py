@@ -3,7 +3,9 @@ replaced by multipole moments, and near triangles are summed exactly. By Stokes'
 of near triangles is that of the boundary of their union. So only their *open* edges are summed, at
 which near triangles do not cancel. An edge is *singular* if the triangles of the whole mesh do not
 cancel at it. A near triangle is given by its record, the row of numbers that describes it in the
-tree.
+tree. A node of the tree is *far* from a point if its distance is more than a certain multiple of
+its radius; triangles in no far node are *near*. A *lane* is one entry of Dr.Jit's arrays, such as a
+point or a ray.
 
 The method is that of Barill et al. 2018 ("Fast winding numbers for soups and clouds") with orders 0
 to 2, gradients and Hessians from the same moments, a bound of the truncation error, and proved
