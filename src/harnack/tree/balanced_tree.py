@@ -99,20 +99,20 @@ class BalancedTree:
         for arity in self.arities:
             below.append(arity * (1 + below[-1]))
         # The root has the index 0, its first child 1. From there, level by level downwards.
-        number, after = [np.zeros(1, np.int64)], [np.array([self.node_count], np.int64)]
-        first = [np.ones(1, np.int64)]
+        index, next_index = [np.zeros(1, np.int64)], [np.array([self.node_count], np.int64)]
+        first_child = [np.ones(1, np.int64)]
         for level, arity in reversed(list(enumerate(self.arities))):
             position = np.arange(arity)
-            child = first[0][:, None] + position
+            child = first_child[0][:, None] + position
             # After a child's subtree comes its next sibling; after the last, what follows its
             # parent's subtree.
-            following = np.where(position < arity - 1, child + 1, after[0][:, None])
-            start = first[0][:, None] + arity + position * below[level]
-            number.insert(0, child.reshape(-1))
-            after.insert(0, following.reshape(-1))
-            first.insert(0, start.reshape(-1))
-        first[0] = np.zeros_like(first[0])
-        return tuple(number), tuple(first), tuple(after)
+            after_child = np.where(position < arity - 1, child + 1, next_index[0][:, None])
+            child_of_child = first_child[0][:, None] + arity + position * below[level]
+            index.insert(0, child.reshape(-1))
+            next_index.insert(0, after_child.reshape(-1))
+            first_child.insert(0, child_of_child.reshape(-1))
+        first_child[0] = np.zeros_like(first_child[0])
+        return tuple(index), tuple(first_child), tuple(next_index)
 
     def values_in_slots(self, values: FloatArray, empty: float = 0.0) -> FloatArray:
         """Arrange values (n, ...) of the n primitives by the slots of leaves: (leaves, leaf_size,
@@ -142,17 +142,20 @@ def build_balanced_tree(points: FloatArray, *, leaf_size: int = 8, arity: int = 
     if arity not in (2, 4):
         raise ValueError(f"arity must be 2 or 4, not {arity}")
     # One row for each node: the indices of its points, and their coordinates (3, nodes, points).
-    rows = np.arange(len(points), dtype=np.int64)[None]
-    x = np.array(points.T, dtype=np.float64, order="C")[:, None]
+    point_ids = np.arange(len(points), dtype=np.int64)[None]
+    positions = np.array(points.T, dtype=np.float64, order="C")[:, None]
     depth = max(0, math.ceil(math.log2(len(points) / leaf_size)))
     remaining = depth
-    while remaining and rows.shape[1] > _POINTS_IN_CACHE:
-        rows, x = _split(rows, x)
+    while remaining and point_ids.shape[1] > _POINTS_IN_CACHE:
+        point_ids, positions = _split(point_ids, positions)
         remaining -= 1
-    at_once = max(1, _POINTS_IN_CACHE // rows.shape[1])
+    at_once = max(1, _POINTS_IN_CACHE // point_ids.shape[1])
     leaves: list[IntArray] = []
-    for start in range(0, len(rows), at_once):
-        batch, coordinates = rows[start : start + at_once], x[:, start : start + at_once]
+    for start in range(0, len(point_ids), at_once):
+        batch, coordinates = (
+            point_ids[start : start + at_once],
+            positions[:, start : start + at_once],
+        )
         for _ in range(remaining):
             batch, coordinates = _split(batch, coordinates)
         leaves.append(batch)
@@ -162,11 +165,11 @@ def build_balanced_tree(points: FloatArray, *, leaf_size: int = 8, arity: int = 
     return BalancedTree(slots, (4,) * (depth // 2) + (2,) * (depth % 2))
 
 
-def _split(rows: IntArray, positions: FloatArray) -> tuple[IntArray, FloatArray]:
+def _split(point_ids: IntArray, positions: FloatArray) -> tuple[IntArray, FloatArray]:
     """Split each of k nodes into two halves of its points, at the median along the longest side of
     the points' bounding box.
 
-    rows: (k, w) the indices of the points of each node, one node per row.
+    point_ids: (k, w) the indices of the points of each node, one node per row.
     positions: (3, k, w) the coordinates of these points.
 
     The last slot of a row may be empty: its index is NO_PRIMITIVE and its position NaN, which sorts
@@ -177,20 +180,22 @@ def _split(rows: IntArray, positions: FloatArray) -> tuple[IntArray, FloatArray]
         The indices (2k, ceil(w/2)) and the positions (3, 2k, ceil(w/2)) of the points of the
         halves; the two halves of a node follow each other.
     """
-    count, width = rows.shape
+    count, width = point_ids.shape
     half, middle = (width + 1) // 2, width // 2
     # The coordinate of each point along its node's longest side, and the order that splits it.
     key = positions[_box_sizes(positions).argmax(axis=0), np.arange(count)]
     order = cast("IntArray", np.argpartition(key, middle, axis=1))
-    short = np.flatnonzero(np.isnan(key[:, -1]))
-    at = (order[short] == width - 1).argmax(axis=1)  # the empty slot: somewhere on the right
+    short_rows = np.flatnonzero(np.isnan(key[:, -1]))
+    empty_slot = (order[short_rows] == width - 1).argmax(
+        axis=1
+    )  # the empty slot: somewhere on the right
     # Move the empty slot to the end of the row.
-    order[short, at], order[short, -1] = order[short, -1], width - 1
+    order[short_rows, empty_slot], order[short_rows, -1] = order[short_rows, -1], width - 1
     if width % 2:  # m points of 2m on either side, the empty slot on the left
-        order[short, -1], order[short, middle] = order[short, middle], width - 1
+        order[short_rows, -1], order[short_rows, middle] = order[short_rows, middle], width - 1
     # From places in a row to places in the flattened array.
-    order += np.arange(0, rows.size, width, dtype=np.int64)[:, None]
-    return _halves(rows, order, half, NO_PRIMITIVE), np.stack(
+    order += np.arange(0, point_ids.size, width, dtype=np.int64)[:, None]
+    return _halves(point_ids, order, half, NO_PRIMITIVE), np.stack(
         [_halves(coordinate, order, half, np.nan) for coordinate in positions]
     )
 
@@ -288,12 +293,12 @@ def pack_tree(
     heads = np.zeros((tree.node_count, PACKET), backend.dtype)
     payloads = np.zeros((tree.node_count, extra), backend.dtype)
     links = tree.node_links()
-    for number, first, after, values in zip(*links, levels, strict=True):
-        heads[number, :_CALLER_NUMBERS] = values[:, :_CALLER_NUMBERS]
-        heads[number, _CALLER_NUMBERS] = after
+    for index, first_child, next_index, values in zip(*links, levels, strict=True):
+        heads[index, :_CALLER_NUMBERS] = values[:, :_CALLER_NUMBERS]
+        heads[index, _CALLER_NUMBERS] = next_index
         # Minus the first child; for leaves it is replaced below.
-        heads[number, _CALLER_NUMBERS + 1] = -first
-        payloads[number] = values[:, _CALLER_NUMBERS:]
+        heads[index, _CALLER_NUMBERS + 1] = -first_child
+        payloads[index] = values[:, _CALLER_NUMBERS:]
     leaves = links[0][0]
     heads[leaves, _CALLER_NUMBERS + 1] = np.arange(len(leaves))
     return PackedTree(

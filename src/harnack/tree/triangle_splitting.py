@@ -68,8 +68,8 @@ def split_intersecting_faces(
     is_uncut = np.ones(len(faces), np.bool_)
     is_uncut[cut] = False
     # The number of each face among those that are cut.
-    number = np.cumsum(~is_uncut) - 1
-    pieces, owner = _cut_up(corners[~is_uncut], number[cut], knives)
+    place_among_cut = np.cumsum(~is_uncut) - 1
+    pieces, owner = _cut_up(corners[~is_uncut], place_among_cut[cut], knives)
     edges = pieces - np.roll(pieces, 1, axis=1)
     longest = np.linalg.norm(edges, axis=2).max(axis=1)
     # Twice the area, against the is_thickness times the longest edge.
@@ -154,8 +154,8 @@ def _crossing_faces(
     edge_start = np.searchsorted(np.sort(edge), np.arange(len(edges) + 1))
     crossed, crossing = _crossings_of_edges(tree, vertices, faces, edges)
     count = edge_start[crossed + 1] - edge_start[crossed]
-    rows = np.repeat(edge_start[crossed], count) + _ranks_in_groups(count)
-    passing, passed = faces_by_edge[rows], np.repeat(crossing, count)
+    places = np.repeat(edge_start[crossed], count) + _ranks_in_groups(count)
+    passing, passed = faces_by_edge[places], np.repeat(crossing, count)
     pairs = np.concatenate([np.column_stack([passing, passed]), np.column_stack([passed, passing])])
     pairs = np.unique(pairs[pairs[:, 0] != pairs[:, 1]], axis=0)
     return pairs[:, 0], pairs[:, 1]
@@ -241,12 +241,14 @@ def _next_foreign_crossing(
     return dr.while_loop(start, is_running, body, label="crossings of edges")[:2]
 
 
-def _cut_up(pieces: FloatArray, rows: IntArray, knives: FloatArray) -> tuple[FloatArray, IntArray]:
+def _cut_up(
+    pieces: FloatArray, piece_ids: IntArray, knives: FloatArray
+) -> tuple[FloatArray, IntArray]:
     """Cut triangles by the planes of other triangles, the knives.
 
     pieces: (n, 3, 3) the triangles that are cut.
-    rows: (k,) the index of the triangle that each knife cuts. A knife cuts only where its triangle,
-        not only its plane, meets the piece.
+    piece_ids: (k,) the index of the triangle that each knife cuts. A knife cuts only where its
+        triangle, not only its plane, meets the piece.
     knives: (k, 3, 3) the triangles whose planes cut them.
 
     In each round every piece is cut by one of the knives that meet it: the knife in the middle of
@@ -258,35 +260,39 @@ def _cut_up(pieces: FloatArray, rows: IntArray, knives: FloatArray) -> tuple[Flo
     """
     done: list[FloatArray] = []
     owners: list[IntArray] = []
-    # Pairs of a piece, rows[i], and a knife, knife[i]. source: the original triangle of each piece.
-    knife, source = np.arange(len(knives)), np.arange(len(pieces))
+    # Pairs of a piece, piece_ids[i], and a knife, knife_ids[i]. triangle_ids: the original triangle
+    # of each piece.
+    knife_ids, triangle_ids = np.arange(len(knives)), np.arange(len(pieces))
     while True:
-        height = _heights(pieces[rows], knives[knife])
+        height = _heights(pieces[piece_ids], knives[knife_ids])
         height[np.abs(height) < _COINCIDENT] = 0
         is_met = (height.max(axis=1) > 0) & (height.min(axis=1) < 0)
         is_met[is_met] = _cut_meets_triangle(
-            pieces[rows[is_met]], height[is_met], knives[knife[is_met]]
+            pieces[piece_ids[is_met]], height[is_met], knives[knife_ids[is_met]]
         )
-        rows, knife, height = rows[is_met], knife[is_met], height[is_met]
+        piece_ids, knife_ids, height = piece_ids[is_met], knife_ids[is_met], height[is_met]
         # Pieces that no knife meets are done.
         is_cut = np.zeros(len(pieces), np.bool_)
-        is_cut[rows] = True
+        is_cut[piece_ids] = True
         done.append(pieces[~is_cut])
-        owners.append(source[~is_cut])
-        if not len(rows):
+        owners.append(triangle_ids[~is_cut])
+        if not len(piece_ids):
             return np.concatenate(done), np.concatenate(owners)
         # Sort pairs by piece; the middle one of each piece cuts it now.
-        order = np.argsort(rows, kind="stable")
-        rows, knife, height = rows[order], knife[order], height[order]
-        owner, first, count = np.unique(rows, return_index=True, return_counts=True)
-        middle = first + count // 2
-        is_left = np.ones(len(rows), np.bool_)
+        order = np.argsort(piece_ids, kind="stable")
+        piece_ids, knife_ids, height = piece_ids[order], knife_ids[order], height[order]
+        cut_ids, first_pair, count = np.unique(piece_ids, return_index=True, return_counts=True)
+        middle = first_pair + count // 2
+        is_left = np.ones(len(piece_ids), np.bool_)
         is_left[middle] = False
-        pieces, source = _pieces_at_plane(pieces[owner], height[middle]), np.tile(source[owner], 3)
+        pieces, triangle_ids = (
+            _pieces_at_plane(pieces[cut_ids], height[middle]),
+            np.tile(triangle_ids[cut_ids], 3),
+        )
         # The other knives of a piece are tried on its three new pieces, which are len(owner) apart.
-        targets = np.searchsorted(owner, rows[is_left])
-        rows = (targets[:, None] + len(owner) * np.arange(3)).ravel()
-        knife = np.repeat(knife[is_left], 3)
+        targets = np.searchsorted(cut_ids, piece_ids[is_left])
+        piece_ids = (targets[:, None] + len(cut_ids) * np.arange(3)).ravel()
+        knife_ids = np.repeat(knife_ids[is_left], 3)
 
 
 def _pieces_at_plane(pieces: FloatArray, heights: FloatArray) -> FloatArray:

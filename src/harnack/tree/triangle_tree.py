@@ -123,10 +123,10 @@ def node_slabs(
         n = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
         n[~(np.linalg.norm(n, axis=1) > 0.5)] = (0.0, 0.0, 1.0)
         # Offsets of all corners below each node from its center: h along n, and |r|^2 across.
-        away = points.reshape(len(n), -1, 3) - 0.5 * (box[:, None, :3] + box[:, None, 3:])
-        height = (away @ n[:, :, None])[..., 0]
+        offset = points.reshape(len(n), -1, 3) - 0.5 * (box[:, None, :3] + box[:, None, 3:])
+        height = (offset @ n[:, :, None])[..., 0]
         low, high = np.nanmin(height, axis=1), np.nanmax(height, axis=1)
-        square = np.einsum("nij,nij->ni", away, away) - height * height
+        square = np.einsum("nij,nij->ni", offset, offset) - height * height
         radius = np.sqrt(np.maximum(np.nanmax(square, axis=1), 0)) * (1 + 1e-6) + 1e-7
         levels.append(np.column_stack([n, 0.5 * (low + high), 0.5 * (high - low), radius]))
         normals = normals.reshape(-1, arity, 3).sum(axis=1)

@@ -120,8 +120,8 @@ def _level_gaps(
     gradient come from the solid angle of the edges, which is the sum of the solid angles of
     triangles from each edge to an apex far away.
     """
-    gaps: list[FloatArray] = []
-    slopes: list[FloatArray] = []
+    gap_batches: list[FloatArray] = []
+    slope_batches: list[FloatArray] = []
     step = max(1, _MAX_PAIRS // len(edges))
     for start in range(0, len(points), step):
         batch = points[start : start + step, None]
@@ -133,13 +133,13 @@ def _level_gaps(
         denominator = cosine + b * (p @ _APEX) + a * (q @ _APEX)
         angle = 2 * np.arctan2(normal @ _APEX, denominator)
         with np.errstate(divide="ignore", invalid="ignore"):  # on an edge it has no slope
-            rates = ((a + b) / (a * b * cosine))[:, :, None] * normal
-        # The formula of Van Oosterom and Strackee for the solid angle; `rates` is the gradient.
+            edge_gradients = ((a + b) / (a * b * cosine))[:, :, None] * normal
+        # The formula of Van Oosterom and Strackee for the solid angle of an edge, and its gradient.
         gap: FloatArray = angle.sum(axis=1) / (4 * math.pi) - level
-        gaps.append(np.abs(gap - np.round(gap)))
-        slopes.append(np.linalg.norm(rates.sum(axis=1), axis=1) / (4 * math.pi))
-    gap = np.concatenate(gaps)
-    return gap, gap / np.maximum(np.concatenate(slopes), 1e-300)
+        gap_batches.append(np.abs(gap - np.round(gap)))
+        slope_batches.append(np.linalg.norm(edge_gradients.sum(axis=1), axis=1) / (4 * math.pi))
+    gap = np.concatenate(gap_batches)
+    return gap, gap / np.maximum(np.concatenate(slope_batches), 1e-300)
 
 
 def _mean_winding(corners: FloatArray, point: FloatArray) -> float:

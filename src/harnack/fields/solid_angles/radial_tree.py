@@ -1,13 +1,13 @@
 """Sums f over dipoles of a radial potential K(r), the kernel: direct sums, or sums by a tree in
 which a cluster of far dipoles counts as a single source, given by its moments. A *dipole* is an
 oriented point with a vector m, its moment; its weight is |m|. A *record* is a row of numbers that
-kernels read, for a dipole or for a node of the tree. A *node* stands for the cluster of all dipoles
-below it; its *accepting distance* is the distance beyond which its moments may be used.
+describes a dipole or a node of the tree. A *node* stands for the cluster of all dipoles below it;
+its *accepting distance* is the distance beyond which its moments may be used.
 
 Expansion. A cluster consists of dipoles m_i at c + d_i with |d_i| <= R. At the point x = c - z, at
 the distance r = D of z, Taylor's formula in d_i gives
 
-    w = -sum_i m_i.grad K(z + d_i) = -(T1[D] + T2[D^2] + T3[D^3]/2) K(z) + (rest),
+    f = -sum_i m_i.grad K(z + d_i) = -(T1[D] + T2[D^2] + T3[D^3]/2) K(z) + (rest),
 
 with T1 = sum m_i, T2 = sym sum m_i d_i, T3 = sym sum m_i d_i d_i, where in brackets D stands for
 the derivative and sym for the symmetric part. With psi_k as in `radial_kernel`, D K = -z psi_1,
@@ -362,8 +362,8 @@ def coefficients(level: TaylorMoments) -> FloatArray:
 
 
 def node_records(level: TaylorMoments, accept: FloatArray) -> FloatArray:
-    """Records (k, 30) of the k nodes of a level of a tree, as kernels read them: center, accepting
-    distance, radius, weight; then the 23 numbers of `coefficients`, and the third moment.
+    """Records (k, 30) of the k nodes of a level of a tree: center, accepting distance, radius,
+    weight; then the 23 numbers of `coefficients`, and the third moment.
 
     accept: (k,) for each node, the distance beyond which its moments are used.
     """

@@ -138,17 +138,17 @@ def simple_loops(edges: IntArray) -> list[IntArray]:
     off a loop as soon as it comes back to a vertex."""
     loops: list[IntArray] = []
     for trail in closed_trails(edges):
-        path: list[int] = []
-        position: dict[int, int] = {}
+        walk: list[int] = []
+        place_in_walk: dict[int, int] = {}
         for vertex in trail.tolist():
-            if vertex not in position:
-                position[vertex] = len(path)
-                path.append(vertex)
+            if vertex not in place_in_walk:
+                place_in_walk[vertex] = len(walk)
+                walk.append(vertex)
                 continue
             # The walk is back at a vertex: cut the loop off, and go on from that vertex.
-            start = position[vertex]
-            loops.append(np.array(path[start:], np.int64))
-            for dropped in path[start + 1 :]:
-                del position[dropped]
-            path = path[: start + 1]
+            start = place_in_walk[vertex]
+            loops.append(np.array(walk[start:], np.int64))
+            for dropped in walk[start + 1 :]:
+                del place_in_walk[dropped]
+            walk = walk[: start + 1]
     return loops
