@@ -99,6 +99,7 @@ class BalancedTree:
         for arity in self.arities:
             below.append(arity * (1 + below[-1]))
         # The root has the index 0, its first child 1. From there, level by level downwards.
+        # `next_index` is where the walk goes on after a node's subtree.
         index, next_index = [np.zeros(1, np.int64)], [np.array([self.node_count], np.int64)]
         first_child = [np.ones(1, np.int64)]
         for level, arity in reversed(list(enumerate(self.arities))):
@@ -186,10 +187,8 @@ def _split(point_ids: IntArray, positions: FloatArray) -> tuple[IntArray, FloatA
     key = positions[_box_sizes(positions).argmax(axis=0), np.arange(count)]
     order = cast("IntArray", np.argpartition(key, middle, axis=1))
     short_rows = np.flatnonzero(np.isnan(key[:, -1]))
-    empty_slot = (order[short_rows] == width - 1).argmax(
-        axis=1
-    )  # the empty slot: somewhere on the right
-    # Move the empty slot to the end of the row.
+    # The empty slot is somewhere on the right: move it to the end of the row.
+    empty_slot = (order[short_rows] == width - 1).argmax(axis=1)
     order[short_rows, empty_slot], order[short_rows, -1] = order[short_rows, -1], width - 1
     if width % 2:  # m points of 2m on either side, the empty slot on the left
         order[short_rows, -1], order[short_rows, middle] = order[short_rows, middle], width - 1

@@ -128,13 +128,14 @@ def _level_gaps(
         # Both ends of each edge relative to each point, (batch, k, 3), and their distances.
         p, q = edges[None, :, 0] - batch, edges[None, :, 1] - batch
         a, b = np.linalg.norm(p, axis=2), np.linalg.norm(q, axis=2)
+        # The solid angle of the triangle from each edge to the apex by the formula of Van Oosterom
+        # and Strackee, and the edge's part of the gradient.
         normal: FloatArray = np.cross(p, q)
         cosine = a * b + (p * q).sum(axis=2)  # a b (1 + the cosine of the angle between p and q)
         denominator = cosine + b * (p @ _APEX) + a * (q @ _APEX)
         angle = 2 * np.arctan2(normal @ _APEX, denominator)
         with np.errstate(divide="ignore", invalid="ignore"):  # on an edge it has no slope
             edge_gradients = ((a + b) / (a * b * cosine))[:, :, None] * normal
-        # The formula of Van Oosterom and Strackee for the solid angle of an edge, and its gradient.
         gap: FloatArray = angle.sum(axis=1) / (4 * math.pi) - level
         gap_batches.append(np.abs(gap - np.round(gap)))
         slope_batches.append(np.linalg.norm(edge_gradients.sum(axis=1), axis=1) / (4 * math.pi))
