@@ -84,11 +84,11 @@ class BoxTree:
         real, index = self.tree.backend.Float, self.tree.backend.UInt32
         t_after, n_after = real(after[0]), index(after[1])
         # A function from a box to the t where the ray enters it and leaves it.
-        span = self._make_slab_test(o, d)
+        enter_and_leave = self._make_slab_test(o, d)
 
         def visit(node: VisitedNode, state: LoopValues) -> tuple[Mask, LoopValues]:
             """Enter a node if the ray meets its box before the best box so far."""
-            near, far = span(node.head)
+            near, far = enter_and_leave(node.head)
             is_met = (near <= far) & (far >= start) & (near <= fmin(state[0], end))
             return is_met, for_each_primitive(node, is_met & node.is_leaf, nearer, state)
 
@@ -96,7 +96,7 @@ class BoxTree:
             """Take the box in the record `row` if it comes after `after` and before the best so
             far."""
             best, leave, number = state
-            near, far = span(row)
+            near, far = enter_and_leave(row)
             t, n = fmax(near, start), index(fmax(row[_BOX_NUMBER_COLUMN], real(0)))
             is_after = (t > t_after) | ((t == t_after) & (n > n_after))
             is_before_best = (t < best) | ((t == best) & (n < number))

@@ -289,7 +289,8 @@ def _cut_up(
             _pieces_at_plane(pieces[cut_ids], height[middle]),
             np.tile(triangle_ids[cut_ids], 3),
         )
-        # The other knives of a piece are tried on its three new pieces, which are len(owner) apart.
+        # The other knives of a piece are tried on its three new pieces. These are len(cut_ids)
+        # apart in the list of new pieces.
         targets = np.searchsorted(cut_ids, piece_ids[is_left])
         piece_ids = (targets[:, None] + len(cut_ids) * np.arange(3)).ravel()
         knife_ids = np.repeat(knife_ids[is_left], 3)

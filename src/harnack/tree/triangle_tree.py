@@ -536,26 +536,28 @@ def _crossing_depth(
     e = end[0] - start[0], end[1] - start[1]
     # The positions of the ray and of the apex (s') along the longest edge.
     share = dr.rcp(select_longest(*squares))
-    along = -dr.fma(start[0], e[0], start[1] * e[1]) * share
-    aside = dr.fma(apex[0] - start[0], e[0], (apex[1] - start[1]) * e[1]) * share
+    ray_position = -dr.fma(start[0], e[0], start[1] * e[1]) * share
+    apex_position = dr.fma(apex[0] - start[0], e[0], (apex[1] - start[1]) * e[1]) * share
     zero = type(ab)(0)
-    along, aside = clamp(along, zero, 1), clamp(aside, zero, 1)
-    # 0 <= along - w aside <= 1 - w.
-    max_w = fmin((1 - along) / (1 - aside), fmin(along / aside, type(ab)(1)))
+    ray_position, apex_position = clamp(ray_position, zero, 1), clamp(apex_position, zero, 1)
+    # So that 0 <= s <= 1 - w for s = ray_position - w apex_position.
+    max_w = fmin(
+        (1 - ray_position) / (1 - apex_position), fmin(ray_position / apex_position, type(ab)(1))
+    )
     w = clamp(select_longest(ab, bc, -ac) / (bc - ac + ab), zero, max_w)
-    s = clamp(dr.fma(-w, aside, along), zero, 1 - w)
+    s = clamp(dr.fma(-w, apex_position, ray_position), zero, 1 - w)
     t = dr.fma(s, end[2] - start[2], dr.fma(w, apex[2] - start[2], start[2]))
     # Edges that the ray passes through decide t; vertices come last and overrule them.
-    near = close * close
+    close_square = close * close
     for (tail, head), area, square in zip(
         ((a, b), (b, c), (a, c)), (ab, bc, ac), squares, strict=True
     ):
         share = -dr.fma(tail[0], head[0] - tail[0], tail[1] * (head[1] - tail[1])) / square
         edge_depth = dr.fma(clamp(share, zero, 1), head[2] - tail[2], tail[2])
-        is_on_edge = (area * area <= near * square) & (share > 0) & (share < 1)
+        is_on_edge = (area * area <= close_square * square) & (share > 0) & (share < 1)
         t = dr.select(is_on_edge, edge_depth, t)
     for u, v, depth in corners:
-        t = dr.select(dr.fma(u, u, v * v) <= 4 * near, depth, t)
+        t = dr.select(dr.fma(u, u, v * v) <= 4 * close_square, depth, t)
     return t
 
 

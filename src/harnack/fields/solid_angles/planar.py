@@ -87,8 +87,9 @@ class PlanarRegion:
         ratio = height_bound / distance
         # Near the curve the rounding of positions moves f by up to about 2 slack/distance.
         tolerance = 1e-3 + 16 * slack / distance + error
-        # Outside |f| is at most 2 pi h/d, inside at least 2 pi (1 - h/d). So a larger |f| proves D
-        # inside, and a smaller one outside. If h < d/2, |f| = pi is between both numbers.
+        # If D is outside, |f| is at most 2 pi h/d; if inside, at least 2 pi (1 - h/d). So an |f|
+        # above the first number proves D inside, one below the second number proves D outside. If
+        # h < d/2, pi is between both numbers and separates the cases with the most room.
         is_inside = dr.abs(f) > turn * fmax(ratio, 0.5) + tolerance
         is_outside = dr.abs(f) < turn * fmin(1 - ratio, 0.5) - tolerance
         free_height = fmax(dr.abs(height) - slack, 0)
@@ -97,7 +98,8 @@ class PlanarRegion:
         is_beside = ~(is_inside | is_outside) & (free_height >= 0.4 * distance)
         zero = type(f)(0)
         radius = dr.select(is_beside, free_height, distance)
-        # (-2 pi, 2 pi) outside, else (-4 pi, 4 pi); then half of that where the side is known.
+        # D outside: (-2 pi, 2 pi). D inside: (-4 pi, 0) or (0, 4 pi), by the sign of f. Smaller
+        # ball: (-2 pi, 0) or (0, 2 pi), by the side of the plane. Else (-4 pi, 4 pi).
         lower = dr.select(is_outside, -turn, -2 * turn)
         upper = dr.select(is_outside, turn, 2 * turn)
         lower = dr.select(is_inside, dr.select(f < 0, lower, zero), lower)

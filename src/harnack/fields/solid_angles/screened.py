@@ -170,11 +170,13 @@ def screened_promises(
     r = BALL_FRACTION * max_radius / dr.fma(_BALL_SHRINKAGE * kappa, max_radius, 1)
     growth = kernel.growth(r)
     slope = dr.norm(gradient) + sums.gradient_truncation
-    taylor = (1 + SUM_MARGIN) * r * dr.fma(r, radial.remainder(BALL_FRACTION, r, growth), slope)
-    change = fmin(radial.variation(r, growth), taylor)
+    change_by_taylor = (
+        (1 + SUM_MARGIN) * r * dr.fma(r, radial.remainder(BALL_FRACTION, r, growth), slope)
+    )
+    max_change = fmin(radial.variation(r, growth), change_by_taylor)
     # The products of f - S and f + S with the least cosine and with 1.
     min_cosine = dr.cos(fmin(kappa * r, math.pi))
-    ends = (f - change, f + change)
+    ends = (f - max_change, f + max_change)
     products = [end * min_cosine for end in ends]
     lower, upper = fmin(ends[0], products[0]), fmax(ends[1], products[1])
     # A negative cosine exchanges the ends of the interval.
