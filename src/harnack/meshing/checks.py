@@ -119,9 +119,9 @@ def orient2d(a: FloatArray, b: FloatArray, c: FloatArray) -> SignArray:
 
 
 def _scaled(points: FloatArray) -> FloatArray:
-    """The points, times a power of two that makes the absolute value of the largest coordinate lie
-    between 1/2 and 1. No coordinate is rounded by that, and the signs of determinants stay the
-    same."""
+    """The points, times a power of two that makes the largest absolute value of a coordinate at
+    least 1/2 and less than 1. The signs of determinants stay the same. Short of underflow no
+    coordinate is rounded."""
     largest = float(np.abs(points).max(initial=0.0))
     return points if largest == 0 else np.ldexp(points, -int(np.frexp(largest)[1]))
 
@@ -207,10 +207,10 @@ def intersecting_faces(
     back onto their neighbors, are found. Returns the indices (k,) of these faces, in increasing
     order.
 
-    A face of which an edge only touches the other face is not found by that edge (`touching_pairs`
-    finds it). If the surface goes on behind such an edge and comes out on the other side, another
-    edge passes through. Two triangles in one plane overlap, whatever they share, unless the line of
-    an edge separates them.
+    An edge that only ends on another face does not count (`touching_pairs` finds it). If the
+    surface goes on behind that end and comes out on the other side, another edge passes through.
+    Two triangles in one plane overlap, whatever they share, unless the line of an edge separates
+    them.
 
     vertices, faces: (n, 3), (m, 3) the mesh.
     among: (m,) mask of chosen faces; pairs without a chosen face are not tested. None if all are
