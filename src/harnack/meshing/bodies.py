@@ -224,6 +224,7 @@ def _make_overlap(parts: list[TriangleMesh]) -> list[TriangleMesh]:
                     highs[j][opposite_faces] >= lows[k][face]
                 )
                 opposite_faces = opposite_faces[is_met.all(axis=1)]
+                # The largest distance of a corner of the earlier face from the plane of this face.
                 plane_distances = np.abs(
                     (corners[j][opposite_faces] - corners[k][face, 0]) @ normal
                 )

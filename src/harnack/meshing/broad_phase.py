@@ -219,8 +219,8 @@ class _PairTests:
 
 
 def _are_apart(a: Corners, b: Corners, shared: list[list[Mask]]) -> Mask:
-    """Whether two triangles are proved to have nothing in common but the corners that they share.
-    False proves nothing.
+    """Whether two triangles are proved to have nothing in common but the corners that they share,
+    and the edge between these. False proves nothing.
 
     a, b: the three corners of each triangle.
     shared: shared[i][k] is whether corner i of `a` is the same vertex as corner k of `b`.
@@ -416,7 +416,7 @@ def _are_opposite_at_corner(a: Corners, b: Corners) -> Mask:
     through it: the other corners of `a` strictly on one side, those of `b` strictly on the other.
     One plane is tried. For each triangle, take the sum of the unit vectors along both edges at the
     shared corner, scaled to length 1; the plane's normal is the difference of the two sums."""
-    edges = [a_error_1[k] - a_error_1[0] for a_error_1, k in itertools.product((a, b), (1, 2))]
+    edges = [triangle[k] - triangle[0] for triangle, k in itertools.product((a, b), (1, 2))]
     mean_directions = [dr.normalize(edges[k]) + dr.normalize(edges[k + 1]) for k in (0, 2)]
     plane_normal = dr.normalize(mean_directions[1]) - dr.normalize(mean_directions[0])
     rounding = ROUNDING * dr.norm(plane_normal)
