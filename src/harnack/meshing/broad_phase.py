@@ -416,15 +416,11 @@ def _are_opposite_at_corner(a: Corners, b: Corners) -> Mask:
     through it: the other corners of `a` strictly on one side, those of `b` strictly on the other.
     One plane is tried. For each triangle, take the sum of the unit vectors along both edges at the
     shared corner, scaled to length 1; the plane's normal is the difference of the two sums."""
-    edges = [triangle[k] - triangle[0] for triangle, k in itertools.product((a, b), (1, 2))]
+    edges = [one[k] - one[0] for one, k in itertools.product((a, b), (1, 2))]
     mean_directions = [dr.normalize(edges[k]) + dr.normalize(edges[k + 1]) for k in (0, 2)]
     plane_normal = dr.normalize(mean_directions[1]) - dr.normalize(mean_directions[0])
     rounding = ROUNDING * dr.norm(plane_normal)
+    # The dot products with the edges of a, then of b; each with a bound of its rounding error.
     values = [(dr.dot(plane_normal, edge), rounding * dr.norm(edge) + _UNDERFLOW) for edge in edges]
-    (a_dot_1, a_error_1), (a_dot_2, a_error_2), (b_dot_1, b_error_1), (b_dot_2, b_error_2) = values
-    return (
-        (a_dot_1 < -a_error_1)
-        & (a_dot_2 < -a_error_2)
-        & (b_dot_1 > b_error_1)
-        & (b_dot_2 > b_error_2)
-    )
+    (p, one), (q, two), (r, three), (s, four) = values
+    return (p < -one) & (q < -two) & (r > three) & (s > four)
