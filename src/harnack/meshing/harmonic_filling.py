@@ -171,7 +171,7 @@ def _fill_all_holes(
     mesh_intersection_count, seed, previous = 0, options.seed, None
     for attempt in range(options.attempts):
         is_last = attempt == options.attempts - 1
-        report(f"cells of {width:.3g}" + ", smaller in places" * bool(refinement_balls))
+        report(f"cells of {cell_size:.3g}" + ", smaller in places" * bool(refinement_balls))
         try:
             patches = _mesh_patches(
                 function,
@@ -191,7 +191,7 @@ def _fill_all_holes(
             if is_last or is_hopeless or mesh_intersection_count > _MAX_MESH_RETRIES:
                 location = ", ".join(f"{c:.4g}" for c in error.locations[0])
                 raise MeshingError(
-                    f"{error} (cells were {width:.3g} wide, and smaller in {len(error.locations)} "
+                    f"{error} (cells were {cell_size:.3g} wide, and smaller in {len(error.locations)} "
                     f"places, such as near ({location}))"
                 ) from None
             report(f"{error} ({len(error.locations)} places)")

@@ -132,8 +132,8 @@ def fill_holes(
         x, together = _drop_unused(patched, np.concatenate([together, new[is_accepted]]), len(x))
         pending = [pending[k] for k in sorted(reasons)]
     counts = Counter(reasons.values())
-    reason = ", ".join(f"{count:,} {reason}" for reason, count in counts.items())
-    return HoleFilling(x[len(vertices) :], together[len(faces) :], pending, reason)
+    all_reasons = ", ".join(f"{count:,} {reason}" for reason, count in counts.items())
+    return HoleFilling(x[len(vertices) :], together[len(faces) :], pending, all_reasons)
 
 
 def _drop_unused(x: FloatArray, faces: IntArray, input_count: int) -> tuple[FloatArray, IntArray]:
@@ -613,7 +613,7 @@ def _graph_laplacian(ends: IntArray, weight: FloatArray, count: int) -> Any:
 def _fair_patches(x: FloatArray, faces: IntArray, new: IntArray, input_count: int) -> FloatArray:
     """Move the new vertices so that the patches and the faces around them bend least. Returns all
     vertices (n, 3). What is minimized is the sum, over the vertices of patches, of |Laplacian of
-    the position|^2 divided by the area around the vertex. Vertices at edges that remain open do not
+    the position|^2 times the area around the vertex. Vertices at edges that remain open do not
     count in the sum.
 
     x: (n, 3) all vertices; those from index `input_count` on are new.
@@ -641,8 +641,8 @@ def _fair_patches(x: FloatArray, faces: IntArray, new: IntArray, input_count: in
     is_in_sum[edges.vertices[edges.multiplicity != 2]] = False
     rows = np.flatnonzero(is_in_sum & (area > 0))
     laplacian = _graph_laplacian(edges.vertices, weight, len(x))[rows]
-    # The Laplacian per area is the row divided by the area; its square times the area is the row's
-    # square divided by the area.
+    # A row of the graph's Laplacian is the Laplacian at a vertex times the area around it, so its
+    # square is divided by the area.
     row_scale = 1 / np.sqrt(np.maximum(area[rows], 1e-300))
     return _solve_least_squares(laplacian.multiply(row_scale[:, None]).tocsr(), x, input_count)
 
