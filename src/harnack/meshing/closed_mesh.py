@@ -203,8 +203,8 @@ def extruded_manifold(
     square_count = straight.surface_area() / (scale * max_edge) ** 2
     if square_count > _MAX_CELLS:
         raise MeshingError(
-            f"a twisted outline within {tolerance:.3g} has about {4 * count:,.0f} faces: choose a "
-            "larger `tolerance`"
+            f"a twisted outline within {tolerance:.3g} has about {4 * square_count:,.0f} faces: "
+            "choose a larger `tolerance`"
         )
 
     def mapped(points: FloatArray) -> FloatArray:

@@ -191,8 +191,8 @@ def _fill_all_holes(
             if is_last or is_hopeless or mesh_intersection_count > _MAX_MESH_RETRIES:
                 location = ", ".join(f"{c:.4g}" for c in error.locations[0])
                 raise MeshingError(
-                    f"{error} (cells were {cell_size:.3g} wide, and smaller in {len(error.locations)} "
-                    f"places, such as near ({location}))"
+                    f"{error} (cells were {cell_size:.3g} wide, and smaller in "
+                    f"{len(error.locations)} places, such as near ({location}))"
                 ) from None
             report(f"{error} ({len(error.locations)} places)")
             # The radius is two cells, half of that in the next attempt, and so on.
