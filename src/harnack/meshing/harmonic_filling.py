@@ -4,10 +4,10 @@ filling; here `patches` is the filling as a whole. The mesh has vertices (n, 3) 
 which hold indices of vertices; its boundary edges have a single face.
 
 The surface w = 1/2 modulo 1 is the level set 2 pi, modulo 4 pi, of the solid angle of the boundary
-edges (`geometry.boundary_edges`): a smooth surface that ends at these edges. The surface is meshed so that
-its mesh has exactly these boundary edges, and both meshes are joined at the common vertices. A
-harmonic filling connects all boundary loops of a gap, whereas `hole_filling` closes each loop by
-itself.
+edges (`geometry.boundary_edges` has the proof): a smooth surface that ends at these edges. The
+surface is meshed so that its mesh has exactly these boundary edges, and both meshes are joined at
+the common vertices. A harmonic filling connects all boundary loops of a gap, whereas `hole_filling`
+closes each loop by itself.
 """
 
 from __future__ import annotations
