@@ -138,8 +138,8 @@ def triangulate(vertices: FloatArray, corners: IntArray, sizes: IntArray) -> Int
         work += int(is_concave.sum()) * (corner_count * corner_count + _WORK_PER_POLYGON)
         if work > _MAX_EAR_WORK:
             raise MeshError(
-                f"{is_concave.sum():,} polygons with dents and {corner_count:,} corners each take too long to "
-                "triangulate: let the program that made the file triangulate them"
+                f"{is_concave.sum():,} polygons with dents and {corner_count:,} corners each take "
+                "too long to triangulate: let the program that made the file triangulate them"
             )
         triangles.append(_fans(polygons[~is_concave]))
         polygon_of_triangles.append(np.repeat(group[~is_concave], corner_count - 2))
