@@ -38,7 +38,6 @@ MAX_POINTS = 100_000_000
 _CHUNK = 4096
 # The radius at which a point's Voronoi cell is cut off is at most this multiple of the median of
 # its neighbors' radii.
-# The largest ratio of a cell's radius to the median radius of its neighbors' cells.
 _MAX_RADIUS_RATIO = 3.0
 # Number of points whose cells are computed at once.
 _POINTS_PER_BATCH = 1 << 18
@@ -265,12 +264,6 @@ _COLLINEAR_RATIO = 1e-9
 # random halves, quarters, ... of the points, until they are fewer than _MIN_SUBSET. If none
 # qualifies, the choice of smallest flatness is taken; a choice replaces the best one before it if
 # its flatness is below _FLATNESS_GAIN times that of the best.
-# Choice of the number of neighbors if none is prescribed. Flatness is the median, over at most
-# _PROBES points, of the ratio of the smallest to the middle standard deviation of a neighborhood.
-# The first of _NEIGHBOR_COUNTS whose flatness is below _MAX_FLATNESS is taken. If there is none,
-# the largest count is tried among random halves, quarters, ... of the points, until they are fewer
-# than _MIN_SUBSET. If none qualifies, the flattest choice is taken; a choice counts as flatter than
-# the best before it if it improves its flatness by the factor _FLATNESS_GAIN.
 _NEIGHBOR_COUNTS, _MAX_FLATNESS, _PROBES, _MIN_SUBSET, _FLATNESS_GAIN = (
     (16, 32, 64),
     0.45,

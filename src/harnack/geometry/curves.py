@@ -85,7 +85,7 @@ class Circle:
         if largest == 0.0:
             raise ValueError("normal of a circle is zero: give the direction of its axis")
         # A normal of unit length, to rounding, is kept as it is.
-        if abs(float(normal @ normal) - 1) > 1e-15:  # else it has unit length, to rounding
+        if abs(float(normal @ normal) - 1) > 1e-15:
             normal = normal / largest
             normal = normal / np.linalg.norm(normal)
         object.__setattr__(self, "radius", float(radius))
@@ -271,7 +271,7 @@ def _as_list(loops: Any) -> list[tuple[int, Any]]:
     if array.ndim == 3:
         return _numbered(array)
     # Older NumPy makes an array of objects of loops of different lengths.
-    if array.dtype == object and array.ndim == 1 and len(array):  # so does older NumPy
+    if array.dtype == object and array.ndim == 1 and len(array):
         return _numbered(array)
     if array.ndim == 1 and array.size == 0:
         return []

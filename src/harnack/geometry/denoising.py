@@ -42,14 +42,10 @@ __all__ = ["CloudDenoiser", "NoiseEstimate", "estimate_noise", "outlier_indices"
 
 # A point is an outlier if the distance of its fourth neighbor is more than _OUTLIER_RATIO times the
 # typical distance of fourth neighbors.
-# A point is an outlier if the distance of its fourth neighbor is more than _OUTLIER_RATIO times the
-# median of the same distance of its neighbors.
 _OUTLIER_RATIO, _OUTLIER_NEIGHBORS = 6.0, 4
 # Noise is measured at _PROBES points. The number of neighbors is the first of _COUNTS for which the
 # farthest neighbor is at least _MIN_REACH standard deviations away. Neighbors do not count if the
 # cosine between the normals is at most _MIN_NORMAL_COSINE, 60 degrees.
-# Noise is measured at _PROBES points, among the first of _COUNTS neighbors that reach _MIN_REACH
-# standard deviations far; neighbors whose normals turn by more than 60 degrees do not count.
 _PROBES, _COUNTS, _MIN_REACH, _MIN_NORMAL_COSINE = 1000, (16, 64, 256, 1024), 4.5, 0.5
 # _NEIGHBORS_PER_NOISE * noise / spacing neighbors are used, within the two limits: half of them lie
 # within 3.1 sqrt(noise * spacing), by experiment a compromise of noise and detail.
@@ -67,15 +63,10 @@ _DISTANCE_DECAY, _NORMAL_SCALE, _ESTIMATED_NORMAL_SCALE = 3.0, 0.8, 0.4
 _NORMAL_ITERATIONS, _PLANE_NEIGHBORS, _INITIAL_NEIGHBORS = 2, 32, 32
 # A point is not moved if its neighbors face the other way: then the rate at which the mean of t_j
 # falls, as the point moves along n, is below this.
-# A point is not moved if its neighbors face the other way: then the derivative of the mean of t_j
-# along n is below this.
 _MIN_SLOPE = 0.25
 # A point is dropped if less than this fraction of its neighbors, by weight, has a normal similar to
 # its own estimated one: such points lie in the middle of thin parts. At edges and corners the
 # fraction is larger.
-# A point is dropped if less than this fraction of its neighbors, by weight, has a normal similar to
-# its estimated one: such points lie in the middle of thin parts. At edges and corners the fraction
-# is larger.
 _MIN_AGREEING_WEIGHT = 0.1
 
 
@@ -346,7 +337,6 @@ def _move_along_normals(
         # The rate at which the mean of t_j falls as x moves along n.
         slope = 0.5 * (weight * (cosine + 1)).sum(axis=1)
         # A point with a smaller slope stays.
-        # A point whose normal no neighbor supports stays.
         mean = np.where(slope > _MIN_SLOPE, (weight * heights).sum(axis=1), 0.0)
         moved[rows] = start[rows] + (mean / np.maximum(slope, _MIN_SLOPE))[:, None] * n
 

@@ -35,7 +35,6 @@ MAX_FACES = 100_000_000
 
 # Twice the area of a face, divided by the square of its longest edge, up to which the face counts
 # as flat.
-# Twice the area, over the square of the longest edge, up to which a face counts as flat.
 ZERO_AREA_RATIO = 8.0 * float(np.finfo(np.float64).eps)
 
 

@@ -32,16 +32,13 @@ from harnack.geometry.meshes import MAX_FACES, MAX_VERTICES, MeshError
 __all__ = ["PolygonFaces", "cluster_into_polygons", "validate_polygons"]
 
 # A face counts as collinear if its corners are nearer to a line than this fraction of its size.
-# A face whose corners are closer to a line than this fraction of its size counts as collinear.
 _COLLINEAR_TOLERANCE = 1e-9
 # A turn from one edge to the next counts as a turn to the left only if its sine is at least this.
-# The turn between two edges counts if its sine is at least this.
 _MIN_TURN_SINE = 1e-6
 # The turns of a convex polygon add up to 2 pi, within this tolerance in radians.
 _REVOLUTION_TOLERANCE = 1e-6
 # Faces without a convex projection are examined further, which takes 0.5 ms each, up to this
 # number.
-# Faces with a non-convex projection are examined further, 0.5 ms each, up to this number.
 _MAX_EXAMINED_FACES = 20_000
 
 
@@ -320,14 +317,12 @@ def _check_not_collinear(mesh: PolygonFaces) -> None:
     relative /= np.abs(upper - lower).max(axis=1)[face][:, None]
     # The pole of each face is its corner a; it is the last of the face in the order by face and
     # radius.
-    # The pole of each face is its corner farthest from the center; offsets are relative to it.
     squared_radius = (relative * relative).sum(axis=1)
     order = np.lexsort((squared_radius, face))
     last = np.append(np.flatnonzero(np.diff(face[order])), len(order) - 1)
     pole = relative[order[last]]
     offset = relative - pole[face]
     # The direction from a to b.
-    # From the pole to the corner that is farthest from it.
     square_distance = (offset * offset).sum(axis=1)
     order = np.lexsort((square_distance, face))
     direction = offset[order[last]]
@@ -344,7 +339,6 @@ def _check_not_collinear(mesh: PolygonFaces) -> None:
 
 
 # The weight of normals relative to positions, a length in the unit of the mesh.
-# The weight of normals relative to positions, in units of the mesh.
 _NORMAL_WEIGHT = 0.25
 
 

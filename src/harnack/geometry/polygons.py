@@ -83,16 +83,12 @@ def _welded_edges(loops: Loops, points: FloatArray) -> tuple[IntArray, IntArray]
 
 # The largest work for ear clipping, which takes about ten seconds. The work is the sum of the
 # squared number of corners plus _WORK_PER_POLYGON, over the polygons that need it.
-# The largest work for ear clipping, which takes about ten seconds: the sum, over the polygons that
-# need it, of the squared number of corners plus _WORK_PER_POLYGON.
 _MAX_EAR_WORK = 1_000_000_000
 _WORK_PER_POLYGON = 1000
 # Twice the area of a triangle, in a polygon of size about 1, up to which it counts as flat.
 _FLAT_AREA = 1e-12
 # For ear clipping, corners in the middle of a straight edge are moved inwards: a corner at the
 # distances a and b from the ends of the edge moves by this times a b.
-# Straight edges with corners in their middle are bent inwards: a corner at the distances a and b
-# from the ends moves by this times a b.
 _INWARD_CURVATURE = 1e-6
 _CORNERS_PER_GROUP = 2_000_000
 

@@ -28,8 +28,6 @@ __all__ = ["TangentVoronoi"]
 _LINES_PER_ITERATION = 4
 # Lines count as parallel if the sine of their angle is below this; parallel lines count as equal if
 # their distance is below this.
-# Lines count as parallel if the sine of their angle is below this, and as equal if they are
-# parallel and their distance is below this.
 _PARALLEL = 1e-12
 
 
@@ -232,7 +230,6 @@ def _clip_bisectors(
             upper = dr.select(slope > _PARALLEL, fmin(upper, bound), upper)
             # An own line beyond a parallel one is no edge. If lines are equal, only the first
             # counts.
-            # If lines are equal, only the first counts.
             is_hidden = is_parallel & (distance < dr.select(index > i, _PARALLEL, -_PARALLEL))
             upper = dr.select(is_hidden, -dr.inf, upper)
             has_left = has_left | (

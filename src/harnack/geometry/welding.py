@@ -21,7 +21,6 @@ __all__ = ["Welded", "connected_groups", "pairs_within", "rounding_of"]
 _MAX_ULPS = 4
 # A distance that is more than this fraction of the shortest edge there is never explained by
 # rounding.
-# Rounding explains no distance that is more than this fraction of the shortest edge there.
 _MAX_EDGE_FRACTION = 1e-3
 
 

@@ -260,7 +260,6 @@ def _union_of_components(components: list[TriangleMesh], within: float) -> Trian
     clockwise = [body for body, is_outward in bodies if not is_outward]
     # sets[k] is L_(k+1) of the proof: the points around which the components so far wind at least k
     # + 1 times. Each clockwise component needs one set more, since it moves L_(k+1) to L_k.
-    # sets[k]: the points around which the components so far wind at least k + 1 times.
     sets = [Manifold() for _ in range(len(clockwise) + 1)]
     for solid in (body for body, is_outward in bodies if is_outward):
         shared = [sets[k] ^ solid for k in range(len(sets) - 1)]

@@ -81,7 +81,7 @@ def near_pairs(vertices: FloatArray, faces: IntArray, among: BoolArray | None) -
         batch = pending.pop()
         listed = boxes.overlapping(batch, room)
         # Too many pairs: search for each half of the faces. A single face always has room.
-        if listed is None:  # a single triangle always has room
+        if listed is None:
             pending += np.array_split(batch, 2)
             continue
         batches.append(pairs.unseparated(*listed))
@@ -156,7 +156,6 @@ class _FaceBoxTree:
             index = row[_FACE_INDEX]
             # Two chosen faces are listed once, by the face of smaller index. Empty slots (index -1)
             # are never listed.
-            # Two chosen faces are listed once.
             is_new = (index > own_index) | ((row[_IS_CHOSEN] == 0) & (index >= 0))
             is_pair = active & is_new & overlap(row)
             # The next free position, counted by all lanes together.

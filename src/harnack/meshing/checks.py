@@ -93,7 +93,6 @@ def orient3d(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> Sign
     )
     # A row of zeros makes the determinant 0 exactly. Differences of doubles are 0 only where these
     # are equal.
-    # A difference of doubles is 0 where they are equal, and only there.
     is_zero = (edges == 0).all(axis=1).any(axis=1)
     return _signs_with_fallback(
         np.asarray(determinant),
@@ -274,7 +273,7 @@ def touching_pairs(vertices: FloatArray, faces: IntArray) -> tuple[IntArray, Flo
                 p, q = (vertices[faces[other[rows], k]] for k in (i, j))
                 add(pairs[rows], _segments_meet(vertices[faces[base[rows]]], p, q), p, q)
             # for each corner of `other`, whether it is shared
-            is_common = is_same.any(axis=1 + order)  # for the corners of the other faces
+            is_common = is_same.any(axis=1 + order)
             for i in range(3):
                 rows = np.flatnonzero((shared_count == 1) & ~is_common[:, i] & (sides[:, i] == 0))
                 # Face `base`, begun at the shared corner; the edge from there to p meets the face

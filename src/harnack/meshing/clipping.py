@@ -215,12 +215,9 @@ def winding_around(corner: FloatArray, point: FloatArray) -> float:
 
 # Vertices that are no farther from a boundary than this, relative to the size of the mesh, count as
 # on it.
-# Vertices that are no farther from a boundary than this, relative to the size, count as on it.
 _ON_BOUNDARY = 1e-9
 # Vertices that are nearer to a boundary than this fraction of their shortest edge are moved onto
 # it, or slivers (thin triangles) would remain.
-# Vertices that are nearer to a boundary than this are moved onto it, or slivers would remain:
-# a fraction of the vertex's shortest edge.
 _SNAP_DISTANCE = 0.25
 
 

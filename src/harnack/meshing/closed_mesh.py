@@ -50,12 +50,8 @@ _MAX_SEGMENTS = 2000
 # Otherwise, and where triangles of the union cross, the faces of parts are moved outwards by the
 # second, relative to the size. At sharp corners vertices are moved by at most that divided by the
 # third.
-# The areas of a union and of its parts may differ by the first, relative to the area. Otherwise,
-# and where triangles of the union cross, the faces of parts are moved outwards by the second,
-# relative to the size. At sharp corners vertices are moved by at most that divided by the third.
 _AREA_TOLERANCE, _GROWTH, _MIN_COSINE = 1e-6, 1e-9, 0.1
 # The largest area of a twisted outline, in squares of the longest permitted edge.
-# The largest number of squares of the permitted edge on a twisted outline.
 _MAX_CELLS = 1_000_000
 
 
@@ -315,15 +311,11 @@ _MIN_STEP = 2.0**-26
 # integers of readers.
 _LARGEST = 2.0**36
 # The size of a mesh has to be at least this many grid spacings.
-# A part has to be at least this many steps of the grid long.
 _MIN_STEPS_ACROSS = 1e4
 # If the rounded mesh does not pass its checks, the mesh is simplified, moving it by up to this many
 # grid spacings; the numbers are tried in turn.
-# If the mesh on the grid does not pass its checks, it is simplified, moving it by up to this many
-# steps of the grid; the numbers are tried in turn.
 _SIMPLIFY_STEPS = (4, 32)
 # Where triangles cross, vertices are moved by up to this many grid spacings.
-# Where triangles cross, the mesh is mended, moving it by up to this many steps of the grid.
 _REPAIR_STEPS = 32
 
 
@@ -370,7 +362,7 @@ class ClosedMesh(trimesh.Trimesh):
             written = _quantize(written, grid_spacing)
             name = file_type or str(getattr(file_obj, "name", file_obj))
             # Text files need as many decimals as 2^-k has to be exact.
-            if name.lower().endswith(("obj", "off")):  # exact decimals of a multiple of 2^-k
+            if name.lower().endswith(("obj", "off")):
                 options.setdefault("digits", max(1, round(-math.log2(grid_spacing))))
         return cast("Any", written).export(file_obj, file_type, **options)
 
@@ -457,7 +449,6 @@ def _merge_on_grid(surface: TriangleMesh, step: float) -> tuple[FloatArray, IntA
     x = grid * step
     # group[i]: a number that vertices have in common if their coordinates so far, axis by axis, are
     # equal.
-    # Vertices at the same point, by their coordinates one after the other.
     group = np.zeros(len(x), np.int64)
     for column in (grid - grid.min(axis=0)).astype(np.int64).T:
         _, group, _, _ = unique_with_inverse(group * (int(column.max()) + 1) + column)

@@ -99,8 +99,6 @@ __all__ = [
 
 # For offsets of meshes: the size of cells, in tolerances; and the number of steps of the secant
 # method that find the level on an edge of a cell.
-# For offsets of meshes: the size of cells, in tolerances; and the number of secant steps that find
-# the level on an edge of a cell.
 _OFFSET_CELLS, _SECANT_STEPS = 6.0, 2
 # In lattices of at least this many cells, the cells in which the other operands of an intersection
 # leave nothing are left out from the start.
@@ -108,13 +106,9 @@ _MANY_CELLS = 100_000
 # How far surfaces of offsets may be moved, in tolerances. First by merging coplanar triangles:
 # these lengths are tried in turn until crossing triangles can be moved apart. Then by moving them
 # apart.
-# How far surfaces of offsets may be moved, in tolerances: by merging coplanar triangles, tried in
-# this order until the result can be mended; and by the mending of crossing triangles afterwards.
 _MERGED_WITHIN, _MENDED_WITHIN = (0.5, 0.25, 0.1), 0.5
 # Triangles of offsets are cut in three if their centers are farther from the level set than the
 # first, in tolerances; the second is how many times that is repeated.
-# Triangles of offsets are cut in three if their centers are farther from the level than the first,
-# in tolerances; the second is the number of rounds.
 _FAR_OFF, _SPLITS = 1.8, 2
 
 # Meshes a level set of a solid angle, which ends at the boundary curve: takes the field and the
@@ -412,7 +406,6 @@ class CsgMesher:
         middle = 0.5 * (low + high)
         samples = self.function(field, middle).sample(points)
         # The half of the cells that is nearest to the middle of the wall.
-        # Cells where the wall may be near.
         near = samples.distance <= np.median(samples.distance)
         steep = float(np.median(np.linalg.norm(samples.gradient[near], axis=1)))
         self.evaluations += len(points)
@@ -611,9 +604,6 @@ _CELL_SIZE_RATIO = 0.6
 # Where operands were cut by each other, slivers (thin triangles) may pass through their neighbors
 # by rounding. They are removed by moving the surface by up to the first length, in tolerances; if
 # that fails, by up to the next.
-# Where operands were cut by each other, slivers may pass through their neighbors by rounding. They
-# are removed by moving the surface by up to the first length, in tolerances; if that fails by the
-# next.
 _SLIVERS_WITHIN = (1e-3, 1e-4, 0.0)
 # The margin around an extent, relative to its size.
 _MARGIN = 0.01

@@ -187,7 +187,6 @@ _MAX_ATTEMPTS = 4
 # smaller everywhere.
 _MOST_LOCAL = 4
 # Edges of the curve are divided into pieces no longer than this, in sizes of cells.
-# Edges of the curve are divided into pieces no longer than this many cells.
 _MAX_EDGE_CELLS = 2.5
 # How often edges of the curve that are missing among those of the tetrahedra are halved.
 _MAX_HALVINGS = 4
@@ -354,7 +353,7 @@ def _mesh_in_cells(
     curve = BoundaryCurve.of(_curve_loops(function), _MAX_EDGE_CELLS * spacing)
     # Points keep a distance from the curve that grows with its edges, so edges are halved where
     # smaller cells are wanted.
-    for k, balls in enumerate(finer):  # balls on long edges leave no room for points
+    for k, balls in enumerate(finer):
         curve = curve.split_near(balls, spacing * 0.5**k)
     margin = 0.5 * spacing if walls is None else 0.0
     root = box_cells(task.lower - margin, task.upper + margin, spacing, exact=walls is not None)

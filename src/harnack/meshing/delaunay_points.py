@@ -42,8 +42,6 @@ _MAX_CELLS = 4_000_000
 _CONVERGED = 1e-9
 # How often the limit of Newton's steps to a multiple root is computed from two of them; and the
 # range of ratios of a step to the one before in which that is done.
-# How often steps to a multiple root are continued as a geometric series, and the range of ratios of
-# a step to the one before for which they are.
 _SERIES_STEPS, _RATE_RANGE = 4, (0.4, 0.97)
 _CORNERS = np.array(list(itertools.product((0.0, 1.0), repeat=3)))
 
@@ -269,7 +267,6 @@ def _corners_and_centers(
     steps: FloatArray = (x - x.min(axis=0)) / (0.25 * leaves[0].size)
     keys = np.rint(steps).astype(np.int64)
     # Of equal points the first one is kept; it belongs to the smallest cell.
-    # Of equal points the first, which is that of the smallest cell.
     kept: IntArray = np.sort(np.unique(keys, axis=0, return_index=True)[1])
     return x[kept], size[kept]
 
@@ -292,7 +289,6 @@ def _is_far(points: FloatArray, free: FloatArray, boundary: BoundaryCurve) -> Bo
     is_far = np.ones(len(points), np.bool_)
     # Curves may have edges of any lengths: edges of one size, up to a factor of 2, are examined at
     # a time; only the eight edges with the nearest midpoints count.
-    # Curves may have edges of any lengths: edges of one size are examined at a time.
     log2_half = np.floor(np.log2(half))
     for exponent in np.unique(log2_half):
         rows = np.flatnonzero(log2_half == exponent)

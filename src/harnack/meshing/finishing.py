@@ -38,15 +38,11 @@ __all__ = ["check_options", "simplify_mesh", "thicken", "to_trimesh", "vertex_no
 
 # Triangles may turn over when they are moved to a side if they have at most this fraction of the
 # area: so few are slivers (thin triangles).
-# The largest fraction of the area whose triangles may turn over when they are moved to a side. So
-# few are slivers.
 _MAX_TURNED_AREA = 1e-2
 # The largest number of triangles whose hulls are computed.
 _MOST_HULLS = 20_000
 # A surface is thickened too much if points of a side come nearer to it than this fraction of half
 # of the thickness.
-# A part is too thick if points of a side come nearer to the surface than this fraction of half of
-# the thickness.
 _MIN_SIDE_DISTANCE = 0.98
 
 
@@ -99,8 +95,6 @@ def _offset_part(surface: TriangleMesh, normals: FloatArray, thickness: float) -
     offset = 0.5 * thickness * normals / _normal_cosines(surface, normals)[:, None]
     a, b = boundary_edges(surface.faces).T
     # A face of the upper side runs the boundary edge from a to b, so the wall runs it from b to a.
-    # A face of the upper side runs the boundary edge from a to b, so the wall runs it from b to a.
-    # The sides have the vertices 0 to n - 1 and n to 2 n - 1. Each wall is two triangles.
     walls = [np.stack([b, a, a + n], axis=1), np.stack([b, a + n, b + n], axis=1)]
     vertices = np.concatenate([surface.vertices + offset, surface.vertices - offset])
     return TriangleMesh(
@@ -148,11 +142,10 @@ def _why_too_thick(surface: TriangleMesh, normals: FloatArray, thickness: float)
         side = surface.vertices + sign * half * normals
         turned = (area_normals(side[surface.faces]) * face_normals).sum(axis=1) <= 0
         # A smaller area is slivers.
-        if areas[turned].sum() > _MAX_TURNED_AREA * areas.sum():  # a smaller area is slivers
+        if areas[turned].sum() > _MAX_TURNED_AREA * areas.sum():
             return f"{turned.sum()} triangles turn over: the surface bends more than 1/{half:.3g}"
         # Only the vertex that a point was moved from, and the neighbors of this vertex, may be near
         # the point.
-        # At most the neighbors of the vertex that a point was moved from are nearer to the point.
         distances, nearest = tree.query(side, k=neighbor_count)
         pairs = np.stack([np.broadcast_to(vertex_ids[:, None], nearest.shape), nearest], axis=-1)
         is_too_near = (distances < _MIN_SIDE_DISTANCE * half) & (pairs[..., 0] != pairs[..., 1])
@@ -203,8 +196,6 @@ def _hull_union(surface: TriangleMesh, radius: float, tolerance: float, why: str
 _CREASE_COSINE = math.cos(math.radians(30))
 # How far simplification may move a surface, tried in this order; and how far vertices near crossing
 # triangles may be moved afterwards. Both are relative to the tolerance.
-# How far simplification may move a surface, tried in this order, and how far mending may move it
-# afterwards; relative to the tolerance.
 _SIMPLIFIED_WITHIN, _MENDED_WITHIN = (0.4, 0.2, 0.1), 0.05
 
 
@@ -300,7 +291,7 @@ def to_trimesh(surface: TriangleMesh, facts: dict[str, Any], is_closed: bool) ->
             )
         facts = {**facts, "volume": volume}
     # The function is larger inside.
-    elif not len(boundary) and mesh.volume < 0:  # f is larger inside
+    elif not len(boundary) and mesh.volume < 0:
         mesh.invert()
     mesh.metadata["harnack"] = {
         "proved": 0,

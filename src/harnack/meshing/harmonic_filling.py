@@ -63,12 +63,8 @@ _CELLS_ACROSS = 24
 # Boundary edges that are missing among the edges of the tetrahedra are halved, at most so often.
 # The largest number of pieces in all, and for each edge: so many arise where edges lie on each
 # other.
-# How often edges of holes that are missing among those of the tetrahedra are halved; and the
-# largest number of pieces, in all and for each edge: so many arise where edges lie on each other.
 _MAX_HALVINGS, _MAX_PIECES, _MAX_PIECES_PER_EDGE = 12, 20_000, 64
 # How often a filling that intersects the mesh is computed again, with smaller cells.
-# How often patches (the pieces of a filling) that intersect the mesh are computed again, with
-# smaller cells.
 _MAX_MESH_RETRIES = 1
 # How far the winding number may be from 1/2, modulo 1, at vertices of patches.
 _MAX_WINDING_ERROR = 1e-6

@@ -50,14 +50,10 @@ _MAX_LOOP_EDGES = 600
 # Loops of up to the first number of edges are triangulated with the smallest angles, longer ones
 # with the smallest area. Loops of up to the second number are triangulated with the smallest angles
 # even in attempts that ask for the smallest area.
-# Loops of up to so many edges are triangulated by angles, and longer ones by areas; and loops of up
-# to so many edges are triangulated by angles even in attempts that go by areas.
 _MAX_BY_ANGLES, _ALWAYS_BY_ANGLES = 150, 10
 # Two angles count as equal if their cosines differ by no more than this.
 _EQUAL_COSINES = 1e-9
 # Edges are split if they are longer than this multiple of the usual length around the hole; and the
-# largest number of rounds of splitting.
-# Edges are split that are longer than this multiple of the usual length around the hole; and the
 # largest number of rounds of splitting.
 _LONG_RATIO, _SPLIT_ROUNDS = 1.4, 10
 # Patches of more faces than this are not split any more.
@@ -69,13 +65,9 @@ _FLIP_ROUNDS = 12
 # The weight of an edge in a Laplacian is half of the sum of the cotangents of the two opposite
 # angles. Weights are at least the first number and cotangents at most the second in absolute value,
 # so that the matrices are positive definite.
-# The smallest weight of an edge, and the largest absolute value of a cotangent, so that every
-# matrix is definite. The weight is half of the sum of the two cotangents.
 _MIN_WEIGHT, _MAX_COTANGENT = 0.02, 20.0
 # The strategies, tried in this order: whether loops are triangulated with the smallest angles (else
 # area), and how often the patch is faired, each time with the cotangents of the patch before.
-# The strategies in the order of the attempts: whether loops are triangulated by angles, and how
-# often the patch is faired, each time with the cotangents of the patch before.
 _STRATEGIES = ((True, 6), (False, 2), (True, 0), (False, 0))
 # The largest deviation of the mesh's winding number from 1/2 modulo 1 on a patch.
 _MAX_WINDING_DEVIATION = 0.36
@@ -223,7 +215,7 @@ def hole_loops(vertices: FloatArray, faces: IntArray, edges: IntArray) -> list[I
             a, b = b, following.pop((a, b))
             # A vertex is reached again: what follows it on the path is a loop; the rest of the path
             # goes on.
-            if a in position:  # a loop is complete; what led to it goes on
+            if a in position:
                 first = position[a]
                 loops.append(np.array(path[first:]))
                 for vertex in path[first + 1 :]:
@@ -637,7 +629,6 @@ def _fair_patches(x: FloatArray, faces: IntArray, new: IntArray, input_count: in
         np.add.at(area, triangles[:, k], twice_area / 6)
     weight = np.maximum(weight, _MIN_WEIGHT)
     # Beside holes that remain open the Laplacian is incomplete, so their vertices do not count.
-    # Beside holes that remain open only new vertices count.
     is_in_sum[edges.vertices[edges.multiplicity != 2]] = False
     rows = np.flatnonzero(is_in_sum & (area > 0))
     laplacian = _graph_laplacian(edges.vertices, weight, len(x))[rows]

@@ -50,22 +50,15 @@ _VOLUME_TOLERANCE = 0.01
 # Each face and the middle of the mesh span a tetrahedron, with a positive volume if the face looks
 # away from the middle. The mesh winds counter-clockwise if the sum of these volumes is more than
 # this fraction of the sum of their magnitudes.
-# Each face and the middle of the mesh span a tetrahedron. The mesh winds counter-clockwise if the
-# sum of the signed volumes is more than this fraction of the sum of their magnitudes.
 _OUTWARD_SHARE = 0.5
 # The distance of points next to faces from these, relative to the size.
 _BESIDE = 1e-6
 # The largest number of points on the wrong side whose distances from the surfaces are computed, and
 # the largest number that a `Difference` lists.
-# The largest number of differing points whose distances from the surfaces are computed, and the
-# largest number that a `Difference` lists.
 _MAX_RETESTED, _MAX_LISTED = 40, 10
 # About how many faces of each closed part are tested.
-# The number of points of each closed part that are tested for where the part lies and what became
-# of it.
 _PART_SAMPLES = 16
 # A mesh is an open sheet if there is nothing inside next to at least this fraction of its area.
-# A mesh is an open sheet if at least this fraction of its area has nothing inside.
 _OPEN_SHARE = 0.4
 
 
@@ -164,7 +157,7 @@ class IntendedSolid:
         # Faces that still have three different corners.
         rows = np.flatnonzero((joined != np.roll(joined, 1, axis=1)).all(axis=1))
         # Every face has its reverse: keep one of both.
-        if not len(welded.net.faces):  # every face has its reverse
+        if not len(welded.net.faces):
             rows = rows[np.unique(np.sort(joined[rows], axis=1), axis=0, return_index=True)[1]]
         joined, is_turned = joined[rows], np.zeros(len(faces), np.bool_)
         if as_it_is or not len(rows):
@@ -174,7 +167,7 @@ class IntendedSolid:
         raw = _turned(raw[rows], disagrees)
         # Most faces have their material inside; -1 reverses the order of corners while closed parts
         # are looked for.
-        step = 1 if volume_of(x, agreeing) >= 0 else -1  # most faces have their material inside
+        step = 1 if volume_of(x, agreeing) >= 0 else -1
         parts = closed_parts(x, raw[:, ::step], agreeing[:, ::step])
         turned = _inside_out(x, agreeing, parts)
         oriented = _turned(agreeing, turned)
@@ -182,7 +175,7 @@ class IntendedSolid:
             parts = closed_parts(x, _turned(raw, turned), oriented)
         # Faces are reported as turned only if whole parts are: not if single faces disagreed with
         # their neighbors.
-        if not disagrees.any():  # otherwise no part is turned as a whole
+        if not disagrees.any():
             is_turned[rows] = turned
         return cls(x, _turned(faces, is_turned), is_turned, oriented, parts, welded.rounded)
 

@@ -288,7 +288,6 @@ def _proved_by_stars(
     vertex_number[vertices] = np.arange(len(vertices))
     # Pairs of a tetrahedron and a corner of it among `vertices`; then pairs of a gradient and such
     # a corner of its tetrahedron.
-    # Pairs of a corner and a tetrahedron around it; then pairs of a corner and a gradient there.
     tet, corner = np.nonzero(vertex_number[index] >= 0)
     vertex_of_pair = vertex_number[index[tet, corner]]
     entry, corner_of_entry = np.nonzero(vertex_number[index[slopes.owner]] >= 0)
