@@ -114,8 +114,8 @@ class BccLattice:
         max_cells = min(MOST_CELLS, most_faces)
         if (min_cells := float(np.prod(np.sort(self.counts)[:2].astype(float)))) > max_cells:
             raise triangle_limit_error(min_cells, max_cells)
-        # Blocks of up to 8 cells along each axis, of which each axis has at least two; larger
-        # blocks if these are too many.
+        # Blocks have up to 8 cells along each axis, but each axis has at least two blocks. Blocks
+        # are larger if there are too many of them.
         halvings = 0
         while halvings < 3 and (self.counts >= 2 ** (halvings + 2)).all():
             halvings += 1
@@ -216,6 +216,7 @@ class BccLattice:
             ends = self.counts.copy()
             ends[axis] = 1
             layer: IntArray = np.indices(tuple(ends.tolist())).reshape(3, -1).T.copy()
+            # The layer of cells with index 0 along the axis, then the last layer.
             layers.append(layer.copy())
             layer[:, axis] = self.counts[axis] - 1
             layers.append(layer)
@@ -255,6 +256,7 @@ class BccLattice:
                 corner[:, plane_axes] += [i, j]
                 face_keys.append(_flat_indices(corner, shape))
             keys_by_axis.append(face_keys)
+        # Six arrays: for all faces the centers on both sides, and the four corners in turn.
         keys = [np.concatenate(column) for column in zip(*keys_by_axis, strict=True)]
         used = sorted_unique(np.concatenate(keys))
         # From lattice points to their positions in `used`: by a table if it is small, else by
@@ -265,6 +267,7 @@ class BccLattice:
             center_below, center_above, *ring = (index[column] for column in keys)
         else:
             center_below, center_above, *ring = (np.searchsorted(used, column) for column in keys)
+        # A tetrahedron for each edge of the face: from corner k - 1 to corner k of the ring.
         corners = [
             np.stack([center_below, center_above, ring[k - 1], ring[k]], axis=1) for k in range(4)
         ]

@@ -450,6 +450,7 @@ def _share_area(first: FloatArray, second: FloatArray) -> BoolArray:
     first, second: (k, 3, 3) the corners of the triangles of each pair.
     """
     normal = np.abs(area_normals(first))
+    # The two coordinates that the projection keeps.
     axes = np.array([[1, 2], [2, 0], [0, 1]])[normal.argmax(axis=1)]
     flat = [np.take_along_axis(t, axes[:, None].repeat(3, axis=1), axis=2) for t in (first, second)]
     overlaps = np.ones(len(first), np.bool_)
@@ -471,6 +472,7 @@ def _segments_meet(triangle: FloatArray, p: FloatArray, q: FloatArray) -> BoolAr
     p, q: (k, 3) the ends of the segments; if they are equal, the segment is a point.
     """
     normal = np.abs(area_normals(triangle))
+    # The two coordinates that a projection along the nearest axis keeps.
     axes = np.array([[1, 2], [2, 0], [0, 1]])[normal.argmax(axis=1)]
     a = np.take_along_axis(triangle, axes[:, None].repeat(3, axis=1), axis=2)
     p, q = (np.take_along_axis(corner, axes, axis=1) for corner in (p, q))
@@ -492,6 +494,7 @@ def _is_in_angle(triangle: FloatArray, p: FloatArray) -> BoolArray:
     p: (k, 3) the points, each in the plane of its triangle.
     """
     normal = np.abs(area_normals(triangle))
+    # The two coordinates that a projection along the nearest axis keeps.
     axes = np.array([[1, 2], [2, 0], [0, 1]])[normal.argmax(axis=1)]
     a = np.take_along_axis(triangle, axes[:, None].repeat(3, axis=1), axis=2)
     p = np.take_along_axis(p, axes, axis=1)
@@ -748,6 +751,7 @@ def points_off_level(
     # Level sets of fields with a period may end at a curve, on which the field has no value.
     if function.period is not None:
         is_checked[boundary_edges(faces)] = False
+    # The sum of the normals of the faces around each vertex.
     mean = np.zeros_like(vertices)
     for k in range(3):
         np.add.at(mean, faces[:, k], normal)

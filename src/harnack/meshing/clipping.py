@@ -90,6 +90,7 @@ def drop_degenerate_components(surface: TriangleMesh) -> TriangleMesh:
     part = _component_of_faces(surface)
     count = np.bincount(part)
     corner = x[faces]
+    # Each component relative to its own center, against rounding errors.
     center = (
         np.stack([np.bincount(part, c) for c in corner.mean(axis=1).T], axis=1) / count[:, None]
     )
@@ -151,6 +152,7 @@ class Shells:
         """Find the connected components of a closed surface, their volumes and their boxes."""
         number = np.unique(_component_of_faces(surface), return_inverse=True)[1]
         corners = surface.vertices[surface.faces]
+        # Relative to the center, so that rounding errors are relative to the size of the mesh.
         offset = corners[:, 0] - surface.vertices[surface.faces].mean(axis=(0, 1))
         volumes = (
             np.bincount(number, row_dots(area_normals(surface.vertices[surface.faces]), offset)) / 6
@@ -353,6 +355,7 @@ def _cut(surface: TriangleMesh, boundary: _ClipBoundary) -> TriangleMesh:
 
     pieces = [faces[is_kept & ~is_out.any(axis=1)]]
     rows = faces[mixed]
+    # How many corners of each face are outside: one or two.
     number = is_out[mixed].sum(axis=1)
     for k in range(3):
         order = [k, (k + 1) % 3, (k + 2) % 3]

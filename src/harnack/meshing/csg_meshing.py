@@ -491,6 +491,7 @@ class CsgMesher:
             smallest_cell=math.inf,
             intersected_with=(),
         )
+        # The transformed function is value_factor times the original one.
         manifold = local.mesh_sublevel(solid.field, level / solid.map.value_factor)
         self.evaluations += local.evaluations
         self.levels += local.levels

@@ -132,7 +132,9 @@ def _push_inward(
     a, edge_direction = vertices[ends[:, 0]], vertices[ends[:, 1]] - vertices[ends[:, 0]]
     length = np.linalg.norm(edge_direction, axis=1)
     edge_direction, a = (edge_direction / length[:, None])[edge], a[edge]
+    # The position of each point along its edge, from 0 to 1.
     fraction = ((points - a) * edge_direction).sum(axis=1) / length[edge]
+    # For each vertex the sum of the vectors to its neighbors, and the length of its shortest edge.
     inwards, shortest = np.zeros_like(vertices), np.full(len(vertices), np.inf)
     for k in range(3):
         corner, second, third = (faces[:, (k + j) % 3] for j in range(3))

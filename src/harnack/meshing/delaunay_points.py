@@ -160,6 +160,7 @@ def box_cells(
     """
     size = upper - lower
     finest = max(1, math.ceil(math.log2(float(size.max()) / spacing)))
+    # At first the longest side has up to 8 cells; the rest is left to halvings.
     if exact:
         edge = float(size.max()) / 2 ** min(finest, 3)
         counts = np.maximum(1, np.ceil(size / edge * (1 - 1e-9))).astype(int)
@@ -199,6 +200,7 @@ def sample_delaunay_points(
     Raises:
         MemoryError: there are more than four million cells.
     """
+    # Leaves of the octree are `occupied` (they may hold the level set) or proved `empty`.
     tree = refine_cells(root[0], function.clearance, _MAX_CELLS, root[1])
     points, size = _corners_and_centers(tree, _subdivided_cells(function, tree.occupied, finer))
     min_curve_distance = _MIN_CURVE_DISTANCE * np.minimum(size, 2 * float(tree.occupied.size.max()))
@@ -212,6 +214,7 @@ def sample_delaunay_points(
         function, points, size, min_curve_distance[is_far], samples, boundary, walls
     )
     n = len(boundary.points)
+    # The samples at the points of the curve.
     zeros = LevelSamples(np.zeros(n), np.zeros((n, 3)), np.zeros(n))
     together = [
         np.concatenate([getattr(batch, name) for batch in (zeros, samples)])

@@ -151,7 +151,7 @@ def unique_with_inverse(keys: IntArray) -> tuple[IntArray, IntArray, IntArray, I
     if int(keys.max(initial=0)) >> (62 - bits):
         order = np.argsort(keys, kind="stable")
         ordered = keys[order]
-    else:  # keys and indices in one word, since sorting is far faster than `argsort`
+    else:
         # Key and index in one word, since sorting is far faster than `argsort`.
         both = np.sort((keys << bits) | np.arange(len(keys)))
         order, ordered = both & ((1 << bits) - 1), both >> bits

@@ -317,6 +317,7 @@ def _mesh_patches(
     boundary = BoundaryCurve(vertices[rim], rim_edges.reshape(-1, 2))
     extent: Any = function.field.extent((_LEVEL,))
     lower, upper = (np.array(end, np.float64) for end in extent.bounds())
+    # Cells around all points in which the level set can lie.
     root = box_cells(lower - 0.5 * spacing, upper + 0.5 * spacing, spacing, exact=False)
     curve, halved = boundary, np.zeros((0, 2), np.int64)
     points = sample_delaunay_points(function, root, curve, None, seed, finer)
@@ -447,9 +448,7 @@ def _collapse_midpoint(x: FloatArray, faces: IntArray, middle: int, ends: list[i
         at_end = (faces == end).any(axis=1)
         # The midpoint and the end may share three vertices: these two, and the third corner of the
         # face between them.
-        if (
-            len(np.intersect1d(faces_at_middle, faces[at_end])) != 3
-        ):  # these two, and the face's third corner
+        if len(np.intersect1d(faces_at_middle, faces[at_end])) != 3:
             continue
         moved = np.where(faces_at_middle == middle, end, faces_at_middle)
         # The face between both vanishes.

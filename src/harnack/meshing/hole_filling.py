@@ -160,6 +160,7 @@ def _failure_reasons(
     reasons: dict[int, str] = {}
     if not len(new):
         return reasons
+    # Centers of new faces and new vertices are tested; `loops` holds the loop of each.
     vertex_loop = np.zeros(len(x), np.int64)
     vertex_loop[new] = owner[:, None]
     loops = np.concatenate([owner, vertex_loop[input_count:]])
@@ -463,11 +464,13 @@ def _min_dihedral_triangulation(
         turns = [-np.einsum("imk,imk->im", normals, side) for side in sides]
         # No neighbor, no angle.
         turns = [np.where(side.any(axis=2), t, -1.0) for side, t in zip(sides, turns, strict=True)]
+        # For each m, the largest turn of the part that is divided at m, and twice its area.
         worst = np.maximum.reduce([*turns, turn[i, m], turn[m, k]])
         size = area[i, m] + area[m, k] + np.sqrt((cross**2).sum(axis=2))
         smallest = worst.min(axis=1, keepdims=True)
         best = np.where(worst <= smallest + _EQUAL_COSINES, size, np.inf).argmin(axis=1)
         rows = np.arange(n - d)
+        # The last diagonal is an edge of the polygon and never barred.
         bar = barred[rows, rows + d] if d < n - 1 else np.zeros(1, np.bool_)
         turn[rows, rows + d] = np.where(bar, np.inf, worst[rows, best])
         area[rows, rows + d] = size[rows, best]
@@ -715,8 +718,11 @@ def _loop_of_faces(new: IntArray, loops: list[IntArray], count: int) -> IntArray
     part = np.asarray(csgraph.connected_components(joined, directed=False)[1])
     loop_at = np.full(int(part.max()) + 1, -1, np.int64)
     keys = edge_keys(edges.vertices, count)
+    # For each edge, one of its faces.
     face_at = np.empty(len(keys), np.int64)
     face_at[edges.edge_of_pair] = np.arange(3 * len(new)) % len(new)
+    # The first edges of the loops, looked up among the edges of patches. Loops without a patch have
+    # none.
     firsts = edge_keys(np.array([loop[:2] for loop in loops]), count)
     positions = np.minimum(np.searchsorted(keys, firsts), len(keys) - 1)
     matched = np.flatnonzero(keys[positions] == firsts)

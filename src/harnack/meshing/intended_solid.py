@@ -435,8 +435,7 @@ def _winds_clockwise(x: FloatArray, faces: IntArray) -> bool:
     size = float(np.ptp(triangles, axis=(0, 1)).max())
     middle: FloatArray = triangles.mean(axis=(0, 1))
     volumes = row_dots(triangles[:, 0] - middle, area_normals(triangles))
-    # Nearly all faces look away from the middle.
     if float(volumes.sum()) > _OUTWARD_SHARE * float(np.abs(volumes).sum()):
-        return False  # nearly all faces look away from the middle
+        return False  # they look away from the middle
     w = _values(_winding_number(x, faces), _near(triangles, size, rng))
     return bool((w < -0.5).sum() > (w > 0.5).sum())
