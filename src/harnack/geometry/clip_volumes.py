@@ -134,7 +134,7 @@ class PlaneTable:
         return result[1:]
 
     def _entry(self, k: int, i: int) -> Real:
-        """Entry i of row k, as a literal or read from the buffer."""
+        """Entry i of row k: a literal, or read from the buffer."""
         if self.buffer is None:
             return self.backend.Float(float(self.rows[k, i]))
         return dr.gather(self.backend.Float, self.buffer, self.backend.UInt32(4 * k + i))
@@ -297,6 +297,8 @@ class Ball(Volume):
     _device_numbers: Any = field(default=None, repr=False, compare=False)
 
     def __post_init__(self) -> None:
+        """Validate and convert the attributes. Raises ValueError for a center that is not three
+        finite numbers, or a radius that is not positive."""
         if isinstance(self.center, int | float):
             raise ValueError(
                 f"the center of a ball must be three numbers, not {self.center!r}: for one about "
@@ -390,6 +392,8 @@ class Box(Polytope):
     upper: Point
 
     def __post_init__(self) -> None:
+        """Validate and convert the corners. Raises ValueError unless lower <= upper in each
+        coordinate."""
         lower = as_point(self.lower, "the lower corner of a box", finite=False)
         upper = as_point(self.upper, "the upper corner of a box", finite=False)
         if any(a > b or a == np.inf or b == -np.inf for a, b in zip(lower, upper, strict=True)):
@@ -429,6 +433,8 @@ class HalfSpace(Polytope):
     offset: float
 
     def __post_init__(self) -> None:
+        """Validate the attributes, and scale the normal to length one. Raises ValueError for a
+        normal of length zero, or numbers that are not finite."""
         normal = np.array(as_point(self.normal, "the normal of a half-space"))
         largest = float(np.abs(normal).max())
         if largest == 0.0:
@@ -469,6 +475,8 @@ class VolumeIntersection(Volume):
     volumes: tuple[Volume, ...]
 
     def __init__(self, volumes: Iterable[Volume]) -> None:
+        """Validate and store the volumes. Raises TypeError for anything else, and ValueError if
+        there is none."""
         if not isinstance(cast("Any", volumes), Iterable):
             raise TypeError(f"an intersection is of several volumes, not of {volumes!r:.60}")
         members = tuple(volumes)

@@ -69,6 +69,7 @@ class Circle:
     normal: tuple[float, float, float] = (0.0, 0.0, 1.0)
 
     def __post_init__(self) -> None:
+        """Validate and convert the attributes, and scale the normal to length one."""
         radius = _numbers(self.radius, "radius", ())
         if not _MIN_RADIUS <= radius <= MAX_COORDINATE:
             raise ValueError(
@@ -86,6 +87,7 @@ class Circle:
             raise ValueError("normal of a circle is zero: give the direction of its axis")
         # A normal of unit length, to rounding, is kept as it is.
         if abs(float(normal @ normal) - 1) > 1e-15:
+            # Divided by the largest component first, so that squares neither overflow nor vanish.
             normal = normal / largest
             normal = normal / np.linalg.norm(normal)
         object.__setattr__(self, "radius", float(radius))

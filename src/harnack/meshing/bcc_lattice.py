@@ -86,8 +86,8 @@ class BccLattice:
         return self.lower + self.counts * self.size
 
     def points(self, coordinates: IntArray) -> FloatArray:
-        """Points (n, 3) in space, from their integer lattice coordinates (n, 3). Points on the
-        boundary of the box lie exactly on it."""
+        """The points (n, 3) in space with the lattice coordinates `coordinates` (n, 3). Points on
+        the boundary of the box lie exactly on it."""
         x = self.lower + 0.5 * self.size * coordinates
         x = np.where(coordinates == 0, self.lower, x)
         return np.where(coordinates == 2 * self.counts, self.upper, x)
@@ -210,7 +210,7 @@ class BccLattice:
         return touches
 
     def outer_cells(self) -> IntArray:
-        """(n, 3) indices of the cells that have a face on the boundary of the box."""
+        """The indices (n, 3) of the cells that have a face on the boundary of the box."""
         layers: list[IntArray] = []
         for axis in range(3):
             ends = self.counts.copy()
@@ -281,7 +281,7 @@ def distinct_rows(rows: IntArray) -> IntArray:
 
 
 def triangle_limit_error(cells: float, max_cells: int) -> TriangleLimitError:
-    """The error to raise if a mesh would need too many cells; its message names the limit and
+    """Make the error to raise if a mesh would need too many cells; its message names the limit and
     remedies.
 
     cells: about how many cells hold the surface.

@@ -188,7 +188,7 @@ class _PairTests:
 
     @classmethod
     def of(cls, vertices: FloatArray, faces: IntArray) -> _PairTests:
-        """Upload vertices (n, 3) and faces (m, 3)."""
+        """Upload vertices (n, 3) and faces (m, 3) to the device."""
         backend = choose_backend("double")
         a, b, c = (backend.UInt32(np.ascontiguousarray(column, np.uint32)) for column in faces.T)
         return cls(RecordTable.upload(backend, vertices), (a, b, c))

@@ -158,16 +158,20 @@ def _integers(points: FloatArray) -> Any:
 
 
 def _orient3d_exact(points: Any) -> Any:
-    """(n,) det(a - d, b - d, c - d) without rounding, for integer points (n, 4, 3): a, b, c, d in
-    each row."""
+    """Compute det(a - d, b - d, c - d) without rounding, (n,) integers.
+
+    points: (n, 4, 3) integer coordinates of the points a, b, c, d in each row.
+    """
     rows = points[:, :3] - points[:, 3:]
     (ax, ay, az), (bx, by, bz), (cx, cy, cz) = (rows[:, k].T for k in range(3))
     return (bx * cy - cx * by) * az + (cx * ay - ax * cy) * bz + (ax * by - bx * ay) * cz
 
 
 def _orient2d_exact(points: Any) -> Any:
-    """(n,) det(a - c, b - c) without rounding, for integer points (n, 3, 2): a, b, c in each
-    row."""
+    """Compute det(a - c, b - c) without rounding, (n,) integers.
+
+    points: (n, 3, 2) integer coordinates of the points a, b, c in each row.
+    """
     rows = points[:, :2] - points[:, 2:]
     (ax, ay), (bx, by) = (rows[:, k].T for k in range(2))
     return ax * by - ay * bx
@@ -254,8 +258,12 @@ def touching_pairs(vertices: FloatArray, faces: IntArray) -> tuple[IntArray, Flo
     contacts: list[FloatArray] = []
 
     def add(pairs: IntArray, touches: BoolArray, p: FloatArray, q: FloatArray) -> None:
-        """Add the pairs (k, 2) selected by the mask `touches` (k,) to the result, and as their
-        points of contact the points midway between p and q, both (k, 3)."""
+        """Add pairs to the result, and for each pair its point of contact.
+
+        pairs: (k, 2) pairs of faces.
+        touches: (k,) mask of the pairs to be added.
+        p, q: (k, 3) points; the point of contact is midway between them.
+        """
         batches.append(pairs[touches])
         contacts.append(0.5 * (p + q)[touches])
 
@@ -772,9 +780,9 @@ def points_off_level(
 
 
 def _askew_lines() -> FloatArray:
-    """(13, 3) unit vectors along the axes, the face diagonals and the space diagonals of a cube.
-    The cube is turned so that no vector is near a coordinate plane or a plane at 45 degrees to two
-    axes."""
+    """Directions of 13 lines as unit vectors (13, 3): the axes, the face diagonals and the space
+    diagonals of a cube. The cube is turned so that no line is near a coordinate plane or a plane at
+    45 degrees to two axes."""
     directions = np.array(list(itertools.product((-1.0, 0.0, 1.0), repeat=3)))[14:]
     frame: FloatArray = np.linalg.qr([[7, 7, -3], [3, -16, -7], [19, 7, -13]])[0]
     return (directions / row_norms(directions)[:, None]) @ frame
@@ -783,8 +791,8 @@ def _askew_lines() -> FloatArray:
 def _is_positive(
     function: LevelFunction, points: FloatArray, volume: Volume | None
 ) -> npt.NDArray[np.bool_]:
-    """(n,) whether points (n, 3) count as outside: the function is positive or not a number there,
-    or the point lies outside of the volume."""
+    """(n,) whether points (n, 3) count as outside of the solid: the function is positive or not a
+    number there, or the point lies outside of the volume."""
     is_positive = ~(function.sample(points).value <= 0)
     return is_positive if volume is None else is_positive | ~volume.contains_points(points)
 

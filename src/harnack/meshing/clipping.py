@@ -209,7 +209,7 @@ def _component_of_faces(surface: TriangleMesh) -> IntArray:
 
 
 def winding_around(corner: FloatArray, point: FloatArray) -> float:
-    """The winding number of triangles (m, 3, 3) around a point (3,)."""
+    """The winding number, around a point (3,), of triangles with corners (m, 3, 3)."""
     return float(solid_angles(corner, point).sum()) / (4 * math.pi)
 
 
@@ -290,12 +290,11 @@ def _snap_to_boundary(
     surface: TriangleMesh, boundary: _ClipBoundary
 ) -> tuple[FloatArray, FloatArray]:
     """Move vertices that are very near the plane or sphere `boundary` onto it, since cutting beside
-    them would leave slivers.
+    them would leave slivers (thin triangles). A vertex is moved in the surface's tangent plane, if
+    the move is shorter than a quarter of the vertex's shortest edge. Vertices on the boundary edges
+    of the surface itself are not moved.
 
     Returns the vertices (n, 3), and their signed distances (n,) from the plane or sphere.
-
-    A vertex is moved in the surface's tangent plane, if the move is shorter than a quarter of the
-    vertex's shortest edge. Vertices on the boundary edges of the surface itself are not moved.
     """
     x, faces = surface.vertices, surface.faces
     corner = x[faces]
@@ -348,8 +347,8 @@ def _cut(surface: TriangleMesh, boundary: _ClipBoundary) -> TriangleMesh:
     first_new = len(vertices)
 
     def crossing(i: IntArray, j: IntArray) -> IntArray:
-        """(k,) the indices of the vertices where edges from vertices i to j, both (k,), meet the
-        plane or sphere: i itself if it lies on it, else the new vertex on the edge."""
+        """(k,) the indices of the vertices at which the edges from vertices i to j, both (k,), meet
+        the plane or sphere: i itself if it lies on it, else the new vertex on the edge."""
         index = np.searchsorted(keys, edge_keys(np.column_stack([i, j]), len(vertices)))
         return np.where(h[i] == 0, i, first_new + index)
 

@@ -341,6 +341,7 @@ class ClosedMesh(trimesh.Trimesh):
         return cast("ClosedMesh", copied)
 
     def copy(self, *args: Any, **options: Any) -> trimesh.Trimesh:
+        """A copy of the mesh, as a ClosedMesh."""
         copied = super().copy(*args, **options)
         copied.__class__ = type(self)
         return copied

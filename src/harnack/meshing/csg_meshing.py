@@ -511,7 +511,7 @@ def _is_complement_free(solid: Solid) -> bool:
 
 def is_single_level_set(solid: Solid) -> bool:
     """Whether a solid is meshed as one level set. Other solids are meshed by Boolean operations, or
-    by a method of their own that makes their edges exact."""
+    by a method of their own that makes their sharp edges exact."""
     if isinstance(solid, SublevelSolid):
         return not isinstance(solid.field, Solid) or is_single_level_set(solid.field)
     if isinstance(solid, TransformedSolid):
@@ -614,8 +614,9 @@ _MARGIN = 0.01
 class SolidMeshResult:
     """The closed mesh of a solid, and facts about how it was computed.
 
-    spacing: the smallest size of cells.
-    evaluations: the number of evaluations of fields, in points.
+    surface: the mesh.
+    spacing: the smallest size of cells, a length.
+    evaluations: the number of points at which fields were evaluated.
     levels: the number of level sets that the mesh was made of.
     size: the longest edge of the box around the solid; relative tolerances are fractions of it.
     """

@@ -97,8 +97,8 @@ class HarmonicFilling:
     faces: (p, 3). Indices below the number of the mesh's vertices stand for vertices of the mesh,
         the following ones for new vertices.
     is_refined: whether the faces were refined to the tolerance.
-    spacing: the size of cells.
-    evaluations: the number of evaluations of the solid angle, in points.
+    spacing: the size of cells at first, a length.
+    evaluations: the number of points at which the solid angle was evaluated.
     triangle_fill_count: how many of the faces are single triangles that fill holes of three edges.
     """
 

@@ -77,14 +77,13 @@ Winding = Callable[[FloatArray], FloatArray]
 
 @dataclass(frozen=True)
 class HoleFilling:
-    """The vertices and faces added to a mesh by filling its holes.
+    """The vertices and faces that are added to a mesh by filling its holes.
 
     vertices: (k, 3) new vertices.
-    faces: (p, 3) the faces of the fillings. Indices below the number of the mesh's vertices stand
-        for vertices of the mesh, the following ones for new vertices.
-    unfilled_loops: the loops whose fillings failed, each an array of indices of vertices.
-    reason: why the fillings of these loops failed, in words, with the number of loops for each
-        reason.
+    faces: (p, 3) the faces of the patches that were accepted. Indices below the number of the
+        mesh's vertices stand for vertices of the mesh, the following ones for new vertices.
+    unfilled_loops: the loops whose patches were not accepted, each an array of indices of vertices.
+    reason: why these patches were not accepted, in words, with the number of loops for each reason.
     """
 
     vertices: FloatArray
@@ -583,7 +582,7 @@ def _solve_least_squares(matrix: Any, x: FloatArray, input_count: int) -> FloatA
 
 
 def _graph_laplacian(ends: IntArray, weight: FloatArray, count: int) -> Any:
-    """The Laplacian (count, count) of a graph, as a sparse matrix: -weight for each edge, and at
+    """The Laplacian of a graph, as a sparse matrix (count, count): -weight for each edge, and at
     each vertex the sum of the weights of its edges.
 
     ends: (k, 2) the vertices of each edge.
@@ -693,7 +692,7 @@ def _flip_edges(x: FloatArray, new: IntArray, fixed_edges: IntArray) -> IntArray
 
 
 def _cotangents(a: FloatArray, b: FloatArray, apex: FloatArray) -> FloatArray:
-    """(k,) the cotangents of the angles at points `apex` between the directions to `a` and to `b`,
+    """The cotangents (k,) of the angles at points `apex` between the directions to `a` and to `b`,
     all (k, 3)."""
     u, w = a - apex, b - apex
     return row_dots(u, w) / np.maximum(row_norms(np.cross(u, w)), 1e-300)

@@ -190,7 +190,7 @@ class IntendedSolid:
         return _winding_number(self.vertices, self.oriented)
 
     def winding(self, points: FloatArray) -> FloatArray:
-        """(k,) the winding numbers of the mesh at points (k, 3)."""
+        """The winding numbers (k,) of the mesh at points (k, 3)."""
         return _values(self.field, points)
 
     @functools.cached_property
