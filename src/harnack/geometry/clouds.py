@@ -181,6 +181,7 @@ def estimate_areas(
     areas = np.empty(len(x))
     cells = TangentVoronoi.of(tree.data)
     for start in range(0, len(x), _POINTS_PER_BATCH):
+        # The cut-off radius of each cell: half of R, but at most three times the neighbors' median.
         batch = order[start : start + _POINTS_PER_BATCH]
         max_radius = _MAX_RADIUS_RATIO * np.median(radii[nearest[batch]], axis=1)
         cell_radii = np.minimum(radii[position_of[batch]], max_radius)
@@ -354,6 +355,7 @@ def _choose_neighborhood(x: FloatArray) -> tuple[int, IntArray]:
                 return best_choice
         if len(subset) < _MIN_SUBSET:
             return best_choice
+        # Too noisy: try half of the points, with the largest number of neighbors.
         subset, counts_to_try = (
             np.sort(rng.choice(subset, len(subset) // 2, replace=False)),
             _NEIGHBOR_COUNTS[-1:],

@@ -154,6 +154,7 @@ def _widest_gap_direction(a: FloatArray, b: FloatArray) -> FloatArray:
     angle = np.arctan2(b, a)
     farthest = np.take_along_axis(angle, distance.argmax(axis=1)[:, None], axis=1)
     angle = np.sort(np.where(distance > 1e-10, angle, farthest), axis=1)
+    # Gaps between successive angles; the last one goes around to the first angle.
     gap = np.diff(angle, axis=1, append=angle[:, :1] + 2.0 * np.pi)
     widest = gap.argmax(axis=1)[:, None]
     middle = np.take_along_axis(angle, widest, axis=1) + 0.5 * np.take_along_axis(gap, widest, 1)

@@ -114,6 +114,7 @@ def outlier_indices(points: FloatArray, tree: Any) -> IntArray:
         nearest[rows], distances[rows] = index[:, 1:], distance[:, -1]
 
     parallel_over_slices(find_neighbors, len(points))
+    # The larger one of the two typical distances.
     expected = np.maximum(np.median(distances[nearest], axis=1), np.median(distances))
     return np.flatnonzero(distances > _OUTLIER_RATIO * expected)
 

@@ -117,8 +117,8 @@ class IntendedSolid:
 
     vertices, faces: (n, 3), (m, 3) the mesh.
     is_turned: (m,) mask of the faces whose orientation was reversed.
-    oriented: (k, 3) the faces with three different corners, with equal corners joined, and with the
-        orientation of their neighbors where that is possible.
+    oriented: (k, 3) the faces with three different corners, with equal corners joined, and turned
+        over so that they agree with their neighbors where that is possible, and are not inside out.
     parts: for each closed part of `oriented`, the indices of its faces. Parts may touch, cross or
         lie in each other (`closed_parts`).
     rounded: the number of corners that were joined with others because only rounding separated
