@@ -56,13 +56,14 @@ class Morph(BatchedField):
         of level 1/2 spans the hole.
     gap: the distance between the solids, in the unit of the meshes. With a large gap the slices in
         the middle are small, or empty: for solids of half-diagonal 1, 0.1 to 0.2 is good.
-    w: in [0, gap]. Like `gap` it is a kernel parameter: other numbers compile nothing.
+    w: the height of the slice, in [0, gap]. Like `gap` it is a parameter of compiled kernels, which
+        are not compiled again for other numbers.
     spacing: see above, at most 2. A smaller spacing gives sharper surfaces, and needs 1/spacing^2
         times as many points. For real meshes surfaces were off by at most 0.02, 0.04 and 0.09 of w
         for 1, 1.4 and 2.
-    accuracy: for w between 0 and gap, the sum uses the moments of a cluster of points beyond
-        `accuracy` times its radius; at least 2. Bounds of the truncation error are part of every
-        promise, and tracing uses a higher accuracy where the tolerance needs it.
+    accuracy: for w between 0 and gap, the sum uses the multipole moments of a cluster of points
+        beyond `accuracy` times its radius; at least 2. The truncation error is part of all proved
+        bounds, and tracing uses a higher accuracy where the tolerance needs it.
 
     Raises:
         MeshError: a ValueError, as `validate_mesh`; or an argument is no pair.
