@@ -336,9 +336,9 @@ class Edge:
 
 def edge_variation(square: Real, inverse: Real) -> tuple[Real, Real]:
     """Compute two numbers for an edge of half length h at the distance d from a point: the number
-    h/(d sqrt(d^2+h^2)), and this number divided by d. Twice these numbers are upper bounds of the
-    integrals of |dp|/D^2 and of |dp|/D^3 along the edge, where D is the distance from the point to
-    the point p of the edge (`LiftedEdge.bounds`).
+    h/(d sqrt(d^2+h^2)), and this number divided by d. Twice the first is an upper bound of the
+    length of the edge's Biot and Savart field. Twice the second is an upper bound of the integral
+    of |dp|/D^3 along the edge (`LiftedEdge.bounds`).
 
     square: d^2.
     inverse: 1/(2h)^2.
