@@ -436,8 +436,8 @@ class LiftedProduct:
         return self.re, self.im, self.turns
 
     def times(self, re: Real, im: Real) -> LiftedProduct:
-        """Multiply by a further factor re + i im, and return the new product. If the new product is
-        not finite when scaled, the factor counts for the turns only.
+        """Multiply by a further factor re + i im, and return the new product. If the product is 0
+        or overflows, so that it cannot be scaled, re and im of the old product are kept.
 
         Arguments lie in (-pi, pi]. If the arguments of both factors have different signs, the
         argument of the product is their sum. Otherwise the sum has left the interval exactly if the
