@@ -90,8 +90,8 @@ def build_curve_cells(
     and go into the expansion. So in each cell, near loops and expansion together have the solid
     angle of the curve, modulo 4 pi.
     """
-    # The cube's center and half side are multiples of `_GRID_STEP`; one step is in hand.
     loops = tuple(loop.astype(backend.dtype).astype(np.float64) for loop in loops)
+    # The cube's center and half side are multiples of `_GRID_STEP`; one step is in hand.
     middle = np.round(0.5 * (low + high) / _GRID_STEP) * _GRID_STEP
     half = float(np.maximum(high - middle, middle - low).max())
     half = (math.ceil(half / _GRID_STEP) + 1) * _GRID_STEP

@@ -180,8 +180,8 @@ def _over_pieces(
         piece = _EdgePiece.of(a, b, t, radius)
         re, im = inner_product(spinor(a)[2], spinor(b)[2])
         re, im = dr.fma(zr, re, -(zi * im)), dr.fma(zr, im, zi * re)
-        # The product is scaled, as only its argument matters. A factor that cannot be scaled (an
-        # edge of length 0 at the center) is left out.
+        # The product is scaled, as only its argument matters. A factor that makes it 0
+        # is left out.
         scale = dr.rcp(dr.abs(re) + dr.abs(im))
         is_valid = active & (t == 0) & dr.isfinite(scale)
         zr, zi = dr.select(is_valid, re * scale, zr), dr.select(is_valid, im * scale, zi)
