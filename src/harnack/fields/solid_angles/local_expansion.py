@@ -177,7 +177,7 @@ def evaluate_expansion(coefficients: Sequence[Any], y: Sequence[Any], degree: in
         total[0] = total[0] + weight * (real * re + (imag * im if k else 0.0))
         if j == degree:
             continue
-        # up, iup: real and imaginary part of A_j+1,k+1 without its weight; down: of A_j+1,k-1.
+        # up, iup: real and imaginary part of L_j+1,k+1; down, idown: of L_j+1,k-1.
         up, down = a[j + 1, k + 1, 0], a.get((j + 1, k - 1, 0), 0.0)
         iup, idown = a[j + 1, k + 1, 1], a.get((j + 1, k - 1, 1), 0.0)
         zr, zi = a[j + 1, k, 0], a.get((j + 1, k, 1), 0.0)
@@ -236,7 +236,7 @@ def rounding_tables(degree: int, largest: float) -> FloatArray:
     count = (degree + 1) ** 2
     coordinate = _AbsoluteValues(np.full(count, largest))
     units = [_AbsoluteValues(row) for row in np.eye(count)]
-    # Column i of the results is for an expansion whose coefficient i is 1, all others 0.
+    # Entry i of each result is for an expansion whose coefficient i is 1, all others 0.
     sums = evaluate_expansion(units, (coordinate, coordinate, coordinate), degree)
     roundings = 0.51 * (9 * degree + 2 * count)
     return roundings * np.stack([absolute.number for absolute in sums], axis=1)
