@@ -117,6 +117,7 @@ class DipoleTree:
         # Each dipole is a source with one position and one moment, and its own center.
         levels = dipole_tree_moments(tree, points[:, None], moments[:, None], points, points)
         rows = dipole_records(points, moments)
+        # Column 6 is |m_i|; the rounding is proportional to the size of the sum.
         rounding = final_rounding(backend, size=max(1.0, float(rows[:, 6].sum())))
         slots = records_in_slots(tree, rows)
         clusters = Treecode.of(backend, tree, levels, slots, accuracy)
@@ -142,7 +143,7 @@ class DipoleTree:
             fmax(self.backend.Float(closer), self.backend.Float(1)),
         )
         sums, _ = self._near_sums(x, detail, unit, derivatives)
-        return self.clusters.values(sums, 1.0, unit, self.rounding)
+        return self.clusters.values(sums, 1.0, unit, self.rounding)  # f is 1.0 times the sum
 
     def _sums(self, x: Vec3, detail: Real, unit: Real, derivatives: int) -> tuple[SourceSums, Vec3]:
         """Sum over all dipoles at points x, by the tree.
@@ -188,14 +189,14 @@ class DipoleTree:
             the accuracy of the cells' polynomials, and for larger scales the tree is used.
         """
         unit = coordinate_rounding(x)
-        sums, nearest = self._near_sums(x, detail, unit)
+        sums, nearest_moment = self._near_sums(x, detail, unit)
         # Where the field of a single point dominates, shading uses that point's normal. It is
         # reversed, because gradients point inwards: f is larger inside.
-        area = dr.norm(nearest)
+        area = dr.norm(nearest_moment)
         is_dominated = (
             sums.singularity_distance * sums.singularity_distance < _NEAR_SQUARE_PER_AREA * area
         ) & (area > 0)
-        normal = dr.select(is_dominated, -nearest / area, dr.normalize(sums.gradient))
+        normal = dr.select(is_dominated, -nearest_moment / area, dr.normalize(sums.gradient))
         return sums.sample(1.0, unit, self.rounding, normal)
 
 
@@ -376,10 +377,11 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
         if isinstance(normals, str) and normals != "estimate":
             raise CloudError(f'normals must be (n, 3) or "estimate", not {normals!r}')
         self.fit_report: dict[str, Any] = {}
-        if isinstance(smoothing, str):
+        if isinstance(smoothing, str):  # "auto"
             points, normals, smoothing = self._fitted(points, normals, areas, smoothing)
         if isinstance(normals, str):
             normals = estimate_normals(points)
+        # 1.0 is only a valid number for the check, if areas are still to be estimated.
         known_areas = 1.0 if areas is None else areas
         points, normals, known_areas = validate_cloud(points, normals, known_areas)
         self._set_points(
@@ -435,7 +437,7 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
             field = DipolePotential(x, n, areas, smoothing=length)
             return np.asarray(field.rough_value_and_gradient(x)[1], np.float64)
 
-        known_normals = None if isinstance(normals, str) else normals
+        known_normals = None if isinstance(normals, str) else normals  # else "estimate"
         cloud = DenoisedCloud.of(points, known_normals, gradients)
         self.fit_report = cloud.report
         return cloud.points, cloud.normals, cloud.smoothing
@@ -480,6 +482,7 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
         values: (n,) f minus the level, at the points.
         """
         gradients = self.rough_value_and_gradient(points, precision="double")[1]
+        # The distance that nine tenths of the points do not exceed.
         norms = np.linalg.norm(gradients, axis=1)
         far = float(np.quantile(np.abs(values) / np.maximum(norms, 1e-300), 0.9))
         longest = float((self._box[1] - self._box[0]).max())

@@ -154,12 +154,15 @@ class DipoleCells:
         error, slope_error, tail, tail_slope, rounding, fourth, least, low, high, count = row[
             4:_HEADER_SIZE
         ]
+        # distance: an upper bound of |x - center|; the truncation errors at this distance.
         distance = dr.norm(u) * (1 + SUM_MARGIN)
         error, slope_error = _truncation_at(
             distance * inverse, error, slope_error, tail, tail_slope
         )
-        free = least - distance
-        s4 = fourth * dr.square(dr.square(least / free))
+        # far_distance: a lower bound of the distance from x to the far primitives; s4 as in the
+        # proof.
+        far_distance = least - distance
+        s4 = fourth * dr.square(dr.square(least / far_distance))
         zero, gradient, shift = (
             self.backend.Float(0),
             inverse * vector(*slopes),
@@ -167,7 +170,17 @@ class DipoleCells:
         )
         rounding = dr.fma(shift, dr.norm(gradient) + slope_error + 4 * shift * s4, rounding)
         far = SourceSums(
-            value, gradient, None, error, slope_error, None, rounding, free, s4, s4 / free, zero
+            value,
+            gradient,
+            None,
+            error,
+            slope_error,
+            None,
+            rounding,
+            far_distance,
+            s4,
+            s4 / far_distance,
+            zero,
         )
         # The cell's part of `near`: the index of its first entry, and the number of entries.
         first, count = index(low) + index(high) * _INDEX_BASE, dr.select(active, index(count), 0)
@@ -179,6 +192,7 @@ class DipoleCells:
         def step(i: Any, sums: Any, extra_state: Any) -> tuple[Any, ...]:
             """Add near primitive i of the cell to the sums, given as a flat state, and update the
             caller's state."""
+            # Other lanes in the loop have longer lists.
             in_list = i < count
             primitive = self.primitives.read_record(
                 dr.gather(index, self.near, first + i, in_list), in_list
@@ -190,11 +204,11 @@ class DipoleCells:
 
         start = (index(0), far.to_state(), extra_state)
         _, state, extra_state = dr.while_loop(start, runs, step, label="near primitives")
-        sums, n = SourceSums.from_state(state), self.backend.Float(count)
-        # The rounding of the n additions to the gradient: a near primitive of area a is at most
-        # `_NEAR` + 1 radii away, so its gradient, of order a/distance^3, is at most its part of s4
-        # times this distance.
-        added = (_NEAR + 1) * self.backend.machine_epsilon * n * sums.s4 / inverse
+        sums, near_count = SourceSums.from_state(state), self.backend.Float(count)
+        # The rounding of the additions to the gradient: a near primitive of area a is at
+        # most `_NEAR` + 1 radii away, so its gradient, of order a/distance^3, is at most its part
+        # of s4 times this distance.
+        added = (_NEAR + 1) * self.backend.machine_epsilon * near_count * sums.s4 / inverse
         sums = dataclasses.replace(sums, gradient_truncation=sums.gradient_truncation + added)
         return sums, extra_state, active
 
@@ -437,6 +451,7 @@ def _octree_within_memory(
         return _bytes(backend, levels) > most_bytes
 
     limit, max_near = limits
+    # Double the limit until the cells are small enough in memory.
     while (octree := _octree(packed, half_side, limit, is_too_large)) is None and limit < max_near:
         limit = min(2 * limit, max_near)
     return octree

@@ -87,15 +87,17 @@ def source_tree(tree: BalancedTree, levels: list[NodeMoments], rows: FloatArray)
     to degree 4; the bounds E and G of the terms beyond degree 4 in value and gradient
     (`multipole.truncation_bounds`); and for each degree a bound of its term (`multipole.sup_norm`).
     """
-    numbers: list[FloatArray] = []
+    records: list[FloatArray] = []
     for level in levels:
+        # Points at which the node's moments are used are farther than `reach` from its center.
+        # An order of 3 means terms up to degree 4.
         reach = _NODE_RATIO * level.radius
         error, slope, _ = truncation_bounds(level, reach, _MULTIPOLE_DEGREE - 1)
         moments = _columns(level, _MOMENTS)
         norms = [sup_norm(level.moments, l) for l in range(1, _MULTIPOLE_DEGREE + 1)]
         head = [level.center, reach, level.radius, level.area]
-        numbers.append(np.column_stack([*head, *moments, error, slope, *norms]))
-    return pack_tree(choose_backend("double"), tree, numbers, rows)
+        records.append(np.column_stack([*head, *moments, error, slope, *norms]))
+    return pack_tree(choose_backend("double"), tree, records, rows)
 
 
 def _columns(level: NodeMoments, keys: Iterable[tuple[int, int, int]]) -> list[FloatArray]:
@@ -193,7 +195,7 @@ class DipoleExpansions:
         factor (1 - radius/(2 d))^-4 for D >= d, with d = `min_distance`.
         """
         shifted = np.einsum("oab,kb->koa", shifts, self.coefficients)
-        ratio = 0.5 * radius / self.min_distance  # 0 where there is nothing
+        ratio = 0.5 * radius / self.min_distance  # 0 where there are no primitives
         error, slope = self.error + self.tail, self.slope + self.tail_slope
         far = self.s4 / (1 - ratio) ** 4, self.min_distance - 0.5 * radius
         bounds = _ROUNDED_UP * error, _ROUNDED_UP * slope, 0 * error, 0 * slope, *far
@@ -216,11 +218,12 @@ class DipoleExpansions:
         def term(i: Any, active: Mask) -> list[Any]:
             """Compute what node i adds to the attributes of `DipoleExpansions`, in their order, as
             a flat list of numbers."""
+            # The record of the node, in the order of `source_tree`.
             head, payload = tree.node_heads.read_record(i, active), tree.payload(i, active)
-            numbers = dict(zip(_MOMENTS, payload, strict=False))
+            moments = dict(zip(_MOMENTS, payload, strict=False))
             error, slope_error, *norms = payload[len(_MOMENTS) :]
             r = c - tree.backend.Array3f(*head[:3])
-            expansion = _ClusterExpansion.of(r, _pairs(numbers), norms, radius)
+            expansion = _ClusterExpansion.of(r, _pairs(moments), norms, radius)
             return expansion.of_cluster(error, slope_error, head[4], head[5], radius)
 
         return cls._accumulated(tree.backend, lists, term)
@@ -242,18 +245,23 @@ class DipoleExpansions:
             `DipoleExpansions`, in their order, as a flat list of numbers."""
             row = tree.primitives.read_record(i, active)
             # The moments of degree 1, from area times normal.
-            first = {(1, 0): (row[5], 0.0), (1, 1): (0.5 * row[3], 0.5 * row[4])}
+            first_moments = {(1, 0): (row[5], 0.0), (1, 1): (0.5 * row[3], 0.5 * row[4])}
             r = c - tree.backend.Array3f(*row[:3])
             if tree.primitives.packets_per_record == 1:  # a dipole, which has no further moments
-                local = _ClusterExpansion.of(r, first, [row[6]], radius)
-                bounds = local.rounding, local.rounding / radius, local.tail, local.tail_slope
-                rest = row[6] * _fourth(local.inverse), dr.rcp(local.inverse)
-                return [*local.coefficients, *bounds, *rest]
+                expansion = _ClusterExpansion.of(r, first_moments, [row[6]], radius)
+                bounds = (
+                    expansion.rounding,
+                    expansion.rounding / radius,
+                    expansion.tail,
+                    expansion.tail_slope,
+                )
+                distance_terms = row[6] * _fourth(expansion.inverse), dr.rcp(expansion.inverse)
+                return [*expansion.coefficients, *bounds, *distance_terms]
             size, error, slope_error, *norms = row[_DIPOLE_SIZE:_TRIANGLE_HEADER_SIZE]
             higher = dict(zip(_TRIANGLE_MOMENTS, row[_TRIANGLE_HEADER_SIZE:], strict=False))
             norms.insert(1, 0 * size)  # a triangle's moment of degree 2 is 0
-            local = _ClusterExpansion.of(r, first | _pairs(higher), norms, radius)
-            return local.of_cluster(error, slope_error, size, row[6], radius)
+            expansion = _ClusterExpansion.of(r, first_moments | _pairs(higher), norms, radius)
+            return expansion.of_cluster(error, slope_error, size, row[6], radius)
 
         return cls._accumulated(tree.backend, lists, term)
 
@@ -606,6 +614,7 @@ def _count_nodes(
 
         Returns the mask of the lanes that enter the node, and the new number.
         """
+        # Nodes that are neither far nor pending are entered: the walk goes on to their children.
         is_far = dr.squared_norm(c - vector(*node.head[:3])) > dr.square(far_radius + node.head[3])
         is_pending = ~is_far & ~node.is_leaf & (node.head[4] <= max_node_radius)
         chosen = is_far if far else is_pending

@@ -97,6 +97,7 @@ def multipole_to_local(moments: Pairs, harmonics: Pairs, degree: int) -> list[An
     I_lm(r + u) = sum_jk conj(R_jk(-u)) I_(l+j),(m+k)(r), as the R_lm are linearly independent, and
     R_jk(-u) = (-1)^j R_jk(u). So L_jk = -(-1)^j sum_lm conj(M_lm) I_(l+j),(m+k)(c - y).
     """
+    # conj(a + ib)(u + iv) = (au + bv) + i (av - bu).
     coefficients: list[Any] = []
     degrees = sorted({l for l, _ in moments})
     for j in range(degree + 1):

@@ -71,6 +71,7 @@ def regular_harmonics(x: Any, y: Any, z: Any, order: int) -> Pairs:
     r2 = x * x + y * y + z * z
     harmonics: Pairs = {(0, 0): (0 * x + 1, 0.0)}  # 1 for each entry of x
     for m in range(order + 1):
+        # The entry l = m by the first recurrence, then those with l > m by the second.
         if m:
             u, v = x * (1 / (2 * m)), y * (1 / (2 * m))
             re, im = harmonics[m - 1, m - 1]
@@ -114,8 +115,12 @@ def dipole_moments(harmonics: Pairs, nx: Any, ny: Any, nz: Any) -> Pairs:
 
 def multipole_to_multipole(moments: Pairs, x: Any, y: Any, z: Any) -> Pairs:
     """Move moments to another center: compute the moments M_lm of dipoles about a point c, from
-    their moments about c + (x, y, z), by the addition theorem of R_lm. Moments are pairs by
-    (l, m)."""
+    their moments about c + s with s = (x, y, z). Moments are pairs by (l, m).
+
+    By the addition theorem of R_lm, M_lm is the sum over k and j of the old moment M_kj times
+    R_l-k,m-j(s). The term k = l is the old moment itself.
+    """
+    # The limits of j are those of |j| <= k and |m - j| <= l - k.
     r, old = (
         _with_negative_orders(regular_harmonics(x, y, z, MAX_DEGREE - 1)),
         _with_negative_orders(moments),
@@ -216,6 +221,7 @@ def triangle_tree_moments(tree: BalancedTree, corners: FloatArray) -> list[NodeM
     """
     backend = choose_backend("double")
     buffer = upload_floats(backend, corners.ravel())
+    # Pairs of the barycentric coordinates of a point, and its weight.
     rule = tuple(zip(*(part.tolist() for part in triangle_rule()), strict=True))
 
     def primitive(i: Any) -> _DipolePrimitive:
@@ -269,6 +275,7 @@ def _all_levels(
     """
     level, parts, low, high = _leaf_moments(backend, tree, primitive)
     levels = [level]
+    # arity: the number of children of each node at the next level.
     for arity in tree.arities:
         low = low.reshape(-1, arity, 3).min(axis=1)
         high = high.reshape(-1, arity, 3).max(axis=1)
@@ -412,6 +419,7 @@ def _parent_moments(
     Returns the parents' moments as NumPy arrays; and the real and imaginary parts of their M_lm
     once more, as a list of arrays of the backend, which is `parts` for the next level.
     """
+    # The center as for leaves: the mean position weighted by area, or the center of the box.
     count, arity = len(low), len(children.area) // len(low)
     area = children.area.reshape(-1, arity).sum(axis=1)
     weighted = (children.area[:, None] * children.center).reshape(-1, arity, 3).sum(axis=1)
@@ -449,6 +457,7 @@ def _shifted_powers(level: NodeMoments, s: FloatArray) -> tuple[FloatArray, Floa
     The formulas follow from expanding the products of d + s; the sum of a_i d_i, about the node's
     own center, is 0.
     """
+    # trace: the sum of a_i |d_i|^2; m2_s: the second moment times s.
     a, square = level.area[:, None], (s * s).sum(axis=1)
     trace, m2_s = (
         np.einsum("kii->k", level.second_moment),
@@ -480,6 +489,7 @@ def cartesian_coefficients(moments: Moments, order: int = 2) -> FloatArray:
     """
     real = {key: value.real for key, value in moments.items()}
     imag = {key: value.imag for key, value in moments.items()}
+    # r and i: real and imaginary part of M_lm, times the factor of its Cartesian form.
     dipole = [2 * real[1, 1], 2 * imag[1, 1], real[1, 0]]
     r20, r21, i21 = real[2, 0], 6 * real[2, 1], 6 * imag[2, 1]
     r22, i22 = 6 * real[2, 2], 6 * imag[2, 2]
@@ -497,6 +507,7 @@ def cartesian_coefficients(moments: Moments, order: int = 2) -> FloatArray:
         2 * i32,
     ]
     coefficients = -np.stack([*dipole, *quadrupole, *octupole], axis=1)
+    # The terms of degree 1, 2 and 3 have 3, 5 and 7 coefficients.
     coefficients[:, (3, 8, 15)[order] :] = 0
     return coefficients
 
