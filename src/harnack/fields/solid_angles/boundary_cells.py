@@ -120,10 +120,10 @@ class BoundaryCells:
             return None
         # w at the centers, in the mesh's own coordinates, where it is certain.
         centers = cells.centers()
-        near = distance_lower_bound(rays, to_vector3(backend, centers))
+        triangle_distance = distance_lower_bound(rays, to_vector3(backend, centers))
         w, error = value(centers * mesh.size + mesh.center)
         w[
-            (to_numpy(near) < _TRIANGLE_ROUNDINGS * backend.machine_epsilon)
+            (to_numpy(triangle_distance) < _TRIANGLE_ROUNDINGS * backend.machine_epsilon)
             | ~(error < _MAX_BRANCH_ERROR)
         ] = np.nan
         return cls(cells, rays, backend.Float(w.astype(backend.dtype)))

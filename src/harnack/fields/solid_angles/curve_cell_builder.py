@@ -196,15 +196,15 @@ class _CurveCellBuilder:
         Returns the mask (n,) of the cells that are not split, and the near runs and the expansions
         of all n cells.
         """
-        # For each edge of the inherited runs: its run, its cell, its distance from the cell's
-        # center.
+        # run, cell, distance: for each edge of the inherited runs, the index of its run, the index
+        # of its cell, and its distance from the cell's center.
         double, n = choose_backend("double"), len(centers)
         run, vertex_ids = runs.edges()
         cell = runs.cell[run]
         distance = _distances(self.vertices, centers, cell, vertex_ids, double)
-        count = np.bincount(cell, distance <= _NEAR_RADII * radius, n)
+        near_count = np.bincount(cell, distance <= _NEAR_RADII * radius, n)
         far_bounds = _FarBounds.of(self.edges, centers, radius)
-        is_leaf = (count <= self.most_near) & (
+        is_leaf = (near_count <= self.most_near) & (
             far_bounds.tail <= self.max_tail_ratio * far_bounds.total
         ) | is_last
         # The runs of near edges, closed again; all other edges go into the expansion.
@@ -218,15 +218,23 @@ class _CurveCellBuilder:
         )
         # `remaining` refers to a table of the vertices, the old apexes and the new apexes.
         points = np.concatenate([self.vertices.points, runs.apex, near_runs.apex])
-        rows = RecordTable.upload(double, np.column_stack([points, np.zeros((len(points), 5))]))
+        point_records = RecordTable.upload(
+            double, np.column_stack([points, np.zeros((len(points), 5))])
+        )
         far = far.plus(
             EdgeExpansions.of(
-                rows, remaining, to_vector3(double, centers), dr.opaque(double.Float, radius), n
+                point_records,
+                remaining,
+                to_vector3(double, centers),
+                dr.opaque(double.Float, radius),
+                n,
             )
         )
         if is_leaf.any():
-            table, first_record, record_counts = near_records(self.vertices, near_runs, is_leaf)
-            self.near.append(table)
+            near_table, first_record, record_counts = near_records(
+                self.vertices, near_runs, is_leaf
+            )
+            self.near.append(near_table)
             factor = _rounding_factor(self.vertices, near_runs, centers, radius)[is_leaf]
             bounds = far.subset(is_leaf), far_bounds.subset(is_leaf), factor
             near_range = self.near_record_count + first_record, record_counts
@@ -234,7 +242,7 @@ class _CurveCellBuilder:
             self.tables.append(records)
             self.leaves, self.near_record_count = (
                 self.leaves + len(records),
-                self.near_record_count + len(table),
+                self.near_record_count + len(near_table),
             )
         return is_leaf, near_runs, far
 
@@ -360,6 +368,7 @@ def _distances(
     start = upload_integers(backend, first)
     c = dr.gather(vector, middles, upload_integers(backend, cell))
     p, q = dr.gather(vector, points, start), dr.gather(vector, points, start + 1)
+    # For an edge of length 0 any finite number will do.
     inverse = dr.rcp(fmax(dr.squared_norm(q - p), backend.Float(1e-30)))
     return to_numpy(dr.sqrt(squared_distance_to_segment(p - c, q - p, inverse)))
 
@@ -426,6 +435,8 @@ def _rounding_factor(
     from x to any apex, covers the loops that contain an apex. (The factors 0.51 = 1.02/2 and 1.01
     leave a little for rounding.)
     """
+    # Each cell's factor is the largest over its runs: of the half lengths of their closing edges,
+    # and of the distances of their apexes from the points of the ball.
     factors = np.ones(len(centers))
     run_ids = np.flatnonzero(~runs.is_whole)
     apex, cell, first = runs.apex[run_ids], runs.cell[run_ids], runs.first[run_ids]

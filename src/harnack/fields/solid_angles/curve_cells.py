@@ -241,6 +241,7 @@ class CurveCells:
                 offset = dr.abs(b.u) + dr.abs(b.v)
                 is_certain &= offset > _SIDE_ROUNDINGS * unit  # off the vertex
                 slack = _SIDE_ROUNDINGS * unit * (offset + dr.abs(a.u) + dr.abs(a.v))
+                # inverse is 0 if no edge leads to q.
                 at_x, sure_x = _with_edge(at_x, a, b, inverse != 0, slack)
                 at_center, sure_center = _with_edge(
                     at_center, a_center, b_center, inverse != 0, slack
@@ -297,6 +298,7 @@ class CurveCells:
             row = self.near.read_record(cell_sums.near_first + i, i < count)
             for k in range(VERTICES_PER_RECORD):
                 q, inverse = vector(*row[4 * k : 4 * k + 3]), row[4 * k + 3]
+                # inverse > 0 marks edges of the curve, inverse < 0 closing edges.
                 edge = Edge.between(p, q, dr.select(inverse > 0, inverse, 1), x)
                 new_rates = add_edge_rates(line, edge, lengths, rates)
                 pairs = zip(new_rates, rates, strict=True)
@@ -309,6 +311,7 @@ class CurveCells:
         start = (self.backend.UInt32(0), vector(0), cell_sums.expansion_gradient)
         start = (*start, *(self.backend.Float(0) for _ in lengths))
         _, _, field, *rates = dr.while_loop(start, runs, body, label="near edges along")
+        # A bound of |H . v|, with the field H of the proof.
         slope = dr.abs(dr.dot(field, line.v)) + cell_sums.slope_error
         slope = slope + SUM_MARGIN * cell_sums.sums.inverse_squares  # for rounding
         half_k = (1 + SUM_MARGIN) * 1.5 * cell_sums.far_i3  # K/2
@@ -344,6 +347,8 @@ class CurveCells:
                 state
             )
             row = self.near.read_record(first + i, i < count)
+            # The steps of `edges.sum_over_edges`, on lanes on which an edge leads to q. on_curve:
+            # it is an edge of the curve, and not a closing edge.
             for k in range(VERTICES_PER_RECORD):
                 q, inverse = vector(*row[4 * k : 4 * k + 3]), row[4 * k + 3]
                 b = q - x

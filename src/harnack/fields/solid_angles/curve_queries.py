@@ -107,6 +107,7 @@ def closest_on_segments(segments: RecordTable, x: Vec3) -> Vec3:
         distance so far, and the closest point."""
         nearest, closest = state
         p, q = vector(*row[:3]), vector(*row[4:7])
+        # row[7] is 1/|q - p|^2; the fraction is 0 at p and 1 at q.
         fraction = clamp(dr.dot(x - p, q - p) * row[7], 0, 1)
         point = dr.fma(vector(fraction), q - p, p)
         square = dr.squared_norm(x - point)
@@ -137,6 +138,7 @@ def continuous_change(edges: LoopEdges, p: Vec3, q: Vec3) -> Real:
         """Add the part of the edge from a to b to the change, which is the only entry of the state.
         inverse: not used here."""
         del inverse
+        # The corners of the parallelogram, in order.
         ap, bp, bq, aq = a - p, b - p, b - q, a - q
         return (state[0] - _angle(ap, bp, bq) - _angle(ap, bq, aq),)
 
@@ -242,6 +244,7 @@ def lift_ball(
         prove longer steps than this range.
     slope_error: a bound of the errors of the gradient other than its rounding.
     """
+    # |f(y) - f(x)| <= r (|grad f(x)| + r/2 times the bound of second derivatives) for |y - x| <= r.
     promise = bends[1]
     gradient_bound = dr.norm(gradient) + SUM_MARGIN * inverse_squares + slope_error
     max_change = (

@@ -162,6 +162,7 @@ class LiftedEdge:
         gradient = dr.select(active, self.direction * weight, 0) * c
         if derivatives == 1:
             return SourceTerm(None, gradient)
+        # The term of the Hessian is (c rate^T + rate c^T)/2, as `add_outer_product` adds it.
         c, rate = self.edge.hessian_factors()
         c, rate = dr.select(active, self.direction * c, 0), dr.select(active, rate, 0)
         return SourceTerm(
@@ -198,6 +199,7 @@ class LiftedEdge:
         bounds 1/(1 - q), for q = t/rho up to its largest value b, by 1 + q/(1 - b), and adds up the
         two parts with the weights s4 and s5. So the terms e/2 and 3e/(8d) bound the edge's share.
         """
+        # factor_rounding is not multiplied by anything, steep_rounding by e'.
         distance = fmax(dr.sqrt(self.edge.squared_distance) - 2 * unit, 0)
         half_field, half_integral = edge_variation(
             distance * distance, self.edge.inverse_square_length
@@ -289,6 +291,7 @@ def lifted_sums(edges: LiftedEdges, x: Vec3, derivatives: int) -> LiftedSums:
     def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
         """Add the edge of a record to the sums, given as a state."""
         p, q = vector(*row[:3]), vector(*row[4:7])
+        # Padding has the direction row[3] = 0 and is not active.
         edge = LiftedEdge.between(p, q, row[3], row[7], VerticalRayFrame(x), x)
         return LiftedSums.of(state).add_edge(edge, unit, row[3] != 0).parts()
 

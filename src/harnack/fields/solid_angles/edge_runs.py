@@ -101,6 +101,7 @@ class EdgeRuns:
 
         is_split: (n,) the mask of the cells that are split.
         """
+        # Each chosen run becomes eight, sorted by their new cells.
         is_chosen = is_split[self.cell]
         split_index = np.cumsum(is_split) - 1
         parent, count = split_index[self.cell[is_chosen]], int(is_chosen.sum())
@@ -152,8 +153,8 @@ class EdgeRuns:
         is_first, is_last = np.ones((2, len(old_run)), np.bool_)
         is_first[1:] = is_last[:-1] = old_run[1:] != old_run[:-1]
         first_of = np.maximum.accumulate(np.where(is_first, np.arange(len(old_run)), 0))
-        size = self.count[old_run]
-        gap_around = offset[first_of] + size - (offset + count)
+        old_size = self.count[old_run]
+        gap_around = offset[first_of] + old_size - (offset + count)
         may_join = is_last & self.is_whole[old_run] & (gap_around <= _MAX_GAP)
         # A last run that is also the first becomes the whole loop; another one takes the first run
         # over, which is not kept.
@@ -162,21 +163,21 @@ class EdgeRuns:
         length = count + np.where(is_joined, gap_around + count[first_of], 0)
         is_kept = np.ones(len(old_run), np.bool_)
         is_kept[first_of[is_joined]] = False
-        offset, length = np.where(is_cyclic, 0, offset), np.where(is_cyclic, size, length)
-        is_whole = self.is_whole[old_run] & (length >= size)
+        offset, length = np.where(is_cyclic, 0, offset), np.where(is_cyclic, old_size, length)
+        is_whole = self.is_whole[old_run] & (length >= old_size)
         # Mark the edges in new runs: +1 where a run begins, -1 behind its end, then running sums. A
         # run that passes the end of its loop is marked in two parts.
-        depth_change = np.zeros(len(run) + 1, np.int64)
+        run_changes = np.zeros(len(run) + 1, np.int64)
         offset_end = offset + length
-        np.add.at(depth_change, first_edge[old_run[is_kept]] + offset[is_kept], 1)
-        inside_end = np.minimum(offset_end, size)
-        np.add.at(depth_change, first_edge[old_run[is_kept]] + inside_end[is_kept], -1)
-        passes_end = is_kept & (offset_end > size)
-        np.add.at(depth_change, first_edge[old_run[passes_end]], 1)
+        np.add.at(run_changes, first_edge[old_run[is_kept]] + offset[is_kept], 1)
+        inside_end = np.minimum(offset_end, old_size)
+        np.add.at(run_changes, first_edge[old_run[is_kept]] + inside_end[is_kept], -1)
+        passes_end = is_kept & (offset_end > old_size)
+        np.add.at(run_changes, first_edge[old_run[passes_end]], 1)
         np.add.at(
-            depth_change, first_edge[old_run[passes_end]] + (offset_end - size)[passes_end], -1
+            run_changes, first_edge[old_run[passes_end]] + (offset_end - old_size)[passes_end], -1
         )
-        in_run = np.cumsum(depth_change[:-1]) > 0
+        in_run = np.cumsum(run_changes[:-1]) > 0
         cell, first = self.cell[old_run][is_kept], (self.first[old_run] + offset)[is_kept]
         apexes = np.zeros((int(is_kept.sum()), 3))
         return EdgeRuns(cell, first, length[is_kept], is_whole[is_kept], apexes), in_run
@@ -254,6 +255,7 @@ def subtract_runs(
     Returns the edges, sorted by cell. They refer to a table of points that has the vertices first,
     then the apexes of `before`, then the apexes of `after`.
     """
+    # An edge runs from a row of the table of vertices to the next row.
     remaining = np.flatnonzero(~is_in_after)
     run, vertex = (part[remaining] for part in edges)
     closing = after.closing_edges(vertices + len(before.cell))

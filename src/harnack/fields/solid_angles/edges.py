@@ -167,6 +167,7 @@ class LoopEdges:
         def of_record(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
             """Update the state by the edges in a record, one after another."""
             for k in range(self.edges_per_record):
+                # row[4 * k + 3] is 1/|q - p|^2.
                 p, q = self.vertex(row, k), self.vertex(row, k + 1)
                 state = body(p, q, row[4 * k + 3], state)
             return state
@@ -486,6 +487,7 @@ def spinor(a: Vec3) -> tuple[Real, Real, Spinor]:
     length = dr.sqrt(dr.fma(a.z, a.z, dr.fma(a.x, a.x, a.y * a.y)))
     s = length + dr.abs(a.z)
     is_up = a.z >= 0
+    # Real and imaginary part of the first number, then of the second.
     chi = (
         dr.select(is_up, s, a.x),
         dr.select(is_up, 0, -a.y),

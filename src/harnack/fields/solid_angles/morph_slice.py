@@ -245,11 +245,15 @@ def quadrature_points(corners: FloatArray, longest: float) -> QuadraturePoints:
         pieces, each with a point at its centroid. Much smaller triangles that lie in the same cell
         of space and face the same way are merged: they get a single point.
     """
+    # A kind of triangles that does not occur has no part.
     is_small = _longest_edges(corners) <= _CELL_FRACTION * longest
     parts = [
-        sample(rows, longest)
-        for sample, rows in ((_subdivide, corners[~is_small]), (_merge_small, corners[is_small]))
-        if len(rows)
+        make_points(triangles, longest)
+        for make_points, triangles in (
+            (_subdivide, corners[~is_small]),
+            (_merge_small, corners[is_small]),
+        )
+        if len(triangles)
     ]
     return QuadraturePoints(
         np.concatenate([part.points for part in parts]),
@@ -309,9 +313,12 @@ def _subdivide(corners: FloatArray, longest: float) -> QuadraturePoints:
         middle = a[:, None] + u[:, None] * (b - a)[:, None] + v[:, None] * (c - a)[:, None]
         points.append(middle.reshape(-1, 3))
         moments.append(np.repeat(_areas(triangles) / count**2, count**2, axis=0))
-    spread = float((_mean_squares(corners) / counts**2).max())
+    # A piece is 1/count times as large as its triangle, in all lengths.
+    second_ratio = float((_mean_squares(corners) / counts**2).max())
     farthest = float((_corner_distances(corners, corners.mean(axis=1)) / counts).max())
-    return QuadraturePoints(np.concatenate(points), np.concatenate(moments), farthest, spread, 0.0)
+    return QuadraturePoints(
+        np.concatenate(points), np.concatenate(moments), farthest, second_ratio, 0.0
+    )
 
 
 def _merge_small(corners: FloatArray, longest: float) -> QuadraturePoints:
@@ -322,6 +329,8 @@ def _merge_small(corners: FloatArray, longest: float) -> QuadraturePoints:
 
     longest: the largest length of the edges of pieces. Cells are `_CELL_FRACTION` times as wide.
     """
+    # Two groups have different keys: the cell of space, the axis of the largest component of the
+    # normals, and its sign.
     moments, centroids = _areas(corners), corners.mean(axis=1)
     axis = np.abs(moments).argmax(axis=1)
     is_positive = np.take_along_axis(moments, axis[:, None], axis=1)[:, 0] > 0
@@ -333,15 +342,21 @@ def _merge_small(corners: FloatArray, longest: float) -> QuadraturePoints:
     area = np.linalg.norm(moments, axis=1)
     points = _sums(group, area[:, None] * centroids) / _sums(group, area[:, None])
     offset = centroids - points[group]
-    total = _sums(group, moments)
-    length = np.linalg.norm(total, axis=1)
-    # square: the integral of |d|^2 over each triangle; first: |T|_F of each group.
-    square = area * (_mean_squares(corners) + (offset * offset).sum(axis=1))
+    group_moments = _sums(group, moments)
+    moment_lengths = np.linalg.norm(group_moments, axis=1)
+    # square_integrals: of |d|^2 over each triangle; first_moment_lengths: |T|_F of each group.
+    square_integrals = area * (_mean_squares(corners) + (offset * offset).sum(axis=1))
     outer = np.einsum("ki,kj->kij", moments, offset).reshape(-1, 9)
-    first = np.linalg.norm(_sums(group, outer), axis=1)
-    spread = float((_sums(group, square[:, None])[:, 0] / length).max())
+    first_moment_lengths = np.linalg.norm(_sums(group, outer), axis=1)
+    second_ratio = float((_sums(group, square_integrals[:, None])[:, 0] / moment_lengths).max())
     farthest = float(_corner_distances(corners, points[group]).max())
-    return QuadraturePoints(points, total, farthest, spread, float((first / length).max()))
+    return QuadraturePoints(
+        points,
+        group_moments,
+        farthest,
+        second_ratio,
+        float((first_moment_lengths / moment_lengths).max()),
+    )
 
 
 def _sums(group: IntArray, values: FloatArray) -> FloatArray:
@@ -398,7 +413,7 @@ class MorphSlice(VariableAccuracyField["_SliceBuffers"]):
         accuracy: float,
     ) -> None:  # fmt: skip
         super().__init__()
-        self.heights = (w, gap - w)
+        self.heights = (w, gap - w)  # of the slice above mesh a, and below mesh b
         self.spacing, self.accuracy = spacing, accuracy
         low = np.min([pair.min(axis=(0, 1)) for pair in corners], axis=0)
         high = np.max([pair.max(axis=(0, 1)) for pair in corners], axis=0)
@@ -460,8 +475,8 @@ class MorphSlice(VariableAccuracyField["_SliceBuffers"]):
         points: (n, 3) points of the surface.
         precision: that of the computation; None for the default.
 
-        Returns (n,) lengths in the unit of the meshes. A bound is infinite where a point of a
-        triangle may be as far from its quadrature point as the quadrature point is from x.
+        Returns (n,) lengths in the unit of the meshes. They are infinite if a triangle of a mesh
+        reaches as far from its quadrature point as the slice is from that mesh.
 
         Proof. Let a quadrature point at distance D stand for a group of triangles with the total
         moment m (area times normal), made of triangles with moments m_i at offsets d_i from it. The
@@ -527,6 +542,7 @@ class MorphSlice(VariableAccuracyField["_SliceBuffers"]):
         distance of at least rho from all quadrature points |f| is at most the sum of the lengths of
         all moments, over rho^2."""
         if levels not in self._extents:
+            # weight: the sum of the lengths of all moments.
             weight = sum(float(dipoles.rows[:, 6].sum()) for dipoles in self._dipoles)
             margin = 1.0001 * self._size * math.sqrt(weight / min(abs(level) for level in levels))
             low, high = self._box
