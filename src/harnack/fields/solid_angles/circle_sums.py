@@ -251,8 +251,8 @@ class CircleSet:
         x = vector(x)
 
         def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
-            """Add the circle of a record to the state: angle, gradient, distance of the nearest
-            circle, the three integrals, and the lower bound of the continued angle."""
+            """Add the circle in the record `row` to the state: angle, gradient, distance of the
+            nearest circle, the three integrals, and the lower bound of the continued angle."""
             angle, gradient, distance, inverse_squares, inverse_cubes, inverse_fourths, lower = (
                 state
             )
@@ -297,7 +297,7 @@ class CircleSet:
         x = vector(x)
 
         def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
-            """Add the Hessian of the circle of a record to the total, whose entries are the
+            """Add the Hessian of the circle in the record `row` to the total, whose entries are the
             state."""
             relative = self._relative(row, x)
             a, n, outward = relative.a, relative.normal, relative.outward
@@ -363,8 +363,7 @@ class CircleSet:
         real, vector = self._types
 
         def add(row: list[Real], rates: tuple[Any, ...]) -> tuple[Any, ...]:
-            """Add the circle of a record to the bounds `rates`, of which there is one for each
-            length."""
+            """Add the circle in the record `row` to the bounds `rates`, one for each length."""
             relative = self._relative(row, line.x)
             # slack: the rounding of distances. axial: |w| of the proof.
             slack, axial = line.slack, fmin(dr.abs(dr.dot(relative.normal, line.v)), 1)
@@ -408,8 +407,8 @@ class CircleSet:
         x = vector(x)
 
         def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
-            """Update the state by the circle of a record. The state holds the closest point so far,
-            and its squared distance."""
+            """Update the state by the circle in the record `row`. The state holds the closest point
+            so far, and its squared distance."""
             best, nearest = state
             relative = self._relative(row, x)
             # The closest point lies in the direction of `outward` from the center. If x is on the
@@ -430,7 +429,8 @@ class CircleSet:
         return self.records.backend.Float, self.records.backend.Array3f
 
     def _relative(self, row: list[Real], x: Vec3) -> _RelativeCircle:
-        """Compute how the circle of a record is seen from points x (3, n), in unit coordinates."""
+        """Compute how the circle in the record `row` is seen from points x (3, n), in unit
+        coordinates."""
         vector = self.records.backend.Array3f
         center, a, normal = vector(*row[:3]), row[3], vector(*row[4:7])
         displacement = x - center

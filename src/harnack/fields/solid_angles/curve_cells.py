@@ -209,7 +209,7 @@ class CurveCells:
         rounding does not leave it open on which side of the line an edge passes.
 
         Proof. The far edges contribute the polynomial, everywhere in the ball. The near loops are
-        closed, so that the lifted sum of their edges (`edge_lift`) is their solid angle; it has no
+        closed, so that the sum over their edges in `edge_lift` is their solid angle; it has no
         jumps on the line, as long as the line meets no edge. A coordinate across the line is off by
         at most eight units of the distances of the edge's ends. The real and the imaginary part of
         an edge's factor are off by that times the coordinates of the ends. Only for factors near
@@ -219,7 +219,7 @@ class CurveCells:
         count, center = dr.select(active, cell_sums.count, 0), cell_sums.center
 
         def runs(i: Any, *_: Any) -> Mask:
-            """The mask of the lanes that have further records of near edges."""
+            """Whether the loop goes on, for each lane: its cell has a record i of near edges."""
             return i < count
 
         def body(i: Any, p: Vec3, is_certain: Mask, *products: Real) -> tuple[Any, ...]:
@@ -284,7 +284,7 @@ class CurveCells:
         count = dr.select(active, cell_sums.count, 0)
 
         def runs(i: Any, *_: Any) -> Mask:
-            """The mask of the lanes that have further records of near edges."""
+            """Whether the loop goes on, for each lane: its cell has a record i of near edges."""
             return i < count
 
         def body(i: Any, p: Vec3, field: Vec3, *rates: Real) -> tuple[Any, ...]:
@@ -334,7 +334,7 @@ class CurveCells:
         real, index, vector = self.backend.Float, self.backend.UInt32, self.backend.Array3f
 
         def runs(i: Any, *_: Any) -> Mask:
-            """The mask of the lanes that have further records of near edges."""
+            """Whether the loop goes on, for each lane: its cell has a record i of near edges."""
             return i < count
 
         def body(i: Any, *state: Any) -> tuple[Any, ...]:

@@ -103,7 +103,7 @@ def closest_on_segments(segments: RecordTable, x: Vec3) -> Vec3:
     x = vector(x)
 
     def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
-        """Update the state by the segment of a record. The state holds the smallest squared
+        """Update the state by the segment in the record `row`. The state holds the smallest squared
         distance so far, and the closest point."""
         nearest, closest = state
         p, q = vector(*row[:3]), vector(*row[4:7])

@@ -186,12 +186,12 @@ class DipoleCells:
         first, count = index(low) + index(high) * _INDEX_BASE, dr.select(active, index(count), 0)
 
         def runs(i: Any, *_: Any) -> Mask:
-            """The mask of the lanes that have further near primitives."""
+            """Whether the loop goes on, for each lane: its cell has a near primitive i."""
             return i < count
 
         def step(i: Any, sums: Any, extra_state: Any) -> tuple[Any, ...]:
-            """Add near primitive i of the cell to the sums, given as a flat state, and update the
-            caller's state."""
+            """Add near primitive i of the cell to the sums, given as a flat state, and update
+            `extra_state`, the state of the caller."""
             # Other lanes in the loop have longer lists.
             in_list = i < count
             primitive = self.primitives.read_record(
@@ -447,7 +447,7 @@ def _octree_within_memory(
     """
 
     def is_too_large(levels: list[_CellLevel]) -> bool:
-        """Whether the cells of these depths take more than `most_bytes` bytes."""
+        """Whether cells take more than `most_bytes` bytes. levels: the cells of each depth."""
         return _bytes(backend, levels) > most_bytes
 
     limit, max_near = limits

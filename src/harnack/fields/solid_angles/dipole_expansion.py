@@ -548,11 +548,12 @@ class PendingSources:
                 enters &= state[0] <= count_limit
 
             def runs(slot: Any, *_: Any) -> Mask:
-                """The mask of the lanes that enter the leaf and have further slots in it."""
+                """Whether the loop goes on, for each lane: it enters a leaf that has this slot."""
                 return enters & node.is_leaf & (slot < tree.leaf_size)
 
             def step(slot: Any, count: Any) -> tuple[Any, ...]:
-                """Count and store the primitive in a slot of the leaf if it is sought."""
+                """Count and store the primitive in a slot of the leaf if it is sought. count: the
+                number so far."""
                 chosen = is_chosen(tree.primitive(node.leaf, slot, enters), enters)
                 if store is not None:
                     store(count, node.leaf * tree.leaf_size + slot, chosen)

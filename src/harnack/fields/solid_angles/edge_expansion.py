@@ -162,7 +162,7 @@ def _over_pieces(
     index, real, vector = backend.UInt32, backend.Float, backend.Array3f
 
     def runs(j: Any, *_: Any) -> Mask:
-        """The mask of the lanes that have further edges."""
+        """Whether the loop goes on, for each lane: its ball has a far edge j."""
         return j < count
 
     def body(j: Any, t: Real, zr: Real, zi: Real, *sums: Real) -> tuple[Any, ...]:

@@ -289,7 +289,7 @@ def lifted_sums(edges: LiftedEdges, x: Vec3, derivatives: int) -> LiftedSums:
     vector = backend.Array3f
 
     def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
-        """Add the edge of a record to the sums, given as a state."""
+        """Add the edge in the record `row` to the sums, given as a state."""
         p, q = vector(*row[:3]), vector(*row[4:7])
         # Padding has the direction row[3] = 0 and is not active.
         edge = LiftedEdge.between(p, q, row[3], row[7], VerticalRayFrame(x), x)
@@ -311,8 +311,8 @@ def edge_rates(edges: LiftedEdges, x: Vec3, derivatives: int) -> SourceSums:
     vector = backend.Array3f
 
     def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
-        """Add the edge of a record to the sums, given as a state. Padding, of direction 0, adds
-        nothing."""
+        """Add the edge in the record `row` to the sums, given as a state. Padding, of direction 0,
+        adds nothing."""
         p, q, active = vector(*row[:3]), vector(*row[4:7]), row[3] != 0
         edge = LiftedEdge.between(p, q, row[3], row[7], VerticalRayFrame(x), x)
         sums = SourceSums.from_state(state).add_term(edge.terms(derivatives, active), True)

@@ -150,7 +150,8 @@ class LoopEdges:
         return replace(self, records=self.records.view(first, trips))
 
     def vertex(self, row: list[Real], k: int) -> Vec3:
-        """Read the position of vertex k of a record, at which edge k of the record starts."""
+        """Read the position (3,) of vertex k from the record `row`. Edge k of the record starts at
+        it."""
         return self.backend.Array3f(*row[4 * k : 4 * k + 3])
 
     def for_each(
@@ -165,7 +166,7 @@ class LoopEdges:
         """
 
         def of_record(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
-            """Update the state by the edges in a record, one after another."""
+            """Update the state by the edges in the record `row`, one after another."""
             for k in range(self.edges_per_record):
                 # row[4 * k + 3] is 1/|q - p|^2.
                 p, q = self.vertex(row, k), self.vertex(row, k + 1)
@@ -411,7 +412,7 @@ def sum_over_edges(edges: LoopEdges, x: Vec3, active: Mask = True) -> EdgeSums:
     real, x = edges.backend.Float, edges.backend.Array3f(x)
 
     def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
-        """Add the edges of a record to the state: the product of factors (zr, zi), half the
+        """Add the edges in the record `row` to the state: the product of factors (zr, zi), half the
         gradient g, the smallest squared distance d2, a quarter of the bound of the integral of
         |dp|/D^2, and half of the other two integrals."""
         zr, zi, g, d2, inverse_squares, inverse_cubes, inverse_fourths = state

@@ -160,6 +160,7 @@ def evaluate_expansion(coefficients: Sequence[Any], y: Sequence[Any], degree: in
 
     coefficients: L_jk, in the order of `coefficient_keys`.
     y: the three coordinates of the point relative to the center, in units of the ball's radius.
+    degree: the degree of the expansion.
 
     Formulas. With A_jk = w_k conj L_jk, w_0 = 1 and w_k = 2 otherwise, f = Re sum A_jk R_jk over k
     >= 0. R_j,-1 = -conj R_j1. So by the derivatives of R_jk (`multipole`), each derivative of f is

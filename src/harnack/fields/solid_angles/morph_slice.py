@@ -129,6 +129,7 @@ class SlicedKernel(RadialKernel):
 
         distance: D, which is not used.
         inverse: 1/D.
+        last: the largest index.
         """
         del distance
         # c = w/D, s2 = (r/D)^2; moment: i_n, and theta_k = psi_k D^(2k+1).
@@ -167,6 +168,7 @@ class SlicedKernel(RadialKernel):
 def moment_polynomial(n: int, degree: int) -> tuple[float, ...]:
     """Fit a polynomial to the integral i_n(c) of `SlicedKernel` for c in [0, 1].
 
+    n: the index of the integral.
     degree: the degree of the polynomial, whose variable is 2c - 1.
 
     Returns its coefficients in ascending order.

@@ -139,7 +139,8 @@ def multipole_to_multipole(moments: Pairs, x: Any, y: Any, z: Any) -> Pairs:
 
 
 def _with_negative_orders(values: Pairs) -> Pairs:
-    """Add the entries for m < 0 to harmonics R_lm or moments M_lm that are given for m >= 0."""
+    """Add the entries for m < 0 to harmonics R_lm or moments M_lm: `values` has the entries for
+    m >= 0, as pairs by (l, m). The entry (l, -m) is (-1)^m times the conjugate of (l, m)."""
     negative = {
         (l, -m): (re, -im) if m % 2 == 0 else (-re, im) for (l, m), (re, im) in values.items() if m
     }
@@ -313,22 +314,22 @@ def _leaf_moments(
             return slot + 1, *body(primitive(dr.gather(index, slots, slot)), *state)
 
         def more(slot: Any, *_: Any) -> Any:
-            """The mask of the leaves that have further slots."""
+            """Whether the loop goes on, for each lane: its leaf has this slot."""
             return slot < end
 
         return dr.while_loop((first, *state), more, step, label="slots")[1:]
 
     def measure(source: _DipolePrimitive, low: Vec3, high: Vec3, area: Real, weighted: Vec3) -> Any:
-        """Update a leaf's measures by a primitive: the box from low to high, the area, and the sum
-        of area times position of the dipoles."""
+        """Update a leaf's measures by the primitive `source`: the box from low to high, the area,
+        and `weighted`, the sum of area times position over the dipoles."""
         for dipole in source.dipoles:
             size = dr.norm(dipole.normal)
             area, weighted = area + size, weighted + size * sum(w * p for w, p in dipole.points)
         return fmin(low, source.low), fmax(high, source.high), area, weighted
 
     def sum_up(source: _DipolePrimitive, *parts: Real) -> tuple[Any, ...]:
-        """Add a primitive to the sums `parts` about the leaf's center. The first sums are those of
-        `_power_terms`, the further ones the real and imaginary parts of M_lm."""
+        """Add the primitive `source` to the sums `parts` about the leaf's center. The first sums
+        are those of `_power_terms`, the further ones the real and imaginary parts of M_lm."""
         for dipole in source.dipoles:
             offsets = [(weight, point - center) for weight, point in dipole.points]
             more = _power_terms(dr.norm(dipole.normal), offsets) + _flatten(
@@ -452,7 +453,8 @@ def _shifted_powers(level: NodeMoments, s: FloatArray) -> tuple[FloatArray, Floa
     """Compute the second, third and fourth moments of k nodes (as defined by `NodeMoments`) about
     the points center - s instead of their centers. Each dipole's offset d becomes d + s.
 
-    s: (k, 3).
+    level: the moments of the nodes.
+    s: (k, 3) the shift of each node.
 
     The formulas follow from expanding the products of d + s; the sum of a_i d_i, about the node's
     own center, is 0.
