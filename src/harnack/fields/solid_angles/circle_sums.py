@@ -174,7 +174,8 @@ class UnitCircle:
 
 @dataclass(frozen=True)
 class CircleSums:
-    """Quantities of a set of circles at a point x, summed over the circles.
+    """Quantities of a set of circles at a point x, summed over the circles: the solid angle that
+    they subtend at x, its gradient, the distance, and integrals that bound derivatives.
 
     angle: the sum of the circles' solid angles, seen from x, each in (-2 pi, 2 pi).
     gradient: (3,) its gradient.

@@ -135,8 +135,8 @@ def continuous_change(edges: LoopEdges, p: Vec3, q: Vec3) -> Real:
     real = edges.backend.Float
 
     def add(a: Vec3, b: Vec3, inverse: Real, state: tuple[Any, ...]) -> tuple[Any, ...]:
-        """Add the part of the edge from a to b to the change, which is the only entry of the state.
-        inverse: not used here."""
+        """Add the part of the edge from a to b to the change of the solid angle, the only entry of
+        the state. inverse: not used here."""
         del inverse
         # The corners of the parallelogram, in order.
         ap, bp, bq, aq = a - p, b - p, b - q, a - q

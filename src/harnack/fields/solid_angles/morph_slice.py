@@ -197,7 +197,7 @@ def _horner(x: Real, coefficients: tuple[float, ...]) -> Real:
 
 
 def _psi_factor(k: int) -> float:
-    """The factor (2/pi) 2^k k! in the formula for psi_k of `SlicedKernel`."""
+    """Compute the factor (2/pi) 2^k k! in the formula of `SlicedKernel` for the function psi_k."""
     return 2 / math.pi * 2.0**k * math.factorial(k)
 
 
@@ -400,10 +400,10 @@ class MorphSlice(VariableAccuracyField["_SliceBuffers"]):
     Proved bounds of f near a point x. Let d be the smallest distance, in four dimensions, of a
     quadrature point from x. There are two kinds: bounds of the second derivatives within 0.1 d,
     0.25 d and 0.45 d (`TaylorRemainder`), and a range of f on a ball in four dimensions of radius
-    0.35 d (`HarmonicBall`). The march takes the longer of the steps that they prove, which is
-    mostly that of the second derivatives. `SlicedKernel` has the proof of their bounds: at the
-    distance D in four dimensions, the second derivatives of a dipole's part of f are at most those
-    of a dipole in space at the same distance.
+    0.35 d (`HarmonicBall`). The march uses the bounds of the second derivatives, which prove longer
+    steps; the range is for callers that request it. `SlicedKernel` has the proof: at the distance D
+    in four dimensions, the second derivatives of a dipole's part of f are at most those of a dipole
+    in space at the same distance.
     """
 
     default_level = 0.5

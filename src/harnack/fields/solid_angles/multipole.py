@@ -390,7 +390,8 @@ def _spread_dipole_moments(normal: Vec3, points: Sequence[tuple[float, Vec3]]) -
 
 
 def _flatten(moments: Pairs) -> list[Any]:
-    """List the real and imaginary parts of moments, in the order of `_MOMENT_PARTS`."""
+    """List the real and imaginary parts of moments, in the order of `_MOMENT_PARTS`: by (l, m),
+    real before imaginary part."""
     return [moments[l, m][part] for l, m, part in _MOMENT_PARTS]
 
 
