@@ -161,26 +161,28 @@ class BoundaryCells:
         roundings off the ray, and so is the true t. If x were between these two, a point of the
         triangle would be as near to x.
         """
-        # local: the sums in the cell of x. turns: the number of triangles that the line from its
-        # center to x crosses, counted with signs. value: w modulo 1.
+        # cell_sums: the sums in the cell of x. turns: the number of triangles that the line from
+        # its center to x crosses, counted with signs. value: w modulo 1.
         backend, real = self.cells.backend, self.cells.backend.Float
-        local, inside = self.cells.sums(x, active)
-        displacement = x - local.center
+        cell_sums, inside = self.cells.sums(x, active)
+        displacement = x - cell_sums.center
         distance = dr.norm(displacement)
         inside &= distance > _TRIANGLE_ROUNDINGS * unit
         direction = dr.select(inside, displacement / distance, backend.Array3f(0, 0, 1))
-        frame = RayFrame.along(backend, local.center, direction)
-        change, is_certain = self.cells.change_from_center(local, frame, x, unit, inside)
+        frame = RayFrame.along(backend, cell_sums.center, direction)
+        change, is_certain = self.cells.change_from_center(cell_sums, frame, x, unit, inside)
         turns, is_clear = self.rays.signed_crossings_between(frame, distance, unit, inside)
         on_triangle = jump_sum_within(self.rays, x, _TRIANGLE_ROUNDINGS * unit, inside)
         estimate = (
-            dr.gather(real, self.center_values, local.cell, inside) - turns + _PER_SPHERE * change
+            dr.gather(real, self.center_values, cell_sums.cell, inside)
+            - turns
+            + _PER_SPHERE * change
         )
-        value = _PER_SPHERE * local.sums.angle
+        value = _PER_SPHERE * cell_sums.sums.angle
         # w is the value plus an integer, the branch.
         offset = estimate - value
         branch = dr.round(offset)
-        error = local.error + local.rounding
+        error = cell_sums.error + cell_sums.rounding
         is_valid = inside & is_certain & is_clear & (on_triangle == 0)
         is_valid &= (dr.abs(offset - branch) < _MAX_BRANCH_ERROR) & (
             _PER_SPHERE * error < _MAX_BRANCH_ERROR

@@ -410,7 +410,7 @@ class CircleSet:
         def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
             """Update the state by the circle in the record `row`. The state holds the closest point
             so far, and its squared distance."""
-            best, nearest = state
+            closest_point, smallest_square = state
             relative = self._relative(row, x)
             # The closest point lies in the direction of `outward` from the center. If x is on the
             # axis, all points of the circle are equally far: any direction in the plane is right.
@@ -418,9 +418,11 @@ class CircleSet:
             perpendicular = dr.normalize(_perpendicular(vector, relative.normal))
             radial = dr.select(outward_length > 0, relative.outward / outward_length, perpendicular)
             point = dr.fma(vector(relative.a), radial, vector(*row[:3]))
-            square = dr.squared_norm(x - point)
-            closer = square < nearest
-            return dr.select(closer, point, best), dr.select(closer, square, nearest)
+            squared_distance = dr.squared_norm(x - point)
+            is_closer = squared_distance < smallest_square
+            return dr.select(is_closer, point, closest_point), dr.select(
+                is_closer, squared_distance, smallest_square
+            )
 
         return self.records.for_each(add, (vector(0), real(dr.inf)), "nearest circle")
 

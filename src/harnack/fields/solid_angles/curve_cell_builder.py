@@ -474,14 +474,17 @@ def _cell_records(
     # The constant is known modulo 4 pi: the smallest such number is used.
     coefficients[:, 0] -= _PERIOD * np.round(coefficients[:, 0] / _PERIOD)
     rounding = backend.machine_epsilon * np.abs(coefficients[:, 1:]) @ tables[1:]
-    value = rounding[:, 0] + backend.machine_epsilon * (48 + 7.25 * VERTICES_PER_RECORD * count)
-    slope = far.slope + rounding[:, 1:].sum(axis=1) / radius
+    # 48 is 16 of `LoopEdges.rounding` and 32 of the third part.
+    value_rounding = rounding[:, 0] + backend.machine_epsilon * (
+        48 + 7.25 * VERTICES_PER_RECORD * count
+    )
+    slope_error = far.slope + rounding[:, 1:].sum(axis=1) / radius
     # `least` is finite also for cells without far edges.
     inverse, least = np.full(len(first), 1 / radius), np.minimum(bounds.least, 1e3)
     columns = [
         far.error * margin,
-        slope * margin,
-        value * margin,
+        slope_error * margin,
+        value_rounding * margin,
         least,
         factor,
         bounds.inverse_cubes,

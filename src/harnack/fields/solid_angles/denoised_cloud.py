@@ -132,6 +132,7 @@ def _estimated_normals(cloud: CloudDenoiser, gradients: Gradients) -> FloatArray
     """
     x = cloud.points[cloud.selected]
     normals = estimate_normals(x)
+    # Each point stands for a square whose side is the spacing.
     areas = np.full(len(x), cloud.spacing**2)
     for _ in range(_FLIP_ROUNDS):
         slopes = gradients(x, normals, areas, _FLIP_SMOOTHING * cloud.spacing)

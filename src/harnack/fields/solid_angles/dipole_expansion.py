@@ -243,6 +243,7 @@ class DipoleExpansions:
         def term(i: Any, active: Mask) -> list[Any]:
             """Compute what primitive i, a dipole or a triangle, adds to the attributes of
             `DipoleExpansions`, in their order, as a flat list of numbers."""
+            # row: position, area times normal, area; of a triangle all of `triangle_sources`.
             row = tree.primitives.read_record(i, active)
             # The moments of degree 1, from area times normal.
             first_moments = {(1, 0): (row[5], 0.0), (1, 1): (0.5 * row[3], 0.5 * row[4])}

@@ -201,15 +201,17 @@ class EdgeRuns:
         center = centers[self.cell]
         to_first = _unit(table.points[self.first] - center)
         to_last = _unit(table.points[self.first + self.count] - center)
-        mean = to_first + to_last
+        direction_sum = to_first + to_last
         difference = _unit(to_first - to_last)
         # A vector perpendicular to the difference, on the side of the sum.
         axis = np.eye(3)[np.abs(difference).argmin(axis=1)]
         perpendicular = _unit(axis - (axis * difference).sum(axis=1, keepdims=True) * difference)
-        perpendicular *= np.where((perpendicular * mean).sum(axis=1, keepdims=True) < 0, -1.0, 1.0)
-        is_short = np.linalg.norm(mean, axis=1, keepdims=True) < 0.1
+        perpendicular *= np.where(
+            (perpendicular * direction_sum).sum(axis=1, keepdims=True) < 0, -1.0, 1.0
+        )
+        is_short = np.linalg.norm(direction_sum, axis=1, keepdims=True) < 0.1
         apex = center + _APEX_RATIO * radius[self.cell, None] * np.where(
-            is_short, perpendicular, _unit(mean)
+            is_short, perpendicular, _unit(direction_sum)
         )
         apex = apex.astype(number).astype(np.float64)
         return EdgeRuns(self.cell, self.first, self.count, self.is_whole, apex)

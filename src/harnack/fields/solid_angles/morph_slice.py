@@ -423,6 +423,7 @@ class MorphSlice(VariableAccuracyField["_SliceBuffers"]):
         self._center = round_to_single(0.5 * (low + high))
         # A power of two, so that lengths are scaled without rounding.
         self._size = 2.0 ** math.ceil(math.log2(0.5 * float((high - low).max())))
+        # The longest edges of pieces, for each mesh.
         longest = [spacing * height for height in self.heights]
         _check_count([piece_counts(*pair) for pair in zip(corners, longest, strict=True)], w, gap)
         self._pieces = tuple(

@@ -99,6 +99,7 @@ def dipole_moments(harmonics: Pairs, nx: Any, ny: Any, nz: Any) -> Pairs:
     By the derivatives of R_lm in the module's description,
     M_lm = nz R_l-1,m - (x - iy) R_l-1,m+1 + (x + iy) R_l-1,m-1 with x = nx/2 and y = ny/2.
     """
+    # A harmonic is a + ib; a product such as (x - iy)(a + ib) is written out in its two parts.
     r, x, y = _with_negative_orders(harmonics), 0.5 * nx, 0.5 * ny
     moments: Pairs = {}
     for l, m in MOMENT_KEYS:
@@ -120,7 +121,7 @@ def multipole_to_multipole(moments: Pairs, x: Any, y: Any, z: Any) -> Pairs:
     By the addition theorem of R_lm, M_lm is the sum over k and j of the old moment M_kj times
     R_l-k,m-j(s). The term k = l is the old moment itself.
     """
-    # The limits of j are those of |j| <= k and |m - j| <= l - k.
+    # The limits of j are those of |j| <= k and |m - j| <= l - k. Moments with m = 0 are real.
     r, old = (
         _with_negative_orders(regular_harmonics(x, y, z, MAX_DEGREE - 1)),
         _with_negative_orders(moments),
