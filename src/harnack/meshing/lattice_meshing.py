@@ -717,12 +717,12 @@ def _sample_lattice(
     samples = LevelSamples(np.full(count, 10 * OUTSIDE_VALUE), np.ones((count, 3)), np.zeros(count))
     points = points[~is_irrelevant]
     samples = samples.replaced(~is_irrelevant, function.sample(points))
-    is_invalid = ~np.isfinite(samples.value[~is_irrelevant])
-    if is_invalid.any():
-        x, y, z = points[is_invalid][0]
+    is_bad = ~np.isfinite(samples.value[~is_irrelevant])
+    if is_bad.any():
+        x, y, z = points[is_bad][0]
         advice = ", or a smaller `cell_size`: it is asked for three cells around other parts"
         raise UnrefinableError(
-            f"{type(function.field).__name__} has no finite value at {is_invalid.sum():,} points, such "
+            f"{type(function.field).__name__} has no finite value at {is_bad.sum():,} points, such "
             f"as ({x:.4g}, {y:.4g}, {z:.4g}): choose a `clip` where it has"
             + (advice if is_irrelevant.any() else "")
         )
