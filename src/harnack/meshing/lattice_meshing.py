@@ -436,8 +436,9 @@ def mesh_open_surface(
         from the level set.
     report: called with messages about progress.
 
-    Returns: The mesh; and for which fraction of the tetrahedra it is proved that the mesh before
-    refinement has the topology of the level set.
+    Returns:
+        The mesh; and for which fraction of the tetrahedra it is proved that the mesh before
+        refinement has the topology of the level set.
 
     Raises:
         MeshingError: the level set does not meet the box, or there are too many cells.
@@ -901,8 +902,10 @@ def _snap_points(
     walls: the lower and the upper corner of the box; points on its faces stay on these. None for no
         such condition.
 
-    Returns: The points (n, 3); samples of the function at them; and the mask (n,) of the points on
-    the level set."""
+    Returns:
+        The points (n, 3); samples of the function at them; and the mask (n,) of the points on the
+        level set.
+    """
     size = float(lattice.size.min())
     near = np.flatnonzero((samples.distance < _SNAP_DISTANCE * size) & ~is_fixed)
     max_step = np.full(len(near), 0.5 * _SNAP_DISTANCE * size)

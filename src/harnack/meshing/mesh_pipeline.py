@@ -572,9 +572,10 @@ def _level_and_solid(
 
     thickness: the thickness of the closed part that is made of a level set; None for none.
 
-    Returns: The level, or None for the field's default; and one of three: False for the level set;
-    True for the points of a `Solid`; or, for a solid given by values of f, the interval (low, high)
-    of these values. In the last case the level is None.
+    Returns:
+        The level, or None for the field's default; and one of three: False for the level set; True
+        for the points of a `Solid`; or, for a solid given by values of f, the interval (low, high)
+        of these values. In the last case the level is None.
 
     Raises:
         ValueError: several levels; a solid that is to be thickened.

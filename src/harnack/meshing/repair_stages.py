@@ -390,8 +390,9 @@ def _unite_bodies(
     settings: the options of the repair. Slivers that arise from cuts are removed by moving the
         surface by at most half of `settings.tolerance`.
 
-    Returns: The boundary; and its entries in `metadata["harnack"]`. The entry "kept" (how many
-    faces of the input are there) is 0.
+    Returns:
+        The boundary; and its entries in `metadata["harnack"]`. The entry "kept" (how many faces of
+        the input are there) is 0.
 
     Raises:
         MeshError, MeshingError: the mesh is not closed, no parts of it overlap, or the union cannot
@@ -498,9 +499,10 @@ def _keep_valid(
     """Stage "cleaned" of the repair: keep the valid triangles, remove the others, and fill all
     holes.
 
-    Returns: The closed mesh; and its entries in `metadata["harnack"]`: how many triangles were
-    kept, turned over, removed for each reason ("left_out"), and added by fillings ("patches"); how
-    many holes were filled; and how many fillings are harmonic (none in this stage).
+    Returns:
+        The closed mesh; and its entries in `metadata["harnack"]`: how many triangles were kept,
+        turned over, removed for each reason ("left_out"), and added by fillings ("patches"); how
+        many holes were filled; and how many fillings are harmonic (none in this stage).
 
     Raises:
         MeshError, MeshingError: too few triangles are valid, or a hole cannot be filled.
@@ -543,7 +545,8 @@ def _weld_loose(
     that are near to each other, clean the mesh and fill its holes. Vertices move, so no triangle
     counts as kept.
 
-    Returns: The closed mesh; and its entries in `metadata["harnack"]`.
+    Returns:
+        The closed mesh; and its entries in `metadata["harnack"]`.
 
     Raises:
         MeshError, MeshingError: the triangles are not loose, or the mesh cannot be cleaned.
@@ -576,7 +579,8 @@ def _fill_only(
     If smooth fillings were asked for and cannot be made, all holes get harmonic fillings instead,
     provided that `keep` is "all"; otherwise the error is raised, and `repair` tries its next stage.
 
-    Returns: The closed mesh; and its entries in `metadata["harnack"]`.
+    Returns:
+        The closed mesh; and its entries in `metadata["harnack"]`.
 
     Raises:
         MeshError: some triangles cannot be kept (`_vertices_and_faces_to_keep`), a component is
@@ -631,7 +635,8 @@ def _with_filled_holes(
     loops: for each hole, the indices (k,) of the vertices around it. A hole gets a smooth filling
         if the options ask for these; a harmonic filling if they do not, or if the smooth one fails.
 
-    Returns: The closed mesh; and its entries in `metadata["harnack"]`.
+    Returns:
+        The closed mesh; and its entries in `metadata["harnack"]`.
 
     Raises:
         MeshingError: the fillings cannot be made, or meet the mesh or each other; or, unless `keep`
