@@ -127,8 +127,8 @@ def refine(
         )
         a, b, c = faces[is_fan].T
         fans = [np.stack([*ends, fan_centers], axis=1) for ends in ((a, b), (b, c), (c, a))]
-        split_faces_ = split_faces(vertices, faces[~is_fan], new_vertex[marks.edges[~is_fan]])
-        faces = np.concatenate([split_faces_, *fans])
+        smaller_faces = split_faces(vertices, faces[~is_fan], new_vertex[marks.edges[~is_fan]])
+        faces = np.concatenate([smaller_faces, *fans])
     if function.field.has_variable_accuracy:
         vertices = _converge_vertices(function, vertices, faces, tolerance, walls)
     return vertices, faces
