@@ -225,6 +225,7 @@ def _check(arguments: Any) -> int:
         walls = wall_thickness(arguments.mesh)
         with write_atomically(Path(arguments.colors)) as partial:
             kind = Path(arguments.colors).suffix.lower()[1:]
+            # Red below the smallest thickness, gray from three times that on.
             cast(
                 "Any", walls.to_colored_mesh(arguments.min_thickness, 3 * arguments.min_thickness)
             ).export(partial, kind)
@@ -256,6 +257,7 @@ def _gallery(arguments: Any) -> int:
             f"{index}/{len(scenes)} [bold]{scene.name}[/]: {scene.title}", highlight=False
         )
         target = folder / f"{scene.name}.png"
+        # Pictures of the demo are small; options that were given count nevertheless.
         small = {"size": _DEMO_SIZE, "spp": scene.demo_spp} if arguments.demo else {}
         scene.render(
             target, **{**small, **options_set("render", arguments), "progress": not arguments.quiet}

@@ -54,6 +54,7 @@ def options_set(verb: str, arguments: Any) -> dict[str, Any]:
     if style and "isolines" not in given_options:
         raise ValueError(f"--isolines-{next(iter(style))} without isolines: give --isolines too")
     if style:
+        # The style applies to all isolines.
         lines = given_options["isolines"]
         given_options["isolines"] = [replace(line, **style) for line in lines]
     return given_options
@@ -253,6 +254,7 @@ def _of_scene(scene: Scene, arguments: Any, given_options: dict[str, Any]) -> Co
         raise ValueError(
             f"scene {scene.name} has several surfaces; --{single_surface_options[0]} does not apply"
         )
+    # A scene file can name a field of the gallery by its scene and its number there.
     sources = [
         (surface.field, {"scene": scene.name, "number": number})
         for number, surface in enumerate(surfaces)

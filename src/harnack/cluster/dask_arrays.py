@@ -145,6 +145,7 @@ def _align_blocks(
     aligned = dict(dask_args)
     for name, array in others.items():
         shape = np.shape(array)
+        # A number or a single point or direction belongs to all rows.
         if name not in dask_args and shape not in ((), (3,)) and shape[0] == count:
             aligned[name] = dask_array.from_array(np.asarray(array), chunks=-1)
     for name, array in aligned.items():

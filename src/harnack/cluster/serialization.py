@@ -544,6 +544,7 @@ def _with_encoded_keys(state: Any) -> Any:
     if not isinstance(state, dict):
         return state
     attributes = dict(cast("dict[Any, Any]", state))
+    # Some values are names, too, and some are dictionaries of names.
     attributes |= {key: _encoded(attributes[key]) for key in _NAME_ATTRIBUTES if key in attributes}
     attributes |= {
         key: _with_encoded_keys(attributes[key])
@@ -586,6 +587,7 @@ def _transient_attributes(kind: type) -> dict[str, Any]:
     }
     if dataclasses.is_dataclass(kind):
         for definition in dataclasses.fields(kind):
+            # Private fields that are not compared hold what is computed from the others.
             private = definition.name.startswith("_")
             if private and not definition.compare and definition.default is not dataclasses.MISSING:
                 replacements[definition.name] = definition.default

@@ -49,6 +49,7 @@ def connect_client(client: Any) -> Generator[Any]:
         return
     distributed = import_optional("distributed", "client")
     own_client = None
+    # A client that is opened here is closed here.
     if isinstance(client, str):
         try:
             client = own_client = distributed.Client(

@@ -103,6 +103,7 @@ def _compute_tasks(client: Any, tasks: list[Any]) -> Iterator[None]:
             future.result()
             yield
     finally:
+        # After an error, tasks that have not begun are canceled.
         client.cancel([pending for pending in futures if pending.status == "pending"])
 
 

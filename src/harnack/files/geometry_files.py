@@ -319,6 +319,7 @@ def _read_geometry(path: Path, kind: str, read_as: ReadAs | None) -> LoadedGeome
         return _as_curves(read_loops(path), "curves, since the file lists nothing else")
     contents = _READERS[kind](path, read_bytes(path))
     try:
+        # Faces come first, then polylines, then points.
         if (contents.faces.sizes >= 3).any():
             return _interpret_faces(contents, read_as)
         if len(contents.polylines):
@@ -356,6 +357,7 @@ def _interpret_faces(
     look like (`_looks_like_curves`)."""
     if read_as == "polygons":
         return _polygons(contents)
+    # Only some formats are read as curves.
     can_be_loops = contents.path.suffix.lower() in _LOOP_FILES
     if read_as == "loops" and len(contents.polylines) and can_be_loops:
         return _as_curves(

@@ -89,6 +89,8 @@ def _header(place: FileLocation, data: bytes) -> dict[str, Any]:
     if place.path.suffix.lower() == ".glb":
         if len(data) < 20 or data[:4] != b"glTF":
             raise place.error("this is no .glb file: it does not begin with 'glTF'")
+        # A .glb file begins with "glTF", the version and the file's length; then come the length of
+        # the header and its type.
         version, length, size = (int.from_bytes(data[k : k + 4], "little") for k in (4, 8, 12))
         if version != 2:
             raise place.error(f"version {version} of glTF is not read, only 2")
@@ -121,6 +123,7 @@ def _buffer_files(path: Path, header: dict[str, Any]) -> dict[str, bytes]:
         if uri is None or uri.startswith("data:") or uri in files:
             continue
         name = Path(unquote(uri))
+        # A hostile file could name any file of this machine.
         if name.is_absolute() or ".." in name.parts or ":" in uri:
             raise FileLocation(path).error(f"its buffer {uri[:80]!r} is not a file beside it")
         files[uri] = read_bytes(path.parent / name)

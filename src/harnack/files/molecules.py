@@ -82,6 +82,7 @@ def parse_molecule(path: Path, data: bytes) -> Atoms:
         first = " ".join(str(error).split())
         raise place.error(f"the molecule cannot be read ({first})") from None
     sizes = [model.count_atom_sites() for model in structure]
+    # Only the first model counts.
     atoms = _drop_alternate_locations(structure[0]) if sizes else []
     known_atoms = [atom for atom in atoms if atom.element.atomic_number > 0]
     if not known_atoms:

@@ -146,6 +146,7 @@ def _text_line_loops(line: str, font: Any, size: float, max_error: float) -> lis
             )
     text_to_path = _import_optional("matplotlib.textpath").TextToPath()
     points, codes = text_to_path.get_text_path(properties, line, ismath=False)
+    # matplotlib makes letters of its own font size.
     scale = size / text_to_path.FONT_SCALE
     positions = np.asarray(points, dtype=np.float64).reshape(-1, 2) * scale
     return _path_to_loops(positions, [int(code) for code in codes], max_error)
@@ -313,6 +314,7 @@ def _filled_shapes(
         parse_transform = _import_optional("svgpathtools.parser").parse_transform
         local_transform: FloatArray = parse_transform(element.attrib["transform"], strict=True)
         transform = transform @ local_transform
+    # Shapes that cannot be seen are left out, but the elements in them are looked at.
     is_filled = styles.get("fill") not in ("none", "transparent")
     is_filled &= not _NO_OPACITY.fullmatch(styles.get("fill-opacity", "1"))
     if tag in _SHAPES and is_filled and styles.get("visibility") != "hidden":
@@ -451,6 +453,7 @@ def _loops(segments: list[Any], matrix: FloatArray, tolerance: float) -> list[Fl
     loop_pieces: list[list[FloatArray]] = []
     end_point: complex | None = None
     for segment in segments:
+        # A segment that does not begin where the last one ends begins a new polygon.
         if end_point is None or segment.start != end_point:
             loop_pieces.append([_transform_points(matrix, [segment.start])])
         end_point = segment.end

@@ -355,6 +355,7 @@ def _text_tables(path: Path, data: bytes, header: PlyHeader) -> dict[str, Elemen
         values = TextValues(rows)
         counts = values.counts
         columns, ends = _columns(section, values, np.cumsum(counts) - counts, places)
+        # Each row must end where the next line begins.
         wrong = np.flatnonzero(ends != np.cumsum(counts))
         if wrong.size:
             how = "few" if ends[wrong[0]] > np.cumsum(counts)[wrong[0]] else "many"
@@ -468,6 +469,7 @@ def _header(path: Path, data: bytes) -> PlyHeader:
         elif words[0] == b"element" and len(words) == 3 and words[2].isdigit():
             name = words[1].decode("ascii", "backslashreplace")
             sections.append(PlyElement(name, _parse_count(words[2], place), ()))
+        # A property belongs to the element before it.
         elif words[0] == b"property" and sections:
             last = sections[-1]
             columns = (*last.properties, _parse_property(words, last, place))

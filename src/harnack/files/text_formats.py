@@ -53,6 +53,7 @@ def read_xyz(path: Path, data: bytes) -> FileGeometry:
         raise FileLocation(path).error("it holds no points: write one a line, x y z")
     numbers, counts = read_floats(lines)
     columns = int(counts[0])
+    # All lines must have as many columns as the first.
     ragged = np.flatnonzero(counts != columns)
     if ragged.size:
         raise lines.locations[ragged[0]].error(

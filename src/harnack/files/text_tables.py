@@ -78,6 +78,7 @@ def split_content_lines(
     if comment is not None and comment in data:
         lines = [line.split(comment, 1)[0] if comment in line else line for line in lines]
     lines = [line.strip() for line in lines]
+    # The numbers of the lines in the file, which stay when blank lines are left out.
     numbers: Sequence[int] = range(first, first + len(lines))
     if not all(lines):
         numbers = [number for number, line in zip(numbers, lines, strict=True) if line]
@@ -241,6 +242,7 @@ def _parse_words(
 
     counts = np.fromiter((len(line.split()) for line in lines.text), np.int64)
     try:
+        # First the fast way: Python's own conversion of all words.
         words = chain.from_iterable(map(bytes.split, lines.text))
         numbers = np.fromiter(map(kind, words), np.dtype(kind))
         if np.isfinite(numbers).all():

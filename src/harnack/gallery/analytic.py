@@ -116,6 +116,7 @@ def _fitted_knot() -> list[Surface]:
     by a series of 16 x 16 x 9 cosines."""
     curve = example_curves.torus_knot(2, 3, 150)
     step = np.linalg.norm(np.roll(curve, -1, axis=0) - curve, axis=1)
+    # The Gaussians' width, and the lengths of the curve's edges as weights of the sum.
     width = 0.15 * float(np.ptp(curve, axis=0).max()) / 2
 
     def density(x: FloatArray) -> FloatArray:

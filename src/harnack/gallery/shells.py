@@ -161,6 +161,7 @@ class GridShell:
         points: list[FloatArray] = []
         inward: list[FloatArray] = []
         for a, b in zip(self.outline, np.roll(self.outline, -1, axis=0), strict=True):
+            # The outline is counter-clockwise, so the region is on the left of its edges.
             length = float(np.linalg.norm(b - a))
             count = max(1, round(length / self.spacing))
             fraction = (np.arange(count)[:, None] + 0.5) / count

@@ -333,6 +333,7 @@ def check_estimated_triangles(
     if not len(sampled):
         return
     corner = vertices[sampled]
+    # The midpoints of the three edges of each triangle; the farthest one decides.
     midpoint_samples = function.sample(0.5 * (corner + np.roll(corner, 1, axis=1)).reshape(-1, 3))
     is_flat = (midpoint_samples.value != 0) & ~midpoint_samples.gradient.any(axis=1)
     if is_flat.any():
@@ -412,6 +413,7 @@ class IrrelevantRegion:
             TriangleLimitError: there are more such cells than a mesh of `max_triangles` triangles
                 may have.
         """
+        # The lattice as a key of the dictionary.
         key = (
             *lattice.lower.tolist(),
             *lattice.size.tolist(),
@@ -451,6 +453,7 @@ def mesh_open_surface(
     coordinates, corners = lattice.tetrahedra(cells)
     points = lattice.points(coordinates)
     report(f"{len(points):,} points, {len(corners):,} tetrahedra")
+    # No point is fixed, left out, or counted as on the level set wherever it is.
     no_points = np.zeros(len(points), np.bool_)
     samples = _sample_lattice(function, points, lattice, no_points)
     first = _march(function, points, samples, corners, no_points, no_points, lattice, walls)
@@ -460,10 +463,12 @@ def mesh_open_surface(
         raise MeshingError("the level set is empty: no cell of the box holds the level")
     _check_is_continuous(function, vertices, faces, lattice)
     check_estimated_triangles(function, vertices, faces, tolerance)
+    # The surface spans no curve.
     no_curve = BoundaryCurve(np.zeros((0, 3)), np.zeros((0, 2), np.int64))
     size = float(lattice.size.max())
     is_cut = first.is_cut(corners)
     isotopy = isotopy_of(function, first.points, corners, is_cut, faces, no_curve, size, walls)
+    # Better shapes first, then within the tolerance, then better shapes that stay within it.
     vertices = smooth(function, vertices, faces, walls)
     vertices, faces = refine(function, vertices, faces, tolerance, walls, report)
     vertices = smooth_within_tolerance(function, vertices, faces, walls, tolerance)
@@ -586,6 +591,8 @@ def split_faces_off_level(
         moved = newton_to_level(
             function, center[off_level], samples.select(off_level), max_step, None
         )
+        # Each of these faces becomes a fan of three around its new vertex. The new faces are the
+        # last ones, and are examined in the next round.
         rows, new_vertices = pending[off_level], len(vertices) + np.arange(len(off_level))
         a, b, c = faces[rows].T
         vertices = np.concatenate([vertices, moved])
@@ -664,6 +671,7 @@ def _refinable_points(
     triangles would never end. Their centers are less than one and a half cells from the faces of
     the box."""
     lower, upper = lattice.lower + 1.5 * lattice.size, lattice.upper - 1.5 * lattice.size
+    # Whether each cell is relevant, and all cells around it too.
     deep = None if does_matter is None else lattice.interior_cells(does_matter)
 
     def counts(points: FloatArray) -> BoolArray:
@@ -715,6 +723,7 @@ def _sample_lattice(
             everywhere.
     """
     count = len(points)
+    # The values of points that are not evaluated: far above the level.
     samples = LevelSamples(np.full(count, 10 * OUTSIDE_VALUE), np.ones((count, 3)), np.zeros(count))
     points = points[~is_irrelevant]
     samples = samples.replaced(~is_irrelevant, function.sample(points))

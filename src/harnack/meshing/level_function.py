@@ -177,6 +177,7 @@ class LevelFunction:
             return sample.value, sample.gradient, change
 
         self.evaluations += 2 * len(points)
+        # Kernels take vectors, so each radius is passed as a vector of three equal numbers.
         value, gradient, change = map_batches(
             self._backend, compute, points, np.column_stack([radius] * 3), at_once=1 << 18
         )

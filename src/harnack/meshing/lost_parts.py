@@ -207,6 +207,7 @@ class LostParts:
         beyond = _are_farther(distant.points, corner, max(tolerance, _ALLOWED_CELLS * spacing))
         within = _bound_of_distances(distant.points, corner) if len(distant.points) else tolerance
         measured = distant.select(_spread(len(distant.points), _MAX_MEASURED))
+        # At some of the points it is measured whether they are on a thin part or in a narrow gap.
         thickness, is_inside = _thicknesses(function, measured, spacing)
         is_thin = np.isfinite(thickness)
         thickness = thickness[is_thin]

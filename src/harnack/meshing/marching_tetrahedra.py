@@ -210,6 +210,7 @@ def _integrate_change(
             f"how {type(field).__name__} changes along {len(p)} edges of the mesh is not proved, "
             "and it has no `change_along`: choose a smaller `cell_size`"
         )
+    # The integral only decides how many whole periods are added.
     periods = np.round((integrated - wrapped) / period)
     if np.abs(integrated - wrapped - period * periods).max(initial=0.0) > 1e-6:
         raise MeshingError(
@@ -364,6 +365,7 @@ def _sides(points: TetrahedronPoints, tets: Tetrahedra, crossings: EdgeCrossings
     for i, j in itertools.permutations(range(4), 2):
         chosen = rows[(first_free_corner == i) & ~is_on[:, j]]
         side[chosen, j] = crossed(i, j, chosen)
+    # Going from corner to corner by another way must lead to the same side.
     is_wrong = np.zeros(len(rows), np.bool_)
     for i, j in _PAIRS:
         chosen = rows[~is_on[:, i] & ~is_on[:, j]]

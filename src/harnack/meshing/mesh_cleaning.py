@@ -99,6 +99,7 @@ def clean_and_fill(
         report(f"{len(loops):,} holes" + f", {ring} rings wider in places" * (ring > 0))
         working, unfilled, why = working.filled(loops)
         holes += len(loops) - len(unfilled)
+        # Where the mesh is still no closed manifold, remove the faces around, and try again.
         failing_vertices = np.concatenate([nonmanifold_vertices(working.faces), *unfilled])
         if not len(failing_vertices):
             return working.result(holes)
@@ -177,6 +178,7 @@ class _WorkingMesh:
         all_faces = np.arange(len(faces))
         corner = vertices[joined_faces]
         area = row_norms(area_normals(corner))
+        # Three reasons in turn: faces without an area, duplicates, and faces that intersect others.
         rows = all_faces[area > 0]
         reasons = ("flat", "doubled", "crossing", "branching", "one-sided", "around", "inside")
         counts = dict.fromkeys(reasons, 0) | {"flat": len(faces) - len(rows)}
@@ -251,6 +253,8 @@ class _WorkingMesh:
             piece_of_face = _pieces(edges, len(working.faces))
             face_count = edges.multiplicity[edges.edge_of_pair].reshape(3, -1)
             count = int(piece_of_face.max()) + 1
+            # For each piece, whether some face of it has an edge of more than two faces, or an open
+            # edge.
             has_overused_edge, has_open_edge = (
                 np.bincount(piece_of_face, is_marked.any(axis=0), minlength=count) > 0
                 for is_marked in (face_count > 2, face_count == 1)
@@ -258,6 +262,8 @@ class _WorkingMesh:
             area = np.bincount(
                 piece_of_face, row_norms(area_normals(working.vertices[working.faces]))
             )
+            # A fin ends in the open; the piece with the largest area is taken to be the surface
+            # itself.
             fins = np.flatnonzero(has_overused_edge & has_open_edge & (area < area.max()))
             if not len(fins):
                 return working

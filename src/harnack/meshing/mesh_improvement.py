@@ -273,6 +273,7 @@ def relax_vertices(
     for _ in range(_MOST_ROUNDS_OF_MOVES):
         angles = least_angles(vertices, faces)
         thin_vertices = np.unique(faces[angles < _THIN])
+        # Only vertices of thin triangles are moved, and none on the boundary.
         stars = _VertexStars.of(faces, thin_vertices[~is_fixed[thin_vertices]], len(vertices))
         if not len(stars.centers):
             break
@@ -435,6 +436,7 @@ def _moves_stay_near(
     is_candidate = np.zeros(len(stars.centers), np.bool_)
     is_candidate[rows] = True
     pairs = np.flatnonzero(is_candidate[stars.owner])
+    # The triangles around the candidates, as they are after the move.
     corner = vertices[stars.corners[pairs]]
     corner[:, 0] = targets[stars.owner[pairs]]
     samples = function.sample(corner.mean(axis=1))

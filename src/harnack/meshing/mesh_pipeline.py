@@ -209,8 +209,8 @@ def mesh(
             not have; keywords beside an object that holds them.
         ValueError: options are out of range or contradict each other; several levels.
     """
-    target, choices = surface_and_options("mesh", surface, options, keywords, _HONORED)
-    accuracy = MeshTolerance.of(choices)
+    target, trace_choices = surface_and_options("mesh", surface, options, keywords, _HONORED)
+    accuracy = MeshTolerance.of(trace_choices)
     check_options(cell_size, thickness, seed, max_triangles)
     simplify, largest = flag(simplify, "simplify"), target.largest > 0
     report = teller(progress)
@@ -220,6 +220,7 @@ def mesh(
         raise ValueError('simplify is for closed meshes: give side="below" or thickness as well')
     volume = intersection_of([field.domain, target.clip, target.section])
     asked = _MeshOptions(volume, accuracy, cell_size, seed, max_triangles, report)
+    # Three ways of meshing, by the kind of the field.
     if uses_sign_meshing(field):
         made = _mesh_from_signs(field, level, solid, thickness is not None, asked)
     elif solid:
@@ -230,14 +231,17 @@ def mesh(
     if solid:
         facts["side"] = target.side or "below"
     else:
+        # Of a level set, `largest` keeps the component with the largest area, before it is
+        # thickened.
         triangles = largest_component(triangles) if largest else triangles
         made.check_level(triangles)
     tolerance = accuracy.at(made.size)
     if thickness is not None:
         report("thickening")
         normals = vertex_normals(made.function, triangles)
-        triangles, more = thicken(triangles, normals, float(thickness), 0.5 * tolerance)
-        facts |= more
+        # Half of the tolerance is left for the simplification.
+        triangles, more_facts = thicken(triangles, normals, float(thickness), 0.5 * tolerance)
+        facts |= more_facts
     if largest and is_closed:
         triangles = largest_body(triangles)
 
@@ -248,14 +252,15 @@ def mesh(
             made.check_level(surface)
         check_manifold(surface.faces)
 
+    # Meshes that are not known to be valid are checked here.
     if not made.is_checked:
         report("checking")
         check(triangles)
         check_no_self_intersection(triangles.vertices, triangles.faces)
     if simplify:
         report("simplifying")
-        triangles, more = simplify_mesh(triangles, tolerance, check)
-        facts |= more
+        triangles, more_facts = simplify_mesh(triangles, tolerance, check)
+        facts |= more_facts
     return to_trimesh(triangles, facts, is_closed)
 
 
@@ -267,8 +272,9 @@ class _MeshOptions:
         cut.
     spacing: the size of cells, a length; None to choose it.
     most_faces: the largest number of triangles.
-    report: called with messages about progress. The other attributes are arguments of `mesh` with
-        the same names."""
+    report: called with messages about progress.
+
+    The other attributes are arguments of `mesh` with the same names."""
 
     volume: Volume | None
     tolerance: MeshTolerance
@@ -369,6 +375,7 @@ def _mesh_from_signs(
             raise EmptySurfaceError(f"{error}{empty_surface_hint(field)}") from error
         facts.append(more)
         losses.append(lost)
+        # The last mesh decides; with two levels this is set to False later.
         is_intersection_free = made.is_intersection_free
         return made.surface
 
@@ -629,6 +636,7 @@ def _checked(field: Field) -> Field:
             raise TypeError(
                 "the mesh of a circle ends on a polygon: give circle.polygon(n) in its place"
             )
+        # Without the settings of the given one.
         return SolidAngle(list(field.loops))
     if field.period is not None:
         raise TypeError(
@@ -652,6 +660,7 @@ def _mesh_solid(
         solid.
     asked: the arguments of `mesh`."""
     region = LevelFunction(*solid_and_level(field, solid, level), most_faces=asked.most_faces)
+    # In a list, so that a nested function can change it.
     angle_evaluations = [0]
 
     def angle_mesher(error: float, cells: float) -> AngleMesher:
@@ -777,6 +786,7 @@ def _mesh_in_lattice(
             break
         except MeshingError as error:
             attempts -= 1
+            # Give up after the last attempt, or if even the smallest cells to come would not help.
             if not attempts or not is_retry_promising(
                 error, previous_error, CELL_REFINEMENT_FACTOR**attempts
             ):

@@ -73,6 +73,7 @@ def project_outliers(
             return None
         (vertices, faces), is_new = changed
         try:
+            # New points off the level set are mended in the next round.
             check(TriangleMesh.without_unused_vertices(vertices, faces[is_new]))
         except OffLevelError as error:
             places = error.locations

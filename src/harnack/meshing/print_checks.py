@@ -149,6 +149,8 @@ def check_print(
         else [as_positive(item, "build_volume") for item in build_volume]
     )
     x, faces, rounding_hint = _mesh_of(part)
+    # Later checks assume what earlier ones found: whether the mesh is closed, and whether faces
+    # cross.
     problems = _topology(x, faces)
     is_closed = not _has_errors(problems)
     shells = Shells.of(TriangleMesh(x, faces))
@@ -164,6 +166,7 @@ def check_print(
     size = cast("tuple[float, float, float]", tuple((box_upper - box_lower).tolist()))
     problems += _size_problems(size, checked_build_volume)
     problems.append(rounding_hint)
+    # Errors first.
     reported = sorted((item for item in problems if item.count), key=lambda item: not item.is_error)
     volume = float(shells.volumes.sum()) if is_closed else None
     return PrintCheck(tuple(reported), size, volume, len(faces), len(shells.volumes))
@@ -207,6 +210,7 @@ def _mesh_of(part: Any) -> tuple[FloatArray, IntArray, PrintProblem]:
             ) from None
         x, faces = validate_mesh(vertices, raw_faces, allow_zero_area=True)
         rounded_count = 0
+    # Vertices that differ by rounding get the index of one of them.
     welded = Welded.of(x, faces)
     count = rounded_count + welded.rounded
     text = f"{count:,} {'corner is' if count == 1 else 'corners are'} apart from others by rounding"

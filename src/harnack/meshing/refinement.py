@@ -154,6 +154,7 @@ def _converge_vertices(
     if not len(rows):
         return vertices
     max_step = np.full(len(rows), 0.5 * tolerance)
+    # Twenty short steps, of half of the tolerance at most.
     moved = newton_to_level(
         function, vertices[rows], samples.select(rows), max_step, walls, steps=20
     )
@@ -553,6 +554,7 @@ def _undo_flipped(before: FloatArray, after: FloatArray, faces: IntArray) -> Flo
         new_normal = area_normals(new_corner)
         old_corner = before[faces]
         old_normal = area_normals(old_corner)
+        # The cosine between both normals is at most 0.3.
         is_turned = row_dots(new_normal, old_normal) <= 0.3 * row_norms(new_normal) * row_norms(
             old_normal
         )

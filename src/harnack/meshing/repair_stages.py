@@ -243,6 +243,7 @@ def repair(
 class _RepairOptions:
     """The arguments of `repair`, checked.
 
+    keep: which stages to try, "all", "valid" or "none"; None for all stages.
     patches: how holes are filled, "smooth" or "harmonic": the argument `filling`.
     tolerance: the largest distance of new triangles from the surface w = 1/2.
     spacing: the size of cells, a length: the argument `cell_size`; None to choose it.
@@ -315,6 +316,7 @@ class _Result:
         dropped = 0
         if largest and len(parts) > 1:
             surface = largest_body(surface)
+            # A body may have several components: its cavities.
             dropped = len(parts) - len(component_facts(surface))
             facts["kept"] = _count_kept(surface, self.surface, facts["kept"])
         repaired = ClosedMesh(surface.vertices, surface.faces, process=False, validate=False)
@@ -446,6 +448,7 @@ def _remesh(
     intended.check_encloses()
     mesh_arrays = without_zero_area_faces(intended.vertices, intended.oriented)
     field = WindingNumber(*mesh_arrays)
+    # Cells of a given size are used as they are; otherwise several sizes are tried.
     if settings.spacing is not None:
         made = _mesh_half_level(field, settings.spacing, settings)
     else:
@@ -591,6 +594,7 @@ def _fill_only(
     if intended.is_turned.any():
         raise MeshError("a part of the mesh is inside out")
     edges = checked_boundary_edges(faces)
+    # With keep="all" crossing triangles stay as well.
     if settings.keep is None and len(crossing := intersecting_faces(vertices, faces)):
         raise MeshError(f"{len(crossing):,} triangles of the mesh pass through others")
     loops = hole_loops(vertices, faces, edges)

@@ -88,6 +88,7 @@ def resolve_local_intersections(
     vertices, faces = surface.vertices, surface.faces
     is_gone, new_faces, crossing_count = np.zeros(len(faces), np.bool_), [faces[:0]], 0
     for neighborhood_rows, movable in _regions(vertices, faces, crossing):
+        # The faces of a neighborhood are replaced by what becomes of them.
         is_gone[neighborhood_rows] = True
         if len(neighborhood_rows) > _MAX_NEIGHBORHOOD:
             new_faces.append(faces[neighborhood_rows])

@@ -297,6 +297,7 @@ class SignFunction(LevelFunction):
         rows = np.arange(len(start))
         for k in range(steps):
             ends = first[rows], last[rows]
+            # Odd steps halve the interval, even ones take the root of the secant.
             t = 0.5 * (ends[0] + ends[1]) if k % 2 else _secant(*ends, low[rows], high[rows])
             value = self.values(start[rows] + t[:, None] * edge[rows])
             is_positive = value > 0
@@ -365,6 +366,7 @@ def _check_encloses(field: DipolePotential, level: float) -> None:
     """
     if field.smoothing or not field.is_estimated[1] or not level > 0:
         return
+    # The values at every step-th point, at most 2000 of them.
     step = -(-len(field.points) // _MOST_PROBES)
     median = float(np.median(field.value(field.points[::step], precision="double")))
     if not median > _MIN_VALUE_SHARE * level:

@@ -164,12 +164,14 @@ def mesh_from_signs(
     level_points = PointsOnLevel.of(function, tolerance).within(*box, volume)
     while True:
         report(f"cells of {spacing:.3g}")
+        # Two more layers of cells around the box, in which a closed surface may be coarse.
         layers = 2 if closed else 0
         lattice = BccLattice.covering_box(*box, spacing, layers=layers)
         try:
             mesh = extract_from_signs(function, lattice, 0.8 * tolerance, report, closed=closed)
         except EmptySurfaceError as error:
             empty_mesh = TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64))
+            # A level set that is known to have points is lost, not empty.
             lost = LostParts.of(function, level_points, empty_mesh, tolerance, spacing)
             if not lost.far:
                 raise
@@ -443,6 +445,7 @@ def _finite_values(function: SignFunction, points: FloatArray, size: FloatArray)
         MeshingError: some values are still not finite.
     """
     value = function.values(points)
+    # Try two points beside each of these, along the diagonal of a cell.
     for k in (1, 2):
         rows = np.flatnonzero(~np.isfinite(value))
         if not len(rows):

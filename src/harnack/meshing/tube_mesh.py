@@ -229,11 +229,14 @@ class _Sweep:
         Points that are equal in successive rings are one vertex, and faces without three different
         vertices are left out."""
         count, n = len(rings), self.ring_size
+        # Each quadrilateral has two neighboring points a, b of a ring and the points d, c of the
+        # next ring.
         row, column = np.mgrid[: count - 1 if shift is None else count, :n].reshape(2, -1)
         column_shift = np.where(row == count - 1, shift or 0, 0)
         next_row = (row + 1) % count * n
         a, b = row * n + column, row * n + (column + 1) % n
         c, d = next_row + (column + column_shift + 1) % n, next_row + (column + column_shift) % n
+        # Equal points get the same number: in successive rings, and at the poles of half balls.
         vertex: IntArray = np.arange(count * n, dtype=np.int64).reshape((count, n))
         for k in range(1, count):
             is_same = (rings[k] == rings[k - 1]).all(axis=1)
