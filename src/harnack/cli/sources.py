@@ -147,23 +147,26 @@ def load_live_content(verb: str, arguments: Any, path: Path) -> Content:
         raise ValueError("a page needs a scene, a surface file or a formula, no Mitsuba scene")
     sliders = dict(arguments.slider)
     if path.suffix.lower() == ".json" and arguments.source not in SCENES:
+        # A scene file has sliders of its own; those of the command line replace them.
         sliders = {**read_scene(path).sliders, **sliders}
     option_names = [option.name for option in options_of(verb)]
-    of_formula = [name for name in sliders if name not in option_names]
+    formula_names = [name for name in sliders if name not in option_names]
     for name in sliders:
         # A slider begins at the value that is given as an option.
         value = getattr(arguments, name, None) if name in option_names else None
         if value is not None:
             sliders[name] = replace(sliders[name], start=value)
-    if of_formula and not is_formula(arguments.source):
+    if formula_names and not is_formula(arguments.source):
         raise ValueError(
-            f"--slider {of_formula[0]}: there are sliders of options that are numbers, such as "
+            f"--slider {formula_names[0]}: there are sliders of options that are numbers, such as "
             "level, and of names in formulas"
         )
-    starts = {name: cast("float", sliders[name].start) for name in of_formula}
-    surfaces, settings, sources = load_content(verb, arguments, path, starts)
+    # The formula is read once with each name at the start of its slider.
+    start_values = {name: cast("float", sliders[name].start) for name in formula_names}
+    surfaces, settings, sources = load_content(verb, arguments, path, start_values)
     show = getattr(arguments, "show", None)
     if path.suffix.lower() == ".json" and arguments.source not in SCENES:
+        # A scene file may have options of pictures that pages lack.
         dropped_options = sorted(
             name
             for name, value in settings.items()
@@ -176,7 +179,7 @@ def load_live_content(verb: str, arguments: Any, path: Path) -> Content:
     if any(name in SURFACE_OPTIONS for name in sliders):
         surfaces, settings = _unpacked(surfaces, settings)
     settings = _with_flat_options(settings, sliders) | sliders
-    if not of_formula:
+    if not formula_names:
         return surfaces, settings, sources
     formula_text, fixed = arguments.source, dict(arguments.parameters)
 
@@ -187,7 +190,7 @@ def load_live_content(verb: str, arguments: Any, path: Path) -> Content:
     keyword_only = inspect.Parameter.KEYWORD_ONLY
     # Pages read the names of sliders from the function's signature.
     cast("Any", field).__signature__ = inspect.Signature(
-        [inspect.Parameter(name, keyword_only) for name in of_formula]
+        [inspect.Parameter(name, keyword_only) for name in formula_names]
     )
     return field, settings, sources
 

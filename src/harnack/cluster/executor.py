@@ -216,6 +216,8 @@ class _LocalTasks:
     waiting: (name, arguments) of the tasks that were submitted and not run yet."""
 
     def __init__(self, packed: SerializedObject, step: str) -> None:
+        """Prepare the tasks of the serialized job `packed`. step: the name of the job's method that
+        a task calls."""
         self.do: TaskFunction = getattr(packed.deserialize(), step)
         self.waiting: list[tuple[str, tuple[Any, ...]]] = []
 
@@ -245,6 +247,8 @@ class _DaskTasks:
     packed: the future of the serialized job."""
 
     def __init__(self, client: Any, packed: SerializedObject, step: str) -> None:
+        """Send the serialized job `packed` to the cluster of `client`. step: the name of the job's
+        method that a task calls."""
         distributed = import_optional("distributed", "client")
         self.client, self.step = client, step
         self.worker_lost = distributed.KilledWorker

@@ -474,8 +474,9 @@ def _arc(arc: Any, matrix: FloatArray, tolerance: float) -> FloatArray:
     """A polyline within `tolerance` of an elliptic arc, moved by the transform `matrix` (3, 3).
     Returns its points (n, 2) without the first one.
 
-    The number of chords follows from a bound of their error: if an arc of the angle a and the
-    larger radius r is divided into n chords, they are within r (a/n)^2/8 of it.
+    The number of chords, at least 2, follows from a bound of their error: if an arc of the angle a
+    and the larger radius r is divided into n chords, they are within r (a/n)^2/8 of it. The
+    transform stretches r at most by its matrix norm.
 
     Raises:
         ValueError: the arc has more than 100,000 chords.

@@ -161,18 +161,19 @@ class GridShell:
         points: list[FloatArray] = []
         inward: list[FloatArray] = []
         for a, b in zip(self.outline, np.roll(self.outline, -1, axis=0), strict=True):
-            # The outline is counter-clockwise, so the region is on the left of its edges.
             length = float(np.linalg.norm(b - a))
             count = max(1, round(length / self.spacing))
             fraction = (np.arange(count)[:, None] + 0.5) / count
             points.append(a + fraction * (b - a))
+            # The outline is counter-clockwise, so the region is on the left of its edges.
             inward.append(np.tile(np.array([a[1] - b[1], b[0] - a[0]]) / length, (count, 1)))
         for x, y, r in self.holes:
             count = max(8, round(2 * math.pi * r / self.spacing))
             angle = 2 * math.pi * (np.arange(count) + 0.5) / count
-            out = np.column_stack([np.cos(angle), np.sin(angle)])
-            points.append(np.array([x, y]) + r * out)
-            inward.append(out)
+            # The region is outside of the holes.
+            outward = np.column_stack([np.cos(angle), np.sin(angle)])
+            points.append(np.array([x, y]) + r * outward)
+            inward.append(outward)
         return np.concatenate(points), np.concatenate(inward)
 
     def _edges(self) -> list[FloatArray]:

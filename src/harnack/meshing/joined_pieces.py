@@ -131,7 +131,8 @@ class _Cut:
     def of(
         cls, vertices: FloatArray, faces: IntArray, rows: IntArray, closed: IntArray | None = None
     ) -> _Cut:
-        """Cut the faces `rows` (indices) of a mesh along each other.
+        """Cut the faces with the indices `rows` (j,) of a mesh along each other, and compute the
+        winding numbers on both sides of the pieces.
 
         closed: all faces of the mesh, including faces without an area, with which winding numbers
             are computed. None if `faces` has all of them."""

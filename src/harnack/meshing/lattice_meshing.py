@@ -672,18 +672,18 @@ def _refinable_points(
     the box."""
     lower, upper = lattice.lower + 1.5 * lattice.size, lattice.upper - 1.5 * lattice.size
     # Whether each cell is relevant, and all cells around it too.
-    deep = None if does_matter is None else lattice.interior_cells(does_matter)
+    is_interior_cell = None if does_matter is None else lattice.interior_cells(does_matter)
 
-    def counts(points: FloatArray) -> BoolArray:
+    def may_refine(points: FloatArray) -> BoolArray:
         """(n,) whether triangles may be refined at `points` (n, 3)."""
         is_inside = np.ones(len(points), np.bool_)
         for x, low, high in zip(points.T, lower, upper, strict=True):
             is_inside &= (x >= low) & (x <= high)
-        if deep is not None:
-            is_inside &= deep[tuple(lattice.cell_indices(points).T)]
+        if is_interior_cell is not None:
+            is_inside &= is_interior_cell[tuple(lattice.cell_indices(points).T)]
         return is_inside
 
-    return counts
+    return may_refine
 
 
 def _wall_faces(

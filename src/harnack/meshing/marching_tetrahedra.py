@@ -346,8 +346,9 @@ def _halves(vertices: FloatArray, ring: list[IntArray]) -> tuple[IntArray, IntAr
 
 def _sides(points: TetrahedronPoints, tets: Tetrahedra, crossings: EdgeCrossings) -> IntArray:
     """(m, 4) for each corner of each of m tetrahedra, on which side of the level it lies: the
-    signed number of level crossings on the edge to this corner from the first corner of the
-    tetrahedron that is not on the level. It is 0 for that corner and for corners on the level.
+    number of level crossings (upward minus downward) on the edge to this corner from the first
+    corner of the tetrahedron that is not on the level. It is 0 for that corner and for corners on
+    the level.
 
     Raises:
         LocalizedMeshingError: the crossings of three edges of a face do not add up.
@@ -457,6 +458,7 @@ def _illinois(
         low = np.where(is_positive, np.where(repeats > 1, 0.5 * low, low), value)
         high = np.where(is_positive, value, np.where(repeats < -1, 0.5 * high, high))
         left, right = np.where(is_positive, left, fraction), np.where(is_positive, fraction, right)
+        # The root of the secant; values of equal size would divide by 0.
         fraction = left + (right - left) * low / np.minimum(low - high, -1e-300)
     return np.clip(fraction, _MIN_END_DISTANCE, 1 - _MIN_END_DISTANCE)
 

@@ -168,7 +168,8 @@ def least_angles(vertices: FloatArray, faces: IntArray) -> FloatArray:
     side = np.stack([corner[:, (k + 2) % 3] - corner[:, (k + 1) % 3] for k in range(3)], axis=1)
     square = np.einsum("ijk,ijk->ij", side, side)
     twice_area = row_norms(np.cross(side[:, 0], side[:, 1]))
-    # The least angle is opposite the shortest side: tan = 2 area/(b . c).
+    # The smallest angle is opposite the shortest side a. For the other sides b and c, its tangent
+    # is 2 area/(b . c), and 2 b . c = b^2 + c^2 - a^2.
     shortest = square.argmin(axis=1)
     dot = 0.5 * (square.sum(axis=1) - 2 * square[np.arange(len(faces)), shortest])
     return np.arctan2(twice_area, dot)

@@ -128,6 +128,7 @@ def _project_and_split(
         midpoint[rows] = np.where(is_cut, count + position, -1).reshape(3, -1).T
     # Other faces with a far center get a vertex there, and become a fan of three.
     fan_rows = np.setdiff1d(center_rows, np.flatnonzero((midpoint >= 0).any(axis=1)))
+    # Move all three kinds of points at once: far vertices, new vertices on edges, new centers.
     start = np.concatenate(
         [
             vertices[moved_vertices],
@@ -150,6 +151,7 @@ def _project_and_split(
         split,
         *(np.stack([*edge, fan_centers], axis=1) for edge in ((a, b), (b, c), (c, a))),
     ]
+    # To be checked: new faces, and faces at moved vertices.
     removed_rows = np.union1d(np.flatnonzero(is_split), fan_rows)
     remaining = np.delete(faces, removed_rows, axis=0)
     is_moved = np.zeros(len(vertices), np.bool_)

@@ -381,12 +381,14 @@ def _contacts(
 
 
 def _thin_walls(x: FloatArray, faces: IntArray, wall: float, is_solid: bool) -> PrintProblem:
-    """The problem of places where the part is thinner than `wall`, a length. If the mesh bounds no
-    solid (`is_solid`), the problem says instead that thickness could not be measured."""
+    """The problem of places where the part is thinner than `wall`, a length.
+
+    is_solid: whether the mesh bounds a solid. If it does not, the problem says instead that
+        thickness could not be measured."""
     if not is_solid:
         # The name differs from that of walls that were measured to be thin.
-        why = "how thick walls are is not known before the rest is mended"
-        return PrintProblem("walls not measured", 1, np.zeros((0, 3)), why)
+        message = "how thick walls are is not known before the rest is mended"
+        return PrintProblem("walls not measured", 1, np.zeros((0, 3)), message)
     thickness = wall_thickness(MeshSolid(x, faces))
     locations = thickness.thin_locations(wall - _ROUNDING * float(np.ptp(x, axis=0).max()))
     suffix = f"; the thinnest is {thickness.thinnest:.3g}"

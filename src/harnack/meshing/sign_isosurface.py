@@ -553,12 +553,14 @@ class _CreaseRefinement:
         a, b = x[ends[:, 0]], x[ends[:, 1]]
         fraction, to_line, sine2 = _toward_tangent_planes(a, b, one, other)
         edge_length = row_norms(b - a)
+        # Of these, the edges that are far from the line between the tangent planes.
         is_far = (
             (sine2 > _MIN_SQUARE)
             & (row_norms(to_line) > tolerance)
             & (edge_length > _SHORTEST * tolerance)
         )
         rows, to_line, fraction = rows[is_far], to_line[is_far], fraction[is_far]
+        # Of these, the edges beside which the level set is found.
         foot, far_length = a[is_far] + fraction[:, None] * (b - a)[is_far], edge_length[is_far]
         points, normal, is_found = _level_along(function, foot, to_line, _OFFSET * far_length)
         rows, points, normal, fraction = (
@@ -584,6 +586,7 @@ class _CreaseRefinement:
         )
         is_bent = np.concatenate([bent, is_on_crease])
         new_vertices_of_face = vertex_of_edge[edges]
+        # Faces whose three new vertices all lie on creases.
         corner = np.flatnonzero(
             (new_vertices_of_face >= 0).all(axis=1)
             & is_bent[np.maximum(new_vertices_of_face, 0)].all(axis=1)
