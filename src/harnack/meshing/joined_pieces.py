@@ -326,7 +326,9 @@ def _apart_at_contacts(x: FloatArray, faces: IntArray) -> tuple[FloatArray, IntA
     vertex."""
     m = len(faces)
     edge, opposite = neighbors(x, faces).T
-    # Corner k of face i is k m + i, and edge k runs from it to the next.
+    # Corner k of face i has the number k m + i, and so has the half edge from it to the next
+    # corner. Of two half edges that belong together, one starts where the other ends: these corners
+    # are of one fan.
     start, end = (edge, (opposite + m) % (3 * m)), ((edge + m) % (3 * m), opposite)
     fan = connected_groups(np.concatenate([start, end], axis=1).T, 3 * m)
     first_corner = np.unique(fan, return_index=True)[1]

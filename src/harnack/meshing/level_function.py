@@ -216,6 +216,7 @@ class LevelFunction:
         )
         # A quarter above and a quarter below, minus the rounding error.
         quarter = self._backend.Float(0.2499 * self.period) - 2 * sample.value_error
+        # The longest distance within which the enclosures prove that f stays in that range.
         return (
             sample.value,
             sample.gradient,

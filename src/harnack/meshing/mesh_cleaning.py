@@ -312,7 +312,7 @@ class _WorkingMesh:
             MeshingError: the surface passes through itself.
         """
         # A rank above all indices of input faces puts fillings last.
-        filling_rank = len(self.vertices) + len(self.source_face)  # after all input faces
+        filling_rank = len(self.vertices) + len(self.source_face)
         order = np.argsort(
             np.where(self.source_face < 0, filling_rank, self.source_face), kind="stable"
         )

@@ -126,11 +126,13 @@ def _independent_flips(
     key: (n,) a number that identifies the new edge of each pair."""
     rows = rows[np.argsort(-gain[rows], kind="stable")]
     rank = np.arange(len(rows))
+    # For each face the rank of the best candidate that changes it; rank 0 gains most.
     best_rank = np.full(face_count, len(rows))
     for k in (0, 1):
         np.minimum.at(best_rank, pairs[rows, k], rank)
     is_best = (best_rank[pairs[rows]] == rank[:, None]).all(axis=1)
     rows = rows[is_best]
+    # Of the flips that make the same edge, keep one.
     return rows[np.unique(key[rows], return_index=True)[1]]
 
 

@@ -682,7 +682,8 @@ def _mesh_solid(
         return mesh_angle
 
     def check_level(surface: TriangleMesh, size: float) -> None:
-        """Raise a MeshingError unless the mesh is within the tolerance of the solid's level set."""
+        """Raise a MeshingError unless the mesh is within the tolerance of the solid's level set.
+        size: the longest side of its box, a length, to which the tolerance is relative."""
         _check_level(region, surface, asked.tolerance.at(size), asked.volume)
 
     def check(surface: TriangleMesh, size: float) -> None:

@@ -482,24 +482,27 @@ def smooth(
     is_free[np.unique(faces)] = True
     is_free[boundary] = False
     neighbor_count = np.maximum(np.bincount(ends.ravel(), minlength=len(vertices)), 1)
-    rows = np.flatnonzero(is_free)
-    size = float(np.ptp(vertices[is_free], axis=0).max(initial=0.0)) if len(rows) else 0.0
+    free_rows = np.flatnonzero(is_free)
+    size = float(np.ptp(vertices[is_free], axis=0).max(initial=0.0)) if len(free_rows) else 0.0
     for _ in range(rounds):
         neighbor_sum = np.zeros_like(vertices)
+        # The sum of the neighbors of each vertex, over both directions of all edges.
         for i, j in ((0, 1), (1, 0)):
             for axis in range(3):
                 neighbor_sum[:, axis] += np.bincount(
                     ends[:, i], vertices[ends[:, j], axis], minlength=len(vertices)
                 )
         target = 0.5 * (vertices + neighbor_sum / neighbor_count[:, None])
-        target_samples = function.sample(target[rows])
+        target_samples = function.sample(target[free_rows])
         # Newton's steps are limited to twice the move: beside the boundary, gradients turn.
-        span = row_norms(target[rows] - vertices[rows]) + 1e-300
+        move_length = row_norms(target[free_rows] - vertices[free_rows]) + 1e-300
         moved = vertices.copy()
-        moved[rows] = newton_to_level(function, target[rows], target_samples, 2 * span, walls)
-        moved_samples = function.sample(moved[rows])
-        is_off = moved_samples.distance > 1e-7 * size + 1e-12 * row_norms(moved[rows])
-        moved[rows[is_off]] = vertices[rows[is_off]]
+        moved[free_rows] = newton_to_level(
+            function, target[free_rows], target_samples, 2 * move_length, walls
+        )
+        moved_samples = function.sample(moved[free_rows])
+        is_off = moved_samples.distance > 1e-7 * size + 1e-12 * row_norms(moved[free_rows])
+        moved[free_rows[is_off]] = vertices[free_rows[is_off]]
         vertices = _undo_flipped(vertices, moved, faces)
     return vertices
 

@@ -135,9 +135,8 @@ class _Sweep:
         along the edge before it, or is too short for its corners: then a line along the tube
         between corresponding points of two rings would run backwards."""
         points, edge_vectors = self.points, np.diff(self.points, axis=0)
-        directions = (
-            edge_vectors / np.abs(edge_vectors).max(axis=1)[:, None]
-        )  # squares of small ones underflow
+        # Scaled before they are normalized, since squares of small numbers underflow.
+        directions = edge_vectors / np.abs(edge_vectors).max(axis=1)[:, None]
         directions /= row_norms(directions)[:, None]
         is_closed = len(directions) > 2 and bool((points[0] == points[-1]).all())
         frames_and_shift = self._transported(directions, is_closed=is_closed)
@@ -151,9 +150,8 @@ class _Sweep:
             self._corner(point, turn, self._directions(end))
             for point, turn, (_, end) in zip(points[1:], direction_pairs, frames, strict=False)
         ]
+        # The rings at the start and at the end of each edge: those of its two corners, or half balls.
         if is_closed:
-            # The rings at the start and at the end of each edge: those of its two corners, or half
-            # balls.
             starts, ends = [np.roll(corners[-1], shift, axis=1), *corners[:-1]], corners
         else:
             starts = [self._end(points[0], directions[0], frames[0][0], -1), *corners]
@@ -196,6 +194,7 @@ class _Sweep:
         inward_part = directions @ across
         step = 2 * math.pi / self.ring_size
         count = math.ceil(angle / step)
+        # A small turn has a single ring, in the plane that bisects the corner.
         angles = np.array([0.5 * angle]) if count <= 1 else np.linspace(0.0, angle, count + 1)
         # The ring's directions rotated by each angle, in the plane of `across` and `before`.
         outer_points = directions + inward_part[:, None] * (
