@@ -150,7 +150,7 @@ class _Sweep:
             self._corner(point, turn, self._directions(end))
             for point, turn, (_, end) in zip(points[1:], direction_pairs, frames, strict=False)
         ]
-        # The rings at the start and at the end of each edge: those of its two corners, or half balls.
+        # The rings at the start and at the end of each edge: at corners, or half balls at ends.
         if is_closed:
             starts, ends = [np.roll(corners[-1], shift, axis=1), *corners[:-1]], corners
         else:
