@@ -54,7 +54,7 @@ class _Parser(argparse.ArgumentParser):
 
 
 class _Once(argparse.Action):
-    """What argparse does for an option that may be given only once: it stores the value. (By
+    """The action of argparse for an option that may be given only once: it stores the value. (By
     default argparse would take the last of several values.)"""
 
     def __call__(

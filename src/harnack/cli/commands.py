@@ -194,7 +194,7 @@ def _repaired(facts: dict[str, Any], old: int, new: int) -> str:
 
 
 def _counted(count: int, noun: str) -> str:
-    """A count and its noun as text, such as "1 hole" or "2 holes"."""
+    """A count and its noun, as text such as "1 hole" or "2 holes"."""
     return f"{count:,} {noun}" + ("" if count == 1 else "s")
 
 

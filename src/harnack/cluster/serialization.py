@@ -203,8 +203,8 @@ def _hash_and_files(
     label: what the value is, for messages.
     identifiers: identifiers in users' code that are known already; they select the attributes of
         users' modules that are written."""
-    # The fast way writes equal parts at each place, and does not end for an object that contains
-    # itself. Then parts that occur again are written as references.
+    # The fast way writes equal parts at each place, so it fails for an object that contains itself.
+    # The other way writes a reference for a part that was written before.
     try:
         pickler = _pickle(_make_hashing_pickler, value, label, identifiers, fast=True)
     except (RecursionError, TypeError, ValueError):  # an object that contains itself

@@ -409,8 +409,9 @@ def _row_ends(section: PlyElement, values: BinaryValues, begin: int) -> Iterator
     """Yield the position at which each row of an element ends, one row after the other, for
     elements whose rows have different lengths because they contain lists.
 
-    begin: the position at which the first row begins. Raises struct.error if a row ends after the
-        end of the file, or a list has a negative length."""
+    begin: the position at which the first row begins.
+
+    Raises struct.error if a row ends after the end of the file, or a list has a negative length."""
     # For each list: the bytes since the list before, how its length is stored, and the bytes of
     # each of its numbers. At the end `fixed_bytes` is what follows the last list.
     fixed_bytes = 0

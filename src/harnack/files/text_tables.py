@@ -188,7 +188,7 @@ def read_integers(lines: TextLines) -> tuple[IntArray, IntArray]:
     Raises:
         FileFormatError: some word is not an integer; the message names the line of the first one.
     """
-    # Floating-point numbers below 2^53 that are whole are exact.
+    # NumPy reads floating-point numbers; if they are whole and below 2^53, they are exact.
     table = _parse_with_numpy(lines)
     if table is not None and (np.abs(table) < 2.0**53).all() and (table == np.rint(table)).all():
         return table.astype(np.int64).ravel(), _row_lengths(table)

@@ -233,6 +233,7 @@ def _check_off_level_around(function: LevelFunction, points: FloatArray, radius:
     The function is examined at some of `points` (n, 3) on the level set. The error is raised if at
     more than half of them it equals the level, up to rounding, both at the point and at the
     distance `radius` from it in all six axis directions."""
+    # Every k-th point, with the smallest k for which at most 2000 are left.
     probes = points[:: -(-len(points) // _MOST_PROBES)]
     offsets = radius * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
     near_points = (probes[:, None] + offsets).reshape(-1, 3)
@@ -259,6 +260,7 @@ def _check_passes_level(function: LevelFunction, points: FloatArray, size: float
     at the point the gradient may be 0. The function touches its level if both ends of the segment
     have values on the same side of the level, and the value closest to the level, found by golden
     section search, is as close to it as rounding allows."""
+    # Every k-th point, with the smallest k for which at most 60 are left.
     x = points[:: -(-len(points) // _MAX_TRIED)]
     offset = _TOUCH_OFFSET * size
     # Of the gradients at three points beside x the steepest one gives the direction.

@@ -235,6 +235,7 @@ def _distances(
     if closed:
         lower, upper = lattice.lower + 2 * lattice.size, lattice.upper - 2 * lattice.size
         faces = faces[((x[faces] > lower) & (x[faces] < upper)).all(axis=(1, 2))]
+    # Every k-th face, with the smallest k for which at most 20,000 are left.
     surface = TriangleMesh.without_unused_vertices(
         x, faces[:: -(-len(faces) // _MOST_MEASURED) or 1]
     )

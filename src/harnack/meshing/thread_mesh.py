@@ -84,10 +84,11 @@ def _vertices(
     height, radii: (lines,) the z of each line at angle 0, and its radius.
     segments: the number of vertices of a line in one turn.
     lead: the height that a line gains in a turn.
-    shift: after a turn, a line is where the line `shift` places further was at angle 0.
+    shift: after a full turn, line i is where line i + shift began (at angle 0).
 
     Returns (lines * segments + shift, 3): the points of each line at each angle, line after line;
-    then the points at angle 0 of the lines that follow the last ones after a turn."""
+    then the points at angle 0 of the `shift` lines above the last one, where the last lines end
+    after a turn."""
     angle = 2 * math.pi * np.arange(segments) / segments
     continued = height[-shift:] + lead, radii[-shift:]
     z = height[:, None] + lead * angle / (2 * math.pi)
@@ -101,8 +102,8 @@ def _index(line: IntArray, step: IntArray, lines: int, segments: int, shift: int
     angle.
 
     line: the numbers of the lines, from 0 to `lines` - 1 (or up to `shift` more at angle 0).
-    step: the angles, as numbers from 0 to `segments` (a full turn). After a full turn, a line
-        continues in the line `shift` places further, at angle 0.
+    step: the angles, as numbers from 0 to `segments` (a full turn). Line i after a full turn is
+        line i + shift at angle 0.
     lines, segments: the number of lines, and of the vertices of a line in one turn."""
     line, step = np.where(step == segments, line + shift, line), np.where(step == segments, 0, step)
     return np.where(line < lines, line * segments + step, lines * segments + line - lines)
@@ -114,7 +115,7 @@ def _faces(lines: int, segments: int, shift: int) -> IntArray:
     of triangles around a point of the axis (`_middles`).
 
     lines, segments: the number of helical lines, and of the vertices of a line in one turn.
-    shift: after a turn, a line is where the line `shift` places further was at angle 0."""
+    shift: after a full turn, line i is where line i + shift began (at angle 0)."""
     line, step = (grid.ravel() for grid in np.mgrid[: lines - 1, :segments])
 
     def at(i: IntArray, j: IntArray) -> IntArray:

@@ -109,6 +109,7 @@ def _simpler(points: FloatArray, length: float) -> FloatArray:
         square = float(edge @ edge)
         fraction = (offsets @ edge / square if square > 0 else np.zeros(len(offsets))).clip(0, 1)
         distance = row_norms(offsets - fraction[:, None] * edge)
+        # If both ends are at the same point, no edge replaces the range: it is divided.
         if not len(distance) or (square > 0 and distance.max() <= length):
             continue
         # Keep the farthest vertex, and continue on both sides of it.
