@@ -323,8 +323,8 @@ def _refuse_file_options(arguments: Any) -> None:
 
 
 def _split(values: Mapping[str, Any], names: Sequence[str]) -> tuple[dict[str, Any], ...]:
-    """Split a dictionary in two: the entries whose names are among `names`, and all other
-    entries."""
+    """Split the dictionary `values` in two: the entries whose names are among `names`, and all
+    other entries."""
     named = {name: value for name, value in values.items() if name in names}
     return named, {name: value for name, value in values.items() if name not in names}
 
@@ -364,9 +364,9 @@ def _unpacked(surfaces: Any, settings: dict[str, Any]) -> tuple[Any, dict[str, A
 
 
 def _with_flat_options(settings: dict[str, Any], sliders: Mapping[str, Any]) -> dict[str, Any]:
-    """The settings by name. If a slider moves an option of traces, the entry "options" (a
-    `TraceOptions`) is replaced by two entries, its tolerance and its number of steps, since a
-    slider can only be the value of an entry."""
+    """The settings by name. If one of the sliders (by name) moves an option of traces, the entry
+    "options" (a `TraceOptions`) is replaced by two entries, its tolerance and its number of steps,
+    since a slider can only be the value of an entry."""
     options = settings.get("options")
     if not isinstance(options, TraceOptions) or not any(name in TRACE_OPTIONS for name in sliders):
         return settings

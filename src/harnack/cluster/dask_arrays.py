@@ -125,6 +125,7 @@ def _align_blocks(
 ) -> dict[str, Any]:
     """Divide Dask arrays into the same blocks of rows. Returns them by name.
 
+    dask_array: the module dask.array.
     dask_args: the Dask arrays by name; the blocks are those of the first array.
     others: further arguments by name; an array among them with as many rows becomes a Dask array
         too.

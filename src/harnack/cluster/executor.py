@@ -385,16 +385,17 @@ def _ordered_results(
 
 
 def _unchanged(packed: SerializedObject) -> SerializedObject:
-    """Return the argument. This is the Dask task whose result is the serialized job, on which all
-    tasks of the job depend."""
+    """Return the argument, a serialized job. This is the Dask task on whose result all tasks of the
+    job depend."""
     return packed
 
 
 def _run_task(
     packed: SerializedObject, step: str, arguments: tuple[Any, ...]
 ) -> tuple[TaskResult, str, str]:
-    """Run one task on this worker: call the method `step` of the job with `arguments`. Returns its
-    result, the worker's address, and the worker's `rounding_fingerprint`."""
+    """Run one task on this worker: call the method `step` of the serialized job `packed` with
+    `arguments`. Returns its result, the worker's address, and the worker's `rounding_fingerprint`.
+    """
     with exclusive_compute() as address:
         method: TaskFunction = getattr(packed.deserialize(), step)
         return method(*arguments), address, rounding_fingerprint()

@@ -253,8 +253,8 @@ def _location_of(module: ModuleType) -> str | None:
 
 @functools.cache
 def _is_user_location(root: str, location: str) -> bool:
-    """Whether a file or folder belongs to a user, not to Python, an installed package or this
-    library. root: the name of the top-level module that it is a part of."""
+    """Whether the file or folder `location` belongs to a user, not to Python, an installed package
+    or this library. root: the name of the top-level module that it is a part of."""
     if root == "harnack":
         return False
     path = Path(location).resolve()

@@ -1,7 +1,7 @@
 """Readers of files with meshes, point clouds, closed curves, blobs or molecules. The extension of
 the file's name decides its format; its contents decide what it is read as, unless the caller says
-so (`read_as`). Results contain a summary: a text about the contents of the file, and why they are
-read like that. Positions that are equal count as the same vertex where faces or edges are joined.
+so (`read_as`). `contents` is the geometry that was found in a file: vertices, faces, polylines.
+Results contain a summary: a text about the contents of the file, and why they are read like that.
 """
 
 from __future__ import annotations
@@ -116,8 +116,9 @@ def _validated(loop: FloatArray, place: FileLocation) -> FloatArray:
 
 
 def _all_loops(contents: FileGeometry) -> list[LocatedLoop]:
-    """The closed curves (n, 3) of a file, each with its place in the file. These are its faces and
-    its polylines, joined end to end. If a .ply file has neither, its vertices are a single curve.
+    """The closed curves (n, 3) in the contents of a file, each with its place in the file. These
+    are its faces and its polylines, joined end to end. If a .ply file has neither, its vertices are
+    a single curve.
 
     Raises:
         FileFormatError: there are none, or polylines are open.
@@ -491,8 +492,8 @@ def _cloud(contents: FileGeometry) -> LoadedCloud:
 
 
 def _as_curves(loops: list[FloatArray], reason: str) -> LoadedCurves:
-    """Collect closed curves (n, 3) in a `LoadedCurves`, with a summary that gives their number and
-    the reason why the file is read as curves."""
+    """Collect closed curves `loops`, arrays (n, 3), in a `LoadedCurves`, with a summary that gives
+    their number and the reason why the file is read as curves."""
     noun = "loop" if len(loops) == 1 else "loops"
     return LoadedCurves(
         tuple(loops), f"{len(loops):,} {noun} of {sum(map(len, loops)):,} vertices: {reason}"

@@ -187,7 +187,10 @@ def _check_coordinates(path: Path, text: str) -> None:
 
 def _summarize(elements: tuple[str, ...], left_out: dict[str, int], model_count: int) -> str:
     """The summary of a molecule as a text: the number of atoms, the commonest elements, and how
-    many atoms were left out, by reason."""
+    many atoms were left out.
+
+    elements: the name of each atom's element. left_out: the number of atoms that were left out, by
+        reason. model_count: the number of models in the file."""
     common = Counter(elements).most_common(_MAX_LISTED_ELEMENTS)
     names = ", ".join(f"{count:,} {name}" for name, count in common)
     summary = (

@@ -308,8 +308,8 @@ def _polygons(
 def _columns(
     section: PlyElement, values: Values, begins: IntArray, places: FileLocations
 ) -> tuple[dict[str, PropertyColumn], IntArray]:
-    """The properties of an element in all its rows, as columns by name; and the position (n,) at
-    which each row ends.
+    """The properties of the element `section` in all its rows, as columns by name; and the position
+    (n,) at which each row ends.
 
     values: the numbers of the file. begins: (n,) the position at which each row begins.
     places: the locations of the rows, for errors.
@@ -406,10 +406,10 @@ def _binary_tables(path: Path, data: bytes, header: PlyHeader) -> dict[str, Elem
 
 
 def _row_ends(section: PlyElement, values: BinaryValues, begin: int) -> Iterator[int]:
-    """Yield the position at which each row of an element ends, one row after the other, for
-    elements whose rows have different lengths because they contain lists.
+    """Yield the position at which each row of the element `section` ends, one row after the other.
+    This is for elements whose rows have different lengths because they contain lists.
 
-    begin: the position at which the first row begins.
+    values: the bytes of the file. begin: the position at which the first row begins.
 
     Raises struct.error if a row ends after the end of the file, or a list has a negative length."""
     # For each list: the bytes since the list before, how its length is stored, and the bytes of
@@ -437,7 +437,7 @@ def _row_ends(section: PlyElement, values: BinaryValues, begin: int) -> Iterator
 
 
 def _too_short(path: Path, section: PlyElement) -> FileFormatError:
-    """The error for a file that ends before all rows of an element."""
+    """The error for a file that ends before all rows of the element `section`."""
     return FileLocation(path).error(
         f"the file ends before the {section.count:,} rows of element {section.name!r} that its "
         "header declares"

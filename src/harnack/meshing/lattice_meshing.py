@@ -270,10 +270,10 @@ def _check_passes_level(function: LevelFunction, points: FloatArray, size: float
     steepest = gradients[np.arange(len(x)), (gradients**2).sum(axis=2).argmax(axis=1)]
     direction = steepest / np.maximum(row_norms(steepest), 1e-300)[:, None]
 
-    def along(left: FloatArray) -> FloatArray:
+    def along(s: FloatArray) -> FloatArray:
         """(k,) the function's values on the segments at the signed distances s (k,) from the points
         x."""
-        return function.values(x + left[:, None] * direction)
+        return function.values(x + s[:, None] * direction)
 
     low, high = np.full(len(x), -offset), np.full(len(x), offset)
     # Multiplied by this sign, the values at the lower ends are positive; so the smallest value
@@ -282,10 +282,11 @@ def _check_passes_level(function: LevelFunction, points: FloatArray, size: float
     end_value = np.minimum(sign_of_point * along(low), sign_of_point * along(high))
     smallest = end_value.copy()
     for _ in range(_SECTIONS):
-        left, right = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
-        f_left, f_right = sign_of_point * along(left), sign_of_point * along(right)
+        # The two inner points of a golden section of the interval from low to high.
+        s, t = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
+        f_left, f_right = sign_of_point * along(s), sign_of_point * along(t)
         smallest = np.minimum(smallest, np.minimum(f_left, f_right))
-        low, high = np.where(f_left > f_right, left, low), np.where(f_left > f_right, high, right)
+        low, high = np.where(f_left > f_right, s, low), np.where(f_left > f_right, high, t)
     is_touching = (end_value > 0) & (smallest >= 0) & (smallest <= _TOUCHING * end_value)
     if is_touching.mean() > 0.5:
         a, b, c = x[is_touching][0]

@@ -295,8 +295,8 @@ def _thicknesses(
     length.
 
     From each point the sign of the function is followed along the normal and against it, at
-    distances up to the size of a cell. The result is the distance to the next change of sign, on
-    the side where it is smaller.
+    distances up to the size of a cell, `spacing`. The result is the distance to the next change of
+    sign, on the side where it is smaller.
 
     Returns:
         The thicknesses (k,), inf where the sign does not change again; and a mask (k,): True where

@@ -197,8 +197,9 @@ def _integrate_change(
     """(n,) the continuous change of the field's function f along the segments from p to q (n, 3),
     as the field integrates it.
 
-    wrapped: (n,) the differences f(q) - f(p), known up to whole periods. The result is these plus
-        the whole periods that the integral gives, so that its error is not that of the integral.
+    wrapped: (n,) the differences f(q) - f(p), known up to whole multiples of `period`. The integral
+        only decides which multiples are added to these, so the result does not have the integral's
+        error.
 
     Raises:
         MeshingError: the field cannot integrate its change, or the result does not differ by whole
@@ -389,7 +390,8 @@ def _roots(
 ) -> FloatArray:
     """(r, 3) the points where edges of tetrahedra meet the level set.
 
-    edges: (r,) the indices of these edges, each of which has a crossing.
+    crossings: the crossings and the change of the function along all edges.
+    edges: (r,) the indices of the edges that have a crossing.
 
     The points are found by the secant method if the function has `secant_steps`, else by
     Chandrupatla's method. If an end of an edge has the value `OUTSIDE_VALUE`, which stands for the

@@ -936,6 +936,7 @@ def _around_curve(field: SolidAngle, extent: Volume | None, volume: Volume | Non
         MeshingError: there is no extent, and the clip volume is unbounded.
     """
     if extent is not None:
+        # The surface lies inside of its extent, so it does not end at the box.
         return _MeshingBox(*_bounds_of(extent), False)
     assert volume is not None
     points = np.concatenate(list(field.loops))

@@ -298,6 +298,7 @@ def _component_problems(shells: Shells, is_closed: bool, is_clear: bool) -> list
     """The problems of the connected components of a mesh: components that are inside out, or lie in
     the material of other components; several separate bodies; tiny bodies; and cavities.
 
+    shells: the components.
     is_closed: whether the mesh is closed. If it is not, only tiny and several bodies are reported.
     is_clear: whether the mesh is closed and no faces pass through each other. Then a component lies
         inside another one either as a whole or not at all."""

@@ -265,8 +265,8 @@ def _checked_settings(
     seed: int,
     report: Callable[[str], None],
 ) -> _RepairOptions:
-    """Check the arguments of `repair`, and collect them in one object. spacing: the argument
-    `cell_size`.
+    """Check the arguments of `repair`, and collect them in one object. patches: the argument
+    `filling`. spacing: the argument `cell_size`. The others have the same names.
 
     Raises:
         ValueError: one of them is not among the allowed values.
@@ -526,9 +526,11 @@ def _keep_valid(
 
 
 def _count_turned(intended: IntendedSolid, cleaned: CleanedMesh) -> int:
-    """How many of the kept triangles have the reverse of the orientation that they had in the
-    input. A triangle may be reversed twice, which leaves it as it was: once with its whole
-    component (`IntendedSolid`), and once to agree with its neighbors (in the cleaning)."""
+    """How many of the triangles that the cleaning kept have the reverse of the orientation that
+    they had in the input. A triangle may be reversed twice, which leaves it as it was: once with
+    its whole component (`IntendedSolid`), and once to agree with its neighbors (in the cleaning).
+
+    cleaned: the result of the cleaning."""
     # The cleaning counts faces without those of zero area.
     was_turned_before = np.delete(
         intended.is_turned, zero_area_faces(intended.vertices, intended.faces)

@@ -721,7 +721,7 @@ def _undo_until_valid(
     Pairs of faces that have no moved vertex are not tested.
 
     x: (n, 3) the vertices after the moves.
-    flat: (n, 3) the vertices before the moves, on the triangles in which the level set cuts
+    unmoved: (n, 3) the vertices before the moves, on the triangles in which the level set cuts
         tetrahedra.
     faces: (m, 3).
 

@@ -255,7 +255,7 @@ class _Sweep:
         the edge. From each edge to the next, the frame turns by the rotation that takes one edge's
         direction to the next one's.
 
-        edges: (n, 3) the unit vectors of the edges.
+        edges: (n, 3) the unit vectors of the edges. is_closed: whether the polyline is closed.
 
         Returns:
             For each edge the frames at its start and at its end; and a shift. For a polyline with
