@@ -93,6 +93,7 @@ def exclusive_compute() -> Generator[str]:
         raise RuntimeError(f"worker {worker and worker.address} cannot work: {error}") from None
     if worker is not None:
         adopt_worker_threads(worker.nanny is not None, worker.state.nthreads)
+    # A lock of this name is the same one for all tasks of this process.
     with import_optional("dask.utils", "client").SerializableLock("harnack"):
         yield "" if worker is None else worker.address
 

@@ -218,6 +218,7 @@ def read_obj(path: Path, data: bytes) -> FileGeometry:
     vertices = read_table(rows[b"v"], 3, too_few_message="a vertex needs three coordinates, not {}")
     faces = _parse_obj_polygons(rows[b"f"], "'f' needs at least 3 vertices", 3, rows[b"v"])
     polylines = _parse_obj_polygons(rows[b"l"], "'l' needs at least 2 vertices", 2, rows[b"v"])
+    # Such faces are handled one by one, which takes long.
     if have_mixed_sizes(faces):
         check_element_count(FileLocation(path), len(lines))
     if len(faces) or len(polylines):

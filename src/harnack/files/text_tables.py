@@ -154,6 +154,7 @@ def read_table(
     table = _parse_with_numpy(lines, range(columns))
     if table is not None and np.isfinite(table).all():
         return table
+    # Word by word, to find the first wrong word, or for lines with too few.
     numbers: list[float] = []
     for k, line in enumerate(lines.text):
         words, place = line.split()[:columns], lines.locations[k]

@@ -93,6 +93,7 @@ def boundary_of_solid(vertices: FloatArray, faces: IntArray) -> TriangleMesh:
     group = connected_groups(pairs_within(points, _SAME), len(points))
     first_at_place = np.unique(group, return_index=True)[1][group]  # corners of the mesh come first
     joined = first_at_place[len(x) :].reshape(-1, 3)
+    # Pieces of which two corners became one vertex have no area.
     joined = joined[(joined != np.roll(joined, 1, axis=1)).all(axis=1)]
     joined = _cut_at_corners(points, joined)
     all_vertices = np.concatenate([x, cut.center + cut.size * points[len(x) :]])

@@ -353,6 +353,7 @@ def _are_farther(points: FloatArray, corner: FloatArray, distance: float) -> Boo
         return is_far
     center = corner.mean(axis=1)
     radius = np.stack([row_norms(corner[:, k] - center) for k in range(3)]).max(axis=0)
+    # Triangles are grouped by the power of 2 above r; small ones, with r < distance, are one group.
     exponent = np.ceil(np.log2(np.maximum(radius, distance))).astype(np.int64)
     for k in np.unique(exponent).tolist():
         remaining, rows = np.flatnonzero(is_far), np.flatnonzero(exponent == k)

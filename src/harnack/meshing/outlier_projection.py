@@ -116,6 +116,7 @@ def _project_and_split(
         function.sample(midpoints).distance > _MAX_MIDPOINT_DISTANCE * tolerance
     ]
     count = len(vertices)
+    # A key is the number a * count + b for the edge between the vertices a < b.
     keys = sorted_unique(edge_keys(split_edges, count))
     ends = np.stack(np.divmod(keys, count), axis=1)
     # For each face the new vertices on its edges, or -1. Neighbors share the edges that are split.

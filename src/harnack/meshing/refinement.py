@@ -409,16 +409,19 @@ def split_faces(vertices: FloatArray, faces: IntArray, middle: IntArray) -> IntA
     is_edge_split = middle >= 0
     split_count = is_edge_split.sum(axis=1)
     parts = [faces[split_count == 0]]
+    # All three edges split: three faces at the corners and one in the middle.
     has_three = split_count == 3
     (a, b, c), (x, y, z) = faces[has_three].T, middle[has_three].T
     parts += [np.stack(t, axis=1) for t in ((a, x, z), (x, b, y), (z, y, c), (x, y, z))]
     for k in range(3):
         order = [k, (k + 1) % 3, (k + 2) % 3]
+        # One edge split, from a to b: two faces.
         has_one = (split_count == 1) & is_edge_split[:, k]
         (a, b, c), x = faces[has_one][:, order].T, middle[has_one, k]
         parts += [np.stack(t, axis=1) for t in ((a, x, c), (x, b, c))]
         has_two = (split_count == 2) & ~is_edge_split[:, k]
-        # The edge from a to b is not cut; y and z are the middles of the other edges.
+        # Two edges split: three faces. The edge from a to b is whole; y and z are the middles of
+        # the other two.
         (a, b, c), y, z = (
             faces[has_two][:, order].T,
             middle[has_two, order[1]],

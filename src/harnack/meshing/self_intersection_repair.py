@@ -125,6 +125,7 @@ def _regions(
     sparse, csgraph = cast("Any", scipy.sparse), cast("Any", csgraph_module)
     corner = vertices[faces]
     lower, upper = corner.min(axis=1), corner.max(axis=1)
+    # Two rings of faces around the crossing ones. Each connected part begins a neighborhood.
     near = _faces_at_corners(faces, faces[crossing])
     second_ring = _faces_at_corners(faces, faces[near])
     edges = half_edges(faces[second_ring])
@@ -134,6 +135,7 @@ def _regions(
     for component in np.unique(component_of_vertex[faces[second_ring, 0]]):
         rows = second_ring[component_of_vertex[faces[second_ring, 0]] == component]
         box_lower, box_upper = lower[rows].min(axis=0), upper[rows].max(axis=0)
+        # All faces whose boxes meet the box of the part.
         face_rows = np.flatnonzero(
             (lower <= box_upper).all(axis=1) & (upper >= box_lower).all(axis=1)
         )
@@ -284,6 +286,7 @@ def _changes(
     Yields: For each change, how far it moves the surface, a length; the indices of the faces that
     it removes; and the faces (k, 3) that replace them."""
     count = len(patch.vertices)
+    # A key is the number a * count + b for the edge between the vertices a < b.
     keys = sorted_unique(edge_keys(half_edges(patch.faces[rows]), count))
     for a, b in np.stack(np.divmod(keys, count), axis=1).tolist():
         for source, target in ((a, b), (b, a)):
