@@ -330,8 +330,9 @@ def _split(values: Mapping[str, Any], names: Sequence[str]) -> tuple[dict[str, A
 
 
 def _replaced(surface: Field | Surface, keywords: Mapping[str, Any]) -> Field | Surface:
-    """The surface, or the surface of a field, with the given keywords of `Surface` changed. A new
-    level of a solid that lies between two levels turns it into a level set."""
+    """A copy of a surface with the given keywords of `Surface` changed; of a field, the surface
+    with these keywords. Without keywords it is returned unchanged. A new level of a solid that lies
+    between two levels turns it into a level set."""
     if not keywords:
         return surface
     if isinstance(surface, Field):

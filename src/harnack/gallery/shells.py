@@ -106,7 +106,7 @@ class GridShell:
 
     @property
     def level(self) -> float:
-        """The value of the solid angle on the shell."""
+        """The value of the solid angle on the shell, -2 pi + `angle`."""
         return -2 * math.pi + self.angle
 
     def beams(self, field: SolidAngle) -> list[FloatArray]:
