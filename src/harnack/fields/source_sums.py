@@ -342,9 +342,9 @@ class SourceSums:
         variation = (1 + SUM_MARGIN) * r * dr.fma(0.5 * r, largest.constant, slope)
         value = share * self.value
         ball = HarmonicBall(r, value - variation, value + variation)
-        # At a singular point f has all values. There, and nearby where rounding leaves nothing of the
-        # gradient, the sample gets a gradient so steep that every level is close to first order,
-        # and an error as large as the distance to such a level.
+        # At a singular point f has all values. There, and nearby where rounding leaves nothing of
+        # the gradient, the sample gets a gradient so steep that every level is close to first
+        # order, and an error as large as the distance to such a level.
         near, max_error = 16 * unit, share * 1.6e5 * math.pi
         is_regular = (
             (self.singularity_distance > near)
@@ -392,7 +392,7 @@ class SourceSums:
         slope = dr.fma(SLOPE_ROUNDINGS * unit, self.s4, slope)
         fraction = _TAYLOR_RADII[-1]
         radius = fraction * (self.singularity_distance * (1 - SUM_MARGIN) - 4 * unit)
-        # Without sources R is infinite, and R s5 would be NaN.
+        # Without sources R may be infinite; then R s5 would be NaN.
         remainder = self.remainder(fraction, dr.select(self.s5 > 0, radius, 0))
         pairs = zip(lengths, rates, strict=True)
         sums = (
