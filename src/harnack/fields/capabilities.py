@@ -180,9 +180,9 @@ class JumpSurface:
         return JumpCrossing(float("inf"), NO_FACET, 0.0, (0.0, 0.0, 0.0))
 
     def initial_offset(self, o: Vec3, d: Vec3, t_min: Real, active: Mask) -> Real:
-        """A number that describes f at the start of a ray o + t d, for example the integer part of
-        f; the field chooses its meaning. The tracer adds the jump at each crossing to it, and
-        passes the sum to `continuation`.
+        """A number that describes f at the start of a ray o + t d, of a kind that the field
+        chooses; for example the sum of the signs of the ray's crossings beyond the start. The
+        tracer adds the jump at each crossing to it, and passes the sum to `continuation`.
 
         t_min: the parameter of the start. Crossings with t <= t_min lie behind the start
             (`next_jump` after (t_min, NO_FACET)); all others lie in front of it.
