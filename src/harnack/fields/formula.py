@@ -270,6 +270,8 @@ class Formula(Field):
         slope, slope_error = self._slope(p, path.direction)
         slopes = SlopeRange.around(slope, slope_error)
         function = self.restrict(p, path.direction)
+        # The two proofs of the docstring: slopes of all points that round to p, and pieces that
+        # begin before p.
         if self.is_abrupt:
             slopes = SlopeRange.around(*self._slope(p, path.direction, is_rounded=True))
         if self.is_abrupt or self.may_jump:
@@ -277,6 +279,9 @@ class Formula(Field):
         enclosures = path.proofs.from_restriction(function, slopes, ahead)
         if not enclosures:
             return path.enclose(sample)
+        # A `PiecewiseTaylorEnclosure` proves nothing on a piece whose slopes are unbounded. The
+        # other kinds assume that f is continuous, so they are made only for a length on which that
+        # is proved.
         if self.may_jump and not all(
             isinstance(entry, PiecewiseTaylorEnclosure) for entry in enclosures
         ):
@@ -332,7 +337,7 @@ class Formula(Field):
         """The jet of f (ranges of its value and derivatives) from the jets of the three
         coordinates.
 
-        like: any number of the backend; unused where f depends on a coordinate.
+        like: a number of the backend; not used.
         """
         return as_jet(self.formula(*coordinates), coordinates[0], type(self).__name__)
 
