@@ -224,8 +224,7 @@ class Extrusion(Solid):
         if not self.is_straight:
             sample = self.evaluate(p)
             min_norm = self._min_gradient_norm(sample)
-            # No level is proved farther than a few times |f|, so a bound up to 2 |f| is long
-            # enough.
+            # A constant of about 1 proves a step of about |f| to the surface: twice that is enough.
             path_constant = _prepared_for(self, p)._path_lipschitz(
                 p, d, fmin(ahead, 2 * dr.abs(sample.value))
             )
