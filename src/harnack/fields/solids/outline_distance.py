@@ -30,9 +30,9 @@ if TYPE_CHECKING:
 
 # The number of edges from which on they are read by chains.
 _MIN_EDGES_FOR_CHAINS = 48
-# Along a line the distance is bounded at knots. The inner knots are these fractions of the requested
-# length. If that is infinite, they are fractions of this multiple of the sum of the largest
-# coordinate and the outline's size.
+# Along a line the distance is bounded at knots. The inner knots are these fractions of the
+# requested length. If that is infinite, they are fractions of this multiple of the sum of the
+# largest coordinate and the outline's size.
 _KNOT_FRACTIONS = (0.0625, 0.125, 0.25, 0.5)
 _ENDLESS_LENGTH = 8.0
 # The error of the vector between a point and an edge, in roundings of the terms of the vector.
@@ -279,8 +279,8 @@ class _OutlineQuery:
         size = dr.abs(from_x) + dr.abs(from_y) + dr.abs(edge_x) + dr.abs(edge_y)
         rounding = _VECTOR_ROUNDINGS * self.unit * size
         bounds = self._with_tangent(bounds, to_x, to_y, distance, rounding)
-        # The ray towards +x crosses the edge if its ends are above and below, and the point is on
-        # its left.
+        # The ray towards +x crosses the edge if one end of the edge is above the ray, the other is
+        # not, and the edge is to the right of the point.
         crosses = (row[1] > self.y) != (row[3] > self.y)
         inside = inside ^ (crosses & ((cross_product > 0) == (row[3] > row[1])))
         is_nearer = distance < nearest
