@@ -297,8 +297,12 @@ def _limits(
 
 
 def _second_derivatives(stencil: list[_StencilSample]) -> FloatArray:
-    """(n,) for each point, a bound of the size of second derivatives: the sum over all nodes of
-    |weight times gradient component|."""
+    """(n,) for each point, the sum of the absolute values of all terms in the central differences
+    of the gradient that give the second derivatives along the three axes. It is at least the sum of
+    the absolute values of these derivatives.
+
+    stencil: the samples at the nodes.
+    """
     return np.sum(
         [np.abs(neighbor.weight * neighbor.gradient[:, neighbor.axis]) for neighbor in stencil],
         axis=0,
