@@ -276,14 +276,14 @@ def _to_lanes(value: object, n: int) -> FloatArray:
 
 # The number of pairs of points that are improved: at most, and as a fraction of the points.
 _MAX_PAIRS, _PAIRS_OF_POINTS = 48, 0.25
-# The number of moves that each pair tries in an iteration, and the number of iterations. The numbers
-# of pairs, moves and iterations are divided by the last number if the change of f between two
-# points must be followed along a path, as each sample of the path takes an evaluation.
+# The number of moves that each pair tries in an iteration, and the number of iterations. The
+# numbers of pairs, moves and iterations are divided by the last number if the change of f between
+# two points must be followed along a path, as each sample of the path takes an evaluation.
 _MOVES, _ROUNDS, _PATH_COST_DIVISOR = 8, 36, 2
 # Points stay within this fraction of the radius, off the border of the ball.
 _MAX_RADIUS_FRACTION = 1 - 1e-6
-# Lengths of moves, in radii of the balls: the first, the smallest, and the factors after success and
-# failure.
+# Lengths of moves, in radii of the balls: the first, the smallest, and the factors after success
+# and failure.
 _FIRST_STEP, _MIN_STEP, _STEP_GROWTH, _STEP_SHRINKAGE = 0.25, 1e-9, 1.6, 0.6
 # Balls whose radius is below this fraction of the coordinates are left out, as rounding moves
 # points in them.
