@@ -76,7 +76,7 @@ class _TextProgress:
 
     _done: the fraction that is finished so far.
     _cached_fraction: the fraction that was finished within the first half second, for example
-    because stored results were found. It does not count in the estimate of the remaining time.
+        because stored results were found. It does not count in the estimate of the remaining time.
     """
 
     def __init__(self, name: str) -> None:

@@ -584,6 +584,8 @@ class BlendedSolid(FormulaSolid):
         return blend(a, b, self.radius, self.power)
 
     def prepare(self, backend: Backend) -> Solid:
+        """The same blend with its operands prepared, and its radius as a kernel parameter of the
+        backend."""
         prepared = copy.copy(self)
         parts = tuple(part.prepare(backend) for part in self.parts)
         object.__setattr__(prepared, "parts", parts)

@@ -169,6 +169,9 @@ class Twist(Deformation):
         )
 
     def preimage_lipschitz(self, p: Vec3) -> tuple[Real, Real]:
+        """A Lipschitz constant of the inverse map on a ball about p, and the radius of that ball.
+        The class docstring has the proof, with the symbols m and a (here `rate`). Without a twist
+        the constant is 1 everywhere."""
         rate = dr.abs(0 * p.x + self.rate)
         axis_distance = _distance_from_axis(p, self.axis)
         # Any radius is valid; this one keeps m within a factor of about 5/4, plus 1/4.
@@ -234,6 +237,8 @@ class Taper(Deformation):
         return min(1.0, self.start[1], self.end[1])
 
     def preimage(self, x: Any, y: Any, z: Any) -> tuple[Any, Any, Any]:
+        """The point that the taper takes to (x, y, z): its coordinates across the axis are divided
+        by the factor r."""
         u, v, w = _axis_last((x, y, z), self.axis)
         (a, r), (b, s) = self.start, self.end
         # The position between start (0) and end (1); then 1/r there.
@@ -242,6 +247,8 @@ class Taper(Deformation):
         return _axis_in_place((u * inverse, v * inverse, w), self.axis)
 
     def volume(self, volume: Volume | None) -> Volume | None:
+        """A box that contains the image of `volume`: the box around a cylinder about the axis,
+        whose radius is multiplied by the larger factor. None if `volume` is None or unbounded."""
         cylinder = _cylinder_around(volume, self.axis)
         if cylinder is None:
             return None
@@ -250,6 +257,8 @@ class Taper(Deformation):
         )
 
     def preimage_lipschitz(self, p: Vec3) -> tuple[Real, Real]:
+        """A Lipschitz constant of the inverse map on a ball about p, and the radius of that ball.
+        The class docstring has the proof, with the symbols k, m and S (here `total`)."""
         (a, r), (b, s) = ((0 * p.x + u, 0 * p.x + v) for u, v in (self.start, self.end))
         axis_distance = _distance_from_axis(p, self.axis)
         radius = 0.25 * axis_distance + 0.25 * (b - a)

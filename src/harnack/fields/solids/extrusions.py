@@ -555,6 +555,9 @@ class SolidOfRevolution(Solid):
         return {"edges": sum(map(len, self.loops))}
 
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+        """A box that contains all points where f <= level: the box of the solid, grown by the level
+        on each side. None if `above` (a volume for all points where f >= level), as these points
+        are unbounded."""
         if above:
             return None
         points = np.concatenate(self.loops)

@@ -180,6 +180,11 @@ class FractalNoise(FormulaSolid):
     fade: Fade = "quintic"
 
     def __post_init__(self) -> None:
+        """Check the arguments, and turn them into numbers of the right type.
+
+        Raises:
+            ValueError, TypeError: an argument out of range or of another kind.
+        """
         object.__setattr__(self, "octaves", as_integer_in_range(self.octaves, "octaves", 1, 24))
         object.__setattr__(self, "seed", as_integer_in_range(self.seed, "the seed", 0, 2**32 - 1))
         if not is_one_of(self.fade, CONSTANTS):
@@ -387,6 +392,7 @@ class DisplacedSolid(FormulaSolid):
     noise: FractalNoise
 
     def __post_init__(self) -> None:
+        """Raise TypeError unless the solid has a formula and the noise is `FractalNoise`."""
         if not isinstance(cast("Any", self.solid), Formula):
             raise TypeError(
                 f"only shapes with a formula are displaced, not {type(self.solid).__name__}"

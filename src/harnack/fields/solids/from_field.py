@@ -130,6 +130,9 @@ class SublevelSolid(SolidOfField):
         object.__setattr__(self, "domain", domain)
 
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+        """A volume that is proved to contain all points where f <= level or, if `above`, all points
+        where f >= level. None if no such volume is known, as for a field that is defined in all of
+        space."""
         if self.field.is_global:
             return None
 

@@ -42,6 +42,7 @@ class Plane(FormulaSolid):
     distance: float = 0.0
 
     def __post_init__(self) -> None:
+        """Check the arguments, and make the normal a unit vector."""
         normal = as_triple(self.normal, "the normal of a plane")
         length = math.hypot(*normal)
         if length == 0.0:
@@ -150,6 +151,8 @@ class Cylinder(FormulaSolid):
             set_frozen(self, "height", as_positive(self.height, "the height of a cylinder"))
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
+        """f at (x, y, z). With ends, the distances from the side and from the ends are combined as
+        distances at right angles."""
         side = norm(x, y) - self.radius
         return (
             side
@@ -158,6 +161,9 @@ class Cylinder(FormulaSolid):
         )
 
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+        """A box that contains all points where f <= level: the box of the cylinder, grown by the
+        level on each side. None for a cylinder without ends, and if `above` (a volume for all
+        points where f >= level), as these points are unbounded."""
         if above:
             return None
         if self.height is None:
@@ -184,6 +190,7 @@ class DoubleCone(FormulaSolid):
     lipschitz = 1.0 + 1e-6  # sine and cosine are rounded
 
     def __post_init__(self) -> None:
+        """Raise ValueError unless the angle is between 0 and 90 degrees."""
         angle = as_finite(self.angle, "the angle of a cone")
         if not 0.0 < angle < 90.0:
             raise ValueError(
@@ -217,6 +224,11 @@ class Capsule(FormulaSolid):
     lipschitz = 1.0
 
     def __post_init__(self) -> None:
+        """Check the arguments.
+
+        Raises:
+            ValueError: start and end are the same point, or the radius is not positive.
+        """
         start = as_triple(self.start, "the start of a capsule")
         end = as_triple(self.end, "the end of a capsule")
         if start == end:
@@ -226,6 +238,8 @@ class Capsule(FormulaSolid):
         set_frozen(self, "radius", as_positive(self.radius, "the radius of a capsule"))
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
+        """f at (x, y, z): the distance from the segment minus the radius. t is the position of the
+        nearest point of the segment's line, as a fraction of the segment."""
         axis = [b - a for a, b in zip(self.start, self.end, strict=True)]
         from_start = [v - a for v, a in zip((x, y, z), self.start, strict=True)]
         square = axis[0] * axis[0] + axis[1] * axis[1] + axis[2] * axis[2]
@@ -237,6 +251,9 @@ class Capsule(FormulaSolid):
         return norm(across, beyond) - self.radius
 
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+        """A box that contains all points where f <= level: the box of the segment, grown by radius
+        and level on each side. None if `above` (a volume for all points where f >= level), as these
+        points are unbounded."""
         if above:
             return None
         r = self.radius + level

@@ -246,6 +246,8 @@ class TransformedSolid(SolidOfField):
         return self._image_sample(self.field.evaluate(local), self._term_bound(p, 0.0))
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
+        """The rows of the Hessian of f at p: M^-T H M^-1 times the value factor, where H is the
+        Hessian of the inner solid at the preimage of p."""
         numbers = self.numbers
         rows = self.field.hessian(type(p)(*numbers.local(p.x, p.y, p.z)))
         # Each row r of H becomes M^-T r; with the same for the columns, the result is M^-T H M^-1.

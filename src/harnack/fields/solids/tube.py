@@ -215,6 +215,9 @@ class Tube(Solid):
         return {"segments": segments, "flattening_error": self.flattening_error}
 
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+        """A box that contains all points where f <= level: the box of the points, grown by radius
+        and level on each side. None if `above` (a volume for all points where f >= level), as these
+        points are unbounded."""
         if above:
             return None
         lower, upper = self.points.min(axis=0), self.points.max(axis=0)
@@ -558,6 +561,7 @@ class TubeNetwork(PatchField["_TubeBuffers"]):
     default_level: float = 0.0
 
     def __init__(self, points: Any, segments: Any, radius: Any) -> None:
+        """Check the arguments, and store them as NumPy arrays."""
         super().__init__()
         array = as_real_array(points, "the points of tubes")
         check_vectors(array, "the points of tubes")
@@ -593,6 +597,8 @@ class TubeNetwork(PatchField["_TubeBuffers"]):
         )
 
     def _upload(self, backend: Backend) -> _TubeBuffers:
+        """Upload the boxes of all tubes, and the records of their segments, to a backend. Positions
+        are relative to the center of the boxes, so that they are rounded less."""
         boxes = PatchBoxes.upload(backend, *self.boxes())
         center = np.array(boxes.center, dtype=np.float64).reshape(3)
         start, end = ((self.points[ends] - center) for ends in self.segments.T)
@@ -606,6 +612,7 @@ class TubeNetwork(PatchField["_TubeBuffers"]):
         return _Segment(data.boxes, data.segments.read_record(index))
 
     def validate_levels(self, levels: tuple[float, ...]) -> None:
+        """Raise ValueError for a level that leaves nothing of the thinnest tube."""
         min_radius = float(self.radius.min())
         for level in levels:
             if not level > -min_radius:
