@@ -89,6 +89,7 @@ def field_from_file(
             normals; or the field does not accept the data.
         ValueError: options that contradict each other or the file.
     """
+    # Check the options as far as possible before the file is read.
     path = Path(path)
     if take_boundary and read_as not in (None, "loops"):
         raise ValueError(
@@ -105,6 +106,7 @@ def field_from_file(
             f'{surface.summary}; leave out normals="estimate", or take its points with '
             'read_as="dipole"'
         )
+    # Check the options against what the file holds.
     is_curve = isinstance(surface, LoadedCurves)
     if smoothing is not None and not isinstance(surface, LoadedCloud):
         raise ValueError(

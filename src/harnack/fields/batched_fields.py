@@ -135,6 +135,7 @@ class PointValues:
         if gradient is not None:
             gradient = gradient * inverse
             is_finite = dr.isfinite(gradient.x) & dr.isfinite(gradient.y) & dr.isfinite(gradient.z)
+            # By the chain rule derivatives of order k are divided by size^k.
             gradient_error = dr.select(is_finite, gradient_error * inverse, dr.inf)
         if hessian is not None:
             hessian = type(hessian)(*(inverse * inverse * entry for entry in hessian.components()))

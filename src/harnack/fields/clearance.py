@@ -94,6 +94,7 @@ def tight_extent(
     clearance = clearance_function(field, levels)
     margin = 1e-4 * float(np.linalg.norm(upper - lower))
     if points is not None:
+        # No cell inside the polytope of the given points needs a test.
         given = kdop_of_points(points, margin)
         cells = nonempty_cells(
             lower, upper, _clearance_outside(given, clearance), max_cells, finest

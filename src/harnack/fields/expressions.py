@@ -169,6 +169,7 @@ def _check_tree(text: str, node: ast.expr, parameters: Iterable[str], depth: int
     """
     if depth > _MAX_DEPTH:
         raise _formula_error(text, f"more than {_MAX_DEPTH} operations are within each other")
+    # An operation with two operands; then signs, names, numbers, calls; all else is refused.
     if isinstance(node, ast.BinOp):
         if not isinstance(node.op, ast.Pow) and type(node.op) not in _OPERATORS:
             raise _formula_error(text, "the operators are + - * / ^")
@@ -224,6 +225,7 @@ def _check_call(text: str, node: ast.Call, parameters: Iterable[str], depth: int
     number of arguments, or arguments that are not allowed. The parameters are those of
     `_check_tree`."""
     name = node.func.id if isinstance(node.func, ast.Name) else ast.unparse(node.func)
+    # Brackets after a number or a parameter, as in x(y + 1), mean a missing *.
     if name in (*_COORDINATES, *_CONSTANTS, *parameters) or not isinstance(node.func, ast.Name):
         raise _formula_error(text, f"is a * missing after {name!r}")
     if name not in _FUNCTIONS:
@@ -276,6 +278,7 @@ def _evaluate_node(node: ast.expr, names: Mapping[str, Any]) -> Any:
         case ast.Name(name):
             return names[name]
         case ast.Constant(value):
+            # Integers become floats, too.
             return float(value)  # pyright: ignore
         case ast.Call(ast.Name(name), arguments):
             return _FUNCTIONS[name](*(_value(argument, names) for argument in arguments))

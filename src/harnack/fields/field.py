@@ -134,6 +134,7 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
         super().__init_subclass__(**kwargs)
         if "__repr__" not in vars(cls):  # a dataclass would write out all numbers
             cls.__repr__ = Field.__repr__
+        # Public class methods are further constructors.
         for name, attribute in list(vars(cls).items()):
             if isinstance(attribute, classmethod) and not name.startswith("_"):
                 checked_maker = no_derivatives(cast("Any", attribute).__func__)
@@ -358,6 +359,8 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
         with dr.suspend_grad():
             p = dr.detach(points)
             gradient, rows = self.evaluate(p).gradient, self.hessian(p)
+        # An expression whose value is the gradient, because `moved` is 0, and whose derivative by
+        # the points is the Hessian.
         moved = points - p
         return gradient + type(points)(*(dr.dot(row, moved) for row in rows))
 

@@ -163,6 +163,7 @@ class Formula(Field):
         size = max_norm(p) + dr.abs(sample.value)
         # At the origin with f = 0 any offset will do.
         size = dr.select(size > 0, size, 1)
+        # Value and gradient at a point a few roundings away.
         coordinates = Dual.at_point(p + direction * (_TIE_OFFSET * epsilon * size))
         try:
             nearby_value = coordinates[0].coerce(self.formula(*coordinates))
@@ -212,6 +213,7 @@ class Formula(Field):
             radius = fmin(multiple * newton_length, _MAX_RADIUS)
             jet = self._jet(Jet.over_ball(p, radius), p.x)
             slopes = (0 * p.x + derivative.max_abs for derivative in jet.first_derivatives)
+            # A bound of the length of the gradient, from bounds of its components.
             constant = safe_norm(type(p)(*slopes)) * (1 + 1e-5)
             is_known = dr.isfinite(constant) & (radius > 0)
             promises.append(

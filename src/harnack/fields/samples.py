@@ -129,6 +129,7 @@ def validate_samples(
             raise TypeError(
                 f"{name} returned {_describe_type(sample)}, not a Sample: {_SAMPLE_HELP}"
             )
+        # Both attributes must be tuples of promises.
         group: Any
         for place, group in (
             ("promises", sample.promises),
@@ -149,6 +150,7 @@ def validate_samples(
                 f"{name}: Sample.gradient is {_describe_type(gradient)}, no 3-vector: "
                 f"{_SAMPLE_HELP}"
             )
+        # Derivatives of the value that do not come from p would be lost.
         if self.has_no_parameters() and not dr.grad_enabled(p):
             check_no_derivatives(type(self).__name__, sample.value)
         return _unbox_numpy(sample).map_promises(_unbox_numpy)

@@ -104,6 +104,7 @@ def _spacing_within(
         return h, is_inside
     for _ in range(24):
         is_inside[:] = True
+        # The domain is convex, so it is enough to test the outermost nodes.
         for axis in range(3):
             for node in (_NODES[0], _NODES[-1]):
                 is_inside &= field.domain.contains_points(
@@ -180,6 +181,7 @@ def _without_truncation(
     for node_sample in stencil:
         nodes = points + (node_sample.node * node_sample.h)[:, None] * np.eye(3)[node_sample.axis]
         sample = sample_field(field, nodes, closely=True)
+        # The errors at the point and at the node.
         errors = error + sample.gradient_error
         exact.append(
             dataclasses.replace(node_sample, gradient=sample.gradient, gradient_error=errors)
@@ -198,6 +200,7 @@ def _pick_spacing(
     """
     if len(trials) == 1:
         return trials[0]
+    # Point k takes its numbers from the spacing choice[k].
     rows = np.arange(len(choice))
 
     def pick(nodes: tuple[_StencilSample, ...]) -> _StencilSample:
@@ -281,6 +284,7 @@ def _limits(
         allowance += np.abs(neighbor.weight) * neighbor.error
     length = np.linalg.norm(samples.gradient, axis=1)
     magnitude = np.abs(samples.value) + (field.period or 0)
+    # Rounding errors of values and coordinates, divided by the spacing.
     tolerance = 1e-6 * length + (1e-12 * magnitude + 1e-12 * length * _max_coordinates(points)) / h
     fine, wide = _difference(nodes)
     tolerance += _RICHARDSON_FRACTION * np.linalg.norm(fine - wide, axis=1)
@@ -341,12 +345,15 @@ def _check_laplacian(
         wide = np.sum(
             [neighbor.wide * neighbor.gradient[:, neighbor.axis] for neighbor in stencil], axis=0
         )
+        # The estimated error of the difference; and rounding, of the gradients and of the
+        # coordinates.
         tolerance = 1e-6 * _second_derivatives(stencil) + _RICHARDSON_FRACTION * np.abs(
             laplacian - wide
         )
         tolerance += 1e-11 * length * (1 + _max_coordinates(points) / h) / h
         return laplacian, tolerance, allowance
 
+    # For each spacing: Laplacian, tolerance, allowance.
     tests = [compare(stencil) for stencil in trials]
     if _is_harmonic(samples):
         message = "HarmonicBall: f is not harmonic, its Laplacian is not 0"
@@ -357,6 +364,7 @@ def _check_laplacian(
         )
     for bound in bounds:
         lower, upper = bound.laplacian_lower, bound.laplacian_upper
+        # By how much the Laplacian is outside of its promised bounds.
         excesses = [
             (np.maximum(np.maximum(lower - laplacian, laplacian - upper), 0), *rest)
             for laplacian, *rest in tests
@@ -448,6 +456,7 @@ def _check_hessian(
     scale = _scale(points, samples)
     length = np.linalg.norm(samples.gradient, axis=1)
     size = np.abs(hessian).max(axis=(1, 2)) + length / scale
+    # A mixed derivative must not depend on the order.
     skew = np.abs(hessian - hessian.transpose(0, 2, 1)).max(axis=(1, 2))
     require(skew <= 1e-9 * size, "the Hessian is not symmetric", points, skew)
     if _is_harmonic(samples):

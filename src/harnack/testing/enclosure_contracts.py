@@ -228,6 +228,7 @@ def _positive_harmonic(
     latitudes[is_at_poles, :2] = (1, -1)
     weights[is_at_poles, 2] = 0
     weights /= weights.sum(axis=1, keepdims=True)
+    # u is f - lower, or upper - f, up to a constant; its value at the center is `mass`.
     u = AxialFunctions("points", latitudes, weights * mass[:, None], radius, n)
     sign = -1.0 if mirrored else 1.0
     ends = (-math.inf, mass) if mirrored else (-mass, math.inf)
@@ -360,12 +361,15 @@ def _zigzag_lines(rng: np.random.Generator, rows: int) -> RandomFunctions:
     """
     radius, constant = _log_uniform(rng, rows, -3, 3), _log_uniform(rng, rows, -3, 3)
     knots = np.sort(rng.uniform(0, 1, (rows, 2)), axis=1) * radius[:, None]
+    # The slopes on the three parts; two fifths of the functions are straight lines of the largest
+    # slope.
     slopes = rng.uniform(-1, 1, (rows, 3)) * constant[:, None]
     is_straight = rng.random(rows) < 0.4
     slopes[is_straight] = (rng.choice([-1.0, 1.0], rows) * constant)[is_straight, None]
 
     def movement(t: FloatArray) -> FloatArray:
         """f(t) - f(0) at positions t (rows, m)."""
+        # Behind each knot the slope differs by the difference of neighboring slopes.
         since_knot = np.maximum(t[:, :, None] - knots[:, None, :], 0)
         return slopes[:, :1] * t + (since_knot * np.diff(slopes, axis=1)[:, None, :]).sum(axis=2)
 
@@ -389,13 +393,16 @@ def _parabolas(rng: np.random.Generator, rows: int) -> RandomFunctions:
     """
     radius, constant = _log_uniform(rng, rows, -3, 3), _log_uniform(rng, rows, -3, 3)
     curvatures = rng.uniform(-1, 1, (rows, 2)) * constant[:, None]
+    # Half of the functions have the largest possible second derivative on both parts.
     is_extremal = rng.random(rows) < 0.5
     curvatures[is_extremal] = (rng.choice([-1.0, 1.0], rows) * constant)[is_extremal, None]
     knot = rng.uniform(0, 1, rows) * radius
+    # Slopes from small to ten times the change of the slope on the ball.
     slope = constant * radius * rng.choice([-1.0, 1.0], rows) * 10 ** rng.uniform(-4, 1, rows)
 
     def movement(t: FloatArray) -> FloatArray:
         """f(t) - f(0) at positions t (rows, m)."""
+        # Behind the knot the second derivative differs by `change`.
         since_knot = np.maximum(t - knot[:, None], 0)
         change = (curvatures[:, 1] - curvatures[:, 0])[:, None]
         return (
@@ -561,6 +568,7 @@ def _require(
     failures = np.flatnonzero(~holds)
     if not failures.size:
         return
+    # Describe the first function that fails.
     row = failures[0]
     numbers = trial.case.map_numbers(lambda n: float(n[row]) if np.ndim(n) else n)
     message = message_format.format(reach=float(trial.reach[row]), length=float(length[row]))

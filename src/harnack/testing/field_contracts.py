@@ -201,6 +201,7 @@ def check_field(
     """
     check_is_field(field)
     generator = np.random.default_rng(rng)
+    # Check and convert the arguments.
     count, directions = (
         as_integer_in_range(number, name, 1, 2**31 - 1)
         for number, name in ((count, "count"), (directions, "directions"))
@@ -220,6 +221,7 @@ def check_field(
     levels = [
         as_real(field.default_level if level is None else level, "levels") for level in level_list
     ]
+    # The tests.
     samples = sample_field(field, points)
     _check_numbers(field, points, samples)
     check_derivatives(field, points, samples)
@@ -257,6 +259,7 @@ def _check_numbers(field: Field, points: FloatArray, samples: FieldSamples) -> N
         raise BrokenPromiseError(f"period must be None or a positive number, not {field.period!r}")
     require(np.isfinite(samples.value), "the value is not a finite number", points)
     require(np.isfinite(samples.gradient).all(axis=1), "the gradient is not finite", points)
+    # Without promises there must be enclosures of the field's own.
     if not samples.promises:
         if _overrides_sample_ray(field):
             return
@@ -285,6 +288,7 @@ def _check_numbers(field: Field, points: FloatArray, samples: FieldSamples) -> N
                 raise BrokenPromiseError(f"HarmonicBall has dimension {promise.dimension!r}")
             is_bounded = np.isfinite(promise.lower) | np.isfinite(promise.upper)
             require(is_bounded, "HarmonicBall: both ends are infinite", points)
+    # A promise with the radius 0 proves nothing.
     is_usable = np.any([promise.radius > 0 for promise in samples.promises], axis=0)
     if is_usable.mean() < 0.5:
         raise BrokenPromiseError(
@@ -331,6 +335,7 @@ def _check_differentiable_value(field: Field, points: FloatArray, samples: Field
     x = to_vector3(backend, points, "points")
     dr.enable_grad(x)
     value = prepared.differentiable_value(x)
+    # Differentiate the sum over all points: the derivative by each point is its own gradient.
     dr.backward(dr.sum(value), dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
     dr.eval(value, x.grad)
     error = np.abs(to_numpy(value) - samples.value)

@@ -80,6 +80,7 @@ def mutated_enclosure(kind: type[Enclosure], factor: float, *, covers: float | N
     covers: multiplies every length that `is_free` accepts; None for the same factor.
     """
     covers_factor = factor if covers is None else covers
+    # Type checkers accept no variable as a base class.
     base: Any = kind
 
     class Scaled(base):
@@ -219,11 +220,13 @@ def accumulated_jumps(
     backend = choose_backend("double")
     prepared = field.prepare(backend)
     o, d = to_vector3(backend, start), to_vector3(backend, direction)
+    # The crossing before the first one is at the start of the ray, on no facet.
     first, last = (backend.Float(np.ascontiguousarray(lengths[:, k])) for k in (0, -1))
     crossing = JumpCrossing(first, backend.UInt32(NO_FACET), backend.Float(0), d)
     while True:
         crossing = prepared.next_jump(o, d, crossing, last, backend.Bool(True))
         t, jump = (_to_lanes(values, len(start)) for values in (crossing.t, crossing.jump))
+        # Rays without another crossing have t = inf.
         is_ahead = np.isfinite(t)
         if not is_ahead.any():
             return total
@@ -240,6 +243,7 @@ def random_points(field: Field, rng: np.random.Generator, n: int) -> FloatArray:
         return 3 * random_directions(rng, n) * rng.random((n, 1))
     lower, upper = volume.bounds()
     lower, upper = np.where(np.isfinite(lower), lower, -3), np.where(np.isfinite(upper), upper, 3)
+    # Draw points in the box until enough of them lie in the domain.
     accepted = np.zeros((0, 3))
     while len(accepted) < n:
         points = rng.uniform(lower, upper, (4 * n, 3))
@@ -324,6 +328,7 @@ class _Candidates:
         """
         n = len(self.p)
         m = len(alternatives.p) // n
+        # The index of the best alternative of each pair.
         best = np.arange(n) * m + alternatives.violation_ratio.reshape(n, m).argmax(axis=1)
         is_better = alternatives.violation_ratio[best] > self.violation_ratio
         mask = is_better[:, None]
@@ -438,6 +443,7 @@ class _ViolationSearch:
         length = np.linalg.norm(w, axis=1, keepdims=True)
         w = w * np.minimum(1, _MAX_RADIUS_FRACTION / np.maximum(length, 1e-300))
         ratios, radii = np.full(len(p), -np.inf), np.full(len(p), 1.0)
+        # The pairs whose first point is in the domain; below, those that can be tested.
         rows = np.flatnonzero(self._is_in_domain(p))
         if len(rows):
             at_p = sample_field(self.field, p[rows])

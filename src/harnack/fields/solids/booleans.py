@@ -121,6 +121,7 @@ class BooleanSolid(Solid):
         )
         object.__setattr__(self, "min_wavelength", min_wavelength(self.parts))
         constants = [part.lipschitz for part in self.parts]
+        # The minimum or maximum of functions has the largest of their constants.
         all_known = all(part is not None for part in constants)
         object.__setattr__(self, "lipschitz", max(constants) if all_known else None)
 
@@ -189,6 +190,7 @@ class BooleanSolid(Solid):
             if rows is None:
                 extreme, rows = value, part_rows
                 continue
+            # On the lanes where this operand is more extreme than those before, take its Hessian.
             is_chosen = (value < extreme) if self.is_union else (value > extreme)
             rows = tuple(dr.select(is_chosen, a, b) for a, b in zip(part_rows, rows, strict=True))
             extreme = dr.select(is_chosen, value, extreme)
@@ -253,6 +255,7 @@ class BooleanSolid(Solid):
             return ()
         if self.is_union:
             operands = [tuple(NegatedEnclosure(kind) for kind in kinds) for kinds in operands]
+        # For a union: min f_i = -max(-f_i).
         greatest = MaximumEnclosure(
             tuple(
                 MaximumOperand(*bounds, kinds)
@@ -492,8 +495,8 @@ class OffsetSolid(SolidOfField):
         return self.field.hessian(p)
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
-        look = self.field.sample_ray(path, t, ahead, back)
-        return replace(look, sample=self._shifted(look.sample))
+        ray_sample = self.field.sample_ray(path, t, ahead, back)
+        return replace(ray_sample, sample=self._shifted(ray_sample.sample))
 
 
 @dataclass(frozen=True, eq=False)

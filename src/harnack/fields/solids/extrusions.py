@@ -103,6 +103,7 @@ class Extrusion(Solid):
         set_frozen(self, "_turning", Twist(math.radians(twist) / height) if twist else None)
         profile = (0.0, 1.0), (height, taper)
         set_frozen(self, "_tapering", Taper(*profile) if taper != 1.0 else None)
+        # Twist and taper have no Lipschitz constant in all of space.
         set_frozen(self, "lipschitz", 1.0 if self.is_straight else None)
 
     @property
@@ -304,6 +305,8 @@ class Extrusion(Solid):
         if taper is not None:
             constant, radius = taper.preimage_lipschitz(p)
             p = cast("Any", type(p))(*taper.preimage(p.x, p.y, p.z))
+        # The proof in the class docstring: constants are multiplied, and the inner ball, taken back
+        # by the first map, is smaller by its constant.
         if twist is not None:
             inner_constant, inner_radius = twist.preimage_lipschitz(p)
             constant, radius = (

@@ -287,6 +287,7 @@ class FractalNoise(FormulaSolid):
                 i, j, k = (b + c for b, c in zip(cell_index, corner, strict=True))
                 vectors.append(lattice_vector(i, j, k, seed, q[0]))
             value, gradient, hessian = cell_noise(self.fade, cell_position, vectors)
+            # The position is multiplied by the scale, so derivatives are too.
             slope = amplitude * scale
             octaves.append(
                 (

@@ -76,6 +76,7 @@ def solid(
             f"{type(field).__name__} jumps across sheets: values on both sides of a level may meet "
             "without any in between, so it bounds no solid"
         )
+    # A band has two numbers, a single level one.
     is_band = between is not None or around is not None
     numbers = _levels(bounds[0] if is_band else (bounds[0],), 2 if is_band else 1)
     if numbers is None:
@@ -86,6 +87,7 @@ def solid(
             f"{type(field).__name__} is angle-valued: no value is below another. Use "
             "around=(level, half_width) for the solid near a level"
         )
+    # f <= level is an offset of f <= 0; f >= level is the complement.
     sublevel = SublevelSolid(field)
     if below is not None:
         return OffsetSolid(sublevel, numbers[0])
@@ -470,8 +472,10 @@ class BandSolid(SolidOfField):
         negated = negated_sample(sample)
         is_below = offset < 0
         epsilon = 2 * float(dr.epsilon(type(offset)))
+        # The rounding of the two differences.
         rounding = 8 * epsilon * (dr.abs(sample.value) + abs(self.level) + self.half_width)
         lipschitz = lipschitz_of(sample)
+        # Where f is below the level, |f - level| has the opposite gradient.
         return replace(
             sample,
             value=dr.abs(offset) - self.half_width,

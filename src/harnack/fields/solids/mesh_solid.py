@@ -232,13 +232,13 @@ class MeshSolid(Solid):
             lengths.
         """
         del ahead, back
-        look = path.enclose(self.evaluate(path.point(t)))
+        ray_sample = path.enclose(self.evaluate(path.point(t)))
         return RaySample(
-            look.sample,
-            look.forward,
-            look.backward,
-            look.slope,
-            look.reach_growth,
+            ray_sample.sample,
+            ray_sample.forward,
+            ray_sample.backward,
+            ray_sample.slope,
+            ray_sample.reach_growth,
             min_gradient_norm=_MIN_GRADIENT,
         )
 
@@ -344,6 +344,7 @@ class _MeshData(UnitFrame):
         for a, b in ((0, 1), (1, 2), (2, 0)):
             edge = to_corners[b] - to_corners[a]
             length = dr.norm(edge)
+            # The distance of the closest point from the edge's line.
             edge_distance = dr.norm(dr.cross(to_corners[a], edge)) / length
             along = dr.select(edge_distance < min_distance, edge / length, along)
             min_distance = fmin(edge_distance, min_distance)
@@ -575,6 +576,7 @@ class ClosedSurface:
         Raises:
             MeshError: the mesh bounds no solid.
         """
+        # Faces whose reversed copies are also faces cancel each other; the rest is the net.
         welded = Welded.of(vertices, faces)
         net = welded.net
         if not len(net.faces):

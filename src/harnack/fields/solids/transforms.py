@@ -62,6 +62,7 @@ class AffineMap(SpaceMap):
             )
         if not (np.isfinite(m).all() and np.isfinite(b).all()):
             raise ValueError("matrix and offset must be finite")
+        # A map whose smallest singular value is relatively tiny counts as singular.
         sizes = np.linalg.svd(m, compute_uv=False)
         if not sizes[-1] > 1e-12 * sizes[0]:
             raise ValueError(
@@ -113,6 +114,7 @@ class AffineMap(SpaceMap):
                     f'{axis!r}: write rotated(degrees, axis), such as rotated(30, "x")'
                 )
             unit = unit / length
+        # The matrix of the cross product with the axis, for Rodrigues' formula.
         angle = math.radians(float(degrees))
         k = np.cross(np.eye(3), unit)  # k v = unit x v
         turn = np.eye(3) + math.sin(angle) * k + (1 - math.cos(angle)) * (k @ k)
@@ -170,6 +172,7 @@ class AffineMap(SpaceMap):
         lower, upper = volume.bounds()
         if not (np.isfinite(lower).all() and np.isfinite(upper).all()):
             return None
+        # The image of a box is the convex hull of the images of its corners.
         corners = np.stack(np.meshgrid(*zip(lower, upper, strict=True)), axis=-1).reshape(-1, 3)
         image = corners @ m.T + b
         return ConvexHull.from_points(image).padded(1e-12 * float(np.abs(image).max()))
@@ -207,6 +210,7 @@ class TransformedSolid(SolidOfField):
             ValueError: the domain of the inner solid has no bounds.
         """
         self._copy_settings()
+        # The domain is mapped; a domain without bounds cannot be.
         domain = self.map.volume(self.field.domain)
         if self.field.domain is not None and domain is None:
             raise ValueError(
@@ -216,6 +220,8 @@ class TransformedSolid(SolidOfField):
         object.__setattr__(self, "domain", domain)
         numbers = _InverseMap.of(self.map)
         object.__setattr__(self, "_numbers", numbers)
+        # Preimages are at most `stretch` times as far apart as the points, so slopes grow by that
+        # factor.
         constant = self.field.lipschitz
         lipschitz = None if constant is None else constant * numbers.stretch * numbers.factor
         object.__setattr__(self, "lipschitz", lipschitz)
@@ -265,6 +271,7 @@ class TransformedSolid(SolidOfField):
         numbers = self.numbers
         local = type(p)(*numbers.local(p.x, p.y, p.z))
         first, second = self.field.derivative_errors(local, self.field.evaluate(local))
+        # The gradient is multiplied by M^-T and the factor, the Hessian by M^-T twice.
         first = first * numbers.stretch * numbers.factor
         if not isinstance(self.field, FormulaSolid):
             return first, second * numbers.stretch * numbers.stretch * numbers.factor
@@ -289,8 +296,8 @@ class TransformedSolid(SolidOfField):
         # direction, so lengths on it are multiplied by the speed.
         speed = safe_norm(direction)
         inner_ray = Ray(vector(*numbers.local(o.x, o.y, o.z)), direction / speed, path.proofs)
-        look = self.field.sample_ray(inner_ray, t * speed, ahead * speed, back * speed)
-        sample = self._image_sample(look.sample, self._term_bound(o, t))
+        ray_sample = self.field.sample_ray(inner_ray, t * speed, ahead * speed, back * speed)
+        sample = self._image_sample(ray_sample.sample, self._term_bound(o, t))
 
         def stretched(enclosures: tuple[Any, ...]) -> tuple[Any, ...]:
             """The enclosures along the ray from those along the line of the preimages."""
@@ -298,10 +305,14 @@ class TransformedSolid(SolidOfField):
                 ScaledEnclosure(enclosure, speed, numbers.factor) for enclosure in enclosures
             )
 
-        slope = look.slope * speed * numbers.factor
-        forward, backward = stretched(look.forward), stretched(look.backward)
-        error = None if look.slope_error is None else look.slope_error * speed * numbers.factor
-        return RaySample(sample, forward, backward, slope, look.reach_growth, error)
+        slope = ray_sample.slope * speed * numbers.factor
+        forward, backward = stretched(ray_sample.forward), stretched(ray_sample.backward)
+        error = (
+            None
+            if ray_sample.slope_error is None
+            else ray_sample.slope_error * speed * numbers.factor
+        )
+        return RaySample(sample, forward, backward, slope, ray_sample.reach_growth, error)
 
     def _term_bound(self, p: Vec3, t: Real) -> Real:
         """A bound of the absolute values of the terms in the sums that are the coordinates of the
@@ -319,6 +330,7 @@ class TransformedSolid(SolidOfField):
         """
         numbers = self.numbers
         epsilon = 2 * float(dr.epsilon(type(sample.value)))
+        # The change of the inner function by the rounding of the preimage.
         rounding = 8 * epsilon * term_bound * safe_norm(sample.gradient)
         factor, stretch = numbers.factor, numbers.stretch
 
@@ -330,6 +342,7 @@ class TransformedSolid(SolidOfField):
                 promise = promise.weakened_for_linear_maps(sample.value)
             return promise.scaled(factor).linearly_mapped(stretch)
 
+        # By the chain rule gradients are multiplied by M^-T.
         return sample.map_promises(
             image_of_promise,
             value=sample.value * factor,

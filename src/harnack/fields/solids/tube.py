@@ -98,6 +98,7 @@ class Tube(Solid):
         starts = [as_integer_in_range(start, "each start", 0, len(points)) for start in self.starts]
         if not 0 <= as_real(self.flattening_error, "flattening_error") < math.inf:
             raise ValueError(f"flattening_error must be a length, not {self.flattening_error!r}")
+        # Split at the starts of polylines, and leave out repeated points of each polyline.
         for part in np.split(points, starts):
             if len(part):
                 differs = np.any(part[1:] != part[:-1], axis=1)
@@ -106,6 +107,7 @@ class Tube(Solid):
                 raise ValueError("a tube needs two points or more that differ: use Sphere for one")
             parts.append(part)
         points = np.concatenate(parts)
+        # The indices at which polylines start, after points were left out.
         ends = np.cumsum([len(part) for part in parts])[:-1]
         object.__setattr__(self, "starts", tuple(int(end) for end in ends))
         points.setflags(write=False)
@@ -163,6 +165,7 @@ class Tube(Solid):
         check_finite(points, "control point {}", ValueError)
         radius = as_positive(radius, "the radius of a tube")
         allowed = 1e-3 * radius if tolerance is None else as_positive(tolerance, "the tolerance")
+        # The first point of each curve is the last of the one before.
         pieces = [points[:1]]
         max_error = 0.0
         for start in range(0, len(points) - 1, 3):
@@ -264,11 +267,13 @@ class Tube(Solid):
             return path.enclose(self.evaluate(p))
         if not hasattr(self, "_records"):
             return self.prepare(backend_of(p)).sample_ray(path, t, ahead, ahead)
+        # If `ahead` is infinite, the inner knots are fractions of another length.
         endless_length = _ENDLESS_LENGTH * (max_norm(p) + self._parameter("_size"))
         length = dr.select(dr.isfinite(ahead), ahead, endless_length)
         knots = (*(fraction * length for fraction in _KNOT_FRACTIONS), ahead)
         sample, distance, bounds = self._sample_with_bounds(p, path.direction, knots)
         slope = dr.dot(sample.gradient, path.direction)
+        # A distance grows no faster than the length.
         max_slope = fmin(slope + sample.gradient_error, 1.0)
         return RaySample(
             sample, (TangentEnclosure(distance, max_slope, knots, bounds),), (), slope, 4.0
@@ -330,11 +335,13 @@ class Tube(Solid):
             final = _add_segments_by_groups(
                 p, direction, knots, records, groups, add_segment, start
             )
+        # The distance, the largest rounding error, and the vector from the nearest point to p.
         distance, error = final[0], final[4]
         away = vector(*final[1:4])
         gradient = dr.select(distance > 0, away / distance, vector(0))
         value = distance - self._parameter("_radius")
         error = error + 4 * epsilon * (distance + self._parameter("_radius"))
+        # The error of a unit vector is that of the vector over its length, and at most 2.
         gradient_error = dr.select(distance > 0, fmin(4 * error / distance, 2), 2)
         sample = Sample(value, gradient, (Lipschitz(zero + 1),), error, gradient_error)
         return sample, distance, tuple(bound - distance - error for bound in final[5:])
@@ -662,6 +669,7 @@ class _Segment(Field):
         vector, epsilon = backend.Array3f, 2 * backend.machine_epsilon
         from_start = vector(p) - self._boxes.center - vector(*row[:3])
         segment = vector(*row[4:7])
+        # The nearest point of the segment, as a fraction of it; and the vector from there to p.
         fraction = clamp(dr.dot(from_start, segment) * row[7], 0, 1)
         away = dr.fma(segment, vector(-fraction), from_start)
         distance = dr.norm(away)
@@ -697,6 +705,7 @@ def _checked_segments(segments: Any, points: FloatArray) -> IntArray:
     if len(array) >= MAX_BOXES:
         raise ValueError(f"{len(array):,} segments are too many: at most {MAX_BOXES:,}")
     pairs = np.array(array, dtype=np.int64)
+    # Each index must be that of a point.
     if (bad := np.flatnonzero(((pairs < 0) | (pairs >= len(points))).any(axis=1))).size:
         raise ValueError(
             f"segment {bad[0]} joins points {pairs[bad[0], 0]} and {pairs[bad[0], 1]}: there are "
