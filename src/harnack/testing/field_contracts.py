@@ -461,6 +461,7 @@ def _check_extent(field: Field, level: float, rng: np.random.Generator, count: i
     center, half = 0.5 * (lower + upper), 0.5 * (upper - lower)
     if not np.isfinite(half).all():
         return
+    # Random segments in and around the box of the extent, up to the border of the domain.
     start = center + rng.uniform(-2.5, 2.5, (count, 3)) * half
     if field.domain is not None:
         start = np.concatenate([start, random_points(field, rng, count)])
@@ -471,11 +472,12 @@ def _check_extent(field: Field, level: float, rng: np.random.Generator, count: i
     lift = lift_along_rays(field, start, d, t)
     # f - level along each segment, with its jumps.
     offsets = sample_field(field, start).value[:, None] + lift.moved + lift.jumped - level
-    # To first order farther from the level than a thousandth of the extent, so f does not touch it.
+    # To first_beyond order farther from the level than a thousandth of the extent, so f does not touch it.
     is_clear = (
         _distance_to_level(field, offsets)
         > 1e-3 * float(half.max()) * lift.gradient_norm + lift.error
     )
+    # Between neighboring samples that are both clear of levels, f has passed a level.
     is_crossed = (
         _level_interval(field, offsets[:, 1:]) != _level_interval(field, offsets[:, :-1])
     ) & is_clear[:, 1:]
@@ -489,12 +491,12 @@ def _check_extent(field: Field, level: float, rng: np.random.Generator, count: i
         lengths = before[:, None] + (after - before)[:, None] * np.linspace(0, 1, 33)
         lift = lift_along_rays(field, start[row], d[row], lengths)
         values = offset[:, None] + lift.moved + lift.jumped
-        first = (_level_interval(field, values) != _level_interval(field, values[:, :1])).argmax(
-            axis=1
-        )
+        first_beyond = (
+            _level_interval(field, values) != _level_interval(field, values[:, :1])
+        ).argmax(axis=1)
         ids = np.arange(len(row))
-        before, after = lengths[ids, first - 1], lengths[ids, first]
-        offset = values[ids, first - 1]
+        before, after = lengths[ids, first_beyond - 1], lengths[ids, first_beyond]
+        offset = values[ids, first_beyond - 1]
     crossings = start[row] + after[:, None] * d[row]
     is_inside = volume.contains_points(crossings)
     require(is_inside, f"extent: the surface of level {level:g} leaves {volume} here", crossings)

@@ -215,7 +215,8 @@ class FractalNoise(FormulaSolid):
         return self._sum(2.0) * CONSTANTS[self.fade].max_second_derivative
 
     def prepare(self, backend: Backend) -> Field:
-        """The same noise with its numbers and bounds as kernel parameters of the backend."""
+        """The same noise with its numbers and bounds as kernel parameters of the backend (numbers
+        that a compiled kernel reads when it runs)."""
         prepared = with_device_numbers(self, backend)
         constants = (self._sum(1.0) * CONSTANTS[self.fade].max_gradient, self.max_second_derivative)
         # `_constants`: bounds of first and second derivatives. `_falls`: the ratio of an octave's

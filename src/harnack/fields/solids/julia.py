@@ -110,8 +110,8 @@ class Julia(Solid):
         return change(self)
 
     def prepare(self, backend: Backend) -> Julia:
-        """The same set with its numbers as kernel parameters of the backend: c, the fourth
-        coordinate, |c| and B."""
+        """The same set with its numbers as kernel parameters of the backend (numbers that a
+        compiled kernel reads when it runs): c, the fourth coordinate, |c| and B."""
         prepared = copy.copy(self)
         size = math.hypot(*self.c)
         for name, value in (
@@ -280,7 +280,8 @@ def _split_in_four(state: Any) -> tuple[Any, Any, Any, Any]:
 
 
 def _kernel_parameters(backend: Backend, value: Any) -> Any:
-    """A number, or nested tuples of numbers, as kernel parameters of a backend."""
+    """A number, or nested tuples of numbers, as kernel parameters of a backend (numbers that a
+    compiled kernel reads when it runs)."""
     if isinstance(value, tuple):
         return tuple(_kernel_parameters(backend, part) for part in cast("tuple[Any, ...]", value))
     return dr.opaque(backend.Float, float(value))

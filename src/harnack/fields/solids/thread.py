@@ -134,7 +134,8 @@ class Thread(Solid):
         return None
 
     def prepare(self, backend: Backend) -> Thread:
-        """The same thread with its numbers as kernel parameters of the backend."""
+        """The same thread with its numbers as kernel parameters of the backend (numbers that a
+        compiled kernel reads when it runs)."""
         prepared = with_device_numbers(self, backend)
         numbers: Any = cast("Any", self)
         points = tuple(
@@ -152,7 +153,7 @@ class Thread(Solid):
         real, data = cast("Any", type(p.x)), cast("Any", self)
         epsilon = 2 * float(dr.epsilon(real))
         r = dr.sqrt(dr.fma(p.x, p.x, p.y * p.y))
-        # u.
+        # u, and then u in the period from 0 to the pitch.
         axial = p.z - dr.atan2(p.y, p.x) * data._lead
         axial = axial - dr.floor(axial / self.pitch) * self.pitch
         error = 8 * epsilon * (dr.abs(p.z) + r + data._size)
@@ -164,11 +165,13 @@ class Thread(Solid):
         is_core = value <= -data._least
         value = dr.select(is_core, -data._least, value)
         d_r, d_z = (dr.select(is_core, 0, derivative) for derivative in (d_r, d_z))
+        # The unit vector away from the axis; 0 on the axis.
         divisor = dr.select(r > 0, r, 1)
         x, y = p.x / divisor, p.y / divisor
         # The gradient in cylindrical coordinates, turned to x, y and z.
         tangential = -d_z * data._lead / divisor
         gradient = cast("Any", type(p))(d_r * x - tangential * y, d_r * y + tangential * x, d_z)
+        # A Dr.Jit array, with the number in each lane.
         constant = 0 * p.x + self.lipschitz
         gradient_error = dr.select(is_core, 0, gradient_error * constant + 16 * epsilon)
         return Sample(value, gradient, (Lipschitz(constant),), error, gradient_error)
@@ -187,6 +190,7 @@ class Thread(Solid):
         del ahead, back
         p, d = path.point(t), path.direction
         ray_sample = path.enclose(self.evaluate(p))
+        # The caller has asked for particular kinds of enclosures.
         if PiecewiseTaylorEnclosure not in path.proofs.kinds:
             return ray_sample
         numbers = cast("Any", self)

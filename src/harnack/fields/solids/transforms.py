@@ -389,8 +389,9 @@ class _InverseMap:
 
     def prepare(self, backend: Backend) -> _InverseMap:
         """The same map with the entries of its matrix and its vector as kernel parameters of the
-        backend. Entries that are 0 or 1 stay Python numbers: then their terms or products are left
-        out of the kernel, which saves most of the work."""
+        backend (numbers that a compiled kernel reads when it runs). Entries that are 0 or 1 stay
+        Python numbers: then their terms or products are left out of the kernel, which saves most of
+        the work."""
         prepared = with_device_numbers(self, backend)
         # The three rows and, as a fourth, the translation.
         rows = tuple(

@@ -263,6 +263,7 @@ class Tube(Solid):
         """
         del back
         p = path.point(t)
+        # The caller has asked for particular kinds of enclosures.
         if PiecewiseTaylorEnclosure not in path.proofs.kinds:
             return path.enclose(self.evaluate(p))
         if not hasattr(self, "_records"):
