@@ -424,6 +424,7 @@ def _require_agreement(
         because differences across a crease are wrong.
     """
     agrees = error <= tolerance + allowance
+    # A few differences across creases are allowed to be wrong.
     if has_creases and agrees.mean() >= _MIN_FRACTION_OFF_CREASES:
         return
     require(agrees, message, points, error)

@@ -91,10 +91,11 @@ def check_ray_samples(
     scale = np.abs(coarse_lift.moved).max(axis=1) + 1e-6
     for forwards in (True, False):
         gaps = scale[:, None] * 10.0 ** generator.uniform(-3, 0.5, (n, 2))
-        no_level = generator.integers(
-            0, 3, n
-        )  # 0: no level below; 1: none above; 2: levels on both sides
+        # 0: no level below; 1: no level above; 2: levels on both sides.
+        no_level = generator.integers(0, 3, n)
         gaps[no_level < 2, no_level[no_level < 2]] = np.inf
+        # A ray in direction -d that ends at the point has its last part at point + s d, s > 0. So
+        # both free lengths are tested on the same points.
         steps = proved_free_lengths(
             field, points, directions if forwards else -directions, reach, gaps,
             enclosures=enclosures, precision=precision, forwards=forwards,
@@ -107,6 +108,7 @@ def check_ray_samples(
         allowed = path.error + path.error[:, :1] + 8 * position + 1e-12 * scale[:, None]
         # By how much f leaves the two gaps.
         excess = np.maximum(path.moved - gaps[:, 1:], -path.moved - gaps[:, :1]) - allowed
+        # For each ray the largest excess, and the point where it is.
         worst = excess.max(axis=1)
         worst_points = (
             points + np.take_along_axis(lengths, excess.argmax(axis=1)[:, None], 1) * directions
@@ -421,6 +423,7 @@ def _distance_to_exit(field: Field, points: FloatArray, d: FloatArray) -> FloatA
     o, direction = to_vector3(backend, points, "points"), to_vector3(backend, d, "d")
     ends = field.domain.prepare(backend).clip(o, direction, backend.Float(0), backend.Float(np.inf))
     end = np.broadcast_to(to_numpy(ends[1]), (len(points),))
+    # A little less, for rounding.
     return np.maximum(end * (1 - 1e-9) - 1e-12 * np.abs(points).max(axis=1), 0)
 
 
@@ -472,7 +475,7 @@ def _check_extent(field: Field, level: float, rng: np.random.Generator, count: i
     lift = lift_along_rays(field, start, d, t)
     # f - level along each segment, with its jumps.
     offsets = sample_field(field, start).value[:, None] + lift.moved + lift.jumped - level
-    # To first_beyond order farther from the level than a thousandth of the extent, so f does not touch it.
+    # To first order farther from the level than a thousandth of the extent, so f does not touch it.
     is_clear = (
         _distance_to_level(field, offsets)
         > 1e-3 * float(half.max()) * lift.gradient_norm + lift.error

@@ -364,6 +364,7 @@ def search_violations(
     """
     search = _ViolationSearch(field, number, 2 * float(np.ptp(points, axis=0).max()) + 1e-300)
     divisor = _PATH_COST_DIVISOR if search.needs_path else 1
+    # The number of pairs. If f must be followed along paths, there are fewer pairs and moves.
     count = min(max(int(_PAIRS_OF_POINTS * len(points)), 6), _MAX_PAIRS) // divisor
     moves_each = _MOVES // divisor
     # The start of the search: p, and y in one of three directions.
@@ -382,7 +383,7 @@ def search_violations(
         step = np.repeat(steps, moves_each)[:, None]
         p, w = (np.repeat(array, moves_each, axis=0) for array in (best.p, best.w))
         reach = np.repeat(best.reach, moves_each)[:, None]
-        # Half of the moves keep p, a quarter of them y.
+        # Half of the moves keep p (kinds 0 and 1), a quarter keep y (kind 3).
         kind = np.arange(len(p))[:, None] % 4
         moves_point = kind >= 2
         change = rng.normal(size=p.shape) * step * 10 ** rng.uniform(-1, 0, (len(p), 1))

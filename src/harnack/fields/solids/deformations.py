@@ -173,7 +173,7 @@ class Twist(Deformation):
         """A Lipschitz constant of the inverse map on a ball about p, and the radius of that ball.
         The class docstring has the proof, with the symbols m and a (here `rate`). Without a twist
         the constant is 1 everywhere."""
-        # (0 * p.x + number is a Dr.Jit array, with the number in each lane.)
+        # 0 * p.x + number is a Dr.Jit array, with the number in each lane.
         rate = dr.abs(0 * p.x + self.rate)
         axis_distance = _distance_from_axis(p, self.axis)
         # Any radius is valid; this one keeps m within a factor of about 5/4, plus 1/4.
