@@ -400,6 +400,7 @@ class FieldCache(Generic[Value]):
         value = make()
         if value is not field:
             if id(field) not in self._kept:
+                # Drop the value when the field is deleted.
                 finalize(field, self._kept.pop, id(field), None).atexit = False
             self._kept[id(field)] = key, {**vars(field)}, value
         return value

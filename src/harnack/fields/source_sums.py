@@ -155,8 +155,9 @@ class SourceSums:
         real, zero = backend.Float, backend.Float(0)
         gradient = backend.Array3f(0) if derivatives >= 1 else None
         hessian = SymmetricMatrix.zero(real) if derivatives == 2 else None
-        second = None if hessian is None else zero
-        bounds = zero, zero, second, zero, real(free_distance), zero, zero, zero
+        hessian_truncation = None if hessian is None else zero
+        # The further attributes in the order of the constructor; all sums are 0.
+        bounds = zero, zero, hessian_truncation, zero, real(free_distance), zero, zero, zero
         return cls(zero, gradient, hessian, *bounds)
 
     @classmethod

@@ -191,6 +191,8 @@ class GreenPotentials:
         y, size = self.centers, self.sizes
         distance = np.abs(y)
         with np.errstate(divide="ignore", invalid="ignore"):
+            # Newton's potential of a ball at the center, and its slope there: outside of the ball
+            # that of a point mass, else that of the interior.
             outside = distance > size
             value = np.where(outside, size**3 / (3 * distance), 0.5 * size**2 - y * y / 6)
             slope = np.where(outside, size**3 * y / (3 * distance**3), y / 3)

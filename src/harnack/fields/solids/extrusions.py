@@ -232,7 +232,7 @@ class Extrusion(Solid):
             ray_sample = path.enclose(replace(sample, ray_promises=(path_constant,)))
             # The speed has no bound looking back.
             return replace(ray_sample, backward=(), min_gradient_norm=min_norm)
-        # The caller has asked for particular kinds of enclosures.
+        # This kind is in the sharpest choice of enclosures; otherwise others were asked for.
         if PiecewiseTaylorEnclosure not in path.proofs.kinds:
             return path.enclose(self.evaluate(p))
         solid = _prepared_for(self, p)
@@ -613,7 +613,7 @@ class SolidOfRevolution(Solid):
         """
         del back
         p, d = path.point(t), path.direction
-        # The caller has asked for particular kinds of enclosures.
+        # This kind is in the sharpest choice of enclosures; otherwise others were asked for.
         if PiecewiseTaylorEnclosure not in path.proofs.kinds:
             return path.enclose(self.evaluate(p))
         outline: OutlineEdges = _prepared_for(self, p)._outline

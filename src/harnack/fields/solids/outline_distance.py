@@ -364,7 +364,7 @@ class _OutlineQuery:
 
 def _chain_records(start: FloatArray, end: FloatArray, loop_index: IntArray) -> FloatArray:
     """The records of chains of consecutive edges (n, 8). For each chain: its box as (lowest x,
-    lowest y, highest x, highest y), y of its first and of its last vertex, the index of its first
+    lowest y, highest x, highest y), y of its loop_start and of its loop_end vertex, the index of its loop_start
     edge, and the number of its edges.
 
     start, end: (n, 2) the ends of the edges.
@@ -376,10 +376,11 @@ def _chain_records(start: FloatArray, end: FloatArray, loop_index: IntArray) -> 
     """
     length = max(8, round(math.sqrt(2 * len(start) / 3)))
     rows: list[Any] = []
+    # The index of the loop_start edge of each run of edges with the same number, and the end.
     loop_starts = np.concatenate([[0], np.flatnonzero(np.diff(loop_index)) + 1, [len(loop_index)]])
-    for first, last in itertools.pairwise(loop_starts.tolist()):
-        for k in range(first, last, length):
-            stop = min(k + length, last)
+    for loop_start, loop_end in itertools.pairwise(loop_starts.tolist()):
+        for k in range(loop_start, loop_end, length):
+            stop = min(k + length, loop_end)
             ends = np.concatenate([start[k:stop], end[k:stop]])
             rows.append(
                 [*ends.min(axis=0), *ends.max(axis=0), start[k, 1], end[stop - 1, 1], k, stop - k]

@@ -100,7 +100,8 @@ def not_a_solid(other: Any) -> str:
 
 def _with_source(prepare: Callable[[Any, Backend], Field]) -> Callable[[Any, Backend], Field]:
     """Decorator of the method `prepare` of a solid: the prepared solid, whose numbers lie on a
-    backend, keeps a reference to the original in its attribute `_source`."""
+    backend, keeps a reference to the original in its attribute `_source`. Python knows the
+    original's numbers, from which `Solid.extent` is computed."""
 
     @functools.wraps(prepare)
     def remembering(self: Any, backend: Backend) -> Field:

@@ -190,7 +190,7 @@ class Thread(Solid):
         del ahead, back
         p, d = path.point(t), path.direction
         ray_sample = path.enclose(self.evaluate(p))
-        # The caller has asked for particular kinds of enclosures.
+        # This kind is in the sharpest choice of enclosures; otherwise others were asked for.
         if PiecewiseTaylorEnclosure not in path.proofs.kinds:
             return ray_sample
         numbers = cast("Any", self)

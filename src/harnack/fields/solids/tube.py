@@ -263,7 +263,7 @@ class Tube(Solid):
         """
         del back
         p = path.point(t)
-        # The caller has asked for particular kinds of enclosures.
+        # This kind is in the sharpest choice of enclosures; otherwise others were asked for.
         if PiecewiseTaylorEnclosure not in path.proofs.kinds:
             return path.enclose(self.evaluate(p))
         if not hasattr(self, "_records"):
@@ -428,7 +428,8 @@ def _add_segments_by_groups(
             rounding = 8 * epsilon * (dr.norm(p) + distance + ball[3])
             slope = dr.dot(from_center, direction) / distance - 2 * rounding / distance
             start = dr.select(is_near, dr.inf, distance - ball[3] - rounding)
-            # If the group is near, the tangent is infinite and changes nothing.
+            # From index 5 on the state holds the bounds at the knots. If the group is near, the
+            # tangent is infinite and changes nothing.
             updated[5:] = min_with_tangent(
                 updated[5:], knots, start, slope, 4 * epsilon * distance, epsilon
             )
