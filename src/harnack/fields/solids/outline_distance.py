@@ -364,7 +364,7 @@ class _OutlineQuery:
 
 def _chain_records(start: FloatArray, end: FloatArray, loop_index: IntArray) -> FloatArray:
     """The records of chains of consecutive edges (n, 8). For each chain: its box as (lowest x,
-    lowest y, highest x, highest y), y of its loop_start and of its loop_end vertex, the index of its loop_start
+    lowest y, highest x, highest y), y of its first and of its last vertex, the index of its first
     edge, and the number of its edges.
 
     start, end: (n, 2) the ends of the edges.
