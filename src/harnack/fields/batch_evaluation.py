@@ -64,6 +64,7 @@ def evaluate_points(
         results = kernel(backend, dr.gather(backend.Array3f, x, order))
         return tuple(_restore_order(array, order, dr.width(x)) for array in results)
 
+    # NumPy arrays would lose derivatives.
     check_no_derivatives("what NumPy's arrays are given of", points)
     vectors = np.asarray(points)
     if vectors.shape == (3,):
@@ -88,6 +89,7 @@ def accepts_numpy_points(hessian: Callable[[Any, Vec3], Any]) -> Callable[..., A
             """The rows of the Hessian at the Dr.Jit points x."""
             return self.prepare(backend).hessian(x)
 
+        # Three arrays of rows (n, 3) become matrices (n, 3, 3).
         return np.stack(evaluate_points(p, kernel, precision), axis=-2)
 
     return general

@@ -413,6 +413,7 @@ def cached_prepare(prepare: Prepare) -> Prepare:
     A field with parameters is uploaded at each call: a parameter may change in place, and its
     derivatives belong to a single trace.
     """
+    # For each backend a cache of prepared fields, without keys.
     caches: defaultdict[Backend, FieldCache[Field]] = defaultdict(FieldCache)
 
     @functools.wraps(prepare)

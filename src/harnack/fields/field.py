@@ -217,6 +217,7 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
         hold other fields. It prepares fields that are attributes, or entries of attributes that are
         lists or tuples. If there are none, it returns the field itself.
         """
+        # The library's own fields define `prepare` where they need it.
         if type(self).__module__.startswith("harnack."):
             return self
         attributes = {name: _prepared(value, backend) for name, value in vars(self).items()}
@@ -229,21 +230,21 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
         """A volume that is proved to contain every point of the level sets of these levels; None if
-        no such volume is known. The default is `domain`.
+        no such volume is known.
 
-        It may be smaller than `domain`. With an extent, a ray without an end can be a proved miss.
+        The default is `domain`. An extent may be smaller than `domain`. With an extent, a ray
+        without an end can be a proved miss.
         """
         del levels
         return self.domain
 
     def occupied_cells(self, levels: tuple[float, ...]) -> OccupancyGrid | None:
         """A grid of cells, some of which are marked as occupied: all other cells are proved to
-        contain no point of the level sets of these levels. None, the default, if no such grid is
-        known.
+        contain no point of the level sets of these levels. None if no such grid is known.
 
-        Searches for first hits skip the cells that are not occupied. This saves time for fields
-        that are expensive to evaluate. If f jumps across facets, f continued smoothly across the
-        facets takes no level in these cells either.
+        The default is None. Searches for first hits skip the cells that are not occupied. This
+        saves time for fields that are expensive to evaluate. If f jumps across facets, f continued
+        smoothly across the facets takes no level in these cells either.
         """
         del levels
         return None
@@ -405,7 +406,10 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
 
     def describe(self) -> dict[str, Any]:
         """The choices that the field made by itself, such as a method or an accuracy, as a
-        dictionary from names to values that is shown to users. The default is empty."""
+        dictionary from names to values that is shown to users.
+
+        The default is empty.
+        """
         return {}
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
@@ -476,6 +480,8 @@ def suggest_field(value: Any) -> str:
     """The end of an error message about an object that is not a field: what kind of object it is,
     and how to make a field of it."""
     kind, name = type(value).__name__, getattr(value, "__name__", "")
+    # An object that holds a field, a list of fields, a class, a mesh, a text, points, or a
+    # function.
     if isinstance(getattr(value, "field", None), Field):
         return f"a {kind}: take its .field, and what else this takes of it, such as its level"
     parts: list[Any] = [*value] if type(value) in (list, tuple) else []

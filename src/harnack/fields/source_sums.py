@@ -246,6 +246,7 @@ class SourceSums:
         free: a distance from x within which none of the node's dipoles lies.
         unit: a bound of the rounding error of a coordinate.
         """
+        # With a = `size` and rho = 1/`inverse`: s4 grows by a/rho^4, s5 by a/rho^5.
         s4_term, second_truncation = size * dr.square(inverse * inverse), self.hessian_truncation
         second_truncation = None if second_truncation is None else second_truncation + left_out[2]
         sums = self.add_term(terms, far)
@@ -273,6 +274,7 @@ class SourceSums:
             There, distances are as long as coordinates, and powers of distances and sums of moments
             are rounded too.
         """
+        # `rounding` is a bound in units of the result, so it is not multiplied.
         value, error = share * self.value, dr.fma(share, self.truncation + self.rounding, rounding)
         if self.gradient is None:
             return PointValues(value, error)

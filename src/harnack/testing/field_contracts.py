@@ -313,6 +313,8 @@ def _check_rounding(field: Field, points: FloatArray) -> None:
     error = rounded.value - exact.value
     if field.period is not None:
         error -= field.period * np.round(error / field.period)
+    # The allowed difference: stated errors, roundings of the value, and of coordinates times the
+    # slope.
     roundoff = 2.0**-24
     length = np.linalg.norm(exact.gradient, axis=1)
     size = np.abs(single).max(axis=1)

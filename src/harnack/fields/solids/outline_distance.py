@@ -123,6 +123,7 @@ class OutlineEdges:
         # Rounding may have made an edge a point.
         keep = square > 0
         start, end, square, loop = (start[keep], end[keep], square[keep], loop[keep])
+        # The records.
         rows = np.column_stack([start, end, 1.0 / square])
         chains = None
         if len(rows) >= _MIN_EDGES_FOR_CHAINS:
@@ -211,6 +212,8 @@ class OutlineEdges:
             """The index of the next chain; and the state with chain i added, by its edges if it is
             near, else by its box."""
             record = chains.read_record(i)
+            # A near chain has `count` edges to visit. A far one has 0, and its box is already in
+            # the state.
             count, state = query.with_chain(record, max_distance, state)
             first_edge, count = type(i)(record[6]), type(i)(count)
 
@@ -335,6 +338,7 @@ class _OutlineQuery:
         to_x, to_y = self.x - clamp(self.x, row[0], row[2]), self.y - clamp(self.y, row[1], row[3])
         distance = dr.sqrt(dr.fma(to_x, to_x, to_y * to_y))
         is_near = distance <= limit
+        # A far box bounds the distances from all its edges.
         bounds_with_box = self._with_tangent(bounds, to_x, to_y, distance, self.error)
         bounds = [dr.select(is_near, a, b) for a, b in zip(bounds, bounds_with_box, strict=True)]
         # A far chain crosses the ray towards +x an odd number of times if its ends are above and
@@ -376,7 +380,7 @@ def _chain_records(start: FloatArray, end: FloatArray, loop_index: IntArray) -> 
     """
     length = max(8, round(math.sqrt(2 * len(start) / 3)))
     rows: list[Any] = []
-    # The index of the loop_start edge of each run of edges with the same number, and the end.
+    # The index of the first edge of each run of edges with the same number, and the end.
     loop_starts = np.concatenate([[0], np.flatnonzero(np.diff(loop_index)) + 1, [len(loop_index)]])
     for loop_start, loop_end in itertools.pairwise(loop_starts.tolist()):
         for k in range(loop_start, loop_end, length):

@@ -136,7 +136,10 @@ class Solid(Field):
 
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
         """A volume that is proved to contain all points where f <= level or, if `above`, all points
-        where f >= level. None if no such volume is known. The default is the domain."""
+        where f >= level. None if no such volume is known.
+
+        The default is the domain.
+        """
         del level, above
         return self.domain
 
@@ -291,7 +294,8 @@ class Solid(Field):
         make: a function that makes the combination from its parts.
         """
         variants = [part.for_ray_count(count) for part in parts]
-        key = tuple(map(id, variants))  # of objects that the solid keeps alive
+        # Fields are compared by identity: each part is an object that the solid keeps alive.
+        key = tuple(map(id, variants))
         if key == tuple(map(id, parts)):
             return self
         if key not in self._ray_count_variants:
