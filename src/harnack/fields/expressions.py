@@ -221,9 +221,14 @@ def _as_float(text: str, value: float) -> float:
 
 
 def _check_call(text: str, node: ast.Call, parameters: Iterable[str], depth: int) -> None:
-    """Raise ValueError if a call in a syntax tree is one of an unknown function, or has the wrong
-    number of arguments, or arguments that are not allowed. The parameters are those of
-    `_check_tree`."""
+    """Raise ValueError if a call in a syntax tree is not allowed in a formula: the function is
+    unknown, the number of arguments is wrong, or an argument is not allowed.
+
+    text: the formula, for messages.
+    node: the call.
+    parameters: the names of the formula's parameters.
+    depth: the number of operations around the arguments.
+    """
     name = node.func.id if isinstance(node.func, ast.Name) else ast.unparse(node.func)
     # Brackets after a number or a parameter, as in x(y + 1), mean a missing *.
     if name in (*_COORDINATES, *_CONSTANTS, *parameters) or not isinstance(node.func, ast.Name):
@@ -232,6 +237,7 @@ def _check_call(text: str, node: ast.Call, parameters: Iterable[str], depth: int
         names = ", ".join(_FUNCTIONS)
         hint = did_you_mean(name, _FUNCTIONS)
         raise _formula_error(text, f"{name!r} is no known function, there are {names}{hint}")
+    # Most functions take one argument.
     fewest, largest = _ARGUMENT_COUNTS.get(name, (1, 1))
     if node.keywords or not fewest <= len(node.args) <= largest:
         count = (

@@ -197,9 +197,11 @@ def value_error_bound(sample: Sample, gradient_norm: Real, size: Real) -> Real:
     """
     kind = cast("Any", type(sample.value))
     epsilon = 2 * float(dr.epsilon(kind))
-    # Numbers below the smallest normal one may underflow to 0.
+    # The rounding of eight units in the last place, which `Sample.value_error` leaves out. Numbers
+    # below the smallest normal one may underflow to 0.
     smallest = kind(float(dr.smallest(kind)))
     value = 8 * fmax(epsilon * dr.abs(sample.value), smallest)
+    # The rounding of p moves it by at most 4 epsilon times size.
     return dr.fma(gradient_norm, 4 * epsilon * size, value + sample.value_error)
 
 

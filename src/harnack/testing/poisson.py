@@ -65,7 +65,8 @@ def cap_movement(q: npt.ArrayLike, height: npt.ArrayLike, dimension: int) -> Flo
     """
     q, b = np.broadcast_arrays(np.asarray(q, np.float64), np.asarray(height, np.float64))
     is_small = np.abs(q) < _SERIES_BELOW
-    # A harmless position takes the place of each one that the other formula covers.
+    # Both formulas are computed at all positions, and one is selected. Where a formula is not
+    # valid, it is computed at a position where it is (0 or 0.5), and its result is not used.
     series = _cap_series(np.where(is_small, q, 0.0), b, dimension)
     closed_form = _cap_closed_form(np.where(is_small, 0.5, q), b, dimension) - cap_mass(
         b, dimension

@@ -54,7 +54,7 @@ def require(
     names the worst of these points.
 
     good: (n,) whether the test holds at each point.
-    message: the begin of the message.
+    message: the beginning of the message.
     amount: (n,) the size of the violation; the point of the largest is the worst. None for the
         first point.
     there: (n, 3) the points where the violation shows, if not at the points themselves.
