@@ -391,8 +391,7 @@ class RefractionTracer:
 
     indices: pairs of a proxy, the Mitsuba mesh that stands for a transparent solid, and its index
         of refraction.
-    hidden: mask of rays to which shapes that emit light are invisible; None if such shapes are
-        seen.
+    hides_lights: whether shapes that emit light are invisible.
     """
 
     def __init__(

@@ -207,10 +207,9 @@ def _render_job(
     if task is None:
         return _render_by_mitsuba(mi, job.scene, options)
     if isinstance(task, AovTask):
+        # A progress bar is shown only if an executor divides the work.
         with progress_bar(
-            # A progress bar is shown only if an executor divides the work.
-            "rendering",
-            progress and not isinstance(executor, LocalRenderExecutor),
+            "rendering", progress and not isinstance(executor, LocalRenderExecutor)
         ) as advance:
             view = task.look(executor, advance)
         color_bar = (
