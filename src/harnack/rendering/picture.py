@@ -305,8 +305,8 @@ def _render_by_mitsuba(
         if is_set:
             raise ValueError(f"{name}: Mitsuba draws this scene, by an integrator of its own")
     image = np.array(mi.render(scene, spp=options.spp or 0, seed=options.seed))
-    # An integrator `aov` names each channel of its nested pictures (NAME.R, ...). These pictures are
-    # also the first channels, so their names are left out here.
+    # An integrator `aov` names each channel of its nested pictures (NAME.R, ...). These pictures
+    # are also the first channels, so their names are left out here.
     names = [name for name in scene.integrator().aov_names() if name[-2:] not in _IN_AOV]
     color_count = image.shape[-1] - len(names)
     # A film has one (luminance), two, three or four color channels; further channels follow.
