@@ -324,7 +324,7 @@ def corners_of(ends: FloatArray) -> FloatArray:
     return np.array(list(itertools.product(*ends.T)))
 
 
-def stage_placement(points: FloatArray, rotation: FloatArray | None = None) -> Placement:
+def stage_placement(points: FloatArray, turned: FloatArray | None = None) -> Placement:
     """Return the placement of surfaces in the studio: they are rotated, scaled until half the
     diagonal of their box is 1, and put on the ground.
 
@@ -335,12 +335,12 @@ def stage_placement(points: FloatArray, rotation: FloatArray | None = None) -> P
         ValueError: they are too far from the origin for their size (`check_offset`).
     """
     check_offset(points)
-    rotation = np.eye(3) if rotation is None else rotation
-    points = points @ rotation.T
+    turned = np.eye(3) if turned is None else turned
+    points = points @ turned.T
     lower, upper = points.min(axis=0), points.max(axis=0)
     scale = 2.0 / max(float(np.linalg.norm(upper - lower)), 1e-30)
     base_point = np.array([*(lower + upper)[:2] / 2, lower[2]])
-    return Placement(scale, rotation, -scale * base_point)
+    return Placement(scale, turned, -scale * base_point)
 
 
 def _sensor(mi: Any, pose: CameraPose, size: tuple[int, int]) -> dict[str, Any]:
