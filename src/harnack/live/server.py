@@ -1,4 +1,5 @@
-"""`view`: a small web server on this machine. Its page asks Python for all changes of the scene."""
+"""`view`: a small web server on this machine. A page is what the browser shows; it asks Python for
+all changes of the scene. A question is one request of a page, and a client is an open page."""
 
 from __future__ import annotations
 
@@ -75,7 +76,7 @@ class LiveView:
         self.close()
 
     def _repr_html_(self) -> str:
-        """The page in a frame, as notebooks on this machine show it."""
+        """Return the page in a frame, as notebooks on this machine show it."""
         return f'<iframe src="{self.address}" style="width:100%;height:480px;border:0"></iframe>'
 
 
@@ -164,7 +165,7 @@ def view(
 
 
 def check_height(height: Any) -> int:
-    """The height of a widget in pixels, if it is a whole number from 16 to 10,000.
+    """Return the height of a widget in pixels, if it is a whole number from 16 to 10,000.
 
     Raises:
         ValueError: the height is not such a number.
@@ -173,16 +174,19 @@ def check_height(height: Any) -> int:
 
 
 def in_notebook() -> bool:
-    """Whether Python runs in a notebook."""
+    """Return whether Python runs in a notebook, of Jupyter or marimo."""
     shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
     marimo = sys.modules.get("marimo")
     return hasattr(shell, "kernel") or (marimo is not None and marimo.running_in_notebook())
 
 
 class _PageServer:
-    """The server of a view's page, and of the requests of its clients (open pages).
+    """The web server that sends a view's page, and answers the questions of its clients (the open
+    pages). One worker thread computes all answers, one after the other.
 
-    live: the scene. page: the HTML text. token: a secret that requests must have; "" for none.
+    live: the scene.
+    page: the HTML text.
+    token: a secret that requests must have; "" for none.
     """
 
     def __init__(self, live: LiveScene, page: str, token: str) -> None:
@@ -192,8 +196,12 @@ class _PageServer:
         self.clients: set[MessageHandler] = set()
 
     def start(self, host: str, port: int) -> LiveView:
-        """Serve the page in a new thread, and return the view. Raises `OSError` if the address
-        cannot be served at."""
+        """Serve the page in a new thread, and return the view.
+
+        Raises:
+            OSError: the address cannot be served at.
+            ModuleNotFoundError: the package aiohttp is not installed.
+        """
         try:
             from aiohttp import web
         except ImportError:
@@ -232,18 +240,18 @@ class _PageServer:
         # In a thread of its own from the start: notebooks have a loop that runs in this one.
         threading.Thread(target=serve, name="harnack-view", daemon=True).start()
         try:
-            bound = asyncio.run_coroutine_threadsafe(begin(), loop).result()
+            bound_port = asyncio.run_coroutine_threadsafe(begin(), loop).result()
         except OSError as wrong:
             LiveView("", loop, ended).close()
             raise OSError(f"a view cannot be served at {host}, port {port}: {wrong}") from None
-        shown = f"[{host}]" if ":" in host else host
+        host_in_url = f"[{host}]" if ":" in host else host
         query = f"?token={self.token}" if self.token else ""
-        return LiveView(f"http://{shown}:{bound}/{query}", loop, ended)
+        return LiveView(f"http://{host_in_url}:{bound_port}/{query}", loop, ended)
 
     def _reason_to_refuse(self, request: web.Request) -> str:
-        """The reason to refuse a request as text, or "" to answer it. With a token, the request
-        must have it. Without a token, the request must come from this machine and from the server's
-        own page, since web pages of other sites could send requests too."""
+        """Return the reason to refuse a request as text, or "" to answer it. With a token, the
+        request must have it. Without a token, the request must come from this machine and from the
+        server's own page, since web pages of other sites could send requests too."""
         name = request.host.rsplit(":", 1)[0].strip("[]")
         if self.token:
             token = request.query.get("token", "")
