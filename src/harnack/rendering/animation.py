@@ -176,7 +176,7 @@ def _job(
     job with the shared ones, and for each picture a tuple that holds its other arguments.
 
     frames: for each picture, the arguments of `render` by name.
-    same: further shared arguments.
+    shared: further shared arguments.
     """
     first = frames[0]
     # Arguments are compared by identity: equal arrays or fields could be expensive to compare.
