@@ -158,6 +158,7 @@ def choose_backend(precision: Precision = "single") -> Backend:
         raise ValueError(
             f'{BACKEND_VARIABLE} is {forced!r}; set it to "llvm", "cuda" or "metal", or unset it'
         )
+    # GPUs are tried in order of preference; LLVM is last.
     for name, (kind, advice) in _DEVICES.items():
         if forced not in ("", name):
             continue
@@ -210,6 +211,8 @@ def backend_of(array: Any) -> Backend:
             "drjit.llvm.ad, drjit.cuda.ad or drjit.metal.ad (in Mitsuba, a variant such as "
             '"llvm_ad_rgb")'
         )
+    # Matrices, complex numbers and quaternions are special; more than two levels are vectors of
+    # vectors.
     if dr.is_special_v(kind) or dr.is_tensor_v(kind) or dr.depth_v(kind) > 2:
         raise TypeError(f"expected a Dr.Jit scalar or vector array, got {full_name}")
     precision = _PRECISIONS.get(dr.type_v(kind))

@@ -177,8 +177,9 @@ def compute_on_active(
     lane_indices, active_count = active_lanes(mask)
     result = broadcast_copy(inactive_result, width, type(lane_indices))
     if not active_count:
-        _begin_new_scope(lane_indices)
+        _begin_new_scope(lane_indices)  # as the computation would have done
         return result
+    # The results of the active lanes replace the inactive ones in place.
     targets, values = (
         [*array_leaves(result)],
         [*array_leaves(compute(gather_record(lanes, lane_indices)))],
@@ -211,6 +212,7 @@ def loop_with_queue(
     width = max(dr.width(leaf) for leaf in array_leaves(start))
     active = dr.full(type(start.active), True, width) & start.active
     ray_indices, ray_count = active_lanes(active)
+    # Rays that are not active from the start have the results of their initial states.
     results = broadcast_copy(result(start), width, type(ray_indices))
     if ray_count:
         _run_queue(start, body, result, ray_indices, ray_count, [*array_leaves(results)], label)
@@ -248,6 +250,7 @@ def _run_queue(
     """
     index_type = cast("Any", type(ray_indices))
     opaque_ray_count = dr.opaque(index_type, ray_count)
+    # The number of lanes is fixed by the device, and not by the number of rays.
     threads = dr.thread_count() if dr.backend_v(ray_indices) == dr.JitBackend.LLVM else 0
     width = min(len(ray_indices), _LANES_PER_THREAD * threads or _LANES_ON_GPU)
     next_position, first_indices = _evaluate_in_own_memory(
@@ -260,7 +263,7 @@ def _run_queue(
         ray_ids = dr.gather(index_type, ray_indices, queue_index, mask)
 
         def gather(leaf: Any) -> Any:
-            """One array of the initial states, at these rays."""
+            """Return one array of the initial states, at these rays."""
             return leaf if dr.width(leaf) == 1 else dr.gather(type(leaf), leaf, ray_ids, mask)
 
         return rebuild_record(start, map(gather, array_leaves(start)))
@@ -274,6 +277,7 @@ def _run_queue(
         """
         new_state = body(lane.state)
         is_ended = lane.active & ~new_state.active
+        # Results are written at the index of the ray, whatever its lane was.
         ray_ids = dr.gather(index_type, ray_indices, lane.queue_index, is_ended)
         for target, value in zip(results, array_leaves(result(new_state)), strict=True):
             dr.scatter(target, value, ray_ids, is_ended)

@@ -77,6 +77,8 @@ class RecordTable:
         rows, width = table.shape
         padded_width = -(-width // PACKET) * PACKET
         unpadded = upload_floats(backend, np.ascontiguousarray(table).ravel())
+        # Entry `position` of the padded table is row `row` and column `column`; columns beyond the
+        # width are 0.
         position = dr.arange(backend.UInt32, rows * padded_width)
         row, column = position // padded_width, position % padded_width
         padded = dr.gather(backend.Float, unpadded, row * width + column, column < width)
@@ -126,6 +128,7 @@ class RecordTable:
         A packet of lanes, which a processor computes together, skips the loop if all of its lanes
         are inactive.
         """
+        # Inactive lanes make no iteration.
         iterations = (
             self.iteration_count if active is True else dr.select(active, self.iteration_count, 0)
         )

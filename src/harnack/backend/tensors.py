@@ -159,9 +159,12 @@ def wrap_for_torch(function: Callable[..., Any]) -> Callable[..., Any]:
             (tuple, list, ...) the caller needs, is appended to the list `container`."""
             inputs, outputs = run_function(arguments, tensors)
             container.append(outputs)
+            # PyTorch keeps the tensors for a second backward pass, and Dr.Jit's graph serves the
+            # first.
             ctx.save_for_backward(*tensors)
             ctx.arguments, ctx.graph = arguments, (inputs, _results(outputs))
             results = tuple(dr.detach(_as_tensor(value)).torch() for value in ctx.graph[1])
+            # PyTorch asks for no gradients of integers.
             integral = (result for result in results if not result.is_floating_point())
             ctx.mark_non_differentiable(*integral)
             return results
@@ -191,6 +194,7 @@ def wrap_for_torch(function: Callable[..., Any]) -> Callable[..., Any]:
     def wrapped(*args: Any) -> Any:
         """Call the function with PyTorch tensors."""
         tensors = [value for value in args if isinstance(value, torch.Tensor)]
+        # Tensors are passed one by one, as PyTorch differentiates by direct arguments only.
         arguments = [None if isinstance(value, torch.Tensor) else value for value in args]
         container: list[Any] = []
         return _in_container(container, iter(Wrapped.apply(arguments, container, *tensors)))
@@ -300,6 +304,8 @@ def wrap_for_jax(
         respect to the result."""
         leaves: list[Any] = jax.tree.leaves(args)
         if _is_traced(jax, (args, cotangents)):
+            # Inside jax.jit only shapes are known: the gradients are computed by a callback when
+            # the compiled program runs.
             shapes = [
                 jax.ShapeDtypeStruct(leaf.shape, leaf.dtype)
                 for leaf in leaves

@@ -230,11 +230,13 @@ def _contained_values(value: Any) -> list[Any]:
     if inspect.isfunction(value):
         if str(value.__module__).partition(".")[0] in _KNOWN_PACKAGES and not value.__closure__:
             return []
+        # The values that a function uses from outside: its closure, globals and defaults.
         closure, defaults = inspect.getclosurevars(value), value.__kwdefaults__ or {}
         groups = closure.globals.values(), defaults.values(), value.__defaults__ or ()
         return [*closure.nonlocals.values(), *(entry for group in groups for entry in group)]
     if inspect.ismethod(value):
         return [value.__func__, value.__self__]
+    # Attributes of other objects are not searched.
     is_known = dataclasses.is_dataclass(value) or callable(value) or hasattr(value, "parameters")
     return [*getattr(value, "__dict__", {}).values()] if is_known else []
 

@@ -185,6 +185,7 @@ class LiveScene:
             raise ValueError('backdrop: what is drawn live stands on a ground: "light" or "dark"')
         content = SlidingContent.of(surfaces, options)
         start_values = content.starts
+        # Points of the surfaces at the start: the scene is placed and framed by them.
         with slider_values_in_errors(start_values):
             objects = _objects_at(content, start_values)
             backend = choose_backend("single")
@@ -311,6 +312,7 @@ class LiveScene:
                 f"the surfaces and their isolines have {colors:,} colors, and what moves is drawn "
                 f"with {_MOST_PAINTS:,} at most: draw fewer surfaces at once"
             )
+        # The curves at which surfaces end, each field's once.
         curves: list[Any] = []
         for k, body in enumerate(objects):
             # Surfaces of the same field have the same curves.
@@ -407,6 +409,7 @@ class LiveScene:
         content, settings = self._at(controls)
         surfaces: list[Any] = [*content] if isinstance(content, list | tuple) else [content]
         curve = _curve_of(_studio_objects(content, settings)) if controls.curves else None
+        # An edited curve is written in place of the field's own.
         if curve is not None:
             surfaces = _with_loops(content, curve, controls.curves)
         if controls.cut_volume is not None:
@@ -581,6 +584,7 @@ def _kernel_data(
         }  # fmt: skip
 
     kernel = record_kernel(compute, lanes, placed)
+    # The test rays and Dr.Jit's results for them, as words in the order of the shader.
     inputs = dict(labeled_leaves("lane", lanes))
     results = {name: kernel.results.get(f"result {name}") for name in _RESULTS}
     if any(results[name] is None for name in _RESULTS[:-1]):
@@ -739,6 +743,7 @@ def state_delta(first: JsonDict, state: JsonDict, *, checks: bool = True) -> Jso
             for name, entry in new.items()
             if name not in ("data", "check") and entry != old[name]
         }
+        # Only the words that differ, by their places.
         at = np.flatnonzero(old["data"] != new["data"]).astype(np.uint32)
         changes |= {"at": at, "to": new["data"][at]}
         surfaces.append(changes | ({"check": new["check"]} if checks else {}))

@@ -108,6 +108,7 @@ def page(
     check_title(title)
     if not target.lower().endswith((".html", ".htm")):
         raise ValueError(f"{target}: a page is written as .html")
+    # The states for all slider values are computed part by part, here or on a cluster.
     job = PageJob(surfaces, settings, register().variant())
     with progress_bar("page", progress) as advance:
         live = job.live

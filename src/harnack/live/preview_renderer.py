@@ -297,6 +297,7 @@ def _aov_preview(
         picture[:] = viridis(evaluations_share(to_numpy(hits["evaluations"])))
     elif show == "status":
         picture[met] = HIT_COLOR
+    # Rays out of steps are magenta in all pictures.
     picture[lost] = linear_to_srgb(np.array(OUT_OF_STEPS_COLOR))
     opaque = np.column_stack([picture, np.ones(len(picture))])
     return Preview(to_uint8(opaque).reshape(size[1], size[0], 4), depths)

@@ -262,6 +262,7 @@ def to_scene_text(surfaces: Any, settings: Mapping[str, Any], sources: FieldSour
     }
     starts = {name: slider.start for name, slider in sliders.items()}
     values = {name: value for name, value in settings.items() if value is not None}
+    # Errors appear on writing and not when the file is read.
     _check_values(SceneFile(tuple(surface_list), {**values, **starts}))
     if settings_json:
         scene["settings"] = settings_json
@@ -352,6 +353,7 @@ def _field_to_json(field: Field, sources: FieldSources) -> Plain:
             "formula": field.function.text,
             "parameters": dict(field.function.parameters),
         }
+        # Only arguments that differ from their defaults are written.
         keywords = {
             "domain": field.domain,
             "level": field.default_level,
@@ -371,6 +373,7 @@ def _field_to_json(field: Field, sources: FieldSources) -> Plain:
             f"a {type(field).__name__} that was made in Python cannot be written into a scene "
             "file, which holds curves, formulas, solids, surfaces of files and of the gallery"
         )
+    # The field is read back to find out whether its arguments say all of it.
     data = _object_to_json(field)
     _check_round_trip(field, _field_of(data, "field", None))
     return data
@@ -468,6 +471,7 @@ def _setting_to_json(name: str, value: Any, sources: FieldSources) -> Any:
         return value.distance
     if name == "enclosures" and not isinstance(value, str):
         raise SceneFileError("enclosures: only those chosen by name can be written")
+    # Attributes that equal their defaults are left out.
     if isinstance(value, Camera):
         values = {option.name: getattr(value, option.name) for option in dataclasses.fields(value)}
         defaults = {option.name: option.default for option in dataclasses.fields(value)}
@@ -532,6 +536,7 @@ def _scene_of(data: Any, find: Callable[[str], Path] | None) -> SceneFile:
     for name, entry in entries.items():
         _check_name(name, SLIDER_OPTIONS, "slider")
         sliders[name] = _construct(Slider, entry, f"sliders: {name}")
+        # The option of a slider has the slider's start value in the settings.
         settings[name] = sliders[name].start
     scene = SceneFile(surfaces, settings, sliders, tuple(sources))
     _check_values(scene)
@@ -625,6 +630,8 @@ def _surface_of(
         for name in data:
             _check_name(name, _SURFACE_KEYS, "keyword of a surface")
         field_entry = data.pop("field")
+        # Fields of files and of the gallery keep their entry, by which the scene can be written
+        # again.
         field = _source_of(field_entry, where, find)
         if field is not None:
             sources.append((field, field_entry))
@@ -735,6 +742,7 @@ def _from_json_value(value: Any, where: str) -> Any:
     data = cast("Plain", value)
     if "curves" in data or "formula" in data:
         return _field_of(data, where, None)
+    # Any other object is a class name with arguments.
     kinds = _constructible_types()
     if len(data) != 1:
         raise SceneFileError(f"{where}: write one name and its arguments, not {data!r:.60}")

@@ -138,6 +138,7 @@ def view(
     live = LiveScene.of(surfaces, settings, edits=True, sources=sources)
     live = live.framed(extreme_slider_values(live.content.sliders))
     title = title or live.content.name
+    # A notebook shows a widget, unless the caller asks for the server by its options.
     if open_browser and port == 0 and host == _LOCAL[0] and block is None and in_notebook():
         try:
             from harnack.live.widget import Widget
@@ -149,6 +150,7 @@ def view(
         else:
             return Widget(live, title, height)
     scene = live.scene(title)
+    # A page that is open to the network is protected by a secret in its address.
     token = "" if host in _LOCAL else secrets.token_urlsafe(16)
     server = _PageServer(live, document(scene, still_png(live), link="server"), token)
     live_view = server.start(host, port)
@@ -157,6 +159,7 @@ def view(
         print("open to the network: whoever has this address can use it", file=sys.stderr)
     if open_browser:
         webbrowser.open(live_view.address)
+    # A script would end at once, and the page with it.
     if block is None:
         block = not (hasattr(sys, "ps1") or "ipykernel" in sys.modules)
     if block:
@@ -297,6 +300,7 @@ class _PageServer:
             await socket.prepare(request)
         except ConnectionError:  # the page was closed before it was answered
             return web.Response()
+        # Each open page has its own session, and tasks for its questions.
         client, waiting = MessageHandler(self.live), set[asyncio.Task[None]]()
         self.clients.add(client)
         try:
@@ -310,6 +314,7 @@ class _PageServer:
                     continue
                 if question is None:
                     continue
+                # Too many questions at once are refused, so that a page cannot fill the memory.
                 if len(waiting) >= _WAITING:
                     problem = f"more than {_WAITING} questions at once"
                     await _send(socket, {"id": question["id"], "error": problem})
@@ -318,6 +323,7 @@ class _PageServer:
                 waiting.add(task)
                 task.add_done_callback(waiting.discard)
         finally:
+            # The page was closed: its computations stop.
             client.is_gone = True
             for task in waiting:
                 task.cancel()

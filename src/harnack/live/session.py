@@ -152,6 +152,7 @@ class MessageHandler:
                 send({"id": number, "done": done})
 
         try:
+            # A question that was cancelled while it waited is not begun.
             report(0.0)
             answer = self.session.answer(question, report)
         except Exception as wrong:
@@ -161,6 +162,7 @@ class MessageHandler:
             self._cancelled.discard(number)
         if isinstance(answer, dict):
             return {"id": number, "answer": answer}
+        # The message of a picture: id, height and width, the ends of the depths, and the pixels.
         head = np.array([number, *answer.pixels.shape[:2]], dtype="<u4").tobytes()
         return head + np.array(answer.depths, dtype="<f4").tobytes() + answer.pixels.tobytes()
 
@@ -272,10 +274,16 @@ class Session:
         """
         origin = _points([question.get("origin")], "origin")
         direction = _points([question.get("direction")], "direction")
-        surfaces = [s.surface for s in self.live.surfaces_at(controls)]
-        results = [trace(s.surface, origin, direction, options=s.options) for s in surfaces]
+        surfaces = [
+            surface_of_scene.surface for surface_of_scene in self.live.surfaces_at(controls)
+        ]
+        results = [
+            trace(surface_of_scene.surface, origin, direction, options=surface_of_scene.options)
+            for surface_of_scene in surfaces
+        ]
         nearest = min(range(len(results)), key=lambda k: float(results[k].t[0]))
         hits, surface = results[nearest], surfaces[nearest]
+        # A ray with a limit of `count` evaluations ends where its step of that number ends.
         steps = [0.0]
         for count in range(1, min(int(hits.evaluations[0]), _MOST_STEPS)):
             options = surface.options.replace(max_steps=count)
@@ -295,6 +303,7 @@ class Session:
             "position": point[0].tolist(),
             "normal": hits.normal[0].tolist(),
         }
+        # A hit on a triangle, across which f jumps: there are no derivatives.
         if hits.primitive_index[0] >= 0:  # f jumps there, and has no derivatives
             return answer | {"triangle": int(hits.primitive_index[0])}
         value, period = float(surface.field.value(point)[0]), surface.field.period
@@ -305,10 +314,13 @@ class Session:
             value += float(shifts[np.argmin(np.abs(value + shifts - levels))])
         answer["value"] = value
         try:
-            kappa = curvature(surface.field, point)
+            curvatures = curvature(surface.field, point)
         except NotImplementedError:
             return answer
-        return answer | {"mean": float(kappa.mean[0]), "gaussian": float(kappa.gaussian[0])}
+        return answer | {
+            "mean": float(curvatures.mean[0]),
+            "gaussian": float(curvatures.gaussian[0]),
+        }
 
     def _preview_response(
         self, question: Mapping[str, Any], controls: ControlState, report: Progress
@@ -355,7 +367,11 @@ class Session:
         state.rays += rays
         drawn = [replace(body, surface=body.surface.for_rays(state.rays)) for body in state.drawn]
         pairs = zip(drawn, state.drawn, strict=True)
-        if not state.prepared or any(a.surface.field is not b.surface.field for a, b in pairs):
+        # `for_rays` returns another field once cells take less time than they save.
+        if not state.prepared or any(
+            prepared_body.surface.field is not old_body.surface.field
+            for prepared_body, old_body in pairs
+        ):
             state.drawn = drawn
             state.prepared = [
                 PreviewSurface(self.live.place(body), surface_colors(body)) for body in drawn
@@ -490,6 +506,7 @@ def _settings(data: Any) -> dict[str, Any]:
             if not isinstance(value, str):
                 raise RequestError(f"material must be a name or a color, not {value!r:.60}")
             try:
+                # Light must not pass through what is drawn live.
                 check_opaque(parse_material(value))
             except ValueError as wrong:
                 raise RequestError(str(wrong)) from None

@@ -109,6 +109,7 @@ def animate(
     if not 1 <= count <= _MAX_FRAMES:
         raise ValueError(f"frames must be from 1 to {_MAX_FRAMES:,}, not {count}")
     fps, orbit = as_finite(arguments.pop("fps"), "fps"), arguments.pop("orbit")
+    # By default the camera moves only if nothing else does.
     if orbit is None:
         is_moving = any(map(_is_function_of_s, (surfaces, *arguments.values())))
         orbit = 0.0 if is_moving else 360.0
@@ -127,9 +128,11 @@ def animate(
     )
     size = check_image_size(arguments.pop("size") or DEFAULT_SIZE)
     with write_atomically(target) as partial, _encoder(partial, size, fps) as add:
+        # A full turn leaves out s = 1, which would show the first picture twice.
         repeats = orbit != 0 and orbit % 360 == 0
         steps = np.arange(count) / max(count if repeats else count - 1, 1)
         changing = {"surfaces": surfaces, "options": options, **arguments}
+        # The values of all arguments at each time.
         moments = [
             {name: _value_at(value, s) for name, value in changing.items()} for s in steps.tolist()
         ]
@@ -137,6 +140,7 @@ def animate(
         frames = [
             {**moment, "camera": camera} for moment, camera in zip(moments, cameras, strict=True)
         ]
+        # Pictures are drawn by `render`, in this process or on a cluster, and added in order.
         job, parts = _job(frames, {"size": size, "progress": False})
         with (
             progress_bar("film", progress) as advance,

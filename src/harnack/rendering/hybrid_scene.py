@@ -246,6 +246,7 @@ class HybridScene:
             offset = o + t * along - ray.o - t * ray.d
             return offset - d * (dr.dot(offset, normal) / normal_dot_d)
 
+        # From the hit to where the rays of the neighbors to the right and below meet its plane.
         across, down = to_neighbor(ray.o_x, ray.d_x), to_neighbor(ray.o_y, ray.d_y)
         for proxy in self.proxies:
             if proxy.placed.isolines:

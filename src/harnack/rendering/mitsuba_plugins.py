@@ -123,12 +123,14 @@ def equivalent_path_tracer(mi: Any, scene: Any) -> PathTracer | None:
     count = sum(is_proxy(shape) for shape in scene.shapes())
     has_medium = any(shape.is_medium_transition() for shape in scene.shapes())
     has_medium |= any(sensor.get_medium() is not None for sensor in scene.sensors())
+    # The integrator is this library's own.
     if isinstance(tracer, PathTracer):
         if has_medium:
             warnings.warn(f"{PLUGIN} follows no light in media: they are left out", stacklevel=5)
         return tracer
     class_name = _kind(integrator)
     follows_paths = class_name == _PATHS or (class_name.startswith(_IN_MEDIA) and not has_medium)
+    # One of Mitsuba's path tracers: its settings are taken over.
     if follows_paths:
         return _with_settings(mi, integrator)
     if not count or _sees_ours(integrator):
@@ -326,6 +328,7 @@ def mitsuba_shape(
     props["bsdf"] = as_bsdf(mi, bsdf)
     if to_world is not None:
         props["to_world"] = mi.ScalarTransform4f(as_matrix(to_world))
+    # Faces on the section may have another material.
     of_cut = _section_bsdf(mi, surface, props["bsdf"], section_bsdf)
     return from_properties(mi, props, surface, tint, of_cut, parse_isolines(isolines))
 

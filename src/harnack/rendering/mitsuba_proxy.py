@@ -68,6 +68,8 @@ def _lined_class(variant: str) -> Any:
             mi.BSDF.__init__(self, mi.Properties())
             self.base, self.paints = base, tuple(paints)
             bsdfs = (base, *self.paints)
+            # The flags of a BSDF tell integrators what to expect: here everything that one of the
+            # BSDFs has.
             self.m_components = [
                 bsdf.flags(k) for bsdf in bsdfs for k in range(bsdf.component_count())
             ]
@@ -170,11 +172,13 @@ def from_properties(
         colors = [isoline.srgb for isoline in isolines]
         props["bsdf"] = isoline_bsdf(mi, props["bsdf"], colors)
         section_bsdf = None if section_bsdf is None else isoline_bsdf(mi, section_bsdf, colors)
+    # Textures with values at vertices do not work: the proxy's vertices are not on the surface.
     if any("MeshAttribute" in _bsdf_text(bsdf) for bsdf in (props.get("bsdf", None), section_bsdf)):
         raise ValueError(
             "a mesh_attribute belongs to vertices or faces, which a level set has not: take a "
             "texture of uv, which are x and y in the world, or draw the mesh of harnack.mesh(field)"
         )
+    # Light sources and media would need Mitsuba's own rays to hit the shape.
     shape = _carrier_class(mi.variant())(props, surface, placement, tint, section_bsdf, isolines)
     if shape.emitter() is not None or shape.is_medium_transition():
         raise ValueError("surfaces that are traced can neither emit light nor bound a medium")
@@ -222,6 +226,7 @@ def _carrier_class(variant: str) -> Any:
             self.placed = PlacedSurface.of(surface, placement, backend, isolines, size)
             self.line_colors = tuple(isoline.srgb for isoline in isolines)
             params = mi.traverse(self)
+            # Two triangles, each a single point at a corner of the box in the world.
             corners = np.concatenate(placement.world_bounds(ends))
             params["vertex_positions"] = upload_floats(backend, corners)
             params["faces"] = mi.UInt32([0, 0, 0, 1, 1, 1])

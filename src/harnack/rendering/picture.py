@@ -160,11 +160,13 @@ def render(
     picture_options = RenderOptions.of(arguments)
     is_divided = client is not None or checkpoint is not None
     chunks = check_chunks(arguments["chunks"], is_divided=is_divided)
+    # A missing package is reported before anything is drawn.
     if picture_options.denoise:
         load_denoiser()
     if target is not None and picture_options.color_bar and target.suffix.lower() == ".exr":
         raise ValueError(f"{target}: EXR files hold the numbers; a color bar is drawn in .png")
     shorthand = shorthand_among(arguments)
+    # A Mitsuba scene has its own camera, materials and lights.
     if not _is_for_studio(surfaces):
         of_studio = {name: arguments[name] for name in STUDIO_OPTIONS}
         refuse_studio_options({**of_studio, **shorthand, "options": options})

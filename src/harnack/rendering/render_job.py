@@ -118,6 +118,7 @@ class RenderJob:
                 mi, scene, sensor, spp=options.spp or EDGE_SPP, cut_out=stage is not None,
                 on_floor=stage is not None and stage.has_ground, cones=options.antialias == "cones",
             )  # fmt: skip
+        # Path tracing, with the settings of the scene's integrator.
         tracer = equivalent_path_tracer(mi, scene)
         if tracer is None:
             return None
@@ -223,6 +224,7 @@ def _loaded(mi: Any, source: Any, size: tuple[int, int] | None) -> Any:
     if not scene.sensors():
         raise ValueError("the scene has no sensor to look through")
     if size is not None:
+        # Mitsuba changes the size of a film that is loaded already.
         params = mi.traverse(scene.sensors()[0])
         params["film.size"] = size
         params.update()

@@ -251,6 +251,7 @@ class ColorScale:
         two such multiples.
         """
         period = 0.0 if self.period is None else self.period
+        # Scales of angles have ticks at fractions of pi.
         pi_multiple = round(period / math.pi)
         if 0 < pi_multiple <= _MAX_PI_MULTIPLE and math.isclose(
             period, pi_multiple * math.pi, rel_tol=1e-6

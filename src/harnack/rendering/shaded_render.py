@@ -166,7 +166,9 @@ def ambient_visibility(
         """Look at the k-th pixel along a direction (2,) in the picture. Returns the sine of the
         elevation of its point over the tangent plane, multiplied by a factor that falls with its
         distance; 0 if nothing is seen there."""
+        # Points are denser near the pixel: their distances grow quadratically.
         distance = 1.0 + reach_in_pixels * ((k + 0.5) / _TAPS) ** 2
+        # The pixel nearest to this point of the picture.
         u, v = x + distance * direction.x, y + distance * direction.y
         is_in_picture = (u >= 0) & (v >= 0) & (u <= columns - 1) & (v <= rows - 1)
         pixel = mi.UInt32(dr.round(v)) * columns + mi.UInt32(dr.round(u))
@@ -516,6 +518,7 @@ def render_shaded(
         dr.eval(gbuffer)
         dr.sync_thread()
         advance(_FIRST_PASS_FRACTION * (stop - start) / count)
+    # All first hits are needed before the first pixel can be lit.
     sky = ambient_visibility(mi, gbuffer.position, gbuffer.normal, gbuffer.width, size)
     dr.eval(sky)
     image = to_numpy(shading.shade(gbuffer, sky)).reshape(*size[::-1], 4)

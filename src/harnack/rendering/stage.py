@@ -277,6 +277,7 @@ def build_studio(
         points = corners_of(np.array(camera.box.bounds()))
     placement = stage_placement(points, rotation_to_z_up(up))
     pose = camera.pose(placement.apply(points), size, placement.apply)
+    # The path tracer of this library, which sees level sets, draws the scene.
     scene: dict[str, Any] = {
         "type": "scene",
         "integrator": {
@@ -363,6 +364,8 @@ def _sensor(mi: Any, pose: CameraPose, size: tuple[int, int]) -> dict[str, Any]:
         "type": "perspective",
         "fov": pose.fov,
         "fov_axis": "larger",
+        # Rays begin at a distance that is a whole multiple of a step, since it is a literal of
+        # kernels.
         "near_clip": max(1e-3, _NEAR_CLIP_STEP * (distance // _NEAR_CLIP_STEP - 1)),
         "far_clip": _FAR_CLIP,
         "to_world": to_world,

@@ -89,11 +89,13 @@ def studio_objects(
             raise TypeError(
                 f"what is drawn are fields and surfaces, not what is {suggest_field(element)}"
             )
+    # One material for all surfaces, or a list with one for each.
     has_list = isinstance(materials, list | tuple) and not _is_color(materials)
     material_values: list[Any] = [*materials] if has_list else [materials] * len(listed)
     drawn: list[tuple[Any, Mapping[str, Any]]] = [(element, shorthand) for element in listed]
     level_option: Any = shorthand.get("level")
     levels: list[Any] = [*level_option] if isinstance(level_option, Sequence | np.ndarray) else []
+    # One field with as many materials as levels: each level becomes an object.
     if len(listed) == 1 and has_list and len(material_values) == len(levels) > 1:
         drawn = [(listed[0], {**shorthand, "level": single_level}) for single_level in levels]
     if len(material_values) != len(drawn):

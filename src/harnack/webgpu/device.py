@@ -125,6 +125,7 @@ class CompiledShader:
             start_time = time.perf_counter()
             results[:, start:end] = self._dispatch(packed, lane_words[:, start:end])
             elapsed = time.perf_counter() - start_time
+            # Long computations may block the display, and short ones waste time on their start.
             if elapsed < _MIN_DISPATCH_SECONDS and batch_size < _MAX_BATCH:
                 batch_size *= 2
             elif elapsed > _MAX_DISPATCH_SECONDS and batch_size > WORKGROUP:

@@ -408,89 +408,96 @@ class _LLVMParser:
     # The actions of the grammar.
 
     def _test(self, condition: str) -> None:
-        """Note the condition under which the current loop goes on."""
+        """Note the condition under which the current loop goes on. The instruction is the branch to
+        the loop's body, "br i1 %condition, ..."."""
         self._loops[-1].condition = self._value(condition, "bool")
 
     def _phi(self, result: str, element: str, before: str, after: str) -> None:
-        """Add a variable to the current loop, with its value before the first iteration and after
-        each iteration. element: its LLVM type."""
+        """Add a variable to the current loop, such as "%result = phi <8 x float> [ %before, ... ],
+        [ %after, ... ]". The two operands are its values before the first iteration and after each
+        iteration. element: its LLVM type, such as "float"."""
         kind = self._kind(element)
+        # The value after an iteration stays text here: its definition comes later, in the body.
         variable = LoopVariable(result, kind, self._value(before, kind), after)
         self._loops[-1].variables.append(variable)
 
     def _alias(self, result: str, element: str, value: str) -> None:
-        """Note that the result is another name of a value. element: the value's LLVM type."""
+        """Note that the result of an instruction is another name of a value, as in "%result =
+        shufflevector <8 x float> %value, ...", which copies a value to all lanes. element: the
+        value's LLVM type, such as "float"."""
         if element != "ptr":
             self._aliases[result] = self._value(value, self._kind(element))
 
     def _lane(self, result: str, name: str) -> None:
-        """Note that the result is the index of the lane, if `name` is "index", or the number of
-        lanes."""
+        """Note that the result of "%result = trunc i64 %name to i32" is the index of the lane, if
+        `name` is "index", or the number of lanes."""
         self._aliases[result] = "lane" if name == "index" else "count"
 
     def _parameter(self, result: str, number: str) -> None:
-        """Note that the result is the address of the array of kernel parameter `number`. The
-        current label is the label of this array."""
+        """Note that the result of an instruction is the address of the array of kernel parameter
+        `number`. The current label is the label of this array."""
         self._addresses[result] = _Address(int(number))
         self._label_parameter(int(number))
 
     def _pointer(self, result: str, pointer: str) -> None:
-        """Note that the result is another name of the address `pointer`."""
+        """Note that the result of an instruction is another name of the address `pointer`."""
         self._addresses[result] = self._addresses[pointer]
 
     def _load_number(self, result: str, element: str, pointer: str) -> None:
-        """Append a statement that loads the only entry of an array. element: its LLVM type.
-        pointer: the name of the array's address."""
+        """Append a statement for "%result = load float, ptr %pointer": it loads the only entry of
+        an array. element: its LLVM type, here "float"."""
         source = self._addresses[pointer]
         self._current_block.append(Load(result, self._kind(element), "number", source.parameter))
 
     def _load_lane(self, result: str, element: str, pointer: str) -> None:
-        """Append a statement that loads the lane's entry of an array. element: its LLVM type.
-        pointer: the name of the array's address."""
+        """Append a statement for "%result = load <8 x float>, ptr %pointer": it loads the lane's
+        entry of an array. element: its LLVM type, here "float"."""
         source = self._addresses[pointer]
         self._current_block.append(Load(result, self._kind(element), "lane", source.parameter))
 
     def _store(self, element: str, value: str, pointer: str) -> None:
-        """Append a statement that stores a value as the lane's entry of an array. element: its LLVM
-        type. pointer: the name of the array's address."""
+        """Append a statement for "store <8 x float> %value, ptr %pointer": it stores a value as the
+        lane's entry of an array. element: its LLVM type, here "float"."""
         kind = self._kind(element)
         self._current_block.append(
             Store(self._addresses[pointer].parameter, kind, self._value(value, kind))
         )
 
     def _record(self, result: str, stride: str, pointer: str, index: str) -> None:
-        """Note that the result is the address of record `index` in a table of records of `stride`
-        numbers. pointer: the name of the table's address."""
+        """Note that the result of "%result = getelementptr [stride x float], ptr %pointer, <8 x
+        i32> %index" is the address of record `index` in a table of records of `stride` numbers."""
         source = self._addresses[pointer]
         self._addresses[result] = _Address(source.parameter, self._value(index, "u32"), int(stride))
 
     def _set_address_mask(self, result: str, mask: str, pointer: str) -> None:
-        """Note that the result is the address `pointer`, to be read only if `mask` is True."""
+        """Note that the result of "%result = select <8 x i1> %mask, <8 x ptr> %pointer, ..." is the
+        address `pointer`, to be read only if `mask` is True."""
         source = self._addresses[pointer]
         self._addresses[result] = _Address(
             source.parameter, source.index, source.stride, self._value(mask, "bool")
         )
 
     def _entry(self, result: str, pointer: str, index: str) -> None:
-        """Note that the result is the address of entry `index` of a table. pointer: the name of the
-        table's address."""
+        """Note that the result of "%result = getelementptr float, ptr %pointer, <8 x i32> %index"
+        is the address of entry `index` of a table."""
         self._record(result, "1", pointer, index)
 
     def _gather_record(self, result: str, pointer: str) -> None:
-        """Note that the result holds all numbers of the record at the address `pointer`. `_extract`
-        reads them one by one."""
+        """Note that the result of a call of Dr.Jit's function gather_...(%pointer) holds all
+        numbers of the record at the address `pointer`. `_extract` reads them one by one."""
         self._records[result] = self._addresses[pointer]
 
     def _extract(self, result: str, element: str, record: str, entry: str) -> None:
-        """Append a statement that loads number `entry` of a record. record: the name of the result
-        that holds the record."""
+        """Append a statement for "%result = extractvalue [4 x <8 x float>] %record, entry": it
+        loads number `entry` of a record. element: its LLVM type, here "float"."""
         source = self._records[record]
         self._read_table(result, element, source, int(entry), source.mask)
 
     def _gather(self, result: str, element: str, pointer: str, mask: str) -> None:
-        """Append a statement that loads the entry at the address `pointer` of a table if the mask
-        is True, otherwise 0. The current label, that of the result, becomes the label of the
-        table."""
+        """Append a statement for "%result = call <8 x float> @llvm.masked.gather(%pointer, ...,
+        %mask, ...)": it loads the entry of a table at an address if the mask is True, otherwise 0.
+        The current label belongs to the result, and becomes the label of the table. element: the
+        LLVM type of the entry, here "float"."""
         source = self._addresses[pointer]
         self._read_table(result, element, source, 0, self._value(mask, "bool"))
         self._label_parameter(source.parameter)
@@ -500,7 +507,11 @@ class _LLVMParser:
     ) -> None:
         """Append a statement that loads number `entry` of the record at the address `source` if
         `mask` is True or None, otherwise 0. The table is noted for the result, as a later
-        instruction may bring its label."""
+        instruction may bring its label.
+
+        result: the name of the result.
+        element: the LLVM type of the number, such as "float".
+        """
         kind = self._kind(element)
         load = Load(
             result, kind, "table", source.parameter, source.index, source.stride, entry, mask
@@ -509,34 +520,42 @@ class _LLVMParser:
         self._tables[result] = source.parameter
 
     def _arithmetic(self, result: str, name: str, element: str, a: str, b: str) -> None:
-        """Append the operation `name` on two operands of the same type as the result."""
+        """Append the operation for an instruction such as "%result = fadd <8 x float> %a, %b",
+        whose name is "fadd". The operands have the type of the result. element: this LLVM type,
+        here "float"."""
         kind = self._kind(element)
         self._emit(result, kind, name, self._value(a, kind), self._value(b, kind))
 
     def _unary(self, result: str, name: str, element: str, a: str) -> None:
-        """Append the operation `name` on a single operand of the same type as the result."""
+        """Append the operation for an instruction such as "%result = fneg <8 x float> %a", whose
+        name is "fneg". element: the LLVM type of operand and result, here "float"."""
         kind = self._kind(element)
         self._emit(result, kind, name, self._value(a, kind))
 
     def _compare(self, result: str, name: str, element: str, a: str, b: str) -> None:
-        """Append a comparison of two operands. name: with its predicate, such as "fcmp olt".
-        element: the LLVM type of the operands."""
+        """Append the comparison for an instruction such as "%result = fcmp olt <8 x float> %a, %b",
+        whose name is "fcmp olt". element: the LLVM type of the operands, here "float"."""
         kind = self._kind(element)
         self._emit(result, "bool", name, self._value(a, kind), self._value(b, kind))
 
     def _select(self, result: str, mask: str, element: str, a: str, b: str) -> None:
-        """Append an operation whose result is a if the mask is True, otherwise b."""
+        """Append the operation for "%result = select <8 x i1> %mask, <8 x float> %a, <8 x float>
+        %b": the result is a if the mask is True, otherwise b. element: the LLVM type of a and b,
+        here "float"."""
         kind = self._kind(element)
         values = self._value(mask, "bool"), self._value(a, kind), self._value(b, kind)
         self._emit(result, kind, "select", *values)
 
     def _convert(self, result: str, name: str, source_type: str, a: str, target_type: str) -> None:
-        """Append a conversion of `a` between LLVM types. A bitcast between equal types only gives a
-        value another name; if the value was read from a table, the current label becomes the
-        table's label."""
+        """Append the conversion for an instruction such as "%result = sitofp <8 x i32> %a to <8 x
+        float>", whose name is "sitofp" and whose source and target types are "i32" and "float".
+
+        A bitcast between equal types only gives a value another name. If a value that was read from
+        a table is bitcast, the current label becomes the label of the table.
+        """
         kind, source_kind = self._kind(target_type), self._kind(source_type)
         value = self._value(a, source_kind)
-        if name == "bitcast" and isinstance(value, str):  # of a value that was read from a table
+        if name == "bitcast" and isinstance(value, str):
             if value in self._tables:
                 self._label_parameter(self._tables[value])
             if kind == source_kind:
@@ -546,11 +565,18 @@ class _LLVMParser:
 
     def _class(self, result: str, name: str, element: str, value: str, mask: str) -> None:
         """Append a test whether a float belongs to certain classes (NaN, infinity, zero and so on).
-        mask: the classes as bits, as in AVX-512's `fpclass`."""
+        It is a call of AVX-512's function `fpclass`.
+
+        result, name, element, value: the name of the result, "fpclass", the LLVM type "float", and
+            the operand.
+        mask: the classes as bits.
+        """
         self._emit(result, "bool", f"{name} {mask}", self._value(value, self._kind(element)))
 
     def _call(self, result: str, element: str, function: str, arguments: str) -> None:
-        """Append the operation that stands for a call of an LLVM function. arguments: their text.
+        """Append the operation that stands for a call of an LLVM function, such as "%result = call
+        <8 x float> @llvm.sqrt.v8f32(<8 x float> %a)". The function here is "sqrt.v8f32". arguments:
+        their text. element: the LLVM type of the result, here "float".
 
         Raises:
             UntranslatableError: the function is unknown.
@@ -570,7 +596,8 @@ class _LLVMParser:
 
     @staticmethod
     def _kind(element: str) -> Kind:
-        """Return the type that numbers of an LLVM type have in our programs.
+        """Return the type that numbers of an LLVM type have in the parsed program: "f32" for
+        "float", "u32" for "i32" and so on. element: the LLVM type.
 
         Raises:
             UntranslatableError: other GPUs do not have the type, such as double precision.

@@ -71,6 +71,7 @@ def record_kernel(
         with dr.suspend_grad(), labels.label_gathers():
             outputs = compute(**lanes)
         results = dict(labeled_leaves("result", dict(outputs)))
+        # Constants need no kernel.
         computed = {k: value for k, value in results.items() if not _is_constant(value)}
         for label, array in computed.items():
             dr.set_label(array, label)
@@ -221,6 +222,7 @@ def _find_arrays(data: Any) -> Iterator[Any]:
     each once, in an order that depends only on the structure of the object."""
     visited: set[int] = set()
     pending: list[Any] = [data]
+    # The search is breadth-first. Objects that were seen before are skipped, so cycles end.
     while pending:
         node = pending.pop(0)
         if id(node) in visited or isinstance(

@@ -229,13 +229,14 @@ class _WGSLWriter:
         """Return the WGSL expression of an operation; `a` holds the expressions of its operands.
         Integers are unsigned in the shader; signed operations reinterpret their bits.
 
-        The name may contain a variant: the predicate of a comparison, the classes of a test, or the
-        source type of a conversion.
+        The name of an operation may be followed by a variant: the predicate of a comparison ("fcmp
+        olt"), the classes of a test, or the source type of a conversion.
         """
         a = [self._operand_text(value) for value in operation.operands]
         name, _, variant = operation.name.partition(" ")
         if name in _INFIX:
             return f"{a[0]} {_INFIX[name]} {a[1]}"
+        # The second operator of a pair is for truth values.
         if name in _BIT_OPERATORS:
             return f"{a[0]} {_BIT_OPERATORS[name][operation.kind == 'bool']} {a[1]}"
         if name in _FUNCTIONS:
@@ -258,6 +259,7 @@ class _WGSLWriter:
                 return f"bitcast<u32>({name[1:]}({_as_signed(a[0])}, {_as_signed(a[1])}))"
             case "iabs":
                 return f"bitcast<u32>(abs({_as_signed(a[0])}))"
+            # The bits of the first number without its sign, and the sign of the second.
             case "copysign":
                 return (
                     f"bitcast<f32>((bitcast<u32>({a[0]}) & 0x7fffffffu) | "
@@ -273,6 +275,7 @@ class _WGSLWriter:
             case "icmp":
                 if variant in ("eq", "ne"):
                     return f"{a[0]} {_COMPARISONS[variant]} {a[1]}"
+                # Predicates such as "slt" compare signed integers, "ult" unsigned ones.
                 x, y = (_as_signed(v) for v in a) if variant[0] == "s" else a
                 return f"{x} {_COMPARISONS[variant[1:]]} {y}"
             case _:
@@ -359,8 +362,10 @@ def _float_class_test(classes: int, x: str) -> str:
 
 
 def _conversion(op: Operation, name: str, source: str, x: str) -> str:
-    """Return the WGSL expression that converts x by the LLVM conversion `name`, from the type
-    `source` to the type of the operation `op`.
+    """Return the WGSL expression that converts x to the type of the operation `op`.
+
+    name: the LLVM conversion, such as "sitofp" (signed integer to float).
+    source: the type of x: "f32", "u32" or "bool".
 
     Raises:
         UntranslatableError: the conversion is unknown.
@@ -376,6 +381,7 @@ def _conversion(op: Operation, name: str, source: str, x: str) -> str:
             return f"to_signed({x})"
         case "fptoui", _, _:
             return f"u32({x})"
+        # Extended with its sign, True becomes an integer of ones.
         case "sext", "bool", _:
             return f"select(0u, 0xffffffffu, {x})"
         case "zext", "bool", _:
