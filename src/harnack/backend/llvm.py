@@ -35,7 +35,8 @@ PATH_VARIABLE = "DRJIT_LIBLLVM_PATH"
 
 
 class LLVMNotFoundError(RuntimeError):
-    """There is no LLVM that Dr.Jit can use. The message ends with a command that mends this."""
+    """The error if there is no LLVM that Dr.Jit can use. The message ends with a command that mends
+    this."""
 
 
 @dataclass(frozen=True)

@@ -241,8 +241,10 @@ def _gradients(inputs: list[Any], outputs: list[Any], cotangents: list[Any]) -> 
         if dr.grad_enabled(tensor):
             dr.accum_grad(tensor, cotangent_tensor)  # an output may occur twice, or be an input
             dr.enqueue(dr.ADMode.Backward, tensor)
+        # The output has no derivative: a gradient of 0 does no harm.
         elif dr.any(cotangent_tensor.array != 0, axis=None):
             raise NotImplementedError(_NO_DERIVATIVE)
+    # All outputs are propagated back to the inputs at once.
     dr.traverse(dr.ADMode.Backward)
     return [dr.grad(source) for source in inputs if dr.is_float_v(source)]
 
@@ -323,12 +325,13 @@ def wrap_for_jax(
         ]
         return jax.tree.unflatten(jax.tree.structure(args), gradients)
 
+    # Where derivatives are needed, JAX calls `forward` and `backward` in place of `call`.
     differentiable: Any = jax.custom_vjp(call)
     differentiable.defvjp(forward, backward)
 
     @functools.wraps(function)
     def wrapped(*args: Any) -> Any:
-        """Call the function with arrays or numbers."""
+        """Call `function` with JAX arrays or numbers."""
         return differentiable(*jax.tree.map(jax.numpy.asarray, args))
 
     return wrapped
@@ -394,7 +397,7 @@ def _differentiable_tensor(array: Any) -> Any:
 
 
 def _as_tensor(value: Any) -> Any:
-    """Return a result of a function, a Dr.Jit array or tensor, as a Dr.Jit tensor.
+    """Return a Dr.Jit array or tensor, the result of a function, as a Dr.Jit tensor.
 
     Raises:
         TypeError: another value.

@@ -73,7 +73,9 @@ class Preview:
 
 @dataclass(frozen=True)
 class PreviewSurface:
-    """A surface on the stage, and its colors, as `live_scene.surface_colors` returns them."""
+    """A surface on the stage (the scaled world, with a floor), and its colors `paints`: for the
+    surface itself, fillings of holes, cut faces, and isolines, as `live_scene.surface_colors`
+    returns them."""
 
     placed: PlacedSurface
     paints: Sequence[Mapping[str, Any]]

@@ -68,9 +68,10 @@ class Slider:
             raise ValueError(f"start must lie between {self.low} and {self.high}: {self.start}")
 
     def nearest(self, number: float) -> float:
-        """Return the largest value of the slider that is at most `number`, clipped to the slider's
-        ends. A slider without a step takes the clipped number itself. A number that differs from a
-        step by rounding only is returned unchanged."""
+        """Move a number to a value that the slider can have. The number is first clipped to the
+        slider's ends. A slider without a step then takes it as it is. A slider with a step takes
+        the largest of its values that is at most the number; a number that differs from such a
+        value by rounding only is returned unchanged."""
         number = min(max(number, self.low), self.high)
         if self.step is None:
             return number

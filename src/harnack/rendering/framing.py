@@ -75,10 +75,10 @@ def rotation_to_z_up(up: Any) -> FloatArray:
 
 
 class UnboundedSurfaceError(ValueError):
-    """The error for a surface that cannot be drawn, as no box around it is known.
+    """The error for a surface that cannot be drawn, as no bounded box that contains it is known.
 
     reason: the text of the error.
-    bounded_level: a level of the same field whose surface has a box; None if no such level is
+    bounded_level: a level of the same field whose surface has such a box; None if no such level is
         known.
     """
 

@@ -437,6 +437,8 @@ class PathTracer:
         """
         mi, previous = self.mi, paths.previous.interaction(self.mi)
         direction = mi.DirectionSample3f(scene, si, previous)
+        # A mirror cannot be sampled by choosing a point of a light: the density is 0 and the weight
+        # 1.
         emitter_pdf = scene.pdf_emitter_direction(previous, direction, active & ~paths.delta)
         weight = _power_heuristic(paths.pdf, emitter_pdf)
         light = paths.throughput * weight * direction.emitter.eval(si, active)

@@ -286,6 +286,7 @@ def estimate_time(
         pixel = upload_indices(mi, np.minimum(indices, pixels - 1))
         sample = dr.opaque(mi.UInt32, 0, count)
         began = time.perf_counter()
+        # One path in each of these pixels.
         results, _ = trace_samples(mi, scene, sensor, tracer, pixel, sample, 0, features)
         dr.eval(results.light)
         dr.sync_thread()
@@ -408,6 +409,7 @@ class RefractionTracer:
         `RefractedHits`."""
         mi, world = self.world.mi, self.world
         nothing = dr.zeros(mi.SurfaceInteraction3f, dr.width(ray.d))
+        # At first there is no hit, all light would reach the eye, and none is reflected.
         hits = RefractedHits(
             ray, nothing, world.no_hit(nothing), mi.Spectrum(1), mi.Spectrum(0), mi.Float(0),
             mi.UInt32(0), dr.full(mi.Bool, True, dr.width(ray.d)),

@@ -70,7 +70,7 @@ _DIRECT, _CHANNELS = "DirectIntegrator", "AOVIntegrator"
 
 def patch_mitsuba_render(mi: Any) -> None:
     """Replace `mitsuba.render` by a function that warns of level sets of harnack that will not be
-    drawn, and then renders as before. A function that is replaced already stays."""
+    drawn, and then renders as before. If it has been replaced before, nothing changes."""
     original = mi.render
     if _MARK in vars(original):
         return
@@ -79,6 +79,7 @@ def patch_mitsuba_render(mi: Any) -> None:
     def render(scene: Any, *args: Any, **settings: Any) -> Any:
         """Call the original `mitsuba.render`, after a warning of level sets of harnack that it will
         not draw."""
+        # The third argument after the scene is the integrator.
         chosen = settings.get("integrator") or (args[2] if len(args) > 2 else None)
         if isinstance(scene, mi.Scene):
             warn_unsupported_integrator(scene, chosen or scene.integrator())

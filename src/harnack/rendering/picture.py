@@ -74,29 +74,31 @@ def render(
     surfaces: a field, a `Surface` or a list of them, drawn in the studio; or a Mitsuba scene, its
         dictionary, or the path of its XML file.
     path: .png (8-bit sRGB, tone mapped) or .exr (the numbers).
-    options: a `TraceOptions` for all surfaces; `precision` and `backend` must not be set. Beside
-        bare fields the keywords of `Surface` may be given (level, clip, section, side, largest),
-        and those of `TraceOptions` in place of `options`. A `Solid` with a section, or of glass, is
-        drawn with its inside. The default tolerance is 1e-4 of half the diagonal of the box of what
-        is drawn.
-    show: "path" follows light paths; "shaded" lights first hits by a formula, in seconds and
-        without noise; or what one ray a pixel found: "normal", "evaluations" (of the fields),
-        "status" and "depth", or "value", which colors the surface by the function `color_by`.
-        Edges of pictures of values are antialiased, the numbers that are returned are not.
+    options: a `TraceOptions` for all surfaces; `precision` and `backend` must not be set. Its
+        attributes may be given as keywords instead. If fields are given, the keywords of `Surface`
+        (level, clip, section, side, largest) may be given too. A `Solid` with a section, or of
+        glass, is drawn with its inside. The default tolerance is 1e-4 of half the diagonal of the
+        box of what is drawn.
+    show: the kind of picture. "path" follows light paths; "shaded" lights first hits by a formula,
+        in seconds and without noise. The other kinds show what one ray a pixel found: "normal",
+        "evaluations" (of the fields), "status", "depth", or "value", which colors the surface by
+        the function `color_by`. Edges of pictures of values are antialiased, but the numbers that
+        are returned are not.
     size: (width, height) in pixels, by default (800, 600) or the scene's own.
-    spp: samples per pixel. With show="path" of each pixel, by default 64 or the number of the
-        scene. With "shaded" and "value" of pixels at edges, by default 9. Other pictures have one
-        ray per pixel.
-    antialias: which pixels of a shaded picture get all their samples: "edges", the default, those
-        that differ from a neighbor; "cones" also those that a surface covers in part, found by
-        a cone around each pixel. With cones, wires thinner than a pixel stay lines. Cones take
+    spp: samples per pixel. With show="path" each pixel has so many, by default 64 or the number of
+        the scene. With "shaded" and "value" pixels at edges have so many, by default 9. Other
+        pictures have one ray per pixel.
+    antialias: which pixels of a shaded picture get all their samples. With "edges", the default,
+        pixels that differ from a neighbor. With "cones", also pixels that a surface covers in part,
+        found by a cone around each pixel. So wires thinner than a pixel stay lines. Cones take
         about twice as many evaluations of fields, estimate distances by |f - level| / |grad f|,
         and raise an error for fields that jump, such as winding numbers of meshes.
     color_by: the function whose values show="value" shows on the surface: a field, "x", "y", "z",
         or a function of three coordinates. Coordinates are those of the surface; for a Mitsuba
         scene, those of the world.
-    color_range: (low, high) of the colors of values, depths or evaluations, by default what is
-        seen; the same for all pictures of a series.
+    color_range: (low, high), the numbers at the ends of the color scale of values, depths or
+        evaluations; by default the least and the greatest number in the picture. Give it to have
+        the same colors in all pictures of a series.
     color_bar: True, or the title, for a bar with numbers to the right of these pictures. It widens
         the picture that is written and displayed, not the array that is returned. Needs Pillow,
         which `pip install harnack[film]` brings.
@@ -122,11 +124,11 @@ def render(
     material: a name of `MATERIALS`, a color as for the backdrop, a `Material` or a BSDF dictionary;
         a list, one for each surface or, of one field, for each level.
     camera: where the stage is seen from, a `Camera`, or (x, y, z) in the surfaces' coordinates.
-    backdrop: "light" or "dark", with a floor. Or nothing but the surfaces before a color, by its
-        name in CSS such as "white", "#rrggbb" or as three numbers of sRGB; before (bottom, top),
-        two colors; before an image, by its file (.png, .jpg, .exr) or as an array (h, w, 3) of
-        bytes or of linear numbers, scaled to cover the picture. Or "transparent", the same with
-        alpha in PNG and EXR files and as a fourth number, by which the first three are multiplied.
+    backdrop: what is seen behind the surfaces. "light" or "dark" has a floor; all others have none.
+        A color is a name of CSS such as "white", "#rrggbb" or three numbers of sRGB. (bottom, top)
+        are two colors. An image is its file (.png, .jpg, .exr) or an array (h, w, 3) of bytes or
+        of linear numbers, scaled to cover the picture. "transparent" gives alpha in PNG and EXR
+        files and as a fourth number, by which the first three are multiplied.
     up: what is up, "x", "y", "z", "-x", ... or a direction in the surfaces' coordinates; by
         default z.
     boundary_radius: the radius, in the surfaces' coordinates, of a tube around the curves at which
@@ -134,8 +136,10 @@ def render(
     section_material: what the faces of opaque solids on their `section` are made of.
     isolines: lines on the surfaces, of heights or of another function, where `show` is "path",
         "shaded" or "value": an `Isolines` or several.
-    thickness: draws surfaces as walls so thick, in their own coordinates: the closed meshes that
-        `harnack.mesh` makes with this thickness, whose triangles are seen from close by.
+    thickness: the thickness, in the surfaces' coordinates, of walls that are drawn in place of the
+        surfaces: the closed meshes that `harnack.mesh` makes with this thickness, whose triangles
+        are seen from close by.
+
     In shaded pictures, the side of larger values of an open surface in one color is darker, and
     what spans the gaps of a mesh is amber, or teal on warm colors.
 

@@ -304,6 +304,7 @@ class ShadedTask:
         self.finder = ConeCoverage(mi, world) if cones else None
         offsets = multijitter_offsets(spp)
         traced = (offsets == _MIDDLE).all(axis=1)  # the offset of a pixel's first ray
+        # If the first ray is one of the grid's samples, it is not traced again.
         self.offsets, self.share_of_first = offsets[~traced], float(traced.mean())
         self.refines = spp > 1
         matrix = np.array(sensor.world_transform().matrix, dtype=np.float64).reshape(4, 4)
@@ -467,6 +468,7 @@ class ShadedTask:
         """
         columns, rows = self.size
         x, y = indices % columns, indices // columns
+        # Columns and rows of the five pixels.
         u = np.clip(x[:, None] + np.array([0, 1, -1, 0, 0]), 0, columns - 1)
         v = np.clip(y[:, None] + np.array([0, 0, 0, 1, -1]), 0, rows - 1)
         rows_of_five = upload_indices(self.mi, (v * columns + u).ravel())
@@ -476,9 +478,9 @@ class ShadedTask:
 
 def _nearest_sky(mi: Any, samples: GBuffer, row: Any, position: FloatArray, sky: FloatArray) -> Any:
     """Estimate for each sample which fraction of the hemisphere over its point nothing hides. This
-    fraction is known for the points of whole pixels. Of the sample's pixel and its neighbors, that
-    pixel counts whose point is nearest to the sample's point; if none of them shows a point, it is
-    1.
+    fraction is known for the points that whole pixels show. Among the sample's pixel and its four
+    neighbors, the pixel is chosen whose point is nearest to the sample's point, and its fraction is
+    taken. If none of them shows a point, the fraction is 1.
 
     samples: the G-buffer of the samples.
     row: for each sample, the index of its pixel among the n chosen pixels.

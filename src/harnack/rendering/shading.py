@@ -121,11 +121,13 @@ def multijitter_offsets(count: int) -> FloatArray:
     any slope look smooth.
     """
     point_count = grid_sample_count(count)
+    # The grid with the most rows that is not higher than wide.
     rows = max(
         r for r in range(1, point_count + 1) if point_count % r == 0 and r * r <= point_count
     )
     columns = point_count // rows
     j, i = (index.ravel() for index in np.mgrid[:rows, :columns])
+    # In each cell, the point is shifted by an amount that depends on the cell's row or column.
     x = (i + (j + 0.5) / rows) / columns
     y = (j + (i + 0.5) / columns) / rows
     return np.column_stack([x, y])

@@ -278,8 +278,9 @@ def _surface(
 
 
 def with_visible_inside(surface: TracedSurface, *, is_clear: bool = False) -> TracedSurface:
-    """Return the surface; a `Solid` whose inside can be seen becomes the boundary of the solid,
-    with faces where volumes cut it.
+    """Return the surface as it is to be drawn if its inside can be seen. If its field is a `Solid`
+    (the points where f <= 0), it becomes the boundary of this solid, with faces where volumes cut
+    it. Other surfaces stay as they are.
 
     is_clear: whether the material is transparent.
 

@@ -134,7 +134,7 @@ def _no_hit(prepared: SurfaceTracer, trace: MarchResult) -> SurfaceHit:
 
 def _refine_hits(prepared: SurfaceTracer, rays: _MarchedRays) -> SurfaceHit:
     """Return the `SurfaceHit` of marched rays. Hits are moved onto the surface as
-    `intersect_surface` describes; other rays keep their end.
+    `intersect_surface` describes; other rays keep the end of their march.
 
     rays: the rays and the `MarchResult` of each.
 

@@ -348,6 +348,7 @@ def _float_class_test(classes: int, x: str) -> str:
         UntranslatableError: no class, or negative numbers.
     """
     bits = f"bitcast<u32>({x})"
+    # By the bits of `classes`: NaN, quiet or signaling; 0; -0; infinity; -infinity; subnormal.
     tests = {
         0x81: f"is_nan({x})",
         0x02: f"({bits} == 0u)",
