@@ -84,6 +84,7 @@ def library_version(path: Path) -> int | None:
     major = _version_from_soname(resolved_path)
     if major is not None:
         return major
+    # From the innermost folder outwards; a number counts only below a folder of LLVM.
     for folder in reversed(resolved_path.parts[:-1]):
         match = re.fullmatch(r"(?:llvm[-@]?)?(\d\d)(?:\.\d+){0,2}(?:_\d+)?", folder)
         if match and "llvm" in str(resolved_path.parent).lower():

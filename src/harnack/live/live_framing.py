@@ -59,6 +59,7 @@ class Framing:
             points = corners_of(np.array(box.bounds()))
         elif not is_whole:
             box = Box(*(_three(end) for end in (points.min(axis=0), points.max(axis=0))))
+        # What stands on the ground: the box or, without a box, the points.
         standing = points if box is None else corners_of(np.array(box.bounds()))
         placement = stage_placement(standing, rotation_to_z_up(up))
         return cls(placement, _orbit(camera, placement, points), box)

@@ -451,7 +451,7 @@ def parse_camera(camera: Any) -> tuple[FloatArray, FloatArray, float]:
 
 
 def _size(question: Mapping[str, Any]) -> tuple[int, int]:
-    """Return the size (w, h) of the asked picture in pixels.
+    """Return the size (w, h) in pixels of the picture that a question asks for.
 
     Raises:
         RequestError: a side is too long.

@@ -84,19 +84,20 @@ def animate(
         hk.animate(lambda s: hk.fields.Morph(a, b, gap=0.2, w=0.2 * s), "morph.mp4")
         hk.animate(field, "levels.gif", level=lambda s: 1 + 4 * s)
 
-    surfaces: as `render` draws them in its studio. They, the camera and options that may change
-        from picture to picture may be functions of s, which goes from 0 in the first picture to 1
-        in the last; with an orbit of 360 degrees, to just before 1, so that the film can be
-        repeated.
+    surfaces: as `render` draws them in its studio. The surfaces, the camera and options that may
+        change from picture to picture may be functions of the time s. It goes from 0 in the first
+        picture to 1 in the last; with an orbit of 360 degrees, to just before 1, so that the film
+        can be repeated.
     path: .gif (Pillow) or .mp4 (PyAV: `pip install harnack[film]`).
     frames: the number of pictures.
     fps: pictures a second. In a GIF each picture lasts a whole number of hundredths of a second.
     orbit: degrees that the camera goes around its target during the film; None is 360 if nothing
         else moves, else 0.
     camera: as `render` takes it. Properties that it does not set (target, distance, angle of view)
-        are the same for all pictures, and such that everything is always in view.
-    client, checkpoint: as `render` takes them. Workers draw whole pictures; a film with more
-        pictures, or at another speed, draws only the pictures that the folder does not have.
+        are the same for all pictures, and chosen such that everything is always in view.
+    client, checkpoint: as `render` takes them. Each process of the cluster draws whole pictures. A
+        film with more pictures, or at another speed, draws only the pictures that the folder does
+        not have.
     options, keywords: as `render` takes them, but for `chunks`; `show` is "shaded" by default.
 
     Raises the errors of `render`; ValueError for no or too many frames, and for another file type;

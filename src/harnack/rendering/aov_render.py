@@ -174,6 +174,7 @@ class AovTask:
         offsets: (m, 2) coordinates in [0, 1) of the points in each pixel.
         """
         mi, count = self.mi, len(offsets)
+        # All m points of the first pixel, then those of the next.
         pixel = upload_indices(mi, np.repeat(pixels, count))
         coordinates = np.tile(offsets, (len(pixels), 1)).T
         positions = mi.Vector2f(

@@ -110,14 +110,14 @@ class Isolines:
         hk.render(field, "b.png", isolines=[hk.Isolines(other, [0, 1], color="white"), ...])
 
     function: the function: "x", "y" or "z", which gives contour lines of height; a `Field`; or a
-        Python function of x, y and z as `harnack.expression` takes it. Its coordinates are those of
-        the surface, wherever that is placed. There are no lines outside the `domain` of a field,
-        unless the field is defined everywhere (`is_global`).
-    levels: the value, or several, at which there are lines. For an angle-valued field they are
-        taken modulo its period.
+        Python function of x, y and z as `harnack.expression` takes it. Its coordinates are the
+        coordinates of the surface, wherever the surface is placed. There are no lines outside the
+        `domain` of a field, unless the field is defined everywhere (`is_global`).
+    levels: the value, or several, at which there are lines. If the values of the field are angles,
+        levels are taken modulo its period.
     interval: in place of levels: there are lines at all whole multiples of this number. It must
-        divide the period of an angle-valued field. Such a field has 12 lines if neither levels nor
-        interval is given.
+        divide the period of a field whose values are angles. Such a field has 12 lines if neither
+        levels nor interval is given.
     width: of the lines, along the surface, in the unit of its coordinates; by default 0.4 percent
         of the diagonal of the surface's box.
     color: a name of CSS, "#rrggbb", or three numbers of sRGB.

@@ -79,9 +79,12 @@ def _lined_class(variant: str) -> Any:
             self.m_flags = flags
 
         def _select_bsdf(self, call: Callable[[Any, Mask], Any], si: Any, active: Mask) -> Any:
-            """Evaluate the BSDF that applies on each lane: `base`, or the BSDF of the isoline.
-            Returns the result of `call(bsdf, mask)`, where the mask holds the active lanes of this
-            BSDF."""
+            """Evaluate on each lane the BSDF that applies: `base` or, on an isoline, the BSDF of
+            this isoline. Returns the result of `call(bsdf, mask)`; the mask selects the active
+            lanes of the BSDF.
+
+            si: the surface interactions, which hold the numbers of the isolines.
+            """
             line_number = si.prim_index
             result = call(self.base, active & (line_number == 0))
             for number, paint in enumerate(self.paints, start=1):

@@ -360,6 +360,7 @@ def _visible_fractions(
         the 16 groups of rays.
     """
     mi = world.mi
+    # The place of a point in its block of 4 x 4 points chooses its group of rays.
     j, i = np.indices(x.shape)
     d = towards[:, (j % _BLOCK) * _BLOCK + i % _BLOCK]
     o = np.stack([x, y, np.zeros_like(x)], axis=-1)[:, :, None]

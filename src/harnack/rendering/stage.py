@@ -340,6 +340,7 @@ def stage_placement(points: FloatArray, turned: FloatArray | None = None) -> Pla
     points = points @ turned.T
     lower, upper = points.min(axis=0), points.max(axis=0)
     scale = 2.0 / max(float(np.linalg.norm(upper - lower)), 1e-30)
+    # The middle of the box's base is placed at the origin of the world.
     base_point = np.array([*(lower + upper)[:2] / 2, lower[2]])
     return Placement(scale, turned, -scale * base_point)
 
