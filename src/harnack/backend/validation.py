@@ -236,7 +236,7 @@ def _contained_values(value: Any) -> list[Any]:
         return [*closure.nonlocals.values(), *(entry for group in groups for entry in group)]
     if inspect.ismethod(value):
         return [value.__func__, value.__self__]
-    # Attributes of other objects are not searched.
+    # Of other objects, only dataclasses, callables and fields (with `parameters`) are searched.
     is_known = dataclasses.is_dataclass(value) or callable(value) or hasattr(value, "parameters")
     return [*getattr(value, "__dict__", {}).values()] if is_known else []
 

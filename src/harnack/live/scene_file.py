@@ -138,8 +138,8 @@ class SceneFile:
 
     @property
     def surfaces_with_options(self) -> tuple[Surface, ...]:
-        """The surfaces, each with those options of the scene that are keywords of `Surface` (level,
-        clip, ...). `harnack.trace` and other functions of a `Surface` take them."""
+        """The surfaces, each with those options of the scene that are keywords of `Surface`
+        (level, clip, ...). `harnack.trace` and other functions of a `Surface` take them."""
         shorthand = {k: value for k, value in self.settings.items() if k in SURFACE_OPTIONS}
         return tuple(
             surface_and_options("a scene", surface, None, shorthand, SURFACE_OPTIONS)[0]

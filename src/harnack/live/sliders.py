@@ -90,7 +90,7 @@ class Slider:
 
 @dataclass(frozen=True)
 class SlidingContent:
-    """The surfaces and options of a live view as functions of sliders.
+    """The surfaces and options of a live view as functions of sliders, numbers that a person moves.
 
     content: surfaces that `hk.render` accepts, or a function of sliders that returns them.
     settings: options of `view` by name; a value is a constant, a slider or a function of sliders.

@@ -255,8 +255,8 @@ def build_studio(
     surfaces_only: bool = False,
     traced_light: bool = True,
 ) -> StudioScene:
-    """Put surfaces, ground, lights and a camera into a scene, for a picture of `size` (width,
-    height) pixels. Returns the `StudioScene`.
+    """Put surfaces, ground, lights and a camera into a scene, for a picture of `size`
+    (width, height) pixels. Returns the `StudioScene`.
 
     studio_objects: the surfaces with their materials.
     camera: from where the surfaces are seen; what it leaves open is chosen such that they fill the

@@ -273,8 +273,8 @@ def _gather_lanes(array: Any, rows: npt.NDArray[np.int64]) -> Any:
 
 
 def _columns_to_arrays(columns: Arrays) -> Arrays:
-    """Put components together to vectors. Returns the results by name, each an array (n,) or (n,
-    3).
+    """Put components together to vectors. Returns the results by name, each an array (n,) or
+    (n, 3).
 
     columns: arrays (n,) with the labels "result NAME" for numbers, or "result NAME k" for component
         k of a vector.
