@@ -431,6 +431,7 @@ class Hysteresis:
         near enough for a hit, and ends where f is farther from the level than the band. Inactive
         rays keep their contact.
         """
+        # f minus the nearest level: positive on the side of larger values.
         offset = -self.levels.offset_to_nearest(accepted.value)
         touching = now.is_touching
         side = dr.select(touching, now.side, self._side(now, accepted, offset))
@@ -489,6 +490,7 @@ class Hysteresis:
         A function with jumps has a single level here. A ray that starts on a facet, up to rounding,
         is on neither side of the level.
         """
+        # f minus the level, before the facet and behind it.
         offset = -self.levels.offset_to_nearest(accepted.value)
         one = type(offset)(1)
         side = dr.select(now.is_touching, now.side, dr.select(offset > 0, one, -1))

@@ -56,7 +56,7 @@ class RayTracer(Protocol):
         ...
 
     def advance(self, walk: Any, /) -> Any:
-        """Return the state after each active ray has made one more trial point, interval or patch."""
+        """Return the state after one more trial point, interval or patch of each active ray."""
         ...
 
     def finish(self, walk: Any, /) -> tuple[MarchState, Any]:
