@@ -51,7 +51,9 @@ def needs_derivatives(prepared: SurfaceTracer, o: Vec3, d: Vec3) -> bool:
     o, d: (3,) origins and directions of the rays.
 
     Raises:
-        NotImplementedError: parameters of a field with jumps have derivatives enabled. They move the facets at which the field jumps, and the derivative of that is not known here; zero would be wrong.
+        NotImplementedError: parameters of a field with jumps have derivatives enabled. They move
+            the facets at which the field jumps, and the derivative of that is not known here; zero
+            would be wrong.
     """
     field = prepared.field
     if not _PARAMETER_FREE.get(field, None, lambda: is_plain_data(vars(field))):

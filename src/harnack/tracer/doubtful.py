@@ -123,9 +123,9 @@ def seen_distance(backend: Backend, field: Field, levels: Levels, hits: Doubtful
     axis = dr.select(dr.abs(normal.x) < 0.6, vector(1, 0, 0), vector(0, 1, 0))
     first_axis = safe_normalize(dr.cross(normal, axis))
     second_axis = dr.cross(normal, first_axis)
-    x, _, is_sure = offset_of(at_hit)
+    offset, _, is_sure = offset_of(at_hit)
     # Multiplied by this sign, a slope < 0 leads towards the level.
-    side = dr.select(x > 0, backend.Float(1), -1)
+    side = dr.select(offset > 0, backend.Float(1), -1)
 
     def sample_once(now: _SearchState) -> _SearchState:
         """Take one more sample: in the next of six directions, or at the point at which f may turn
@@ -174,7 +174,7 @@ def seen_distance(backend: Backend, field: Field, levels: Levels, hits: Doubtful
 
     zero, yes, no = backend.Float(0), backend.Bool(True), backend.Bool(False)
     begin = _SearchState(
-        hits.distance, backend.UInt32(0), is_sure & (x > 0), is_sure & (x < 0), zero, zero, zero,
+        hits.distance, backend.UInt32(0), is_sure & (offset > 0), is_sure & (offset < 0), zero, zero, zero,
         zero, no, yes, backend.UInt32(0), no, yes,
     )  # fmt: skip
     end = loop_while_active(begin, sample_once, "harnack doubtful hits")

@@ -362,6 +362,7 @@ def _with_searched_distances(prepared: SurfaceTracer, hits: Hits, doubt: _Distan
     """
     backend, field = prepared.backend, prepared.field
     is_far = doubt.is_doubtful & (doubt.distance > _SEARCH_TOLERANCES * doubt.tolerance)
+    # Whether any hit is searched, without a kernel of its own: lanes of `is_far` write a 1.
     any_far = dr.zeros(backend.UInt32, 1)
     dr.scatter(any_far, 1, 0, is_far)
     dr.eval(any_far, *vars(hits).values())

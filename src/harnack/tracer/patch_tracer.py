@@ -155,6 +155,7 @@ class PatchTracer:
         hit = active & (now.status == int(RayStatus.HIT))
         undecided = used_all_steps | (active & (now.status == int(RayStatus.OUT_OF_STEPS)))
         ended = hit | undecided
+        # Rays without a hit keep the value of the last patch.
         takes_value = active & (ended | (walk.part == NO_PATCH))
         # After a hit, a patch whose box is entered before it may still be nearer.
         goes_on = active & ~ended if self.any_hit else active & ~undecided

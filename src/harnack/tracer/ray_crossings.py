@@ -357,7 +357,7 @@ def empty_crossings(backend: Backend) -> RayCrossings:
 
 
 def crossings_to_numpy(hits: RayCrossings, n: int, k: int) -> RayCrossings:
-    """Return the crossings of n rays, k for each, as NumPy arrays of shapes (n, k, ...) and (n,)."""
+    """Return the crossings of n rays, k for each, as NumPy arrays (n, k, ...) and (n,)."""
 
     def each(array: Any) -> Any:
         """Return an array of crossings as a NumPy array (n, k, ...)."""

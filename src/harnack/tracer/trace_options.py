@@ -154,8 +154,8 @@ def surface_and_options(
     if isinstance(surface, Surface):
         if surface_keywords:
             raise TypeError(
-                f"{', '.join(of_surface)}: a Surface holds its own; give {verb} "
-                f"surface.replace({next(iter(of_surface))}=...)"
+                f"{', '.join(surface_keywords)}: a Surface holds its own; give {verb} "
+                f"surface.replace({next(iter(surface_keywords))}=...)"
             )
     else:
         surface = Surface(surface, **surface_keywords)
@@ -211,8 +211,8 @@ def trace_options_among(options: Any, keywords: Mapping[str, Any]) -> TraceOptio
         raise TypeError(f"options must be harnack.TraceOptions(...), not {options!r:.60}")
     if trace_keywords:
         raise TypeError(
-            f"{', '.join(of_trace)}: there are options already; give all of them in options, such "
-            f"as options.replace({next(iter(of_trace))}=...), or none"
+            f"{', '.join(trace_keywords)}: there are options already; give all of them in options, such "
+            f"as options.replace({next(iter(trace_keywords))}=...), or none"
         )
     return options
 

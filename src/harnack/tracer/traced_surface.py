@@ -214,7 +214,7 @@ class TracedSurface:
         return default_tolerance(self.volume) if self.tolerance is None else self.tolerance
 
     def for_rays(self, count: int) -> TracedSurface:
-        """Return the same surface with the field prepared for `count` rays (`Field.for_ray_count`)."""
+        """Return this surface with the field prepared for `count` rays (`Field.for_ray_count`)."""
         return replace(self, field=self.field.for_ray_count(count))
 
     def evaluator(self, backend: Backend) -> Field:
