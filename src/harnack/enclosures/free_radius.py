@@ -1,12 +1,15 @@
 """The solver that all proofs on a ball share, and `HarmonicBallEnclosure`, for harmonic functions.
+f is a function that is bounded on a ball B(p, R) about a point p of a ray; a length of the ray from
+p on is free if f takes no level (a value that rays look for) on it.
 
-A proof on a ball B(p, R) shows that all lengths up to q R are free of levels if
+A proof on the ball shows that all lengths up to q R are free if
 
     q k(q) <= gap,
 
-where k has no poles on [0, 1] and the gap has no unit. `largest_free_fraction` finds the largest
-such q from below. Large numbers are never subtracted, so the error of q is small relative to q.
-Near a surface the gap is tiny; if only the absolute error of q were small, rays would stall there.
+where k has no poles on [0, 1], and the gap is the difference between f(p) and a level, divided by a
+difference of values so that it has no unit. `largest_free_fraction` finds the largest such q from
+below. Large numbers are never subtracted, so the error of q is small relative to q. Near a surface
+the gap is tiny; if only the absolute error of q were small, rays would stall there.
 """
 
 from __future__ import annotations
@@ -34,13 +37,16 @@ _ROUNDINGS = 16.0
 
 
 class FreeRadiusCondition(Protocol):
-    """A condition q k(q) <= gap which proves that all of [0, q] is free of levels.
+    """A condition q k(q) <= gap for 0 <= q <= 1, with a function k and a number gap >= 0. If it
+    holds, f is proved to take no level on a ray within q times the radius of a ball about its
+    start: all of [0, q] is free.
 
-    q is a length as a fraction of the ball's radius. The product q k(q) crosses the gap at most
-    once on [0, 1], upwards.
+    The product q k(q) crosses the gap at most once on [0, 1], upwards. So if a q satisfies the
+    condition, all smaller ones do.
     """
 
     @property
+        """The right side of the condition."""
     def gap(self) -> Real: ...
 
     def __call__(self, q: Real) -> Real:

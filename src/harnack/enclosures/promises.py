@@ -1,4 +1,5 @@
-"""Promises: proved bounds of a field's function f near a point, in every direction.
+"""Promises: proved bounds of a field's function f near a point p, in every direction. For example,
+a promise says that f stays within a range on the ball of some radius about p.
 
 A promise is stated in the field's own units and must be *true*: every step that the tracer takes
 relies on it. Enclosures (bounds of f along a path) are derived from promises, once the slope along
@@ -41,7 +42,9 @@ _SECOND_DERIVATIVE_BOUND, _SECOND_DERIVATIVE_BOUND_4D, _FIRST_DERIVATIVE_BOUND =
 
 @dataclass(frozen=True)
 class Promise(abc.ABC):
-    """Base of all kinds of promises about a function f near a point p.
+    """A proved bound of a function f near a point p, the promise: base of all kinds. A promise
+    holds at all points within its `radius` of p; value stands for f(p), and f_v for the derivative
+    of f along a unit vector v.
 
     A subclass is a frozen dataclass of its numbers. `radius` is the distance from p within which
     the promise holds.
@@ -63,6 +66,7 @@ class Promise(abc.ABC):
     if TYPE_CHECKING:
 
         @property
+            """The distance from p within which the promise holds."""
         def radius(self) -> Any: ...
 
     @abc.abstractmethod
