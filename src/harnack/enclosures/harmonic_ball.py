@@ -85,7 +85,7 @@ def _fraction_from_one_side(u: Real, gap_away: Real, gap_toward: Real, dimension
     dimension: that of the ball; 2, 3 or 4.
     """
     growing, falling = _FRACTION_FORMULAS[dimension]
-    # u = 0 forces u to vanish identically: no level is ever reached. Levels below 0 are not, either.
+    # u = 0 forces u to vanish identically: no level is ever reached. Levels below 0 never are.
     up = dr.select((gap_away == dr.inf) | (u <= 0), 1, growing(u, u + gap_away, gap_away))
     v = u - gap_toward
     down = dr.select((v <= 0) | (gap_toward == dr.inf), 1, falling(u, fmax(v, 0), gap_toward))
