@@ -120,7 +120,7 @@ def _nan_if_negative(constant: Real) -> Real:
 
 def first_reach(gap: Real, slope: Real, curvature: Real) -> Real:
     """Return the first s > 0 at which slope s + curvature s^2/2 reaches the gap; infinite if there
-    is none. The result is 0 or NaN, which prove nothing, for a gap of 0 or numbers that are NaN.
+    is none.
 
     gap: the difference in value to a level, >= 0; infinite if there is no level on this side.
     curvature: the second derivative of the parabola.

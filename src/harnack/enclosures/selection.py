@@ -136,7 +136,7 @@ class EnclosureKinds:
     def _enclosure(
         self, promise: Promise, value: Real, error: Real, slopes: SlopeRange
     ) -> Enclosure | None:
-        """Return the enclosure of the first class that can use the promise; None if no class can."""
+        """Return the enclosure of the first class that can use the promise; None if none can."""
         for kind in self.kinds:
             enclosure = kind.from_promise(promise, value, error, slopes)
             if enclosure is not None:
