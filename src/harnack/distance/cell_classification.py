@@ -149,7 +149,7 @@ class ClipCurveDescent:
             normal = dr.select(accepted, trial.normal, normal)
             factor = dr.select(accepted, fmin(4 * factor, 1), factor)
             factor = dr.select(failed & ~crosses_face, 0.25 * factor, factor)
-            # The step s meets the other face where face_rate |s| + s^2/2 face_normal.ddy = face_gap.
+            # The step s meets the face where face_rate |s| + s^2/2 face_normal.ddy = face_gap.
             s, face_gap = factor * w, fmax(face_offset - dr.dot(face_normal, best), 0)
             face_rate = dr.sign(w) * dr.dot(face_normal, tangent)
             limit_divisor = face_rate + dr.sqrt(

@@ -192,6 +192,7 @@ def search(
         x = points[rows]
         root = _Cube.around(x.min(axis=0), x.max(axis=0))
         distances = np.linalg.norm(x - closest[rows], axis=1)
+        # The margin of the cube around the queries. It grows by a factor of four or more.
         margin = max(
             4 * margin, 1.0 + 4 * root.half, 1.1 * float(np.nanmax(distances, initial=0.0))
         )

@@ -467,7 +467,9 @@ class _QueryEvaluator:
         return np.where(np.isnan(closest), guess, closest)
 
     def _inside_domain_or_nan(self, points: FloatArray) -> FloatArray:
-        """Return the points (n, 3), with NaN for those outside the domain, which cuts the surface."""
+        """Return the points (n, 3), with NaN for those outside the field's domain, which cuts the
+        surface.
+        """
         domain = self.surface.field.domain
         if domain is None or not len(points):
             return points

@@ -174,8 +174,8 @@ def seen_distance(backend: Backend, field: Field, levels: Levels, hits: Doubtful
 
     zero, yes, no = backend.Float(0), backend.Bool(True), backend.Bool(False)
     begin = _SearchState(
-        hits.distance, backend.UInt32(0), is_sure & (offset > 0), is_sure & (offset < 0), zero, zero, zero,
-        zero, no, yes, backend.UInt32(0), no, yes,
+        hits.distance, backend.UInt32(0), is_sure & (offset > 0), is_sure & (offset < 0),
+        zero, zero, zero, zero, no, yes, backend.UInt32(0), no, yes,
     )  # fmt: skip
     end = loop_while_active(begin, sample_once, "harnack doubtful hits")
     return dr.select(end.is_found, end.distance, dr.inf)

@@ -112,7 +112,7 @@ class Surface:
             )
 
     def replace(self, **changes: Any) -> Surface:
-        """Return this surface with some arguments changed; these are named as in the constructor."""
+        """Return this surface with some arguments changed, by their names in the constructor."""
         arguments: dict[str, Any] = {"field": self.field, "level": self.levels, **self.keywords}
         arguments |= changes
         return Surface(**arguments)
