@@ -325,6 +325,9 @@ class CellClassifier:
     surface: TracedSurface
 
     def __post_init__(self) -> None:
+        """Prepare the surface in double precision, and the descent to the clip curve if its domain
+        cuts it.
+        """
         self._backend = choose_backend("double")
         self._prepared = self.surface.prepare(self._backend)
         self._levels = self._prepared.levels
@@ -540,8 +543,8 @@ class CellClassifier:
         """Return the point of the level set to which Newton's method along the gradient leads from
         p; `FAR_SENTINEL` if it does not converge to a point within the distance 2 `radius` of p.
 
-        After six steps the method goes on only towards a multiple root, with longer steps
-        (`multiplicity`).
+        After six steps the method goes on only while its steps shrink, as they do towards a
+        multiple root, and they are made longer (`multiplicity`).
         """
         real, vector, count = self._backend.Float, self._backend.Array3f, self._backend.UInt32
         zero = dr.opaque(real, 0.0)  # keeps constant components of a gradient in the loop

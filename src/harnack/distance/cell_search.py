@@ -345,6 +345,10 @@ class _CellSearch:
         tolerance: float,
         max_cells: int,
     ) -> None:
+        """Store the search's inputs. points: (n, 3) the queries. descents: the iterations that lead
+        from a point near the surface to a closest point. The other parameters are attributes of the
+        class.
+        """
         self.trees = trees
         self.classifier, self.cells, self.points, self.descents = (
             classifier,
@@ -441,6 +445,7 @@ class _CellSearch:
             start = coarse.best_start(x, limit)
             y, free, unresolved = self.descents.newton_in_kernel(x, start, limit)
             has_start, end_distance = start.x < 0.5 * FAR_SENTINEL, safe_norm(y - x)
+            # Lanes without a start have nothing to resolve.
             unresolved &= has_start
             is_nearer = has_start & ~unresolved & (end_distance < limit)
             point = dr.select(

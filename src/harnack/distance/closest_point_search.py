@@ -152,6 +152,7 @@ def _find_sorted(
         guess = evaluator.with_jump_points(x, guess)
     tolerance = StoppingRule(_TOLERANCE * _size(surface, x), is_proved)
     batch_field = surface.field.for_ray_count(_SAMPLES_PER_POINT * len(x))
+    # Off the facets of a mesh without a clip, f differs from a smooth function by constants.
     smooth = batch_field.without_jumps() if surface.clip_volume is None else None
     if smooth is None:
         result = search(surface, x, InitialGuess(guess, estimate), evaluator, tolerance, progress)
@@ -174,6 +175,7 @@ def _find_sorted(
     is_refused = distance < lower - allowed_error
     closest = np.where(is_refused[:, None], np.nan, result.closest)
     distance = np.where(is_refused, np.nan, distance)
+    # The cells may prove more than f at the query alone.
     lower = np.fmin(np.maximum(lower, result.lower_bounds), distance)
     return ClosestPoints(x, closest, distance, residual, lower, is_refused)
 
@@ -324,6 +326,9 @@ class _QueryEvaluator:
     levels: Levels
 
     def __post_init__(self) -> None:
+        """Make the attributes with an underscore; `object.__setattr__`, as the dataclass is
+        frozen.
+        """
         backend, field = self.backend, self.surface.evaluator(self.backend)
         assign = object.__setattr__
         assign(self, "_field", field)
@@ -516,6 +521,7 @@ class _QueryEvaluator:
         closest, y, free, is_unfinished, is_far = in_batches(
             self.backend, self._newton_with_float_masks, points, start, limits
         )
+        # Newton's method did not converge there: the slower descent goes on from its last point.
         rows = np.flatnonzero(is_unfinished)
         if len(rows):
             closest[rows], free[rows] = in_batches(
@@ -672,6 +678,7 @@ class _QueryEvaluator:
         failed = np.flatnonzero(np.isnan(corrected[:, 0]))
         if len(failed):
             (corrected[failed],) = in_batches(self.backend, to_level, closest[rows[failed]])
+        # Points that the correction moved out of the domain keep their place.
         is_inside = ~np.isnan(self._inside_domain_or_nan(corrected)[:, 0])
         closest[rows[is_inside]] = corrected[is_inside]
         return closest

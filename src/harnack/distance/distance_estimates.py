@@ -139,8 +139,7 @@ def closest_points(
     options: TraceOptions | None = None,
     **keywords: Unpack[TraceKeywords],
 ) -> FloatArray:
-    """The closest points (n, 3) of a level set to `points` (n, 3), found by a search.
-
+    """Find the closest points (n, 3) of a level set of a field's function to `points` (n, 3).
     For the winding number of a closed mesh, and for its solid, they are exact: the level set
     consists of triangles, which are cut where they intersect, and the nearest one is found. For
     other fields the surface is enclosed in cells, and descents from known surface points in the
@@ -183,8 +182,8 @@ def distance_bounds(
     options: TraceOptions | None = None,
     **keywords: Unpack[TraceKeywords],
 ) -> DistanceBounds:
-    """Distances of points (n, 3) from a level set, with proved lower bounds.
-
+    """Compute distances of points (n, 3) from a level set of a field's function f, with proved
+    lower bounds.
     `lower` is proved by the field's promises (proved bounds of f near a point). These imply that
     some cubic cells of space hold no surface; that in others the surface lies in a slab between two
     parallel planes; and that a ball around each closest point holds no nearer point of the surface.

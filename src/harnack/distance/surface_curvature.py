@@ -78,8 +78,8 @@ def curvature(
     options: TraceOptions | None = None,
     **keywords: Unpack[TraceKeywords],
 ) -> CurvatureSamples:
-    """Mean and Gaussian curvature of the level sets of a field through points (n, 3).
-
+    """Compute the mean and Gaussian curvature of the level sets of a field's function f through
+    points (n, 3).
     surface: a field, or a `Surface`. The curvature at a point is that of the level set through the
         point, whatever its level is; levels, clip and section of a `Surface` have no effect.
     options: a `TraceOptions`; curvatures use its `precision` alone. None is double precision.

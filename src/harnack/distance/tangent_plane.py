@@ -117,8 +117,9 @@ def matvec(rows: tuple[Vec3, Vec3, Vec3], vector: Vec3) -> Vec3:
 
 
 def first_order_distance(above: Real, gradient: Vec3) -> Real:
-    """The first-order estimate of the signed distance from a level set: above/|grad f|, where
-    above = f - level. Its error is O(d^2) at the distance d from a smooth surface.
+    """Return the first-order estimate of the signed distance of a point x from a level set:
+    above/|grad f|, where above = f - level and the gradient are taken at x. Its error is O(d^2) at
+    the distance d from a smooth surface.
 
     Proof. Let y be the closest point of the level set, N its normal grad f/|grad f|(y), and
     x = y + d N (x - y is normal at the closest point; d has the sign of above). Taylor's formula
@@ -131,7 +132,7 @@ def first_order_distance(above: Real, gradient: Vec3) -> Real:
 
 
 def second_order_distance(above: Real, gradient: Vec3, rows: tuple[Vec3, Vec3, Vec3]) -> Real:
-    """The second-order estimate of the signed distance d of a point x from a level set:
+    """Return the second-order estimate of the signed distance d of a point x from a level set:
     d1/(1 - k d1/2) with above = f - level, d1 = above/|grad f| and k = n.An/|grad f|. Its error is
     O(d^3).
 

@@ -60,8 +60,8 @@ _DOUBT_FRACTION, _DOUBT_ROUNDINGS, _SHEET_COUNT, _SEARCH_TOLERANCES = 0.5, 64, 3
 
 @dataclass(frozen=True)
 class Hits:
-    """How n rays ended, as NumPy arrays or, if the rays were Dr.Jit arrays or tensors, as these.
-
+    """How n rays o + t d ended, as NumPy arrays or, if the rays were Dr.Jit arrays or tensors, as
+    these. f is the function of the field, and the surface is where f takes the level.
     is_hit: (n,) mask of rays that hit. Rays that ran out of steps have a finite t as well, so
         `isfinite(t)` is no such mask.
     t: (n,) the ray parameter of the hit, a length; inf for a miss; for a ray that ran out of steps,
@@ -128,8 +128,8 @@ def trace(
     options: TraceOptions | None = None,
     **keywords: Unpack[TraceKeywords],
 ) -> Hits:
-    """First hits of rays with a level set of a field. No hit is missed: every step is proved.
-
+    """Find the first hits of rays with a level set of a field's function f: the points at which f
+    takes a given value, the level. No hit is missed: every step is proved.
     surface: a field; or a `Surface`, with its levels, clip, section and largest component. A
         `Surface` with a `side` raises an error: the faces of a solid where its clip cuts it are no
         level set.
@@ -157,11 +157,11 @@ def trace(
     proved for Dr.Jit's own backends only. So at each call up to 4,096 of the rays are traced by
     Dr.Jit, too, and the results of the device must agree.
 
-    On processors, if there are at least 4,096 rays and successive rays differ much, rays are traced
-    by few lanes that share a queue, unless samples are cheap (`Field.is_cheap`). This gives the
-    same hits, bit by bit, in about half the time. If only the `largest` component is traced, a ray
-    is out of steps if it starts so far away that its coordinates are rounded by more than a small
-    part of a cell.
+    On CPUs, if there are at least 4,096 rays and successive rays differ much, rays are traced by
+    few lanes that share a queue, unless evaluations of f are cheap (`Field.is_cheap`). This gives
+    the same hits, bit by bit, in about half the time. If only the `largest` component is traced, a
+    ray is out of steps if it starts so far away that its coordinates are rounded by more than a
+    small part of a cell.
 
     Raises:
         TypeError, ValueError: shapes that do not match, NaN, directions of length zero, an empty or

@@ -46,8 +46,8 @@ class JumpTraceState:
     """The state of rays through a function f with jumps at facets (triangles), between two
     intervals of the march.
 
-    offset: the offset of f from its continuous part (a whole number for a winding number): that at
-        the start of the ray (`Field.initial_offset`) plus all jumps since.
+    offset: a number from which the field makes f on an interval (`Field.continuation`): that at the
+        start of the ray (`Field.initial_offset`) plus all jumps since.
     behind: the crossing of a facet that was passed last.
     march: the state of the march.
     reported_facet: for rays that look for crossings of the level, the index of the facet that is

@@ -112,7 +112,9 @@ class PreparedHitTolerance:
     value: Real
 
     def value_tolerance(self, gradient_norm: Real, t: Real) -> Real:
-        """The largest |f - level| at a hit at ray parameter t, where |grad f| = gradient_norm."""
+        """Return the largest |f - level| at a hit at ray parameter t, where |grad f| =
+        gradient_norm.
+        """
         return fmax(gradient_norm * dr.fma(t, self.per_length, self.distance), self.value)
 
 

@@ -327,7 +327,7 @@ class March:
         """
 
         def one_trial(now: MarchState) -> MarchState:
-            """One more trial point of each ray."""
+            """Return the state after one more trial point of each ray."""
             return self.next_trial(field, path, end, now, ahead)
 
         return loop_while_active(state, one_trial, "harnack")
@@ -645,7 +645,7 @@ class March:
         )
         coarser = _next_accuracy(accuracy, trial.gaps.nearest, truncation, coarsest)
         if trial.passes_branch_level is not None and trial.needs_branch is not None:
-            # A rejected point is not sampled again anyway.
+            # Only accepted points need this: others are left for a shorter step.
             too_coarse |= trial.needs_branch & accepted  # others go back in any case
             coarser = dr.select(
                 trial.passes_branch_level, fmax(accuracy, 1), coarser
@@ -826,35 +826,37 @@ class March:
         rounding: Real,
         ray_sample: RaySample,
         gradient_norm: Real,
-        size: Real,
+        length_scale: Real,
         end: Real,
     ) -> Mask:
-        """Mask of trial points at which a level is near enough in value for a hit, as `advance`
-        states.
+        """Return the mask of trial points at which f is near enough to a level for a hit, as
+        `advance` states.
 
         gap: the difference between f and the nearest level.
         within: the largest such difference that the tolerance allows.
         total_error, rounding: bounds of the error of f, and of its part due to rounding.
+        ray_sample, gradient_norm: the sample of f at the point, and |grad f|.
         size: a bound of the coordinates.
+        end: the ray parameter at which the ray ends.
 
         A point is no hit if rounding leaves the distance to the surface uncertain by more than a
-            sixteenth of a length L: the size of the coordinates or, if larger, the radius of the
-            ball in which f is proved to be smooth. On a ray without an end, there is a second
-            condition. If only rounding brings the point near the level, it is no hit if rounding
-            leaves t uncertain by more than L. Otherwise, far enough away, rounding would make a hit
-            of every ray parallel to the surface.
+        sixteenth of a length L: the size of the coordinates or, if larger, the radius of the ball
+        in which f is proved to be smooth. On a ray without an end, there is a second condition. If
+        only rounding brings the point near the level, it is no hit if rounding leaves t uncertain
+        by more than L. Otherwise, far enough away, rounding would make a hit of every ray parallel
+        to the surface.
         """
         sample = ray_sample.sample
         near = gap <= fmax(within - sample.truncation_error, 2 * rounding)
         for promise in sample.promises:
             radius = promise.radius
-            size = fmax(dr.select(dr.isfinite(radius), radius, 0), size)
+            length_scale = fmax(dr.select(dr.isfinite(radius), radius, 0), length_scale)
         # By how much |f - level| may exceed the tolerance. Divided by a slope, this is a length:
         # the uncertainty of t along the ray, and of the distance to the surface.
         excess = gap + total_error - within
         may_hit = (gap <= within - sample.truncation_error) | (end < dr.inf)
-        may_hit |= excess <= dr.abs(ray_sample.slope) * size
-        return near & may_hit & (excess <= _LARGEST_UNCERTAINTY * gradient_norm * size)
+        may_hit |= excess <= dr.abs(ray_sample.slope) * length_scale
+        return near & may_hit & (excess <= _LARGEST_UNCERTAINTY * gradient_norm * length_scale)
 
     def _next_trial_step(
         self,

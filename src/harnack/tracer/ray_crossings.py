@@ -53,7 +53,8 @@ _HONORED = (
 
 @dataclass(frozen=True)
 class CrossingArrays:
-    """The first k crossings of n rays, as Dr.Jit arrays. Crossing j of ray i is at i k + j in
+    """The first k crossings of n rays with a surface, as Dr.Jit arrays. A crossing is a point at
+    which a function f passes to the other side of a level. Crossing j of ray i is at i k + j in
     arrays of n k entries.
 
     t: (n k) ray parameters; inf if a ray has fewer crossings.
@@ -203,8 +204,8 @@ def find_crossings(
 
 @dataclass(frozen=True)
 class RayCrossings:
-    """The first k crossings of n rays with the level set, in the order along each ray.
-
+    """The first k crossings of n rays with a level set of a function f, in the order along each
+    ray. A crossing is a point at which f passes to the other side of the level.
     They are NumPy arrays; tensors if the rays were tensors; Dr.Jit arrays if the rays were Dr.Jit
     arrays. The latter are flat: crossing j of ray i is at i k + j.
 
@@ -252,8 +253,8 @@ def crossings(
     options: TraceOptions | None = None,
     **keywords: Unpack[TraceKeywords],
 ) -> RayCrossings:
-    """The first crossings of rays with a level set of a field, in the order along each ray.
-
+    """Find the first crossings of rays with a level set of a field's function f, in the order along
+    each ray. A crossing is a point at which f passes to the other side of the level.
     If f goes farther than the tolerance to both sides of the level, the crossing is not missed, and
     no crossing is counted twice. If a ray touches a level without passing to its other side, or
     starts on it, that is no crossing. If levels are closer in value than four tolerances, a quarter

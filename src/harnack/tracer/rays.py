@@ -1,4 +1,6 @@
-"""`RayBatch`: the rays of a call, as users give them, checked and on a backend."""
+"""`RayBatch`: the rays o + t d of a call, as users give them, checked and on a backend. The
+direction d becomes a unit vector, so that the ray parameter t is a length.
+"""
 
 from __future__ import annotations
 

@@ -259,7 +259,7 @@ def beyond(
     shortest = 4 * epsilon * reach
 
     def sample_once(now: _SearchState) -> _SearchState:
-        """The state after one more sample q."""
+        """Evaluate f at the next point q, and return the state after it."""
         # Which of the points q comes next.
         is_first, is_far = now.count < 3, (now.count == 2) | (now.count == 4)
         is_search = now.count >= _TRIAL_COUNT

@@ -89,6 +89,7 @@ class Surface:
         side: Side | None = None,
         largest: bool | int = False,
     ) -> None:
+        # All arguments are checked, so that no later call meets a wrong one.
         check_is_field(field)
         levels = _as_levels(field.default_level if level is None else level)
         for number in levels:

@@ -78,6 +78,8 @@ class TraceOptions:
     require_crossing: bool = False
 
     def __post_init__(self) -> None:
+        """Check all values; `max_steps` and `over_relaxation` become Python numbers."""
+        # These properties raise an error for wrong values.
         _ = self.hit_tolerance, self.enclosure_kinds
         count = as_integer_in_range(self.max_steps, "max_steps", 1, 2**31 - 1)
         object.__setattr__(self, "max_steps", count)
@@ -211,8 +213,8 @@ def trace_options_among(options: Any, keywords: Mapping[str, Any]) -> TraceOptio
         raise TypeError(f"options must be harnack.TraceOptions(...), not {options!r:.60}")
     if trace_keywords:
         raise TypeError(
-            f"{', '.join(trace_keywords)}: there are options already; give all of them in options, such "
-            f"as options.replace({next(iter(trace_keywords))}=...), or none"
+            f"{', '.join(trace_keywords)}: there are options already; give all of them in options, "
+            f"such as options.replace({next(iter(trace_keywords))}=...), or none"
         )
     return options
 

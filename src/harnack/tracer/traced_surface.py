@@ -317,8 +317,9 @@ def traced_surface(
 
 
 def check_has_inside(surface: TracedSurface) -> None:
-    """Raise ValueError if this is the boundary of a solid, and the field is of a kind that has no
-    closed solids: angle-valued, with jumps, or a union of patches."""
+    """Raise ValueError if the surface is meant as the boundary of a solid, and the field is of a
+    kind that has no closed solids: angle-valued, with jumps, or a union of patches.
+    """
     field = surface.field
     if surface.solid_range is None:
         return
