@@ -111,6 +111,7 @@ class ClipCurveDescent:
             k: the number of points tried so far.
             active: whether the search goes on.
             """
+            # Is the point y on the curve, and nearer to x than the best one?
             trial = self._at(y)
             distance = safe_norm(x - y)
             has_best = dr.isfinite(nearest)
@@ -161,6 +162,7 @@ class ClipCurveDescent:
             is_limited = ~(has_no_face & ~crosses_face) & (limit < dr.abs(s))
             s = dr.select(is_limited, clamp(s, -limit, limit), s)
             target = dr.fma(vector(s), tangent, best) + vector(0.5 * s * s) * ddy
+            # The search ends at short steps, unless a face has shortened them.
             min_step = dr.select(is_limited, 0, _MIN_RELATIVE_STEP * nearest)
             is_short = dr.abs(s) <= fmax(min_step, trial.near)
             corner = dr.select((corner == _TURNING) & ~is_corrected, _TURNED, corner)
@@ -591,9 +593,11 @@ class CellClassifier:
             """Trace ray k, and keep its hit if that is nearer to p. best: the squared distance of
             `point`.
             """
+            # The direction of ray k.
             d = vector(*_DIAGONALS[0]) / 3**0.5
             for number, diagonal in enumerate(_DIAGONALS[1:], 1):
                 d = dr.select(k == number, vector(*diagonal) / 3**0.5, d)
+            # It begins at the surface of the ball and ends at its other side.
             o = dr.fma(vector(-radius), d, p)
             ray_hit = self._prepared.first_hit(o, d, real(0), 2 * radius, self._backend.Bool(True))
             is_hit = ray_hit.status == int(RayStatus.HIT)

@@ -243,6 +243,7 @@ def _search_in_batches(
     min_cells = min(max(_MIN_CELLS, int(cells_per_point * len(points))), _MAX_CELLS, max_cells)
     if surface.field.has_jumps:
         min_cells = _MIN_JUMP_CELLS
+    # The cells depend on the surface and the number of queries alone, so all batches share them.
     coarse, cells = _split(classifier, root, min_cells, progress)
     backend, trees = choose_backend("double"), None
     if len(cells):
@@ -250,6 +251,7 @@ def _search_in_batches(
     results: list[SearchResult] = []
     for start in range(0, max(len(points), 1), _BATCH_SIZE):
         rows = slice(start, start + _BATCH_SIZE)
+        # Without proofs cells are not subdivided further.
         limit = max_cells if tolerance.prove else 0
         cell_search = _CellSearch(
             classifier,
@@ -298,6 +300,7 @@ def _split(
             break
         if len(coarse) < _MIN_COARSE_CELLS:
             coarse = cells
+        # The larger half is split; a flat single piece of surface counts as small.
         sizes = np.where(cells.is_single_piece, 0.25 * cells.thickness, cells.half)
         is_split = sizes >= np.median(sizes)
         children = _subdivide(classifier, cells, is_split)
@@ -393,6 +396,7 @@ class _CellSearch:
         """
         # A mark for each cell that may hold a nearer point, if cells are to be split.
         marks = dr.zeros(self.backend.Bool, len(self.cells)) if self.max_cells else None
+        # Functions that jump have no descents in a kernel; expensive ones start in a fine cell.
         if has_jumps or self._is_expensive:
             tried_starts, ids = self._descend_from_best_start(tree), np.arange(len(self.points))
             if not has_jumps:
@@ -405,6 +409,7 @@ class _CellSearch:
             if marks is None:
                 break
             ids = np.flatnonzero(self._is_unproved())
+            # Split the marked cells, unless no query needs it or there would be too many cells.
             is_split = to_numpy(marks)
             count = int(is_split.sum())
             if not count or not len(ids) or len(self.cells) + 4 * count > self.max_cells:
@@ -448,6 +453,7 @@ class _CellSearch:
             # Lanes without a start have nothing to resolve.
             unresolved &= has_start
             is_nearer = has_start & ~unresolved & (end_distance < limit)
+            # The nearer of the end of the descent and the initial guess, or none.
             point = dr.select(
                 is_nearer, y, dr.select(limit < 0.5 * FAR_SENTINEL, guess_point, missing)
             )
@@ -542,6 +548,7 @@ class _CellSearch:
             if self._is_expensive:
                 starts = starts[:1]
             improved_ids = self._descend_from_candidates(rows, starts)
+            # Queries without a further chance are left out of the next round.
             active = np.isin(rows, improved_ids)
             if self._is_expensive or self.classifier.surface.field.has_jumps:
                 active |= starts[0][:, 0] < 0.5 * FAR_SENTINEL

@@ -231,6 +231,7 @@ class CellTree:
             """
             lower, *listed = state
             cell = _CellRecord.of(vector, row)
+            # Cells in the ball about the best point hold no nearer point.
             is_relevant = active & ~cell.is_within(best.point, best.exclusion_radius)
             cell_bound = cell.lower_bound(x)
             is_open_cell = is_relevant & (cell_bound < best.distance - tolerance)
@@ -239,6 +240,8 @@ class CellTree:
                 dr.scatter(marks, backend.Bool(True), cell_index, is_open_cell & cell.is_cell)
             lower = dr.select(is_relevant & cell.is_cell, fmin(lower, cell_bound), lower)
             estimate = cell.estimate(x)
+            # The point is worth a descent if the estimate, less its slack, is below the best
+            # distance.
             is_listed = is_open_cell & (estimate < best.distance + cell.estimate_slack)
             is_listed &= cell.is_separated(best.point, best.separation_factor)
             for other in points:
@@ -273,9 +276,12 @@ class CellTree:
             about the best point that is proved to hold no nearer point.
             """
             y = best.point
+            # The corner of the box that is farthest from the best point.
             corner = vector(*(fmax(high[k] - y[k], y[k] - low[k]) for k in range(3)))
             return dr.squared_norm(corner) >= best.exclusion_radius * best.exclusion_radius
 
+        # Boxes farther away than the best point are skipped; the list begins with infinite
+        # estimates.
         limit = backend.Float(best.distance)
         empty_list = (
             entry
@@ -284,6 +290,7 @@ class CellTree:
         )
         start = limit, *empty_list
         lower, *listed = self._walk(x, visit_cell, start, lambda state: limit * limit, may_contain)
+        # The points only, without their estimates.
         return lower, listed[1::2]
 
     def _walk(

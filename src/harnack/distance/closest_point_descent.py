@@ -152,6 +152,7 @@ class ClosestPointDescent:
             """
             # The rounding error of f takes as long as f itself, and does not matter here.
             sample = dataclasses.replace(self.field.evaluate(y), value_error=0.0)
+            # The step to the level and the step along the surface, both from y.
             residual, state = self._state_at(y, sample)
             move, _ = self._tangential_step(x, state, real(1))
             step = -residual / lengths.safe_norm(state.gradient)
@@ -161,6 +162,7 @@ class ClosestPointDescent:
             max_length = 0.5 * state.smooth_radius
             is_lost = dr.select(active, length > max_length, is_lost)
             shrinks = (k > 0) & (length < 0.5 * last)
+            # If steps halve, the end is within two steps of y.
             is_far = dr.select(active, shrinks & (distance - 2 * length > limit), is_far)
             # The expected length of the next step.
             next_length = length * dr.square(length / last)
@@ -202,7 +204,9 @@ class ClosestPointDescent:
         _, is_minimum = self._tangential_step(x, state, self.backend.Float(1), rows)
         gradient_norm = lengths.safe_norm(state.gradient)
         step = -residual / gradient_norm
+        # Rounding is no part of the remainder: the step cannot reduce it.
         exact = dataclasses.replace(sample, value_error=0.0, gradient_error=0.0)
+        # The step ends on the level up to its uncertainty.
         arrives = taylor_remainder(exact, dr.abs(step)) <= gradient_norm * state.level_uncertainty
         end, is_short = self._step_to_level(x, residual, state)
         arrives &= is_short
@@ -249,10 +253,12 @@ class ClosestPointDescent:
             active: whether the descent goes on.
             """
             current, is_first = _DescentState(y, g, uncertainty, radius), iteration == 0
+            # In iteration 0 the start is first brought to the level, without a move along it.
             move, is_minimum = self._tangential_step(x, current, factor)
             is_minimum &= ~is_first
             goes_on = active & ~is_minimum
             trial, is_arrived = self._to_level(dr.select(is_first, y, y + move), goes_on)
+            # No farther from x than before, up to rounding.
             limit = dr.norm(x - y) * (1 + 8 * self.backend.machine_epsilon) + 4 * uncertainty
             is_better = goes_on & is_arrived & (dr.norm(x - trial.y) <= limit)
             new_factor = dr.select(is_better, fmin(4 * factor, 1), 0.25 * factor)
@@ -336,6 +342,7 @@ class ClosestPointDescent:
         scale = lengths.max_norm(y)
         epsilon, gradient_norm = self.backend.machine_epsilon, lengths.safe_norm(sample.gradient)
         total_error = dr.fma(8 * epsilon, dr.abs(sample.value), sample.value_error)
+        # Rounding of coordinates, and of f divided by its slope.
         uncertainty = dr.fma(4 * epsilon, scale, total_error / gradient_norm)
         smooth_radius = real(0)
         for promise in sample.all_promises:
@@ -345,6 +352,7 @@ class ClosestPointDescent:
             smooth_radius = fmax(
                 smooth_radius, dr.select(dr.isfinite(promised_radius), promised_radius, 0)
             )
+        # No promise of smoothness: steps have no limit.
         smooth_radius = dr.select(smooth_radius > 0, smooth_radius, dr.inf)
         residual = real(-self.levels.offset_to_nearest(sample.value))
         return residual, _DescentState(
@@ -409,16 +417,18 @@ class ClosestPointDescent:
                 lengths.safe_norm(g),
                 iteration == 0,
             )
+            # Iteration 0 evaluates the start; later ones try a step from y.
             step = -residual / gradient_norm
-            boost = dr.select(iteration > _SIMPLE_ROOT_STEPS, multiplicity(step, last), 1)
-            length = factor * clamp(boost * step, -radius, radius)
+            step_factor = dr.select(iteration > _SIMPLE_ROOT_STEPS, multiplicity(step, last), 1)
+            length = factor * clamp(step_factor * step, -radius, radius)
             point = dr.fma(vector(length / gradient_norm), g, y)
             new_residual, trial = self._evaluate(dr.select(is_first, y, point))
             is_flat = ~is_first & (new_residual == 0) & (lengths.safe_norm(trial.gradient) == 0)
             trial = trial.flat_after(is_flat, current)
             is_better = active & (is_first | (dr.abs(new_residual) < dr.abs(residual)))
-            boost = dr.select(is_better, fmin(2 * factor, 1), 0.25 * factor)
-            factor = dr.select(is_first, factor, boost)
+            # The fraction for the next step.
+            step_factor = dr.select(is_better, fmin(2 * factor, 1), 0.25 * factor)
+            factor = dr.select(is_first, factor, step_factor)
             on_level |= is_better & self._is_on_level(new_residual, trial)
             active &= ~on_level & (iteration <= _MAX_LEVEL_STEPS) & (factor > _MIN_STEP_FRACTION)
             residual = dr.select(is_better, new_residual, residual)

@@ -223,12 +223,14 @@ def _search_smooth_part(
     )
     lower = np.maximum(np.minimum(result.lower_bounds, jump_gap - rounding), 0)
     distance, closest = _length(points - known.closest), known.closest.copy()
+    # Only these can improve the result: points nearer than the known ones on jump surfaces.
     nearer_rows = np.flatnonzero(
         _length(points - result.closest) < np.nan_to_num(distance, nan=np.inf) - rounding
     )
     candidates = smooth_evaluator.remove_truncation(
         points[nearer_rows], result.closest[nearer_rows]
     )
+    # f itself must have the level there, not only `smooth`.
     values = np.asarray(surface.field.value(candidates, precision="double"))
     is_level = np.abs(values[:, None] - surface.level_values).min(axis=1) < _LEVEL_MATCH
     closest[nearer_rows[is_level]] = candidates[is_level]
@@ -238,6 +240,7 @@ def _search_smooth_part(
     unsettled_rows = np.flatnonzero(~is_settled)
     if len(unsettled_rows):
         guess = InitialGuess(closest[unsettled_rows], known.estimate[unsettled_rows])
+        # Search again with f itself, by rays.
         retry = search(surface, points[unsettled_rows], guess, evaluator, tolerance, progress)
         closest[unsettled_rows], lower[unsettled_rows] = (
             retry.closest,
@@ -393,6 +396,7 @@ class _QueryEvaluator:
         x, surface_point, residual, lower, estimate = in_batches(self.backend, compute, points)
         domain = self.surface.field.domain
         if domain is not None and len(x):
+            # Nothing is promised outside the domain.
             lower[~domain.contains_points(x)] = 0
         return x, self._inside_domain_or_nan(surface_point), residual, lower, estimate
 
@@ -732,6 +736,7 @@ class _QueryEvaluator:
                     *in_batches(self.backend, truncation, closest[rows]),
                 )
                 (closest[rows],) = in_batches(self.backend, newton, *newton_arguments)
+                # Points that were not found are left out of the next correction.
                 rows = rows[~np.isnan(closest[rows, 0])]
         if len(rows):
             (closest[rows],) = in_batches(self.backend, on_level, points[rows], closest[rows])

@@ -116,6 +116,7 @@ def signed_distance(
     if method == "lower_bound":
         _check_domain(field, x)
     if field.has_jumps and method != "lower_bound":
+        # These methods do not see facets: the nearest one of the surface is searched for.
         jump_distance = find_closest(backend, traced, levels, x, teller(None)).distance
         result = np.copysign(np.fmin(jump_distance, np.abs(result)), result)
     return _outwards(field) * result

@@ -106,6 +106,7 @@ class JumpSurfaceSearch:
             """
             last = NearestFacet(*state[:5])
             probe, best, nearest, count, active = state[5:]
+            # The next facet is fetched when the probes of the last one are done.
             is_first = active & (probe == 0)
             candidate = next_facet((last.sort_key, last.facet), limit, is_first)
             facet = _select(is_first, candidate, last)
@@ -162,6 +163,7 @@ class JumpSurfaceSearch:
         """
         field, backend = self.surface.field, self.surface.backend
         real, index = backend.Float, backend.UInt32
+        # Asked for no lane, only to learn whether the field can list its facets.
         first_facet = field.nearest_facet(
             x, (real(-1), index(NO_FACET)), real(0), backend.Bool(False)
         )
@@ -217,6 +219,7 @@ def straddles_level(surface: SurfaceTracer, y: Vec3, radius: Real, active: Mask)
         edge_norm = dr.norm(end - start)
         direction, edge_length = (end - start) / edge_norm, radius * edge_norm
         start_crossing = JumpCrossing(real(0), index(NO_FACET), real(0), zero)
+        # Up to the first facet on the edge; the two values are taken on the same side of it.
         t = real(field.next_jump(o, direction, start_crossing, edge_length, active).t)
         before_jump = dr.select(t < edge_length, t, 0.5 * edge_length)
         for distance in (real(0), _FRACTION_TO_FACET * before_jump):
@@ -395,11 +398,13 @@ class _HitPlanes:
         first, second, third = self.first, self.second, self.third
         select = _HitPlane.where
         is_apart = first.is_apart(plane)
+        # If the plane becomes the first one.
         if_best = _HitPlanes(
             plane,
             select(is_apart, first, second),
             select(is_apart & second.is_apart(plane), second, third),
         )
+        # If it does not.
         is_new = is_hit & ~is_best & is_apart
         otherwise = _HitPlanes(
             first,
@@ -466,6 +471,7 @@ def compass_search(surface: SurfaceTracer, x: Vec3, foot: Vec3) -> Vec3:
         values: the planes of hits, `_HitPlanes.parts`.
         """
         hit_planes, is_global = _HitPlanes.of(values), ray < _SPHERE_RAYS
+        # The first rays of a round go to intersections of planes, the others are tilted.
         to_planes = ~is_global & (failed < _PLANE_RAYS)
         direction = dr.select(
             to_planes,
@@ -483,6 +489,8 @@ def compass_search(surface: SurfaceTracer, x: Vec3, foot: Vec3) -> Vec3:
         is_nearer &= is_on_surface(surface, point, hit, is_nearer)
         normal = dr.normalize(hit.gradient)
         has_plane = is_hit & dr.isfinite(dr.squared_norm(normal))
+        # The tangent plane at the hit; its distance from x is that of the hit, projected on the
+        # normal.
         plane = _HitPlane(normal, dr.dot(normal, direction) * hit.t)
         hit_planes = hit_planes.updated(plane, has_plane, has_plane & is_nearer)
         d, t = dr.select(is_nearer, direction, d), dr.select(is_nearer, hit.t, t)

@@ -150,9 +150,11 @@ def _proved_on_level(surface: TracedSurface, corners: FloatArray, size: float) -
 
     center = corners.mean(axis=1)
     (clearances,) = in_batches(backend, clearance, center)
+    # The ball about the center that contains the triangle.
     radius = np.linalg.norm(corners - center[:, None], axis=2).max(axis=1)
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     length = np.linalg.norm(normal, axis=1, keepdims=True)
+    # f right beside the center, on both sides.
     offset = _SIDE_DISTANCE * size * normal / np.maximum(length, 1e-300)
     side_values = [field.value(center + sign * offset, precision="double") for sign in (1, -1)]
     lower, upper = np.minimum(*side_values), np.maximum(*side_values)

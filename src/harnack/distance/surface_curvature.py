@@ -105,6 +105,8 @@ def curvature(
     """
     target, choices = surface_and_options("curvature", surface, options, keywords, ("precision",))
     field, backend = target.field, choose_backend(choices.precision or "double")
+    # Fields that are evaluated within a kernel, and fields that are evaluated in batches by tree
+    # sums.
     if not isinstance(field, BatchedField):
         prepared = field.prepare(backend)
 
@@ -174,6 +176,7 @@ def _refine_accuracy(
     if not can_refine:
         return CurvatureSamples(*columns)
     x = np.asarray(points, np.float64)
+    # The allowed error where the mean curvature itself is nearly 0.
     flat_error = _ACCURACY / _size(field, x)
     for acceptance in _ACCEPTANCE_FACTORS[1:]:
         mean, error = columns[0], columns[3]
@@ -182,6 +185,7 @@ def _refine_accuracy(
         rows = np.flatnonzero(~is_accurate & (is_truncated > 0))
         if not rows.size:
             break
+        # Only the rows whose error is too large are evaluated again.
         *refined, is_truncated[rows] = in_batches(backend, with_acceptance(acceptance), x[rows])
         for column, values in zip(columns, refined, strict=True):
             column[rows] = values
@@ -371,6 +375,7 @@ def curvature_lines(
         hint = did_you_mean(family, get_args(Family))
         raise ValueError(f"unknown family {family!r}; choose one of {names}{hint}")
     step, length = as_positive(step, "step"), as_positive(length, "length")
+    # Steps on either side of the seed.
     count = math.ceil(length / step)
     if count > _MOST_STEPS:
         raise ValueError(f"length/step asks for {count:,} steps: at most {_MOST_STEPS:,}")

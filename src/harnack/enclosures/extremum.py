@@ -77,8 +77,7 @@ class MaximumEnclosure(Enclosure):
         """Return the mask of lanes on which, for the given length, no operand rises to the level
         above, and at least one operand is proved not to fall to the level below.
         """
-        # Start with True (where the gap is a number), and with whether there is a level below at
-        # all.
+        # Start with True (where the gap is a number), and with whether no level lies below.
         free_above, free_below = gaps.above == gaps.above, gaps.below == dr.inf
         for operand in self.operands:
             rise_gaps, fall_gaps = self._gaps(gaps, operand)

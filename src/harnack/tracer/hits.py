@@ -200,12 +200,14 @@ def _trace(surface: TracedSurface, rays: RayBatch) -> Hits:
     prepared = surface.for_rays(count).prepare(backend, many_rays=count >= _MIN_RAYS_FOR_CELLS)
     if not prepared.field.is_cheap and _are_scattered(backend, dr.detach(o), dr.detach(d)):
         prepared = replace(prepared, uses_ray_queue=True)
+    # The trace itself has no derivatives; they are attached to its results.
     with dr.suspend_grad():
         end, hits, doubt = _first_hits(prepared, *(dr.detach(array) for array in rays.arrays))
         if doubt is not None:
             hits = _with_searched_distances(prepared, hits, doubt)
     if not rays.is_numpy and needs_derivatives(prepared, o, d):
         t, normal = attach_derivatives(prepared, o, d, end, hits.normal)
+        # Results without a known derivative raise an error if it is used.
         normal, value, uncertainty = (
             refuse_derivative(prepared, o, d, name, array)
             for name, array in (

@@ -240,6 +240,7 @@ class JumpTracer:
         spent = passed & (now.evaluations >= self.march.max_steps)
         status = dr.select(spent, self.backend.UInt32(int(RayStatus.OUT_OF_STEPS)), now.status)
         is_past = passed | (stopped & (now.status == HIT_AT_JUMP))
+        # Rays that are past the facet go on from the last merged crossing.
         behind = JumpCrossing(
             dr.select(is_past, last.t, previous.behind.t),
             dr.select(is_past, last.facet, previous.behind.facet),
@@ -280,6 +281,7 @@ class JumpTracer:
         tolerance = _COINCIDENT_ROUNDINGS * self.backend.machine_epsilon * (size + first.t)
         # A rounding across the facet is a length of rounding / sine along the ray.
         sine = fmax(dr.abs(dr.dot(first.normal, self.path.direction)), real(_MIN_SINE))
+        # Further crossings up to this t may be at the same point.
         limit = fmax(fmin(first.t + tolerance / sine, self.end), first.t)
 
         def add_next(now: _CoincidentJumps) -> _CoincidentJumps:
@@ -317,11 +319,13 @@ class JumpTracer:
             active=self.backend.Bool(active) & (first.facet != NO_FACET),
         )
         total = loop_while_active(start, add_next, "together")
+        # The first facet whose jump has the sign of the sum gives index and normal.
         up, down = total.jump > 0, total.jump < 0
         facet = dr.select(up, total.up, dr.select(down, total.down, first.facet))
         normal = dr.select(up, total.normal_up, dr.select(down, total.normal_down, first.normal))
         behind = JumpCrossing(total.t, total.last, first.jump, first.normal)
         unclear = total.folded & (total.jump == 0)
+        # Only where rounding is no small part of the ray.
         unclear &= tolerance > _COARSE_FRACTION * (self.end - self.start)
         return JumpCrossing(first.t, facet, real(total.jump), normal), behind, unclear
 

@@ -126,6 +126,7 @@ def _refuse_if_unproved(
     if not len(centers):
         return
     gap, slope, value = _samples(field, levels)(centers)
+    # To first order the surface is gap/slope away.
     far = gap > _FAR_CELLS * cells.cell_size * slope
     if solid is not None:
         far &= ~((value >= solid[0]) & (value <= solid[1]))

@@ -502,6 +502,7 @@ class Hysteresis:
         )
         side = dr.select(starts_on_facet, 0, side)
         offset_behind = offset + ahead.jump
+        # The jump changes sides, brings f near the level, or is far enough beyond it to count.
         passes = active & (side * offset > 0) & (side * offset_behind <= 0)
         begins = active & ~now.is_touching & (dr.abs(offset_behind) <= accepted.band)
         is_off = dr.abs(offset_behind) > fmax(
@@ -591,6 +592,7 @@ def refine_crossing(
         near = dr.abs(offset) <= fmax(
             tolerance.value_tolerance(steepness, now.t), value_error_bound(sample, steepness, size)
         )
+        # The half in which f changes sides.
         is_before = side * offset > 0
         before = dr.select(is_before, now.t, now.before)
         behind = dr.select(is_before, now.behind, now.t)
@@ -626,10 +628,12 @@ def cubic_root(start: Real, end: Real, slope: Real, end_slope: Real) -> Any:
     b = 3 * (end - start) - 2 * slope - end_slope
     c = slope + end_slope - 2 * (end - start)
     low, high = type(start)(0), type(start)(1)
+    # Start at the root of the chord.
     u = start / (start - end)
     for _ in range(_ROOT_ITERATIONS):
         value = dr.fma(dr.fma(dr.fma(c, u, b), u, slope), u, start)
         rate = dr.fma(dr.fma(3 * c, u, 2 * b), u, slope)
+        # Keep the part in which the sign changes.
         before = (value > 0) == (start > 0)
         low, high = dr.select(before, u, low), dr.select(before, high, u)
         next_u = u - value / rate

@@ -560,8 +560,10 @@ class March:
         slack = 8 * self.backend.machine_epsilon * size
         reach = fmax(tolerance, 2 * slack)
         proved = gaps.nearest <= self.tolerance.value
+        # The change of f along the ray may prove that it takes the level.
         for enclosure in ray_sample.forward:
             proved |= enclosure.arrives(gaps, reach)
+        # Otherwise samples are taken along the gradient and along the ray.
         toward = down_or_up(sample.gradient, gaps, path.direction)
         directions_and_slopes = (
             (toward, safe_norm(sample.gradient)),

@@ -113,6 +113,7 @@ class PixelCones:
         margin = (
             _START_MARGIN_APPROXIMATE if prepared.field.has_variable_accuracy else _START_MARGIN
         )
+        # The march ends a small margin outside of the cover: the tolerance grows with the cone.
         tolerance = PreparedHitTolerance(real(0), margin * self.radius, real(0))
         march_options = prepared.levels, tolerance, prepared.max_steps, prepared.over_relaxation
         march = March(backend, *march_options, cone_radius=self.radius)
@@ -143,6 +144,7 @@ class PixelCones:
                 height, slope, (slope - last.slope) / last.step, _MAX_STEP_RATIO * last.step
             )
             count = last.sample_count + 1
+            # The passage ends behind the surface, off the cover, or where its samples are used up.
             has_left = (height >= _END_HEIGHT) & (slope >= 0)
             is_over = (height <= -1) | has_left | (count >= _MAX_SAMPLES) | (t >= t_end)
             step = fmax(step, _MIN_STEP * self.radius * t)

@@ -69,6 +69,8 @@ class RayBatch:
         else:
             backend = choose_backend(precision or precision_of_input(origins, directions))
         o, d, near, far = _uploaded(backend, origins, directions, t_min, t_max)
+        # An empty array makes the whole call empty; others have one entry or as many as there are
+        # rays.
         widths = [dr.width(array) for array in (o, d, near, far)]
         count = max(widths) if min(widths) > 0 else 0
         return cls(backend, o, d, near, far, count, not drjit_arrays, has_tensors)

@@ -146,6 +146,7 @@ def surface_and_options(
             `TraceOptions` beside `options`; `surface` is neither a field nor a `Surface`.
         ValueError: a value that `Surface` or `TraceOptions` refuses.
     """
+    # First, keywords that the called function does not have.
     for name in keywords:
         if name in (*SURFACE_OPTIONS, *TRACE_OPTIONS) and name not in honored:
             raise TypeError(_refusal(verb, name, honored))
@@ -161,6 +162,7 @@ def surface_and_options(
             )
     else:
         surface = Surface(surface, **surface_keywords)
+    # A `Surface` may hold options that the called function does not have.
     if "side" not in honored and surface.solid_range is not None:
         raise TypeError(
             f'{verb} has no side, and this is side="{surface.side}" of a level: faces of a solid '
