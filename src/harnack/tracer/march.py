@@ -838,7 +838,7 @@ class March:
         within: the largest such difference that the tolerance allows.
         total_error, rounding: bounds of the error of f, and of its part due to rounding.
         ray_sample, gradient_norm: the sample of f at the point, and |grad f|.
-        size: a bound of the coordinates.
+        length_scale: a bound of the coordinates.
         end: the ray parameter at which the ray ends.
 
         A point is no hit if rounding leaves the distance to the surface uncertain by more than a
