@@ -586,6 +586,8 @@ class CellClassifier:
     def _nearest_ray_hit(self, p: Vec3, radius: Real) -> Vec3:
         """Return, for functions that jump, the point nearest to p among the first hits of four rays
         through the ball around p, along the diagonals of the cell; `FAR_SENTINEL` without a hit.
+
+        radius: the radius of the ball.
         """
         real, vector, count = self._backend.Float, self._backend.Array3f, self._backend.UInt32
 

@@ -272,7 +272,7 @@ def _warn_of_failures(name: str, result: ClosestPoints) -> None:
     """Warn if no surface was found for some queries; and if, for some, the point found is nearer
     than the field's promises (proved bounds of f near a point) allow, so that they are wrong.
 
-    name: the name of the public function, for messages.
+    name: the name of the public function, for messages. result: what its search found.
     """
     count = len(result.closest)
     unresolved = int(np.isnan(result.closest[:, 0]).sum())

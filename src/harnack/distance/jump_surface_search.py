@@ -140,8 +140,11 @@ class JumpSurfaceSearch:
     ) -> tuple[Mask, Any, Vec3]:
         """Trace the segment from y + scale * start to y + scale * end.
 
-        Returns the mask of lanes on which it hits the surface, the index of the facet that it hits,
-        and the hit point. A hit counts only if f takes values on both sides of a level around y.
+        active: mask of lanes that are traced.
+
+        Returns the mask of lanes on which the segment hits the surface, the index of the facet that
+        it hits, and the hit point. A hit counts only if f takes values on both sides of a level
+        around y.
         """
         backend = self.surface.backend
         real, vector = backend.Float, backend.Array3f
@@ -195,8 +198,8 @@ class JumpSurfaceSearch:
 
 
 def straddles_level(surface: SurfaceTracer, y: Vec3, radius: Real, active: Mask) -> Mask:
-    """Return the mask of lanes on which f takes values on both sides of a level within 1.74 radii
-    of y.
+    """Return the mask of lanes on which f takes values on both sides of a level within 1.74 times
+    `radius` of y.
 
     active: mask of lanes that are tested.
 

@@ -118,6 +118,7 @@ class BoundedLaplacianEnclosure(Enclosure):
     ) -> Self:
         """Return the enclosure from bounds of a function on a ball.
 
+        radius: the radius of the ball.
         ranges: two differences in value: how far the function may fall from its value at the
             center, and how far it may rise.
         laplacian: a lower and an upper bound of its Laplacian on the ball.

@@ -285,7 +285,9 @@ class _ChordCondition:
 
     @classmethod
     def of(cls, gap: Real, mean: Real, dimension: int) -> _ChordCondition:
-        """Make the condition for a gap that is given in units of u, that is, w - 1."""
+        """Make the condition for a gap that is given in units of u, that is, w - 1. mean,
+        dimension: m and n.
+        """
         # g = w^(1/K) - 1, in forms that do not cancel for small gaps.
         if dimension == 3:
             gap = gap / (dr.sqrt(1 + gap) + 1)

@@ -709,7 +709,7 @@ class March:
             levels.
         contact: the contact with a level behind the point; None if rays end at levels.
 
-        It is 0 where the error of f is as large as its distance from a level.
+        For cones, the step is also limited by the growth of the cone. It is 0 where the error of f is as large as its distance from a level.
         """
         growth = _GROWTH_FRACTION * trial.gaps.nearest
         # A tenth of the gap is kept for the growth of the cone.
@@ -785,6 +785,7 @@ class March:
         `end`.
 
         contact: the contact with a level behind the trial point; None if rays end at levels.
+        is_hit: mask of trial points that are hits.
         """
         # After a step of zero, the next enclosures need reach only a third as far: bisection.
         candidate = fmin(now.enclosure_reach, end - trial.t)
@@ -875,6 +876,7 @@ class March:
         which f is predicted to reach a level. A wrong prediction does no harm: a trial point is
         accepted only if an enclosure of f that reaches back from it proves the rest of the step.
 
+        forward, ray_sample: the proved step from the trial point, and the sample of f there.
         gaps: the differences between f and the next levels.
         now: the state at the last accepted point.
         is_smooth: whether value and slope at the last accepted point help to predict f. They do not
@@ -902,7 +904,7 @@ class March:
         cubic has the values and slopes of f at the trial point and at the last accepted point. The
         result is 0 if no point was accepted before.
 
-        now: the state at the last accepted point.
+        ray_sample: the sample at the trial point. now: the state at the last accepted point.
 
         Let h be the distance of the two points, D the difference quotient, and s0 and s the slopes
         at the accepted and the trial point. The derivative is 2 (2s + s0 - 3D)/h (Hermite). For a

@@ -543,11 +543,16 @@ class SurfaceTracer:
         *,
         any_hit: bool = False,
     ) -> Ends:
-        """Trace rays o + t d, and return `collect(end state, index)`. The end state is a
-        `MarchState`, and the index is that of the facet or patch that each ray hit.
+        """Trace rays o + t d, t_min <= t <= t_max, and return `collect(end state, index)`. The end
+        state is a `MarchState`, and the index is that of the facet or patch that each ray hit.
 
+        active: mask of rays that are traced.
+        collect: makes a dataclass of arrays from the end state and the index.
         any_hit: whether a ray may end at any hit, if that takes less work than finding the first
             hit.
+
+        With a queue of rays, rays are traced at once; but not if they look for crossings or if
+        evaluations of the field are cheap.
         """
         march, path, start, end, state = self.begin_march(
             o, d, t_min, t_max, active, crosses=self.require_crossing
