@@ -1,5 +1,5 @@
 """Enclosures, which bound how far a function f can change along a path, and their inputs. f is
-sampled at a point of the path (mostly a ray); F(s) is the change of f at the length s behind that
+sampled at a point of the path (mostly a ray); F(s) is the change of f at the length s beyond that
 point. A level is a value of f that rays look for; a length is free if f takes no level on it.
 
 - `Enclosure`: the base of all enclosures. A new proof is a class derived from it, in this package.
@@ -142,7 +142,7 @@ class SlopeRange:
 
 class Enclosure(abc.ABC):
     """A proof that F stays within an interval that depends on s, for 0 <= s < reach. F(s) =
-    f(path(t+s)) - f(path(t)) is the change of f from its value at a sample, at the length s behind
+    f(path(t+s)) - f(path(t)) is the change of f from its value at a sample, at the length s beyond
     it. A level is a value of f that rays look for; a length s is free if F takes no level on it.
     The gaps (`LevelGaps`) are the differences between f at the sample and the next levels below and
     above.

@@ -143,7 +143,7 @@ def trace(
         place of `options`: `trace(field, o, d, level=2.0, tolerance=1e-6)`.
 
     Arrays of float64 are traced in double precision and give such arrays, other arrays in single
-    precision, unless `precision` says otherwise. To find further crossings behind the first hit,
+    precision, unless `precision` says otherwise. To find further crossings beyond the first hit,
     use `crossings`.
 
     With Dr.Jit rays, t and position carry derivatives with respect to rays, level, and vertices of

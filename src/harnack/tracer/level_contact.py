@@ -279,7 +279,7 @@ class Hysteresis:
     levels: all levels.
     spacing: the difference between the two closest levels; inf for a single level.
     is_free_before, is_free_after: whether the extent of the surface proves that the ray meets no
-        level before the interval that is marched, and behind it. Then f stays on one side of each
+        level before the interval that is marched, and after it. Then f stays on one side of each
         level there, and at that end of the interval it need differ from the level by no more than
         its error.
     start: the ray parameter at which the interval begins.
@@ -336,7 +336,7 @@ class Hysteresis:
         """Make the rule for given levels, and compute their spacing.
 
         free: the masks `is_free_before` and `is_free_after` of the class: whether no level lies on
-            the ray before and behind the interval that is marched.
+            the ray before and after the interval that is marched.
         start, rounding: as in the class.
         """
         period = levels.period
@@ -580,7 +580,7 @@ def refine_crossing(
     tolerance and its error, bisection narrows the interval between the two points. It ends at a
     point within the tolerance, or where the interval is as short as rounding.
     """
-    # 1 if f is larger than the level before the crossing. (Contact has the side behind it.)
+    # 1 if f is larger than the level before the crossing. (Contact has the side after it.)
     side = -contact.side
     count = dr.uint32_array_t(type(contact.root))
     smallest = 4 * float(dr.epsilon(type(contact.root)))

@@ -297,7 +297,7 @@ class March:
 
         Hits. At a hit, |f - level| is at most the tolerance less the truncation error of f, or at
         most twice the rounding error of f if that is larger. If the level is nearer to f than the
-        error of f, the trial point may lie behind the root, by less than the tolerance. Then it is
+        error of f, the trial point may lie beyond the root, by less than the tolerance. Then it is
         a hit (`_refined_accuracy`), so no root is passed. If it is no hit, because the error is
         large, then no enclosure that reaches back makes it accepted, and no step from it is proved,
         as it is not known on which side of the point the level lies.
@@ -317,7 +317,7 @@ class March:
         cone grows by that much, unless the level is never met and f moves away from it faster than
         the cone grows.
 
-        With `occupied`, the part of the ray behind a proved step is skipped, too, as far as it lies
+        With `occupied`, the part of the ray beyond a proved step is skipped, too, as far as it lies
         in cells that contain no level (`EmptySpaceGrid.empty_run` has the proof).
 
         With `only_component`, levels outside of the marked cells belong to other components of the
@@ -437,7 +437,7 @@ class March:
         """Evaluate f at the trial point of each ray, and derive all quantities of a `_TrialSample`.
 
         end: the ray parameter at which the ray, or its interval before the next jump, ends.
-        now: the state of the march; the trial point lies `trial_step` behind its last accepted
+        now: the state of the march; the trial point lies `trial_step` beyond its last accepted
             point.
         ahead: for a function with jumps, the crossing of the facet at the end of the interval; else
             None.
@@ -703,13 +703,14 @@ class March:
         return contact, crosses, jump, value
 
     def _proved_step(self, trial: _TrialSample, gaps: LevelGaps, contact: Contact | None) -> Real:
-        """Return the length of the ray behind the trial point that is proved to hold no level.
+        """Return the length of the ray beyond the trial point that is proved to hold no level.
 
         gaps: the differences between f at the trial point, or behind the jump there, and the next
             levels.
-        contact: the contact with a level behind the point; None if rays end at levels.
+        contact: the contact with a level after the point; None if rays end at levels.
 
-        For cones, the step is also limited by the growth of the cone. It is 0 where the error of f is as large as its distance from a level.
+        For cones, the step is also limited by the growth of the cone. It is 0 where the error of f
+        is as large as its distance from a level.
         """
         growth = _GROWTH_FRACTION * trial.gaps.nearest
         # A tenth of the gap is kept for the growth of the cone.
@@ -744,7 +745,7 @@ class March:
         proved_step: Real,
         trial_step: Real,
     ) -> tuple[Real, Real]:
-        """Extend the proved step and the trial step over the cells behind the proved step that hold
+        """Extend the proved step and the trial step over the cells beyond the proved step that hold
         no level.
 
         occupied: the grid of cells. end: the ray parameter at which rays end.
@@ -784,7 +785,7 @@ class March:
         present length. A ray that has just left a level, or hit it, gets the rest of the ray up to
         `end`.
 
-        contact: the contact with a level behind the trial point; None if rays end at levels.
+        contact: the contact with a level after the trial point; None if rays end at levels.
         is_hit: mask of trial points that are hits.
         """
         # After a step of zero, the next enclosures need reach only a third as far: bisection.
@@ -809,7 +810,7 @@ class March:
 
         accepted: mask of accepted trial points. proved_step: the proved step from there, or from
             the last accepted point on other rays.
-        contact: the contact behind the trial point; None if rays end at levels.
+        contact: the contact after the trial point; None if rays end at levels.
 
         Rays without an end count as free from a very large t on. A ray in contact must sample its
         end (`Hysteresis.must_sample_end`).

@@ -66,7 +66,7 @@ class CrossingArrays:
     end: (n) the ray parameter up to which the ray was followed; inf if it was followed to its end.
     evaluations: (n) the number of evaluations of f.
     status: (n) a `RayStatus`: MISS if the ray has no further crossings, HIT if it has k,
-        OUT_OF_STEPS if the ray behind `end` is not known.
+        OUT_OF_STEPS if the ray beyond `end` is not known.
     """
 
     t: Real
@@ -120,7 +120,7 @@ def find_crossings(
 
     `Hysteresis`, the rule by which a crossing is counted, states the guarantees and proves them. A
     ray is marched from one crossing to the next without a new start: what is known of f at a
-    crossing is used behind it, and the ray may reach and leave levels any number of times.
+    crossing is used after it, and the ray may reach and leave levels any number of times.
     """
     backend = prepared.backend
     real, vector, count = backend.Float, backend.Array3f, backend.UInt32
@@ -221,10 +221,10 @@ class RayCrossings:
         0 for no crossing.
     count: (n,) the number of crossings, at most k.
     traced_to: (n,) the ray parameter up to which the ray was followed: inf if it was followed to
-        its end; else the point just behind the last crossing at which this crossing was noticed, or
+        its end; else the point just beyond the last crossing at which this crossing was noticed, or
         the point at which the ray ran out of steps.
     status: (n,) a `RayStatus`. MISS: the ray is proved to have no other crossings. HIT: there are k
-        crossings, and the rest of the ray was not examined. OUT_OF_STEPS: the ray behind
+        crossings, and the rest of the ray was not examined. OUT_OF_STEPS: the ray beyond
         `traced_to` is not known.
     evaluations: (n,) the number of evaluations of the field.
     """

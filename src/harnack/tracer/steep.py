@@ -75,7 +75,7 @@ def largest_change(field: Field, p: Vec3, value: Real, reach: Real) -> Real:
 @dataclass(frozen=True)
 class SteepPlace:
     """What ranges of the values of f prove at a trial point of a ray and on the length of the ray
-    behind it, where f is a function whose slope has no bound.
+    beyond it, where f is a function whose slope has no bound.
 
     error: a bound of the error of f at the point, from the rounding of f and of the point; inf if
         no bound is known. (|grad f| times the rounding of the point is no bound here.) None for
@@ -83,9 +83,9 @@ class SteepPlace:
     is_level: whether f may equal a level at the exact point. For this f must be continuous there,
         and the level must lie in the range of f around the rounded point, or just outside of it.
         This does not prove that f takes the level; `beyond` tests that.
-    free: a length of the ray behind the point on which f does not take a level, because it stays
+    free: a length of the ray beyond the point on which f does not take a level, because it stays
         away from levels or has no value at all; 0 if no length is proved.
-    ahead: the length of the ray behind the point on which values were bounded.
+    ahead: the length of the ray beyond the point on which values were bounded.
     fall, rise: bounds of how far f falls and rises on that length from its value at the point; inf
         if no bound is known.
     """
@@ -103,7 +103,7 @@ class SteepPlace:
     ) -> SteepPlace:
         """Compute the bounds at the parameter t of rays.
 
-        ahead: the length of the ray behind t on which values are bounded.
+        ahead: the length of the ray beyond t on which values are bounded.
         sample: the sample of f at t.
 
         Proof of the error. The exact point differs from the rounded point by at most `slack` in
@@ -247,7 +247,7 @@ def beyond(
     twice as far; at `reach`. Along the second direction: twice as far as its slope says; at
     `reach`. Then, for points in `searches`: along the first direction by golden sections towards
     the point where f comes nearest to the level; then `reach` back along the second direction, as
-    rounding may have put p behind the level; then half of `reach` along each axis, both ways, from
+    rounding may have put p beyond the level; then half of `reach` along each axis, both ways, from
     the nearest point.
 
     Ranges of f around p prove nothing, as they may contain numbers that f does not take. The same

@@ -197,7 +197,7 @@ class MarchResult:
         for other rays.
     side: if hits require a crossing, 1 if f rises through the level along the ray and -1 if it
         falls; otherwise None. If hits require a crossing, t and gradient are those of the root, and
-        `value` is f a little behind it.
+        `value` is f a little beyond it.
     patch: for a union of patches, the index of the patch that was hit, NO_PATCH for rays without a
         hit; None for other fields.
     """
@@ -509,9 +509,9 @@ class SurfaceTracer:
 
         Proof that this suffices if f is convex along the ray. Suppose that f is W below the level
         at some point of the extent, and reaches the level at the end of the extent. Let e be the
-        error of f there; W >= 8 e (`Hysteresis.band`). Behind the end, f rises at least as steeply
+        error of f there; W >= 8 e (`Hysteresis.band`). Beyond the end, f rises at least as steeply
         as on average before it, and the way from that point to the end is at most end - start. So
-        (end - start)/7 behind the end, f is at least W/7 >= 8/7 e above the level, which a sample
+        (end - start)/7 beyond the end, f is at least W/7 >= 8/7 e above the level, which a sample
         there shows.
         """
         never, size = self.backend.Bool(False), max_norm(path.origin)
