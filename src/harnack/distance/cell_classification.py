@@ -227,8 +227,7 @@ class ClipCurveDescent:
 
         def solution(along_u: Real, along_n: Real) -> Vec3:
             """Return the shortest vector whose inner products with u and n are `along_u` and
-            `along_n`.
-            """
+            `along_n`."""
             first, second = along_u - cosine * along_n, along_n - cosine * along_u
             return (vector(first) * u + vector(second) * n) / sine
 
@@ -292,8 +291,7 @@ def taylor_remainder(sample: Sample, radius: Real, degree: int = 1) -> Real:
     the sample, and T the Taylor polynomial of f about p, of degree 1 or 2. The bound follows from
     the sample's promises (proved bounds of f near p); it is infinite if these imply none. When the
     radius decreases, the bound falls at least as fast as radius^(degree + 1), except for the errors
-    of value and gradient, which are included.
-    """
+    of value and gradient, which are included."""
     bound: Real = dr.inf
     for promise in sample.all_promises:
         bound = fmin(bound, promise.taylor_remainder_bound(sample.value, radius, degree))
@@ -328,8 +326,7 @@ class CellClassifier:
 
     def __post_init__(self) -> None:
         """Prepare the surface in double precision, and the descent to the clip curve if its domain
-        cuts it.
-        """
+        cuts it."""
         self._backend = choose_backend("double")
         self._prepared = self.surface.prepare(self._backend)
         self._levels = self._prepared.levels
@@ -375,8 +372,7 @@ class CellClassifier:
     def with_surface_points(self, cells: SurfaceCells) -> SurfaceCells:
         """Return the same cells with more of their attributes known: a point of the surface in each
         cell, and the normal and curvature of the surface there; and a point of the clip curve. A
-        cell in which such a point is not found has `FAR_SENTINEL` in its place.
-        """
+        cell in which such a point is not found has `FAR_SENTINEL` in its place."""
         if not len(cells):
             return cells
         radius, start = _CUBE_CIRCUMRADIUS * cells.half, cells.center
@@ -434,8 +430,7 @@ class CellClassifier:
 
     def _pulled_inside(self, p: Vec3) -> tuple[Real, Vec3]:
         """Return a lower bound of the signed distance of p from the domain (positive outside); and
-        the point p if it is inside, otherwise a point of the domain's boundary near p.
-        """
+        the point p if it is inside, otherwise a point of the domain's boundary near p."""
         assert self._volume is not None
         distance = self._volume.signed_distance(p)
         normal = self._volume.outward_normal(p)
@@ -475,9 +470,9 @@ class CellClassifier:
         )
         if len(self._levels.values) > 1 or self.surface.field.has_jumps:
             is_slab &= False
-        # |f - level| changes by at most |g| radius + error in the ball. So f cannot reach the next
-        # period.
-        elif self._levels.period is not None:  # no other level lies in the ball
+        elif self._levels.period is not None:
+            # f - level changes by at most |g| radius + error in the ball, so that no other level
+            # (a period away) lies in it.
             is_slab &= dr.fma(gradient_norm, radius, linear_error) < self._levels.period - dr.abs(
                 value
             )
@@ -593,8 +588,7 @@ class CellClassifier:
 
         def body(point: Vec3, best: Real, k: Any) -> tuple[Any, ...]:
             """Trace ray k, and keep its hit if that is nearer to p. best: the squared distance of
-            `point`.
-            """
+            `point`."""
             # The direction of ray k.
             d = vector(*_DIAGONALS[0]) / 3**0.5
             for number, diagonal in enumerate(_DIAGONALS[1:], 1):
@@ -605,9 +599,9 @@ class CellClassifier:
             is_hit = ray_hit.status == int(RayStatus.HIT)
             y = dr.fma(vector(ray_hit.t), d, o)
             square = dr.squared_norm(y - p)
-            nearer = is_hit & (square < best)
-            nearer &= is_on_surface(self._prepared, y, ray_hit, nearer)
-            return dr.select(nearer, y, point), dr.select(nearer, square, best), k + 1
+            is_nearer = is_hit & (square < best)
+            is_nearer &= is_on_surface(self._prepared, y, ray_hit, is_nearer)
+            return dr.select(is_nearer, y, point), dr.select(is_nearer, square, best), k + 1
 
         def is_active(point: Vec3, best: Real, k: Any) -> Mask:
             del point, best
@@ -619,6 +613,5 @@ class CellClassifier:
 
 def _domain(surface: TracedSurface) -> Any:
     """Return the volume in which the surface lies: the intersection of the field's domain and the
-    clip volume, as far as there are any.
-    """
+    clip volume, as far as there are any."""
     return surface.field.domain if surface.clip_volume is None else surface.volume

@@ -77,8 +77,7 @@ class _DescentState:
         """Return this state, with changes in the lanes `is_flat`, in which both f - level and the
         gradient are 0, so that the gradient has no direction. There it gets the gradient of the
         previous state, and an uncertainty of the level that consists of the rounding of coordinates
-        only.
-        """
+        only."""
         epsilon = float(dr.epsilon(type(self.level_uncertainty)))
         rounding = 4 * epsilon * lengths.max_norm(self.y)
         gradient = dr.select(is_flat, previous.gradient, self.gradient)
@@ -91,8 +90,7 @@ class _DescentState:
 
     def where(self, mask: Mask, other: _DescentState) -> tuple[Any, ...]:
         """Return the attributes of this state in the lanes of the mask, and of the other state in
-        all other lanes, as a tuple in the order of the constructor.
-        """
+        all other lanes, as a tuple in the order of the constructor."""
         pairs = zip(self.parts(), other.parts(), strict=True)
         return tuple(dr.select(mask, first, second) for first, second in pairs)
 
@@ -161,13 +159,13 @@ class ClosestPointDescent:
             length, distance = dr.norm(move), dr.norm(x - y)
             max_length = 0.5 * state.smooth_radius
             is_lost = dr.select(active, length > max_length, is_lost)
-            shrinks = (k > 0) & (length < 0.5 * last)
+            is_shrinking = (k > 0) & (length < 0.5 * last)
             # If steps halve, the end is within two steps of y.
-            is_far = dr.select(active, shrinks & (distance - 2 * length > limit), is_far)
+            is_far = dr.select(active, is_shrinking & (distance - 2 * length > limit), is_far)
             # The expected length of the next step.
             next_length = length * dr.square(length / last)
             is_last = (
-                shrinks
+                is_shrinking
                 & ~is_lost
                 & (next_length <= dr.fma(_NEWTON_TOLERANCE, distance, state.level_uncertainty))
             )
@@ -207,11 +205,13 @@ class ClosestPointDescent:
         # Rounding is no part of the remainder: the step cannot reduce it.
         exact = dataclasses.replace(sample, value_error=0.0, gradient_error=0.0)
         # The step ends on the level up to its uncertainty.
-        arrives = taylor_remainder(exact, dr.abs(step)) <= gradient_norm * state.level_uncertainty
+        is_arriving = (
+            taylor_remainder(exact, dr.abs(step)) <= gradient_norm * state.level_uncertainty
+        )
         end, is_short = self._step_to_level(x, residual, state)
-        arrives &= is_short
+        is_arriving &= is_short
         is_found = is_minimum & (
-            self._is_on_level(residual, state) | (self._is_level_resolved(state) & arrives)
+            self._is_on_level(residual, state) | (self._is_level_resolved(state) & is_arriving)
         )
         radius = exclusion_radius(exact, rows, x, y)
         return end, is_found, dr.select(is_found, radius, 0)
@@ -293,22 +293,19 @@ class ClosestPointDescent:
 
     def newton_to_level(self, start: Vec3) -> Vec3:
         """Return the point of a level to which Newton's method along the gradient converges from
-        `start`; NaN where it does not.
-        """
+        `start`; NaN where it does not."""
         end, is_found = self._to_level(start, self.backend.Bool(True))
         return dr.select(is_found, end.y, dr.nan)
 
     def noise(self, y: Vec3) -> Real:
         """Return a bound of the length by which rounding and approximation may have moved the level
-        set at a point y of it.
-        """
+        set at a point y of it."""
         return self._evaluate(y)[1].level_uncertainty
 
     def last_step(self, x: Vec3, y: Vec3) -> Vec3:
         """Make the last step of a search for the point closest to x: move y onto the level along
         the gradient. Returns the end of the step; NaN if the step is too long for the result to be
-        a closest point up to rounding.
-        """
+        a closest point up to rounding."""
         residual, state = self._evaluate(y)
         end, is_short = self._step_to_level(x, residual, state)
         return dr.select(is_short & self._is_level_resolved(state), end, dr.nan)
@@ -375,8 +372,7 @@ class ClosestPointDescent:
     def _is_level_resolved(state: _DescentState) -> Mask:
         """Return whether the position of the level set near the point of a state is known in spite
         of rounding: its uncertainty is at most a sixteenth of the coordinates or of the ball on
-        which f is smooth.
-        """
+        which f is smooth."""
         size = lengths.max_norm(state.y)
         return state.level_uncertainty <= _MAX_RELATIVE_UNCERTAINTY * fmax(
             size, state.smooth_radius

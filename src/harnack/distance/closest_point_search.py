@@ -330,8 +330,7 @@ class _QueryEvaluator:
 
     def __post_init__(self) -> None:
         """Make the attributes with an underscore; `object.__setattr__`, as the dataclass is
-        frozen.
-        """
+        frozen."""
         backend, field = self.backend, self.surface.evaluator(self.backend)
         assign = object.__setattr__
         assign(self, "_field", field)
@@ -373,8 +372,7 @@ class _QueryEvaluator:
         def compute(p: Vec3) -> tuple[Real | Vec3, ...]:
             """Return for the query p: p as rounded; a point of the surface known near it, or NaN; f
             - level; a proved lower bound of the distance from the level set; and the first-order
-            estimate of that distance.
-            """
+            estimate of that distance."""
             sample = self._field.evaluate(p)
             residual = -self.levels.offset_to_nearest(sample.value)
             boundary = self._field.closest_boundary_point(p)
@@ -417,8 +415,7 @@ class _QueryEvaluator:
     def _nearest_face_points(self, points: FloatArray) -> FloatArray:
         """Return the nearest points (n, 3) of the triangles across which f jumps. A point is kept
         only if a level lies between the values of f right beside it, on both sides of the triangle;
-        else it is NaN.
-        """
+        else it is NaN."""
         mesh, surface = self.surface.field.jump_mesh(), self._tracer
         closest = np.full_like(points, np.nan)
         if mesh is None or not len(points):
@@ -449,8 +446,7 @@ class _QueryEvaluator:
 
     def distance_to_jumps(self, points: FloatArray) -> FloatArray:
         """Return the distances (n,) of points (n, 3) from the facets across which f jumps, whether
-        these are part of the surface or not.
-        """
+        these are part of the surface or not."""
         surface = self._tracer
 
         def compute(p: Vec3) -> tuple[Real]:
@@ -461,8 +457,7 @@ class _QueryEvaluator:
     def _search_facets(self, points: FloatArray, guess: FloatArray) -> FloatArray:
         """Return the closest points (n, 3) that `JumpSurfaceSearch` finds on facets, nearer than
         `guess` (n, 3); `guess` where it finds none. It examines at most `_MAX_JUMPS_EXAMINED`
-        facets for each query.
-        """
+        facets for each query."""
         coordinates = np.concatenate([points, np.nan_to_num(guess)])
         search = JumpSurfaceSearch(
             self._tracer, max(float(np.abs(coordinates).max(initial=0)), 1e-30), _MAX_JUMPS_EXAMINED
@@ -477,8 +472,7 @@ class _QueryEvaluator:
 
     def _inside_domain_or_nan(self, points: FloatArray) -> FloatArray:
         """Return the points (n, 3), with NaN for those outside the field's domain, which cuts the
-        surface.
-        """
+        surface."""
         domain = self.surface.field.domain
         if domain is None or not len(points):
             return points
@@ -560,8 +554,7 @@ class _QueryEvaluator:
 
         def arc_to_level(p: Vec3, b: Vec3, lengths: Vec3) -> tuple[Real]:
             """Return the first-order distance of the level from the point that lies at the distance
-            lengths.x from b in the direction of p.
-            """
+            lengths.x from b in the direction of p."""
             to_query = p - b
             sample = self._field.evaluate(b + lengths.x / safe_norm(to_query) * to_query)
             return (
@@ -571,8 +564,7 @@ class _QueryEvaluator:
         def near_edge(p: Vec3, b: Vec3, lengths: Vec3) -> tuple[Vec3]:
             """Return the surface point to which Newton's method leads from the point that lies at
             the distance lengths.x from b in the direction of p; NaN if the surface point is on the
-            side of b away from p.
-            """
+            side of b away from p."""
             to_query = p - b
             y = self._descent.newton_to_level(b + lengths.x / safe_norm(to_query) * to_query)
             is_on_query_side = dr.dot(to_query, y - b) > -_MAX_OPPOSING_COSINE * safe_norm(
@@ -651,8 +643,7 @@ class _QueryEvaluator:
     def _descend(self, p: Vec3, start: Vec3) -> tuple[Vec3, Real]:
         """Descend from `start` to a surface point closest to p. Returns this point, NaN if the
         descent does not end on the level; and the radius of a ball about it in which no surface
-        point is nearer to p, 0 if the descent does not converge.
-        """
+        point is nearer to p, 0 if the descent does not converge."""
         y, is_converged, on_level = self._descent.descend(p, start)
         return dr.select(on_level, y, dr.nan), dr.select(
             is_converged, self._descent.finish(p, y)[2], 0
@@ -679,9 +670,11 @@ class _QueryEvaluator:
 
         closest = closest.copy()
         corrected = self._corrected(exact, points[rows], closest[rows])
-        failed = np.flatnonzero(np.isnan(corrected[:, 0]))
-        if len(failed):
-            (corrected[failed],) = in_batches(self.backend, to_level, closest[rows[failed]])
+        failed_rows = np.flatnonzero(np.isnan(corrected[:, 0]))
+        if len(failed_rows):
+            (corrected[failed_rows],) = in_batches(
+                self.backend, to_level, closest[rows[failed_rows]]
+            )
         # Points that the correction moved out of the domain keep their place.
         is_inside = ~np.isnan(self._inside_domain_or_nan(corrected)[:, 0])
         closest[rows[is_inside]] = corrected[is_inside]
@@ -706,8 +699,7 @@ class _QueryEvaluator:
 
         def truncation(y: Vec3) -> tuple[Vec3, Vec3]:
             """Return the truncation errors at y: of the value (as a vector of equal components),
-            and of the gradient.
-            """
+            and of the gradient."""
             full, sample = exact.field.evaluate(y), approximate.field.evaluate(y)
             vector = self.backend.Array3f
             return vector(full.value - sample.value), vector(full.gradient) - vector(
@@ -744,8 +736,7 @@ class _QueryEvaluator:
 
     def level_uncertainty(self, points: FloatArray) -> FloatArray:
         """Return bounds (n,), lengths, of how far rounding and approximation may have moved the
-        level set at points (n, 3) that lie on it.
-        """
+        level set at points (n, 3) that lie on it."""
         if not len(points):
             return np.zeros(0)
 
@@ -769,8 +760,7 @@ class _LinearlyShiftedField(Field):
 
     def evaluate(self, p: Vec3) -> Sample:
         """Return the sample of the sum at p. The value error of the field includes its truncation
-        error, which is subtracted here.
-        """
+        error, which is subtracted here."""
         sample = self._field.evaluate(p)
         shifted = sample.shifted(dr.dot(self._slope, p - self._anchor) + self._offset)
         return replace(
@@ -794,8 +784,7 @@ def _length(vectors: FloatArray) -> FloatArray:
 def _size(surface: TracedSurface, points: FloatArray) -> float:
     """Return the size of a surface, a length: the diagonal of the box that is known to contain it.
     If there is no finite one, it is the largest extent of the query points (n, 3) along an axis, at
-    least 1.
-    """
+    least 1."""
     if surface.volume is not None:
         lower, upper = surface.volume.bounds()
         if np.isfinite([lower, upper]).all():

@@ -124,8 +124,7 @@ def signed_distance(
 
 def _outwards(field: Field) -> float:
     """Return the factor, 1 or -1, that makes a distance with the sign of f - level negative inside.
-    It is -1 for fields that are larger inside.
-    """
+    It is -1 for fields that are larger inside."""
     return -1.0 if field.is_larger_inside else 1.0
 
 
@@ -309,8 +308,7 @@ def _check_domain(field: Field, points: FloatArray) -> None:
 
 def _first_order(backend: Backend, field: Field, levels: Levels, p: Vec3) -> Real:
     """Return the first-order estimate (f - level)/|grad f| of the signed distance of p from the
-    level set, for the level nearest in value.
-    """
+    level set, for the level nearest in value."""
     del backend
     sample = field.evaluate(p)
     return first_order_distance(-levels.offset_to_nearest(sample.value), sample.gradient)
@@ -318,8 +316,7 @@ def _first_order(backend: Backend, field: Field, levels: Levels, p: Vec3) -> Rea
 
 def _second_order(backend: Backend, field: Field, levels: Levels, p: Vec3) -> Real:
     """Return the second-order estimate of the signed distance of p from the level set, with the
-    sign of f - level, for the level nearest in value.
-    """
+    sign of f - level, for the level nearest in value."""
     del backend
     sample, rows = field.evaluate(p), field.hessian(p)
     return second_order_distance(-levels.offset_to_nearest(sample.value), sample.gradient, rows)
@@ -327,8 +324,7 @@ def _second_order(backend: Backend, field: Field, levels: Levels, p: Vec3) -> Re
 
 def _signed_lower_bound(backend: Backend, field: Field, levels: Levels, p: Vec3) -> Real:
     """Return the proved lower bound of the distance of p from the level sets of all levels, with
-    the sign of f - level for the level nearest in value.
-    """
+    the sign of f - level for the level nearest in value."""
     sample = field.evaluate(p)
     residual = -levels.offset_to_nearest(sample.value)
     return dr.copysign(level_distance_lower_bound(backend, field, levels, p, sample), residual)

@@ -175,8 +175,7 @@ class JumpSurfaceSearch:
 
             def single_facet(after: tuple[Real, Any], limit: Real, active: Mask) -> NearestFacet:
                 """Return the nearest facet if `after` stands for the start of the list, otherwise
-                no facet.
-                """
+                no facet."""
                 del active
                 is_first = (after[0] < 0) & (facet.sort_key < limit)
                 sort_key = dr.select(is_first, facet.sort_key, dr.inf)
@@ -187,8 +186,7 @@ class JumpSurfaceSearch:
 
         def listed_facet(after: tuple[Real, Any], limit: Real, active: Mask) -> NearestFacet:
             """Return the facet that follows the facet `after` (its sort key and index) in the
-            field's list, if it is not farther than `limit`.
-            """
+            field's list, if it is not farther than `limit`."""
             nearest = field.nearest_facet(x, after, limit, active)
             if nearest is None:
                 raise RuntimeError("nearest_sheet tells sheets at some times and not at others")
@@ -215,8 +213,7 @@ def straddles_level(surface: SurfaceTracer, y: Vec3, radius: Real, active: Mask)
     def body(k: Any, lower: Real, upper: Real, active: Mask) -> tuple[Any, ...]:
         """Extend the range [lower, upper] of values of f by two values on edge k of the
         tetrahedron: at its start, and before the first facet on it (or the middle if there is
-        none).
-        """
+        none)."""
         start, end = _probe(vector, k + 1, zero)
         o = dr.fma(vector(radius), start, y)
         edge_norm = dr.norm(end - start)
@@ -313,8 +310,7 @@ _HIT_TEST_RADIUS = 1024.0
 @dataclass(frozen=True)
 class _HitPlane:
     """The plane tangent to the surface at the hit of a ray from the query x. It consists of the
-    points x + r with r . normal = offset, where |normal| = 1. normal = 0 stands for no plane.
-    """
+    points x + r with r . normal = offset, where |normal| = 1. normal = 0 stands for no plane."""
 
     normal: Vec3
     offset: Real
@@ -327,8 +323,7 @@ class _HitPlane:
 
     def is_apart(self, other: _HitPlane) -> Mask:
         """Return the mask of lanes in which both this and the other one are planes (not the
-        placeholder for none), and not nearly parallel.
-        """
+        placeholder for none), and not nearly parallel."""
         return (
             dr.squared_norm(dr.cross(self.normal, other.normal)) > _MIN_PLANE_SINE * _MIN_PLANE_SINE
         )
@@ -348,8 +343,7 @@ class _HitPlane:
 
     def intersection_point(self, second: _HitPlane, third: _HitPlane) -> Vec3:
         """Return the vector from x to the point in which three planes intersect; not finite if the
-        three normals are linearly dependent (Cramer's rule).
-        """
+        three normals are linearly dependent (Cramer's rule)."""
         vector = cast("Any", type(self.normal))
         a, b, c = self.normal, second.normal, third.normal
         normals = (dr.cross(b, c), dr.cross(c, a), dr.cross(a, b))
@@ -366,8 +360,7 @@ class _HitPlanes:
     """Three planes tangent to the surface at hits of rays from the query x, from which a compass
     search guesses where creases are. The first is the plane at the best point so far. The other two
     are the planes of the last two hits that are parallel neither to the first plane nor to each
-    other.
-    """
+    other."""
 
     first: _HitPlane
     second: _HitPlane
@@ -423,8 +416,7 @@ class _HitPlanes:
     def shortest_to_intersection(self, number: Any) -> Vec3:
         """Return the shortest vector from x to an intersection of planes: of all three (number 0),
         of the first and the second (1), of the first and the third (2); or to the first plane alone
-        (3). It is not finite where there is no intersection.
-        """
+        (3). It is not finite where there is no intersection."""
         first, second, third = self.first, self.second, self.third
         vector = cast("Any", type(first.normal))
         to_line = dr.select(
@@ -539,8 +531,7 @@ def is_on_surface(surface: SurfaceTracer, y: Vec3, hit: MarchResult, active: Mas
 def _tilt_direction(d: Vec3, step: Real, angle: Real) -> Vec3:
     """Return the unit vector along d + step w. d is a unit vector, and w the unit vector at right
     angles to d that is given by the angle `angle` (in radians) about d. So `step` is the tangent of
-    the angle between d and the result.
-    """
+    the angle between d and the result."""
     vector = cast("Any", type(d))
     u, v = orthonormal_basis(d)
     sine, cosine = dr.sincos(angle)
@@ -549,8 +540,7 @@ def _tilt_direction(d: Vec3, step: Real, angle: Real) -> Vec3:
 
 def _spiral_direction(vector: Any, n: Real) -> Vec3:
     """Return the unit vector with number n of `_SPHERE_RAYS` unit vectors that are spread evenly
-    over the sphere, along a spiral. vector: the type of 3-vectors.
-    """
+    over the sphere, along a spiral. vector: the type of 3-vectors."""
     z = 1 - (2 * n + 1) / _SPHERE_RAYS
     radius = dr.sqrt(1 - z * z)
     sine, cosine = dr.sincos(_GOLDEN_ANGLE * n)

@@ -94,8 +94,7 @@ class LevelTriangles:
 
     def upload(self, backend: Backend) -> Callable[[Vec3], Vec3]:
         """Upload the triangles. Returns a function of points that gives the vector from each to the
-        nearest triangle point; NaN if there are no triangles.
-        """
+        nearest triangle point; NaN if there are no triangles."""
         vector, real = backend.Array3f, backend.Float
         if not len(self.corners):
             return lambda p: vector(dr.nan) + 0 * p

@@ -195,8 +195,7 @@ def _refine_accuracy(
 def _size(field: Field, points: FloatArray) -> float:
     """Return the size of a field's surface, a length: the diagonal of the box that is proved to
     contain it. If there is no finite box, it is the largest absolute coordinate of the points (n,
-    3).
-    """
+    3)."""
     volume = field.extent((field.default_level,))
     if volume is not None:
         lower, upper = volume.bounds()
@@ -299,8 +298,7 @@ class _Derivatives:
 
 def _or_infinite(is_known: Any, error: Real) -> Real:
     """Return an error bound rounded up, so that it stays a bound. It is infinite in lanes in which
-    the bound is not known (the mask `is_known` is False) or not finite.
-    """
+    the bound is not known (the mask `is_known` is False) or not finite."""
     return dr.select(is_known & dr.isfinite(error), error * (1 + 1e-5), dr.inf)
 
 
@@ -515,8 +513,7 @@ class _CurvatureLineTracer:
 
     def _on_surface(self, x: Vec3, steps: int) -> Vec3:
         """Return the point to which `steps` steps of Newton's method along the gradient lead from
-        x, toward the level set.
-        """
+        x, toward the level set."""
 
         def step(x: Vec3) -> Vec3:
             """Make one Newton step from x."""
@@ -531,8 +528,7 @@ class _CurvatureLineTracer:
 
 def _iterate(step: Callable[[Vec3], Vec3], x: Vec3, times: int, backend: Backend) -> Vec3:
     """Apply the function `step` to x `times` times, and return the result. It is a loop of the
-    kernel, so that the compiled kernel contains the code of `step` only once.
-    """
+    kernel, so that the compiled kernel contains the code of `step` only once."""
     if times == 1:
         return step(x)
 
@@ -583,8 +579,7 @@ def _join_halves(
 
 def _after_second_step(count: int) -> BoolArray:
     """Return a mask (count,) of the steps of a line that is False for the first two and True for
-    all others. The first two are near the seed even if the line does not return to it.
-    """
+    all others. The first two are near the seed even if the line does not return to it."""
     return np.arange(count) > 1
 
 

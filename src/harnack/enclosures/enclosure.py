@@ -66,8 +66,7 @@ class PathRestriction(Protocol):
 @runtime_checkable
 class EvaluableRestriction(Protocol):
     """A function along a path (a ray) that is given by a formula in x, y and z. It can be evaluated
-    in any arithmetic, such as that of intervals.
-    """
+    in any arithmetic, such as that of intervals."""
 
     def evaluate_with(self, coordinates: Callable[[Vec3, Vec3], tuple[Any, Any, Any]]) -> Any:
         """Return the value of the formula at (x, y, z) = coordinates(p, d), in the arithmetic of
@@ -135,8 +134,7 @@ class SlopeRange:
 
     def negated(self) -> SlopeRange:
         """Return the range of the derivative along the opposite direction: the negated ends,
-        exchanged.
-        """
+        exchanged."""
         return SlopeRange(-self.upper, -self.lower)
 
 
@@ -161,8 +159,7 @@ class Enclosure(abc.ABC):
     @property
     def reach_growth(self) -> float:
         """The length on which the next sample should be enclosed, as a multiple of the length that
-        was proved free at this sample. The best values were found by experiment.
-        """
+        was proved free at this sample. The best values were found by experiment."""
         return 2.0
 
     @classmethod

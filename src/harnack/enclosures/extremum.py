@@ -75,8 +75,7 @@ class MaximumEnclosure(Enclosure):
 
     def is_free(self, gaps: LevelGaps, length: Real) -> Mask:
         """Return the mask of lanes on which, for the given length, no operand rises to the level
-        above, and at least one operand is proved not to fall to the level below.
-        """
+        above, and at least one operand is proved not to fall to the level below."""
         # Start with True (where the gap is a number), and with whether no level lies below.
         free_above, free_below = gaps.above == gaps.above, gaps.below == dr.inf
         for operand in self.operands:
@@ -155,8 +154,7 @@ class ScaledEnclosure(Enclosure):
 
     def _gaps(self, gaps: LevelGaps) -> LevelGaps:
         """Return the gaps of f (differences between its value and the next levels), from those of
-        value_factor * f.
-        """
+        value_factor * f."""
         factor = STEP_SAFETY / self.value_factor
         below, above = _scaled(gaps.below, factor), _scaled(gaps.above, factor)
         return LevelGaps(below, above, gaps.is_one_sided)
@@ -164,8 +162,7 @@ class ScaledEnclosure(Enclosure):
 
 def _scaled(gap: Real, factor: Real) -> Real:
     """Return the gap times a positive factor. A finite gap stays finite, even if the product
-    overflows.
-    """
+    overflows."""
     largest = type(gap)(dr.largest(type(gap)))
     return dr.select(gap == dr.inf, gap, fmin(largest, gap * factor))
 
@@ -328,8 +325,8 @@ class BranchPointEnclosure(Enclosure):
                 + self.closest_parameter * self.closest_parameter
                 < radius * radius
             )
-            valid = (
+            is_valid = (
                 starts_inside & (w > 0) & (squared_half_chord > 0) & dr.isfinite(squared_half_chord)
             )  # squares may overflow
-            best = fmax(dr.select(valid, length, 0), best)
+            best = fmax(dr.select(is_valid, length, 0), best)
         return dr.select(gap_away == dr.inf, best * _POWER_SAFETY, 0)

@@ -264,8 +264,7 @@ def longest_free_length(enclosures: tuple[Enclosure, ...], gaps: LevelGaps) -> R
 
 def any_is_free(enclosures: tuple[Enclosure, ...], gaps: LevelGaps, length: Real) -> Mask:
     """Return the mask of lanes on which at least one of the enclosures proves that f takes no level
-    on the length. gaps: the differences between f and the next levels.
-    """
+    on the length. gaps: the differences between f and the next levels."""
     is_free = length <= 0
     for enclosure in enclosures:
         is_free |= enclosure.is_free(gaps, length)

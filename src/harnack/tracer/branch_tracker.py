@@ -100,11 +100,11 @@ class BranchTracker:
         total_error: a bound of the error of the sampled f.
 
         Mostly the differences are those to the neighboring periodic levels (numbers that differ
-        from a true level by an integer). On some rays, in `passes`, they are those to the
+        from a true level by an integer). On some rays, in `passes_level`, they are those to the
         neighboring true levels: where the nearest periodic level is close and is no true level, or
         where the error of f is large.
 
-        The first mask returned holds the rays in `passes` whose sample was given with its branch.
+        The first mask returned holds the rays in `passes_level` whose sample was given with its branch.
         The second holds the rays whose point has to be sampled again with the branch.
 
         A ray passes a periodic level that is no true level by samples with known branch. A step
@@ -112,10 +112,10 @@ class BranchTracker:
         """
         periodic, true = self._periodic_levels.gaps(sample.value), self.levels.gaps(sample.value)
         near = fmax(2 * total_error, _NEAR_LEVEL)
-        passes = (periodic.nearest < near) & (periodic.nearest < 0.5 * true.nearest)
+        passes_level = (periodic.nearest < near) & (periodic.nearest < 0.5 * true.nearest)
         # Written so that an error that is NaN counts as large.
-        passes |= ~(total_error < _MAX_ERROR)
-        down = dr.select(passes, true.below, periodic.below)
-        up = dr.select(passes, true.above, periodic.above)
-        unsure = passes | (~is_sure & (periodic.nearest < 2 * total_error))
-        return LevelGaps(down, up), passes & ~is_modulo, unsure & is_modulo
+        passes_level |= ~(total_error < _MAX_ERROR)
+        down = dr.select(passes_level, true.below, periodic.below)
+        up = dr.select(passes_level, true.above, periodic.above)
+        unsure = passes_level | (~is_sure & (periodic.nearest < 2 * total_error))
+        return LevelGaps(down, up), passes_level & ~is_modulo, unsure & is_modulo

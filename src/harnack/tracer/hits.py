@@ -194,8 +194,7 @@ def _as_tensors(hits: Hits) -> Hits:
 
 def _trace(surface: TracedSurface, rays: RayBatch) -> Hits:
     """Trace rays, and return their hits as Dr.Jit arrays. The arrays carry derivatives if the rays
-    were given as Dr.Jit arrays, and rays, levels or field have derivatives enabled.
-    """
+    were given as Dr.Jit arrays, and rays, levels or field have derivatives enabled."""
     backend, o, d, count = rays.backend, rays.origin, rays.direction, rays.count
     prepared = surface.for_rays(count).prepare(backend, many_rays=count >= _MIN_RAYS_FOR_CELLS)
     if not prepared.field.is_cheap and _are_scattered(backend, dr.detach(o), dr.detach(d)):
@@ -241,8 +240,7 @@ def _are_scattered(backend: Backend, o: Vec3, d: Vec3) -> bool:
 
     def gather(rays: Vec3, rows: Any) -> FloatArray:
         """Return the vectors (n, 3) of the rays with the indices `rows`. A single vector belongs to
-        all rays.
-        """
+        all rays."""
         index = rows if dr.width(rays) > 1 else 0 * rows
         return to_numpy(dr.gather(backend.Array3f, rays, index)).astype(np.float64)
 
@@ -267,19 +265,19 @@ def _first_hits(
     """
     backend = prepared.backend
     end = prepared.first_hit(o, d, near, far)
-    hit = end.status == int(RayStatus.HIT)
+    is_hit = end.status == int(RayStatus.HIT)
     length = norm(end.gradient)
-    normal = dr.select(hit & (length > 0), end.gradient / length, 0)
+    normal = dr.select(is_hit & (length > 0), end.gradient / length, 0)
     index = dr.full(backend.Int32, -1, dr.width(end.status))
     if prepared.field.has_jumps:
         index = dr.reinterpret_array(backend.Int32, end.facet)  # NO_FACET becomes -1
     if end.patch is not None:
         index = dr.reinterpret_array(backend.Int32, end.patch)
-    smooth = hit & ~end.at_jump
+    is_smooth_hit = is_hit & ~end.at_jump
     # Where the gradient is NaN its length has no bound (`tracer.steep`).
     # Rounding adds the length excess / |grad f| to the distance of the surface.
-    uncertain = smooth & (end.tolerance_excess > 0) & (length == length)
-    uncertainty = dr.select(uncertain, end.tolerance_excess / length, 0)
+    is_uncertain = is_smooth_hit & (end.tolerance_excess > 0) & (length == length)
+    uncertainty = dr.select(is_uncertain, end.tolerance_excess / length, 0)
     doubt = None
     # Other hits are at a root, or were tested on the other side of the level.
     if end.side is None and not prepared.field.is_steep:
@@ -346,8 +344,7 @@ class _SearchedHits:
 @dataclass(frozen=True)
 class _SearchDistance:
     """The distance from a hit within which the surface was found, as a dataclass for
-    `compute_on_active`.
-    """
+    `compute_on_active`."""
 
     length: Real
 
@@ -421,8 +418,7 @@ def _trace_on_device(surface: TracedSurface, rays: RayBatch) -> Hits:
 
     def differences(rows: IntArray, expected: Arrays, computed: Arrays) -> str:
         """Return a message on how the device's hits of some rays differ from the expected ones; ""
-        if they agree. rows: the indices of these rays.
-        """
+        if they agree. rows: the indices of these rays."""
         pair = Hits(**expected), Hits(**computed)
         return _compare_hits(*pair, directions[rows], surface.hit_tolerance)
 
@@ -463,8 +459,8 @@ def _compare_hits(
     normal = cast("FloatArray", np.where(expected.is_hit[:, None], expected.normal, actual.normal))
     cosine = np.abs((normal * directions).sum(axis=1))
     differs = expected.status != actual.status
-    unproved = np.maximum(expected.status, actual.status) == int(RayStatus.OUT_OF_STEPS)
-    may_differ = unproved | (hit & (cosine < _GRAZING))
+    is_undecided = np.maximum(expected.status, actual.status) == int(RayStatus.OUT_OF_STEPS)
+    may_differ = is_undecided | (hit & (cosine < _GRAZING))
     if (differs & ~may_differ).any() or differs.sum() > _MAX_OUTLIERS * len(differs):
         k = int(np.flatnonzero(differs)[0])
         return (

@@ -290,20 +290,23 @@ class JumpTracer:
                 JumpCrossing(now.t, now.last, 0.0, first.normal), limit, now.active
             )
             # Facets at an angle to each other are merged only at exactly the same t.
-            parallel = dr.abs(dr.dot(crossing.normal, first.normal)) > _MIN_COSINE
-            same = now.active & (crossing.facet != NO_FACET) & ((crossing.t == first.t) | parallel)
-            new_up = same & (crossing.jump > 0) & (now.up == NO_FACET)
-            new_down = same & (crossing.jump < 0) & (now.down == NO_FACET)
+            is_parallel = dr.abs(dr.dot(crossing.normal, first.normal)) > _MIN_COSINE
+            is_same_point = (
+                now.active & (crossing.facet != NO_FACET) & ((crossing.t == first.t) | is_parallel)
+            )
+            new_up = is_same_point & (crossing.jump > 0) & (now.up == NO_FACET)
+            new_down = is_same_point & (crossing.jump < 0) & (now.down == NO_FACET)
             return _CoincidentJumps(
-                jump=now.jump + dr.select(same, crossing.jump, 0),
-                t=dr.select(same, crossing.t, now.t),
-                last=dr.select(same, crossing.facet, now.last),
+                jump=now.jump + dr.select(is_same_point, crossing.jump, 0),
+                t=dr.select(is_same_point, crossing.t, now.t),
+                last=dr.select(is_same_point, crossing.facet, now.last),
                 up=dr.select(new_up, crossing.facet, now.up),
                 down=dr.select(new_down, crossing.facet, now.down),
                 normal_up=dr.select(new_up, crossing.normal, now.normal_up),
                 normal_down=dr.select(new_down, crossing.normal, now.normal_down),
-                folded=now.folded | (same & parallel & (crossing.jump * first.jump < 0)),
-                active=same,
+                folded=now.folded
+                | (is_same_point & is_parallel & (crossing.jump * first.jump < 0)),
+                active=is_same_point,
             )
 
         no_facet = count(NO_FACET)
@@ -324,22 +327,21 @@ class JumpTracer:
         facet = dr.select(up, total.up, dr.select(down, total.down, first.facet))
         normal = dr.select(up, total.normal_up, dr.select(down, total.normal_down, first.normal))
         behind = JumpCrossing(total.t, total.last, first.jump, first.normal)
-        unclear = total.folded & (total.jump == 0)
+        is_unclear = total.folded & (total.jump == 0)
         # Only where rounding is no small part of the ray.
-        unclear &= tolerance > _COARSE_FRACTION * (self.end - self.start)
-        return JumpCrossing(first.t, facet, real(total.jump), normal), behind, unclear
+        is_unclear &= tolerance > _COARSE_FRACTION * (self.end - self.start)
+        return JumpCrossing(first.t, facet, real(total.jump), normal), behind, is_unclear
 
     def _next(self, behind: JumpCrossing, end: Real, active: Mask) -> JumpCrossing:
         """Return the next crossing of a facet after the crossing `behind`, as arrays of this
-        backend. If there is none up to the parameter `end`, its t is inf and its facet NO_FACET.
-        """
+        backend. If there is none up to the parameter `end`, its t is inf and its facet NO_FACET."""
         real, vector, count = self.backend.Float, self.backend.Array3f, self.backend.UInt32
         ahead = self.field.next_jump(self.path.origin, self.path.direction, behind, end, active)
-        valid = real(ahead.t) <= end
-        valid &= count(ahead.facet) != NO_FACET
+        is_valid = real(ahead.t) <= end
+        is_valid &= count(ahead.facet) != NO_FACET
         return JumpCrossing(
-            dr.select(valid, real(ahead.t), dr.inf),
-            dr.select(valid, count(ahead.facet), count(NO_FACET)),
-            dr.select(valid, real(ahead.jump), 0),
+            dr.select(is_valid, real(ahead.t), dr.inf),
+            dr.select(is_valid, count(ahead.facet), count(NO_FACET)),
+            dr.select(is_valid, real(ahead.jump), 0),
             vector(*ahead.normal),
         )

@@ -559,17 +559,17 @@ class March:
         tolerance = dr.fma(t, self.tolerance.per_length, self.tolerance.distance)
         slack = 8 * self.backend.machine_epsilon * size
         reach = fmax(tolerance, 2 * slack)
-        proved = gaps.nearest <= self.tolerance.value
+        is_proved = gaps.nearest <= self.tolerance.value
         # The change of f along the ray may prove that it takes the level.
         for enclosure in ray_sample.forward:
-            proved |= enclosure.arrives(gaps, reach)
+            is_proved |= enclosure.arrives(gaps, reach)
         # Otherwise samples are taken along the gradient and along the ray.
         toward = down_or_up(sample.gradient, gaps, path.direction)
         directions_and_slopes = (
             (toward, safe_norm(sample.gradient)),
             (path.direction, ray_sample.slope),
         )
-        unsure = is_near & ~proved
+        is_unsure = is_near & ~is_proved
         is_beyond, evaluations = beyond(
             self.backend,
             field,
@@ -580,9 +580,9 @@ class March:
             sample.value,
             reach,
             touches,
-            unsure,
+            is_unsure,
         )
-        return is_near & (proved | is_beyond), evaluations
+        return is_near & (is_proved | is_beyond), evaluations
 
     def _apply_hysteresis(
         self, trial: _TrialSample, hysteresis: Hysteresis, contact: Contact
@@ -628,12 +628,12 @@ class March:
         accepted = now.trial_step <= now.proved_step
         if self.over_relaxation > 1:
             knows_side = trial.accepts_unknown_side | (trial.gaps.nearest > trial.total_error)
-            proved = any_is_free(
+            is_proved = any_is_free(
                 trial.on_ray.backward,
                 trial.gaps.reduced_by(trial.total_error),
                 trial.unproved_length,
             )
-            accepted |= knows_side & proved
+            accepted |= knows_side & is_proved
         is_known = dr.isfinite(trial.total_error)  # without an error bound nothing is free
         if trial.steep is not None:  # values prove the next step
             is_known = is_known | (now.trial_step <= now.proved_step)
@@ -793,8 +793,8 @@ class March:
         shorter = dr.select(dr.isfinite(candidate), candidate / 3, 1 + 16 * trial.coordinate_size)
         reach = dr.select(proved > 0, trial.on_ray.reach_growth * proved, shorter)
         if now.contact is not None and contact is not None:  # off the surface: the whole ray again
-            leaves = now.contact.is_touching & ~contact.is_touching
-            reach = dr.select(leaves | is_hit, end - trial.t, reach)
+            leaves_level = now.contact.is_touching & ~contact.is_touching
+            reach = dr.select(leaves_level | is_hit, end - trial.t, reach)
         return reach
 
     def _is_free(
@@ -851,7 +851,7 @@ class March:
         to the surface.
         """
         sample = ray_sample.sample
-        near = gap <= fmax(within - sample.truncation_error, 2 * rounding)
+        is_close = gap <= fmax(within - sample.truncation_error, 2 * rounding)
         for promise in sample.promises:
             radius = promise.radius
             length_scale = fmax(dr.select(dr.isfinite(radius), radius, 0), length_scale)
@@ -860,7 +860,7 @@ class March:
         excess = gap + total_error - within
         may_hit = (gap <= within - sample.truncation_error) | (end < dr.inf)
         may_hit |= excess <= dr.abs(ray_sample.slope) * length_scale
-        return near & may_hit & (excess <= _LARGEST_UNCERTAINTY * gradient_norm * length_scale)
+        return is_close & may_hit & (excess <= _LARGEST_UNCERTAINTY * gradient_norm * length_scale)
 
     def _next_trial_step(
         self,
@@ -925,8 +925,7 @@ class March:
 
     def _status(self, is_hit: Mask, is_free: Mask) -> Any:
         """Return the `RayStatus` of rays: HIT on lanes of `is_hit`, MISS on other lanes of
-        `is_free` (the rest of the ray is proved to hold no level), else OUT_OF_STEPS.
-        """
+        `is_free` (the rest of the ray is proved to hold no level), else OUT_OF_STEPS."""
         ended = dr.select(is_free, int(RayStatus.MISS), int(RayStatus.OUT_OF_STEPS))
         return self.backend.UInt32(dr.select(is_hit, int(RayStatus.HIT), ended))
 

@@ -126,8 +126,7 @@ class PixelCones:
 
         def sample_at(t: Real) -> tuple[Real, Real]:
             """Return the height over the surface at parameters t, in radii of the cone, and its
-            derivative along the ray.
-            """
+            derivative along the ray."""
             field = (
                 prepared.field
                 if now.accuracy_scale is None

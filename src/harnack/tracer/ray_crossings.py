@@ -138,8 +138,7 @@ def find_crossings(
     def advance(now: _SearchState) -> _SearchState:
         """Bring each active ray to its next crossing, to the next jump of f, or to its end. Returns
         the state after it. A crossing is written to the arrays outside, in the next free place of
-        its ray.
-        """
+        its ray."""
         next_state, facet = now, None
         if now.sheets is None:
             after = march.advance(prepared.field, path, end, now.now)
@@ -367,8 +366,7 @@ def crossings_to_numpy(hits: RayCrossings, n: int, k: int) -> RayCrossings:
 
     def of_ray(array: Any) -> Any:
         """Return an array with one entry for each ray as a NumPy array (n,); a single entry is
-        repeated.
-        """
+        repeated."""
         return np.broadcast_to(to_numpy(array), (n,)).copy()
 
     return RayCrossings(

@@ -86,8 +86,7 @@ def _uploaded(
 ) -> tuple[Vec3, Vec3, Real, Real]:
     """Return origins, unit directions, t_min and t_max as Dr.Jit arrays of a backend. Raises
     ValueError for arrays whose lengths do not match, or that are no rays. Directions are
-    normalized.
-    """
+    normalized."""
     o = as_kernel_parameters(to_vector3(backend, origins, "origins"))
     d = as_kernel_parameters(to_vector3(backend, directions, "directions"))
     near, far = to_float(backend, t_min, "t_min"), to_float(backend, t_max, "t_max")

@@ -46,8 +46,7 @@ _CONTINUITY_FACTOR = 1024.0
 
 def values_between(field: Field, p: Vec3, q: Vec3, slack: Real | None = None) -> Values | None:
     """Return the range of values of a field on the box with corners p and q, enlarged by `slack` on
-    all sides. The result is None if the field has no formula that takes ranges of coordinates.
-    """
+    all sides. The result is None if the field has no formula that takes ranges of coordinates."""
     coordinates = Values.between(p, q, slack)
     formula: Any = getattr(field, "formula", None)
     if formula is None:
@@ -123,7 +122,7 @@ class SteepPlace:
         if at_point is None or on_path is None:
             return cls(None, t < t, real(0), real(0), real(dr.inf), real(dr.inf))
         below, above = value - at_point.value.lower, at_point.value.upper - value
-        valid = (below >= 0) & (above >= 0) & ~at_point.jumps
+        is_valid = (below >= 0) & (above >= 0) & ~at_point.jumps
         gaps = levels.gaps(value)
         is_below = gaps.below < gaps.above
         error_to_level = dr.select(is_below, below, above)
@@ -136,7 +135,7 @@ class SteepPlace:
             & (error_away <= _MAX_ASYMMETRY * error_to_level)
         )
         error = error_to_level if gaps.is_one_sided else fmax(error_to_level, error_away)
-        error = dr.select(valid & dr.isfinite(error), error, dr.inf)
+        error = dr.select(is_valid & dr.isfinite(error), error, dr.inf)
         is_free = on_path.nowhere
         if levels.period is None:
             # A bound that is NaN stands for an infinite bound.
@@ -146,7 +145,7 @@ class SteepPlace:
             is_free = is_free | misses_levels
         free = dr.select(is_free, ahead, 0)
         fall, rise = value - on_path.value.lower, on_path.value.upper - value
-        return cls(error, is_level & valid, free, ahead, fall, rise)
+        return cls(error, is_level & is_valid, free, ahead, fall, rise)
 
     def free_of(self, gaps: LevelGaps) -> Real:
         """Return the length `ahead` of the ray if f is proved to change on it by less than `gaps`,
@@ -342,14 +341,14 @@ def _narrowed(now: _SearchState, length: Real, gap: Real, is_search: Mask) -> _S
     """
     # The worse point is the low end if it is the smaller length of the two: the old best, if the
     # new one is nearer and farther out, or the new one if it is neither.
-    nearer, is_farther = gap <= now.least_gap, length > now.inner
-    end, is_low = dr.select(nearer, now.inner, length), nearer == is_farther
+    is_nearer, is_farther = gap <= now.least_gap, length > now.inner
+    end, is_low = dr.select(is_nearer, now.inner, length), is_nearer == is_farther
     return replace(
         now,
         low=dr.select(is_search & is_low, end, now.low),
         high=dr.select(is_search & ~is_low, end, now.high),
-        inner=dr.select(is_search & nearer, length, now.inner),
-        least_gap=dr.select(is_search & nearer, gap, now.least_gap),
+        inner=dr.select(is_search & is_nearer, length, now.inner),
+        least_gap=dr.select(is_search & is_nearer, gap, now.least_gap),
     )
 
 
@@ -362,5 +361,5 @@ def down_or_up(gradient: Vec3, gaps: LevelGaps, otherwise: Vec3) -> Vec3:
     """
     direction = safe_normalize(gradient)
     direction = dr.select(gaps.below < gaps.above, -direction, direction)
-    finite = dr.isfinite(direction.x + direction.y + direction.z)
-    return dr.select(finite, direction, otherwise)
+    is_finite = dr.isfinite(direction.x + direction.y + direction.z)
+    return dr.select(is_finite, direction, otherwise)

@@ -46,13 +46,11 @@ class RayTracer(Protocol):
     """Interface to the ways to trace rays: through smooth functions, functions with jumps at
     facets, and unions of patches. Each has a state of its own, `walk`; a `MarchState` is what all
     have in common. One call of `advance` makes one trial point, or marches one interval between
-    jumps, or one patch.
-    """
+    jumps, or one patch."""
 
     def begin(self, state: MarchState) -> Any:
         """Return this tracer's own state for rays that have not moved yet. state: their
-        `MarchState`.
-        """
+        `MarchState`."""
         ...
 
     def advance(self, walk: Any, /) -> Any:
@@ -69,8 +67,7 @@ class RayTracer(Protocol):
 
     def run(self, state: MarchState) -> tuple[MarchState, Any]:
         """Advance rays until all have ended, and return the result of `finish`. state: the
-        `MarchState` of rays that have not moved yet.
-        """
+        `MarchState` of rays that have not moved yet."""
         ...
 
 
@@ -107,16 +104,14 @@ class SmoothTracer:
 
     def run(self, state: MarchState) -> tuple[MarchState, Any]:
         """March rays from `state` to a hit or to their end. Returns their end state, and NO_FACET.
-        `March.advance` has the proof that no hit is missed.
-        """
+        `March.advance` has the proof that no hit is missed."""
         return self.finish(self.march.advance(self.field, self.path, self.end, state))
 
 
 @dataclass(frozen=True)
 class _QueuedRay:
     """A ray o + t d as it waits in the queue: its parameters from `start` to `end`, and the state
-    `walk` of its tracer. This is all that a lane needs when it takes the ray from the queue.
-    """
+    `walk` of its tracer. This is all that a lane needs when it takes the ray from the queue."""
 
     origin: Vec3
     direction: Vec3
@@ -222,8 +217,7 @@ class MarchResult:
 class _EndState:
     """What `SurfaceTracer.first_hit` needs of the end of rays: some attributes of a `MarchState`,
     and as `sheet` the index of the facet or patch that was hit. A queue writes each of them to
-    memory, so there are no others.
-    """
+    memory, so there are no others."""
 
     proved_to: Real
     value: Real
@@ -237,8 +231,7 @@ class _EndState:
     @classmethod
     def of(cls, end: MarchState, sheet: Any) -> _EndState:
         """Take these attributes from the end state of rays. sheet: the index of the facet or patch
-        hit.
-        """
+        hit."""
         names = (field.name for field in dataclasses.fields(cls) if field.name != "sheet")
         return cls(**{name: getattr(end, name) for name in names}, sheet=sheet)
 
@@ -252,8 +245,7 @@ class _EndStatus:
     @classmethod
     def of(cls, end: MarchState, sheet: Any) -> _EndStatus:
         """Take the status from the end state of rays; the index of the facet or patch hit is not
-        used.
-        """
+        used."""
         del sheet
         return cls(end.status)
 
@@ -321,8 +313,7 @@ class SurfaceTracer:
 
     def hit_surface(self, hit: MarchResult) -> SurfaceTracer:
         """Return the surface that each ray hit: the patch that was hit if the field is a union of
-        patches, else this surface. Rays without a hit get the first patch.
-        """
+        patches, else this surface. Rays without a hit get the first patch."""
         if hit.patch is None:
             return self
         patch = dr.select(hit.patch == NO_PATCH, self.backend.UInt32(0), hit.patch)
@@ -330,8 +321,7 @@ class SurfaceTracer:
 
     def level_counts(self, p: Vec3) -> Mask:
         """Return the mask of points p at which a level belongs to the surface. If only the largest
-        component is traced, these are the points in its cells; else all points.
-        """
+        component is traced, these are the points in its cells; else all points."""
         if self.occupied is None or not self.only_component:
             return self.backend.Bool(True)
         return self.occupied.cell(p).empty_distance == 0
@@ -349,8 +339,7 @@ class SurfaceTracer:
 
     def clip(self, o: Vec3, d: Vec3, t_min: Real, t_max: Real) -> tuple[Real, Real]:
         """Return the interval (start, end) of ray parameters, within [t_min, t_max], on which rays
-        o + t d can meet the surface: the part in `volume`. It is empty unless start < end.
-        """
+        o + t d can meet the surface: the part in `volume`. It is empty unless start < end."""
         if self.volume is None:
             return t_min, t_max
         return self.volume.clip(o, d, t_min, t_max)

@@ -28,8 +28,7 @@ _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 class TraceKeywords(SurfaceKeywords, total=False):
     """The keywords of `Surface` and of `TraceOptions`, which the functions of the library (`trace`,
-    `render`, ...) take in place of these objects.
-    """
+    `render`, ...) take in place of these objects."""
 
     tolerance: float | HitTolerance | None
     enclosures: EnclosureChoice
@@ -109,8 +108,7 @@ class TraceOptions:
     @property
     def enclosure_kinds(self) -> EnclosureKinds:
         """The classes of enclosures by which steps are proved. An enclosure is an interval that is
-        proved to contain the change of f along a ray.
-        """
+        proved to contain the change of f along a ray."""
         return choose_enclosures(self.enclosures)
 
     def replace(self, **changes: Any) -> TraceOptions:
@@ -194,8 +192,7 @@ def trace_options(
 
 def _refusal(verb: str, name: str, honored: Sequence[str]) -> str:
     """Return the text of the error for an option `name` that the called function `verb` does not
-    have. It lists those that it has, `honored`.
-    """
+    have. It lists those that it has, `honored`."""
     return (
         f"{verb} has no {name}; of the options of surfaces and traces it has {', '.join(honored)}"
     )
@@ -223,8 +220,7 @@ def trace_options_among(options: Any, keywords: Mapping[str, Any]) -> TraceOptio
 
 def shorthand_parameters() -> dict[str, inspect.Parameter]:
     """Return the options of `Surface` and `TraceOptions`, by name, as keyword-only parameters for
-    signatures.
-    """
+    signatures."""
     kinds: tuple[Callable[..., Any], ...] = (Surface, TraceOptions)
     return {
         name: parameter.replace(kind=parameter.KEYWORD_ONLY)
