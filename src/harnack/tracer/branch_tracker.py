@@ -104,8 +104,8 @@ class BranchTracker:
         neighboring true levels: where the nearest periodic level is close and is no true level, or
         where the error of f is large.
 
-        The first mask returned holds the rays in `passes_level` whose sample was given with its branch.
-        The second holds the rays whose point has to be sampled again with the branch.
+        The first mask returned holds the rays in `passes_level` whose sample was given with its
+        branch. The second holds the rays whose point has to be sampled again with the branch.
 
         A ray passes a periodic level that is no true level by samples with known branch. A step
         from such a sample may cross that level, so the next sample needs a known branch, too.
