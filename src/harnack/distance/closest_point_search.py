@@ -370,9 +370,9 @@ class _QueryEvaluator:
         """
 
         def compute(p: Vec3) -> tuple[Real | Vec3, ...]:
-            """Return for the query p: p as rounded; a point of the surface known near it, or NaN; f
-            - level; a proved lower bound of the distance from the level set; and the first-order
-            estimate of that distance."""
+            """Return five results for the query p: p as rounded; a point of the surface known near
+            it, or NaN; f - level; a proved lower bound of the distance from the level set; and the
+            first-order estimate of that distance."""
             sample = self._field.evaluate(p)
             residual = -self.levels.offset_to_nearest(sample.value)
             boundary = self._field.closest_boundary_point(p)
@@ -493,10 +493,10 @@ class _QueryEvaluator:
 
         Returns:
             The closest points (n, 3), NaN where none is found or it is farther than the limit. One
-                that lies outside the field's domain is replaced by the closest point of the clip
-                curve, in which the boundary of the domain cuts the surface. And radii (n,): in the
-                ball of this radius about the closest point, no point of the surface is nearer to
-                the query; 0 if that is not proved.
+            that lies outside the field's domain is replaced by the closest point of the clip curve,
+            in which the boundary of the domain cuts the surface. And radii (n,): in the ball of
+            this radius about the closest point, no point of the surface is nearer to the query; 0
+            if that is not proved.
         """
         if self.surface.field.has_jumps:
 

@@ -140,6 +140,7 @@ def closest_points(
     **keywords: Unpack[TraceKeywords],
 ) -> FloatArray:
     """Find the closest points (n, 3) of a level set of a field's function to `points` (n, 3).
+
     For the winding number of a closed mesh, and for its solid, they are exact: the level set
     consists of triangles, which are cut where they intersect, and the nearest one is found. For
     other fields the surface is enclosed in cells, and descents from known surface points in the
@@ -184,6 +185,7 @@ def distance_bounds(
 ) -> DistanceBounds:
     """Compute distances of points (n, 3) from a level set of a field's function f, with proved
     lower bounds.
+
     `lower` is proved by the field's promises (proved bounds of f near a point). These imply that
     some cubic cells of space hold no surface; that in others the surface lies in a slab between two
     parallel planes; and that a ball around each closest point holds no nearer point of the surface.

@@ -80,6 +80,7 @@ def curvature(
 ) -> CurvatureSamples:
     """Compute the mean and Gaussian curvature of the level sets of a field's function f through
     points (n, 3).
+
     surface: a field, or a `Surface`. The curvature at a point is that of the level set through the
         point, whatever its level is; levels, clip and section of a `Surface` have no effect.
     options: a `TraceOptions`; curvatures use its `precision` alone. None is double precision.

@@ -84,15 +84,17 @@ class MaximumEnclosure(Enclosure):
             free_below |= (fall_gaps.below > 0) & any_is_free(operand.enclosures, fall_gaps, length)
         return (free_above | (gaps.above == dr.inf)) & free_below
 
-    def _shared_valid_length(self, infty: Real) -> Real:
+    def _shared_valid_length(self, infinity: Real) -> Real:
         """Return the length, from the start of the path, on which the enclosures of all operands
         are valid: the smallest of the lengths that they prove if there is no level.
 
-        infty: infinity, as a number of the backend.
+        infinity: infinity, as a number of the backend.
         """
-        length = infty
+        length = infinity
         for operand in self.operands:
-            length = fmin(longest_free_length(operand.enclosures, LevelGaps(infty, infty)), length)
+            length = fmin(
+                longest_free_length(operand.enclosures, LevelGaps(infinity, infinity)), length
+            )
         return length
 
     @staticmethod

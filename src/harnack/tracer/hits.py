@@ -62,6 +62,7 @@ _DOUBT_FRACTION, _DOUBT_ROUNDINGS, _SHEET_COUNT, _SEARCH_TOLERANCES = 0.5, 64, 3
 class Hits:
     """How n rays o + t d ended, as NumPy arrays or, if the rays were Dr.Jit arrays or tensors, as
     these. f is the function of the field, and the surface is where f takes the level.
+
     is_hit: (n,) mask of rays that hit. Rays that ran out of steps have a finite t as well, so
         `isfinite(t)` is no such mask.
     t: (n,) the ray parameter of the hit, a length; inf for a miss; for a ray that ran out of steps,
@@ -130,6 +131,7 @@ def trace(
 ) -> Hits:
     """Find the first hits of rays with a level set of a field's function f: the points at which f
     takes a given value, the level. No hit is missed: every step is proved.
+
     surface: a field; or a `Surface`, with its levels, clip, section and largest component. A
         `Surface` with a `side` raises an error: the faces of a solid where its clip cuts it are no
         level set.

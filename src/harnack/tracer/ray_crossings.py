@@ -205,6 +205,7 @@ def find_crossings(
 class RayCrossings:
     """The first k crossings of n rays with a level set of a function f, in the order along each
     ray. A crossing is a point at which f passes to the other side of the level.
+
     They are NumPy arrays; tensors if the rays were tensors; Dr.Jit arrays if the rays were Dr.Jit
     arrays. The latter are flat: crossing j of ray i is at i k + j.
 
@@ -254,6 +255,7 @@ def crossings(
 ) -> RayCrossings:
     """Find the first crossings of rays with a level set of a field's function f, in the order along
     each ray. A crossing is a point at which f passes to the other side of the level.
+
     If f goes farther than the tolerance to both sides of the level, the crossing is not missed, and
     no crossing is counted twice. If a ray touches a level without passing to its other side, or
     starts on it, that is no crossing. If levels are closer in value than four tolerances, a quarter
