@@ -130,7 +130,7 @@ class ClipCurveDescent:
             crosses_face = has_best & is_new_face & has_no_face & ~accepted & (corner != _TURNING)
             is_corrected = ~trial.is_on & ~crosses_face & (tries < _MAX_CURVE_CORRECTIONS)
             is_corrected &= dr.isfinite(dr.squared_norm(trial.correction))
-            failed = ~accepted & ~is_corrected
+            is_rejected = ~accepted & ~is_corrected
             # A point on the curve that is nearer to x is accepted: the next Newton step.
             curvature_term = 1 - dr.dot(x - y, trial.second_derivative)
             step = dr.dot(x - y, trial.tangent) / fmax(
@@ -149,7 +149,7 @@ class ClipCurveDescent:
             )
             normal = dr.select(accepted, trial.normal, normal)
             factor = dr.select(accepted, fmin(4 * factor, 1), factor)
-            factor = dr.select(failed & ~crosses_face, 0.25 * factor, factor)
+            factor = dr.select(is_rejected & ~crosses_face, 0.25 * factor, factor)
             # The step s meets the face where face_rate |s| + s^2/2 face_normal.ddy = face_gap.
             s, face_gap = factor * w, fmax(face_offset - dr.dot(face_normal, best), 0)
             face_rate = dr.sign(w) * dr.dot(face_normal, tangent)
@@ -190,6 +190,7 @@ class ClipCurveDescent:
         def is_active(*state: Any) -> Mask:
             return state[-1]
 
+        # Nothing of the curve is known at the start; Newton's step is a whole one.
         undefined, zero = vector(dr.nan), vector(0)
         state = (
             vector(start), undefined, real(dr.inf), real(0), zero, undefined, zero, zero, real(0),
@@ -223,15 +224,15 @@ class ClipCurveDescent:
             real(sample.value_error) / gradient_norm,
         )
         cosine = dr.dot(n, u)
-        sine = 1 - cosine * cosine
+        sine_squared = 1 - cosine * cosine
 
         def solution(along_u: Real, along_n: Real) -> Vec3:
             """Return the shortest vector whose inner products with u and n are `along_u` and
             `along_n`."""
             first, second = along_u - cosine * along_n, along_n - cosine * along_u
-            return (vector(first) * u + vector(second) * n) / sine
+            return (vector(first) * u + vector(second) * n) / sine_squared
 
-        t = dr.cross(u, n) * dr.rsqrt(sine)
+        t = dr.cross(u, n) * dr.rsqrt(sine_squared)
         # The step of the differences.
         h = self.backend.machine_epsilon**0.5 * fmax(scale, real(1e-30))
         next_point = dr.fma(vector(h), t, y)

@@ -474,17 +474,21 @@ class ClosestPointDescent:
         eigen = SymmetricEigen2.of(
             dr.fma(height_ratio, uu, 1), dr.fma(height_ratio, vv, 1), height_ratio * uv
         )  # of B
+        # The tangential part of x - y. If it is 0 up to rounding, x - y is normal to the surface.
         tu, tv = dr.dot(to_x, plane.u), dr.dot(to_x, plane.v)
         tangential = dr.sqrt(dr.fma(tu, tu, tv * tv))
         is_normal = tangential <= dr.fma(
             4 * self.backend.machine_epsilon**0.5, distance, 8 * state.level_uncertainty
         )
         is_saddle = is_normal & (eigen.smallest < _INDEFINITE)
+        # Newton's step in the basis of eigenvectors; at a saddle along that of the smaller
+        # eigenvalue.
         along_largest, along_smallest = eigen.coordinates(tu, tv)
         along_largest = along_largest / fmax(dr.abs(eigen.largest), _MIN_EIGENVALUE)
         along_smallest = along_smallest / fmax(dr.abs(eigen.smallest), _MIN_EIGENVALUE)
         along_smallest = dr.select(is_saddle, 0.5 * distance, along_smallest)
         length = dr.sqrt(dr.fma(along_largest, along_largest, along_smallest * along_smallest))
+        # No longer than the ball on which f is smooth and the distance from x allow.
         max_length = factor * dr.select(is_saddle, length, fmin(state.smooth_radius, distance))
         scale = dr.select(length > 0, fmin(max_length / length, 1), 0)
         # The step w = a u + b v along the surface.

@@ -427,7 +427,8 @@ class Hysteresis:
         accepted: that point.
 
         A crossing is counted where f is on the other side of the level than the ray came from, by
-        more than half the band and more than the error of f. A contact begins at a point that is
+        more than half the band and more than the error of f. (At an end of the interval beyond
+        which no level lies, more than the error is enough.) A contact begins at a point that is
         near enough for a hit, and ends where f is farther from the level than the band. Inactive
         rays keep their contact.
         """

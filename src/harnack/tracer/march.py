@@ -377,6 +377,8 @@ class March:
             gaps_ahead = (
                 jump.gaps if trial.passes_branch_level is None else trial.gaps_after_jump(jump.gaps)
             )
+        # Trial steps aim at other levels than those that proofs use only if the ray counts
+        # crossings.
         aim_gaps, contact, value = gaps_ahead, now.contact, trial.value
         if self.hysteresis is not None and now.contact is not None:
             contact, is_hit, jump, value = self._update_contact(
@@ -446,8 +448,8 @@ class March:
         t = now.proved_to + now.trial_step
         if ahead is not None or now.contact is not None:  # the end exactly
             t = dr.select(now.trial_step >= end - now.proved_to, end, t)
-        # Choose the accuracy. Without a tracker, samples of accuracy scale >= 1 are needed: they
-        # are given with their branch.
+        # Choose the accuracy. If samples may lack their branch (an unknown integer) and no tracker
+        # adds it, an accuracy scale of at least 1 makes them have it.
         scaled, tracker, is_modulo = field, self.branch_tracker, None
         if now.accuracy_scale is not None and field.has_variable_accuracy:
             needs_branch = field.has_unknown_branch and tracker is None

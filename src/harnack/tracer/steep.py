@@ -276,6 +276,7 @@ def beyond(
         )
         search_length = dr.select(is_behind, -reach, dr.select(is_side, now.inner, search_length))
         distance = dr.select(is_search, search_length, distance)
+        # Of the points after the search, two lie along each axis.
         axis_step = dr.select((now.side_count & 1) == 0, 0.5 * reach, -0.5 * reach)
         axis = (now.side_count - 1) >> 1  # no axis if the count is 0: 0 - 1 is a large number
         offset = type(p)(*(dr.select(is_side & (axis == k), axis_step, 0) for k in range(3)))
@@ -297,7 +298,9 @@ def beyond(
             low, high = at_q.value.lower, at_q.value.upper
             passed = passes(levels, value, low, high, gaps)
             passed &= ~(between.jumps | between.gaps | between.nowhere)
+            # Or a level lies in the range of f at q up to rounding, where f is continuous.
             passed |= holds(levels, value, low, high, gaps) & ~(around_q.jumps | at_q.nowhere)
+        # The difference between f at q and the level that is nearer to f at p.
         nearest = dr.select(
             gaps.below < gaps.above, gaps.below + low - value, gaps.above + value - high
         )
