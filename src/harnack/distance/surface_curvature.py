@@ -449,7 +449,9 @@ class _CurvatureLineTracer:
         x = self._on_surface(x, _SEED_NEWTON_STEPS)
         direction, is_known = self._direction(x, None)
         lane = dr.arange(integer, 2 * n)
+        # An eigenvector and its negative: the two directions from each seed.
         direction = dr.select(lane < n, direction, -direction)
+        # The points of all lines after all steps.
         points = vector(*(dr.full(self.backend.Float, dr.nan, 2 * n * (count + 1)) for _ in "xyz"))
         dr.scatter(points, x, lane, is_known)
         dr.eval(points, x, direction, is_known)

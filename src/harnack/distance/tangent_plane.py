@@ -133,7 +133,7 @@ def second_order_distance(above: Real, gradient: Vec3, rows: tuple[Vec3, Vec3, V
     d1/(1 - k d1/2) with above = f - level, d1 = above/|grad f| and k = n.An/|grad f|. Its error is
     O(d^3).
 
-    gradient, rows: grad f at x, and the three rows of the Hessian A there; n is the unit gradient.
+    gradient, rows: g = grad f at x, and the three rows of the Hessian A there; n = g/|g|.
     k tells how fast the slope changes along n; it is not a curvature of the surface.
 
     Proof. With x = y + d N as in `first_order_distance`, Taylor along that line is

@@ -201,8 +201,8 @@ class JumpTracer:
         passed = active & has_facet & (now.status == int(RayStatus.MISS))
         if now.contact is not None:
             return self._after_jump(outer, now, ahead, last, passed, active & has_facet)
-        spent = passed & (now.evaluations >= self.march.max_steps)
-        status = dr.select(spent, out_of_steps, now.status)
+        used_all_steps = passed & (now.evaluations >= self.march.max_steps)
+        status = dr.select(used_all_steps, out_of_steps, now.status)
         # Of several facets at a point, a hit reports `ahead`; a ray that passes goes on from
         # `last`.
         crossing = JumpCrossing(
@@ -214,7 +214,7 @@ class JumpTracer:
         return JumpTraceState(
             dr.select(passed, outer.offset + ahead.jump, outer.offset),
             crossing,
-            dataclasses.replace(now, status=status, active=passed & ~spent),
+            dataclasses.replace(now, status=status, active=passed & ~used_all_steps),
         )
 
     def _after_jump(
@@ -237,8 +237,10 @@ class JumpTracer:
         passed: mask of rays that have passed the facet without crossing the level.
         stopped: mask of rays whose interval ends at a facet.
         """
-        spent = passed & (now.evaluations >= self.march.max_steps)
-        status = dr.select(spent, self.backend.UInt32(int(RayStatus.OUT_OF_STEPS)), now.status)
+        used_all_steps = passed & (now.evaluations >= self.march.max_steps)
+        status = dr.select(
+            used_all_steps, self.backend.UInt32(int(RayStatus.OUT_OF_STEPS)), now.status
+        )
         is_past = passed | (stopped & (now.status == HIT_AT_JUMP))
         # Rays that are past the facet go on from the last merged crossing.
         behind = JumpCrossing(
@@ -250,7 +252,7 @@ class JumpTracer:
         return JumpTraceState(
             dr.select(is_past, previous.offset + ahead.jump, previous.offset),
             behind,
-            dataclasses.replace(now, status=status, active=passed & ~spent),
+            dataclasses.replace(now, status=status, active=passed & ~used_all_steps),
             dr.select(is_past, ahead.facet, previous.reported_facet),
         )
 

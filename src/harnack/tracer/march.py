@@ -970,6 +970,7 @@ def _refined_accuracy(
     too_coarse = (
         (gap < _REFINE_BELOW * total_error) & (truncation > allowed) & (scale < _MAX_ACCURACY)
     )
+    # The truncation error falls as a power of the scale: so the scale for this target follows.
     target = fmax(_TRUNCATION_OF_GAP * gap, _TRUNCATION_OF_ALLOWED * allowed)
     factor = clamp(dr.power(truncation / target, 1 / _TRUNCATION_ORDER), *_REFINEMENT_LIMITS)
     return fmin(fmax(scale * factor, 1), _MAX_ACCURACY), too_coarse
@@ -984,5 +985,6 @@ def _next_accuracy(scale: Real, gap: Real, truncation: Real, coarsest: float) ->
         it.
     coarsest: the accuracy scale that 0 stands for.
     """
+    # The truncation error falls as a power of the scale.
     target = scale * dr.power(truncation / (_COARSE_FRACTION * gap), 1 / _TRUNCATION_ORDER)
     return dr.select(target > coarsest, fmin(fmax(target, 1), scale), 0)
