@@ -1,4 +1,6 @@
-"""Distances to level sets and their curvatures, at points."""
+"""Distances of points from level sets (the points at which a field's function f takes a given
+value, the level), closest points, and curvatures of level sets.
+"""
 
 from __future__ import annotations
 

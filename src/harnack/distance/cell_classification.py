@@ -1,6 +1,7 @@
-"""Classifies cubic cells by how a level set passes through them. A cell may be proved to hold no
-point of the level set. In other cells, if possible, a slab (the space between two parallel planes)
-is found that contains the surface, and a point of the surface.
+"""Classifies cubes of space, the cells, by how a surface passes through them. The surface is a
+level set of a function f: f takes a given value on it, the level. A cell may be proved to hold no
+point of the surface. In other cells, if possible, a slab (the space between two parallel planes) is
+found that contains the surface, and a point of the surface.
 
 The boundary of the field's domain cuts the level set in a curve, the *clip curve*. A point of it is
 found in cells through which it passes; `ClipCurveDescent` finds the closest point of this curve.
@@ -58,11 +59,13 @@ _MIN_RELATIVE_STEP = 1e-8
 
 @dataclass(frozen=True)
 class ClipCurveDescent:
-    """Descent to the closest point of the clip curve, in which the boundary of the field's domain
-    cuts the level set. On this curve f = level and h = 0, where h is the signed distance from the
-    boundary of the domain.
+    """Descent to the point of the clip curve that is closest to a query x. In the clip curve the
+    boundary of the field's domain cuts the level set. On this curve f = level and h = 0, where h is
+    the signed distance from the boundary of the domain. The boundary may have several smooth faces,
+    which meet at edges.
 
-    field, domain: prepared for the backend."""
+    field, domain: prepared for the backend.
+    """
 
     backend: Backend
     field: Field
@@ -70,8 +73,9 @@ class ClipCurveDescent:
     domain: Volume
 
     def closest(self, x: Vec3, start: Vec3) -> tuple[Vec3, Real]:
-        """A point y of the curve at which the distance from x has a local minimum, found by descent
-        from `start`; and the curvature of the curve there. NaN where the curve is not reached.
+        """Return a point y of the curve at which the distance from x has a local minimum, found by
+        descent from `start`; and the curvature of the curve there. Both are NaN where the curve is
+        not reached.
 
         Let t be the curve's unit tangent at y, and y'' its second derivative by arc length, which
         follows from the second derivatives of f and h along t (differences of their gradients).
@@ -100,28 +104,33 @@ class ClipCurveDescent:
                 `best`.
             face_normal, face_offset: the plane of another face that ends steps; the normal is 0 if
                 there is none.
-            corner: 0, `_TURNING` or `_TURNED`.
+            corner: 0, `_TURNING` or `_TURNED`: whether the search is about to turn into another
+                face at a corner, or has.
             factor: the fraction of Newton's step that is tried.
             tries: the number of corrections towards the curve since the last step.
+            k: the number of points tried so far.
+            active: whether the search goes on.
             """
+            # Is the point y on the curve, and nearer to x than the best one?
             trial = self._at(y)
             distance = safe_norm(x - y)
-            reached = dr.isfinite(nearest)
+            has_best = dr.isfinite(nearest)
             is_new_face = dr.dot(trial.normal, normal) < 1 - _SAME_FACE
-            gap = fmax(face_offset - dr.dot(face_normal, best), 0)
-            turns = (
+            face_gap = fmax(face_offset - dr.dot(face_normal, best), 0)
+            # At a corner the point in the other face may be a little farther from x.
+            turns_corner = (
                 (corner == _TURNING)
                 & is_new_face
-                & (distance < nearest + 8 * gap + 100 * trial.near)
+                & (distance < nearest + 8 * face_gap + 100 * trial.near)
             )
-            accepted = trial.is_on & (~reached | (distance < nearest) | turns)
+            accepted = trial.is_on & (~has_best | (distance < nearest) | turns_corner)
             # A step across another face makes that face end the next steps. A point that is off the
             # curve otherwise is corrected towards it, several times if necessary.
-            is_free = ~(dr.squared_norm(face_normal) > 0)
-            crosses = reached & is_new_face & is_free & ~accepted & (corner != _TURNING)
-            corrects = ~trial.is_on & ~crosses & (tries < _MAX_CURVE_CORRECTIONS)
-            corrects &= dr.isfinite(dr.squared_norm(trial.correction))
-            failed = ~accepted & ~corrects
+            has_no_face = ~(dr.squared_norm(face_normal) > 0)
+            crosses_face = has_best & is_new_face & has_no_face & ~accepted & (corner != _TURNING)
+            is_corrected = ~trial.is_on & ~crosses_face & (tries < _MAX_CURVE_CORRECTIONS)
+            is_corrected &= dr.isfinite(dr.squared_norm(trial.correction))
+            is_rejected = ~accepted & ~is_corrected
             # A point on the curve that is nearer to x is accepted: the next Newton step.
             curvature_term = 1 - dr.dot(x - y, trial.second_derivative)
             step = dr.dot(x - y, trial.tangent) / fmax(
@@ -132,34 +141,46 @@ class ClipCurveDescent:
             tangent = dr.select(accepted, trial.tangent, tangent)
             ddy = dr.select(accepted, trial.second_derivative, ddy)
             changes_face = accepted & is_new_face
-            face_normal = dr.select(crosses, trial.normal, dr.select(changes_face, 0, face_normal))
-            face_offset = dr.select(crosses, dr.dot(trial.normal, y) + trial.depth, face_offset)
+            face_normal = dr.select(
+                crosses_face, trial.normal, dr.select(changes_face, 0, face_normal)
+            )
+            face_offset = dr.select(
+                crosses_face, dr.dot(trial.normal, y) + trial.depth, face_offset
+            )
             normal = dr.select(accepted, trial.normal, normal)
             factor = dr.select(accepted, fmin(4 * factor, 1), factor)
-            factor = dr.select(failed & ~crosses, 0.25 * factor, factor)
-            # The step s meets the face where rate |s| + s^2/2 face_normal.ddy = gap.
-            s, gap = factor * w, fmax(face_offset - dr.dot(face_normal, best), 0)
-            rate = dr.sign(w) * dr.dot(face_normal, tangent)
-            root = rate + dr.sqrt(rate * rate + 2 * gap * dr.dot(face_normal, ddy))
-            limit = dr.select(root > 0, _STEP_TO_FACE * 2 * gap / root, dr.inf)
-            is_limited = ~(is_free & ~crosses) & (limit < dr.abs(s))
+            factor = dr.select(is_rejected & ~crosses_face, 0.25 * factor, factor)
+            # The step s meets the face where face_rate |s| + s^2/2 face_normal.ddy = face_gap.
+            s, face_gap = factor * w, fmax(face_offset - dr.dot(face_normal, best), 0)
+            face_rate = dr.sign(w) * dr.dot(face_normal, tangent)
+            limit_divisor = face_rate + dr.sqrt(
+                face_rate * face_rate + 2 * face_gap * dr.dot(face_normal, ddy)
+            )
+            limit = dr.select(
+                limit_divisor > 0, _STEP_TO_FACE * 2 * face_gap / limit_divisor, dr.inf
+            )
+            is_limited = ~(has_no_face & ~crosses_face) & (limit < dr.abs(s))
             s = dr.select(is_limited, clamp(s, -limit, limit), s)
             target = dr.fma(vector(s), tangent, best) + vector(0.5 * s * s) * ddy
+            # The search ends at short steps, unless a face has shortened them.
             min_step = dr.select(is_limited, 0, _MIN_RELATIVE_STEP * nearest)
             is_short = dr.abs(s) <= fmax(min_step, trial.near)
-            corner = dr.select((corner == _TURNING) & ~corrects, _TURNED, corner)
-            at_face = is_short & is_limited & ~corrects & (corner == 0)
+            corner = dr.select((corner == _TURNING) & ~is_corrected, _TURNED, corner)
+            # The steps have come to the corner: the next point lies a little beyond the other face.
+            at_face = is_short & is_limited & ~is_corrected & (corner == 0)
             corner = dr.select(at_face, _TURNING, corner)
             target = dr.select(
-                at_face, dr.fma(vector(gap + 8 * trial.near), face_normal, best), target
+                at_face, dr.fma(vector(face_gap + 8 * trial.near), face_normal, best), target
             )
             active &= (
-                (corrects | accepted | reached) & (factor > _MIN_STEP_FACTOR) & (k + 1 < _ROUNDS)
+                (is_corrected | accepted | has_best)
+                & (factor > _MIN_STEP_FACTOR)
+                & (k + 1 < _ROUNDS)
             )
-            active &= corrects | at_face | ~is_short
+            active &= is_corrected | at_face | ~is_short
             y, tries = (
-                dr.select(corrects, y + trial.correction, target),
-                dr.select(corrects, tries + 1, 0),
+                dr.select(is_corrected, y + trial.correction, target),
+                dr.select(is_corrected, tries + 1, 0),
             )
             return (
                 y, best, nearest, w, tangent, ddy, normal, face_normal, face_offset, corner, factor,
@@ -169,6 +190,7 @@ class ClipCurveDescent:
         def is_active(*state: Any) -> Mask:
             return state[-1]
 
+        # Nothing of the curve is known at the start; Newton's step is a whole one.
         undefined, zero = vector(dr.nan), vector(0)
         state = (
             vector(start), undefined, real(dr.inf), real(0), zero, undefined, zero, zero, real(0),
@@ -178,8 +200,14 @@ class ClipCurveDescent:
         return final[1], safe_norm(final[5])
 
     def _at(self, y: Vec3) -> _ClipCurveState:
-        """The state of the descent at a point y near the clip curve: the derivatives of the curve
-        there, and the step that leads back to it."""
+        """Return the geometry at a point y near the clip curve: the derivatives of the curve there,
+        and the step that leads back to it.
+
+        With u and n the unit normals of level set and domain, the tangent t is along their cross
+        product. On the curve u.y' = 0 and n.y' = 0; differentiated by arc length, u.y'' = -u'.t and
+        n.y'' = -n'.t, where u' and n' are the changes of the normals along t, computed by
+        differences.
+        """
         real, vector = self.backend.Float, self.backend.Array3f
         sample = self.field.evaluate(y)
         gradient, scale = vector(sample.gradient), max_norm(y)
@@ -188,6 +216,7 @@ class ClipCurveDescent:
         depth = (
             -self.domain.signed_distance(y) - _DOMAIN_INSET * self.backend.machine_epsilon * scale
         )
+        # To first order, the distances to the level set along u and to the boundary along n.
         offset = self.levels.offset_to_nearest(sample.value) / gradient_norm
         radius = dr.fma(
             _LEVEL_TOLERANCE * self.backend.machine_epsilon,
@@ -195,14 +224,16 @@ class ClipCurveDescent:
             real(sample.value_error) / gradient_norm,
         )
         cosine = dr.dot(n, u)
-        sine = 1 - cosine * cosine
+        sine_squared = 1 - cosine * cosine
 
         def solution(along_u: Real, along_n: Real) -> Vec3:
-            """The shortest vector whose inner products with u and n are `along_u` and `along_n`."""
+            """Return the shortest vector whose inner products with u and n are `along_u` and
+            `along_n`."""
             first, second = along_u - cosine * along_n, along_n - cosine * along_u
-            return (vector(first) * u + vector(second) * n) / sine
+            return (vector(first) * u + vector(second) * n) / sine_squared
 
-        t = dr.cross(u, n) * dr.rsqrt(sine)
+        t = dr.cross(u, n) * dr.rsqrt(sine_squared)
+        # The step of the differences.
         h = self.backend.machine_epsilon**0.5 * fmax(scale, real(1e-30))
         next_point = dr.fma(vector(h), t, y)
         u_change = dr.dot(vector(self.field.evaluate(next_point).gradient) - gradient, t) / (
@@ -257,10 +288,11 @@ _DIAGONALS = ((1.0, 1.0, 1.0), (1.0, 1.0, -1.0), (1.0, -1.0, 1.0), (-1.0, 1.0, 1
 
 
 def taylor_remainder(sample: Sample, radius: Real, degree: int = 1) -> Real:
-    """A bound of the Taylor remainder |f(y) - T(y)| for |y - p| <= radius. p is the point of the
-    sample, and T the Taylor polynomial of f about p, of degree 1 or 2. The bound follows from the
-    sample's promises (proved bounds of f near p); it is infinite if these imply none. When the
-    radius decreases, the bound falls at least as fast as radius^(degree + 1)."""
+    """Return a bound of the Taylor remainder |f(y) - T(y)| for |y - p| <= radius. p is the point of
+    the sample, and T the Taylor polynomial of f about p, of degree 1 or 2. The bound follows from
+    the sample's promises (proved bounds of f near p); it is infinite if these imply none. When the
+    radius decreases, the bound falls at least as fast as radius^(degree + 1), except for the errors
+    of value and gradient, which are included."""
     bound: Real = dr.inf
     for promise in sample.all_promises:
         bound = fmin(bound, promise.taylor_remainder_bound(sample.value, radius, degree))
@@ -268,7 +300,7 @@ def taylor_remainder(sample: Sample, radius: Real, degree: int = 1) -> Real:
 
 
 def multiplicity(step: Real, last: Real) -> Real:
-    """The multiplicity m of the root towards which Newton's method converges, estimated from its
+    """Estimate the multiplicity m of the root towards which Newton's method converges, from its
     last two steps.
 
     step, last: the current step, and the length of the one before.
@@ -284,11 +316,18 @@ def multiplicity(step: Real, last: Real) -> Real:
 
 @dataclass
 class CellClassifier:
-    """Classifies the cells of a level set, in double precision."""
+    """Classifies cells, cubes that may hold a surface, in double precision: it proves some of them
+    empty, and bounds the surface in others. The surface is a level set of a function f, or consists
+    of facets at which f jumps.
+
+    surface: the surface.
+    """
 
     surface: TracedSurface
 
     def __post_init__(self) -> None:
+        """Prepare the surface in double precision, and the descent to the clip curve if its domain
+        cuts it."""
         self._backend = choose_backend("double")
         self._prepared = self.surface.prepare(self._backend)
         self._levels = self._prepared.levels
@@ -301,14 +340,18 @@ class CellClassifier:
 
     @property
     def _field(self) -> Field:
+        """The function f, prepared for the backend."""
         return self._prepared.field
 
     def nonempty_cells(self, center: FloatArray, half: FloatArray) -> SurfaceCells:
-        """The cubes that are not proved to be free of the surface. Each has the slab in which its
-        part of the surface lies, if one is found.
+        """Return the cubes that are not proved to be free of the surface. Each has the slab (two
+        parallel planes) in which its part of the surface lies, if one is found.
 
         center: (n, 3) centers of the cubes.
         half: (n,) half the length of their edges.
+
+        A cube whose ball lies outside the domain is empty. If only its center lies outside, nothing
+        else is known of it.
         """
         is_inside = np.ones(len(center), np.bool_)
         if self._volume is not None and len(center):
@@ -328,9 +371,9 @@ class CellClassifier:
         return cells.select(is_nonempty)
 
     def with_surface_points(self, cells: SurfaceCells) -> SurfaceCells:
-        """The same cells with more of their attributes known: a point of the surface in each cell,
-        and the normal and curvature of the surface there; and a point of the clip curve. A cell in
-        which such a point is not found has `FAR_SENTINEL` in its place."""
+        """Return the same cells with more of their attributes known: a point of the surface in each
+        cell, and the normal and curvature of the surface there; and a point of the clip curve. A
+        cell in which such a point is not found has `FAR_SENTINEL` in its place."""
         if not len(cells):
             return cells
         radius, start = _CUBE_CIRCUMRADIUS * cells.half, cells.center
@@ -343,6 +386,7 @@ class CellClassifier:
         self._remove_outside(surface_point)
         clip_point, clip_curvature = cells.clip_point.copy(), cells.clip_curvature.copy()
         if self._clip_descent is not None:
+            # The boundary of the domain passes through the ball around the cell.
             ids = np.flatnonzero(np.abs(distance) <= radius)
             clip_point[ids], clip_curvature[ids] = self._at(
                 self._clip_point, start[ids], radius[ids]
@@ -364,14 +408,17 @@ class CellClassifier:
         """Evaluate a function of Dr.Jit vectors at points (n, 3). Returns its results as arrays,
         (n,) or (n, 3) each.
 
+        compute: the function.
         values: further arguments of `compute`: vectors (n, 3), or numbers (n,). A number is passed
-            as a vector of three equal components."""
+            as a vector of three equal components.
+        """
         vectors = (np.tile(value[:, None], 3) if value.ndim == 1 else value for value in values)
         return in_batches(self._backend, compute, points, *vectors)
 
     def _remove_outside(self, surface_points: FloatArray) -> None:
         """Replace points (n, 3) that lie outside the domain by `FAR_SENTINEL`, in place."""
         if self._volume is not None and len(surface_points):
+            # The huge coordinates of a missing point could overflow: 0 is tested in their place.
             surface_points[
                 ~self._volume.contains_points(
                     np.where(surface_points < FAR_SENTINEL, surface_points, 0)
@@ -379,19 +426,19 @@ class CellClassifier:
             ] = FAR_SENTINEL
 
     def _distance_outside(self, p: Vec3) -> tuple[Real]:
-        """The signed distance of p from the domain, positive outside."""
+        """Return the signed distance of p from the domain, positive outside."""
         return (self._volume.signed_distance(p),)
 
     def _pulled_inside(self, p: Vec3) -> tuple[Real, Vec3]:
-        """A lower bound of the signed distance of p from the domain (positive outside); and the
-        point p if it is inside, otherwise a point of the domain's boundary near p."""
+        """Return a lower bound of the signed distance of p from the domain (positive outside); and
+        the point p if it is inside, otherwise a point of the domain's boundary near p."""
         assert self._volume is not None
         distance = self._volume.signed_distance(p)
         normal = self._volume.outward_normal(p)
         return distance, dr.select(distance > 0, p - self._backend.Array3f(distance) * normal, p)
 
     def _slab(self, p: Vec3, radii: Vec3) -> tuple[Real | Vec3, ...]:
-        """Bounds of the part of the surface in the ball around p.
+        """Bound the part of the surface in the ball around p.
 
         radii: the ball's radius, as a vector of three equal components.
 
@@ -399,6 +446,9 @@ class CellClassifier:
         that contains the surface in the ball: its unit normal, the offset of its middle plane from
         p along the normal, and half its thickness. If no slab is proved, the normal is 0 and the
         thickness `FAR_SENTINEL`.
+
+        Proof. Let g be the gradient at p and E a bound of |f - (f(p) + g.(y - p))| in the ball. At
+        a surface point y, |f(p) - level + g.(y - p)| <= E. Divided by |g|, this is the slab.
         """
         real, vector, radius = self._backend.Float, self._backend.Array3f, radii.x
         sample = self._field.evaluate(p)
@@ -407,19 +457,30 @@ class CellClassifier:
             clearance = level_distance_lower_bound(
                 self._backend, self._field, self._levels, p, sample
             )
-        value, norm = -self._levels.offset_to_nearest(sample.value), safe_norm(sample.gradient)
-        error = taylor_remainder(sample, radius) + 8 * self._backend.machine_epsilon * dr.abs(
-            sample.value
+        value, gradient_norm = (
+            -self._levels.offset_to_nearest(sample.value),
+            safe_norm(sample.gradient),
         )
-        is_slab = (norm > 0) & dr.isfinite(error) & (error < FAR_SENTINEL * norm)
+        linear_error = taylor_remainder(
+            sample, radius
+        ) + 8 * self._backend.machine_epsilon * dr.abs(sample.value)
+        is_slab = (
+            (gradient_norm > 0)
+            & dr.isfinite(linear_error)
+            & (linear_error < FAR_SENTINEL * gradient_norm)
+        )
         if len(self._levels.values) > 1 or self.surface.field.has_jumps:
             is_slab &= False
-        elif self._levels.period is not None:  # no other level lies in the ball
-            is_slab &= dr.fma(norm, radius, error) < self._levels.period - dr.abs(value)
-        divisor = dr.select(is_slab, norm, 1)
+        elif self._levels.period is not None:
+            # f - level changes by at most |g| radius + error in the ball, so that no other level
+            # (a period away) lies in it.
+            is_slab &= dr.fma(gradient_norm, radius, linear_error) < self._levels.period - dr.abs(
+                value
+            )
+        divisor = dr.select(is_slab, gradient_norm, 1)
         normal = dr.select(is_slab, sample.gradient / divisor, vector(0, 0, 0))
         offset = dr.select(is_slab, -value / divisor, 0)
-        thickness = dr.select(is_slab, error / divisor, FAR_SENTINEL)
+        thickness = dr.select(is_slab, linear_error / divisor, FAR_SENTINEL)
         is_empty = (clearance > radius) | (is_slab & (dr.abs(offset) > radius + thickness))
         return dr.select(is_empty, real(1), 0), normal, offset, thickness
 
@@ -434,7 +495,7 @@ class CellClassifier:
         Returns the surface point, `FAR_SENTINEL` if none is found; the normal of a plane through it
         that approximates the surface; the radius about the point within which the surface may be
         replaced by this plane (it is at most the distance to the curve at which the surface ends);
-        and an upper bound of the curvature of the surface within that radius.
+        and an upper bound of the curvature of the surface at the point.
         """
         radius, unknown = radii.x, self._backend.Float(FAR_SENTINEL)
         if self.surface.field.has_jumps:
@@ -451,6 +512,8 @@ class CellClassifier:
         curvature = unknown
         if self._has_hessian:
             uu, vv, uv = TangentPlane.of(gradient).restrict_hessian(self._field.hessian(y))
+            # The Frobenius norm of the Hessian in the tangent plane is at least its largest
+            # eigenvalue.
             bound = dr.sqrt(dr.fma(uu, uu, dr.fma(vv, vv, 2 * uv * uv))) / safe_norm(gradient)
             curvature = dr.select(bound < FAR_SENTINEL, bound, unknown)
         return (
@@ -461,11 +524,12 @@ class CellClassifier:
         )
 
     def _clip_point(self, p: Vec3, radii: Vec3) -> tuple[Vec3, Real]:
-        """A point of the clip curve near p, `FAR_SENTINEL` if none is found; and the curvature of
-        the curve there.
+        """Return a point of the clip curve near p, `FAR_SENTINEL` if none is found; and the
+        curvature of the curve there.
 
         radii: the radius of the ball around p in which it is searched, as a vector of three equal
-            components."""
+            components.
+        """
         assert self._clip_descent is not None
         y, curvature = self._clip_descent.closest(p, p)
         is_near = safe_norm(y - p) < 2 * radii.x
@@ -474,30 +538,37 @@ class CellClassifier:
         )
 
     def _newton_point(self, p: Vec3, radius: Real) -> Vec3:
-        """The point of the level set to which Newton's method along the gradient leads from p;
-        `FAR_SENTINEL` if it does not converge to a point within the distance 2 `radius` of p."""
+        """Return the point of the level set to which Newton's method along the gradient leads from
+        p; `FAR_SENTINEL` if it does not converge to a point within the distance 2 `radius` of p.
+
+        After six steps the method goes on only while its steps shrink, as they do towards a
+        multiple root, and they are made longer (`multiplicity`).
+        """
         real, vector, count = self._backend.Float, self._backend.Array3f, self._backend.UInt32
         zero = dr.opaque(real, 0.0)  # keeps constant components of a gradient in the loop
 
         def body(y: Vec3, last: Real, k: Any) -> tuple[Any, ...]:
-            """One Newton step from y. last: the length of the step before; k: the number of
-            steps."""
+            """Make one Newton step from y.
+
+            last: the length of the step before.
+            k: the number of steps.
+            """
             sample = self._field.evaluate(y)
             gradient_norm = safe_norm(sample.gradient)
             off_level = self._levels.offset_to_nearest(sample.value)
             newton_step = off_level / gradient_norm
             factor = dr.select(k >= _MAX_STEPS - 1, multiplicity(newton_step, last), 1)
             step = clamp(factor * newton_step, -radius, radius)
-            is_valid = dr.isfinite(step) & (dr.norm(y - p) < 4 * radius)
+            goes_on = dr.isfinite(step) & (dr.norm(y - p) < 4 * radius)
             shrinks = (k < _MAX_STEPS - 1) | (dr.abs(newton_step) < _SLOW_RATES[1] * last)
             # At a point of the surface where the gradient is 0 the iteration has converged.
             is_flat = (off_level == 0) & (gradient_norm == 0)
-            last = dr.select(is_valid, dr.abs(newton_step), dr.select(is_flat, 0, dr.inf))
+            last = dr.select(goes_on, dr.abs(newton_step), dr.select(is_flat, 0, dr.inf))
             y = dr.select(
-                is_valid, dr.fma(vector(step / gradient_norm), sample.gradient + zero, y), y
+                goes_on, dr.fma(vector(step / gradient_norm), sample.gradient + zero, y), y
             )
-            is_valid &= shrinks & (last > 1e-9 * radius)
-            return y, last, dr.select(is_valid, k + 1, _MAX_SLOW_STEPS)
+            goes_on &= shrinks & (last > 1e-9 * radius)
+            return y, last, dr.select(goes_on, k + 1, _MAX_SLOW_STEPS)
 
         def is_active(y: Vec3, last: Real, k: Any) -> Mask:
             del y, last
@@ -509,24 +580,29 @@ class CellClassifier:
         return dr.select(is_near, y, vector(FAR_SENTINEL))
 
     def _nearest_ray_hit(self, p: Vec3, radius: Real) -> Vec3:
-        """For fields that jump: the point nearest to p among the first hits of four rays through
-        the ball around p, along the diagonals of the cell; `FAR_SENTINEL` without a hit."""
+        """Return, for functions that jump, the point nearest to p among the first hits of four rays
+        through the ball around p, along the diagonals of the cell; `FAR_SENTINEL` without a hit.
+
+        radius: the radius of the ball.
+        """
         real, vector, count = self._backend.Float, self._backend.Array3f, self._backend.UInt32
 
         def body(point: Vec3, best: Real, k: Any) -> tuple[Any, ...]:
-            """Trace ray k, and keep its hit if that is nearer to p; best: the squared distance of
+            """Trace ray k, and keep its hit if that is nearer to p. best: the squared distance of
             `point`."""
+            # The direction of ray k.
             d = vector(*_DIAGONALS[0]) / 3**0.5
             for number, diagonal in enumerate(_DIAGONALS[1:], 1):
                 d = dr.select(k == number, vector(*diagonal) / 3**0.5, d)
+            # It begins at the surface of the ball and ends at its other side.
             o = dr.fma(vector(-radius), d, p)
             ray_hit = self._prepared.first_hit(o, d, real(0), 2 * radius, self._backend.Bool(True))
             is_hit = ray_hit.status == int(RayStatus.HIT)
             y = dr.fma(vector(ray_hit.t), d, o)
             square = dr.squared_norm(y - p)
-            nearer = is_hit & (square < best)
-            nearer &= is_on_surface(self._prepared, y, ray_hit, nearer)
-            return dr.select(nearer, y, point), dr.select(nearer, square, best), k + 1
+            is_nearer = is_hit & (square < best)
+            is_nearer &= is_on_surface(self._prepared, y, ray_hit, is_nearer)
+            return dr.select(is_nearer, y, point), dr.select(is_nearer, square, best), k + 1
 
         def is_active(point: Vec3, best: Real, k: Any) -> Mask:
             del point, best
@@ -537,6 +613,6 @@ class CellClassifier:
 
 
 def _domain(surface: TracedSurface) -> Any:
-    """The volume in which the surface lies: the intersection of the field's domain and the clip
-    volume, as far as there are any."""
+    """Return the volume in which the surface lies: the intersection of the field's domain and the
+    clip volume, as far as there are any."""
     return surface.field.domain if surface.clip_volume is None else surface.volume

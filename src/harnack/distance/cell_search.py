@@ -1,5 +1,8 @@
-"""Searches the nearest points of a level set by branch and bound: space is divided into cubic
-cells; cells that are proved to hold no nearer point are skipped, and others subdivided."""
+"""Searches the points of a surface that are nearest to given query points, by branch and bound.
+Space is divided into cubes, the cells. Cells that are proved to hold no nearer point are skipped,
+and others subdivided. In many cells a point of the surface is known, from which a descent (Newton's
+method along the surface) leads to a closest point.
+"""
 
 from __future__ import annotations
 
@@ -57,51 +60,62 @@ _CORNERS = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1
 
 @dataclass
 class SearchResult:
-    """The result of a search for n queries: the closest points (n, 3) of the surface, NaN where
-    none was found; and proved lower bounds (n,) of the distances of the queries from the
-    surface."""
+    """The result of a search for the points of a surface closest to n queries.
+
+    closest: (n, 3) the closest points, NaN where none was found.
+    lower_bounds: (n,) proved lower bounds of the distances of the queries from the surface.
+    """
 
     closest: FloatArray
     lower_bounds: FloatArray
 
 
 class DescentMethods(Protocol):
-    """Interface of the iterations that lead from a point near a surface to the closest point of a
-    query x. Each method returns points of the surface (n, 3), NaN where it finds none; and for each
-    of these the radius of a ball about it that is proved to hold no surface point nearer to x."""
+    """Interface of the iterations (descents) that lead from a point near a surface to the surface
+    point closest to a query x. Each method returns points of the surface (n, 3), NaN where it finds
+    none; and for each of these the radius of a ball about it that is proved to hold no surface
+    point nearer to x."""
 
     def newton_in_kernel(self, x: Vec3, start: Vec3, limit: Real) -> tuple[Vec3, Real, Mask]:
         """Iterate as part of another kernel, from points `start` near the surface, for the queries
-        x. Returns the closest points, the radii, and the mask of the lanes for which `descend` has
-        to be called afterwards. Points farther from x than `limit` need not be found."""
+        x. Points farther from x than `limit` need not be found.
+
+        Returns the closest points, the radii, and the mask of lanes for which `descend` has to be
+        called afterwards.
+        """
         ...
 
     def descend(
         self, points: FloatArray, start: FloatArray, limit: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """Iterate from points `start` (n, 3) near the surface, for the queries `points` (n, 3).
-        Returns the closest points (n, 3) and the radii (n,). Points farther from the query than
-        `limit` (n,) need not be found."""
+        Points farther from the query than `limit` (n,) need not be found.
+
+        Returns the closest points (n, 3) and the radii (n,).
+        """
         ...
 
     def descend_from_boundary(
         self, points: FloatArray, boundary: FloatArray, aside: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Iterate along the surface from points `boundary` (n, 3) of the curve at which it ends.
-        Returns the closest points (n, 3) to the queries `points` (n, 3), and the radii (n,).
+        """Iterate along the surface from points `boundary` (n, 3) of the curve at which it ends,
+        for the queries `points` (n, 3).
 
         aside: (n,) the distance from the curve, in the direction of the query, at which the surface
-            is searched; the iteration starts there."""
+            is searched; the iteration starts there.
+
+        Returns the closest points (n, 3) and the radii (n,).
+        """
         ...
 
 
 @dataclass(frozen=True)
 class InitialGuess:
-    """What is known about the closest points of n queries before the cells are searched.
+    """What is known about the closest points of n queries before cells are searched.
 
     closest: (n, 3) for each query a point of the surface, or NaN.
     estimate: (n,) first-order estimates of the distances.
-    on_boundary: (n,) whether the points `closest` lie on the curve at which the surface ends.
+    on_boundary: whether the points `closest` lie on the curve at which the surface ends.
     """
 
     closest: FloatArray
@@ -109,13 +123,13 @@ class InitialGuess:
     on_boundary: bool = True
 
     def some(self, rows: IntArray | slice) -> InitialGuess:
-        """The initial guess for the queries `rows`."""
+        """Return the initial guess for the queries `rows`."""
         return replace(self, closest=self.closest[rows], estimate=self.estimate[rows])
 
 
 @dataclass(frozen=True)
 class StoppingRule:
-    """The condition under which a search ends.
+    """The condition under which a search for closest points ends.
 
     length: an improvement of the distance by less than this length is not pursued.
     prove: whether cells are subdivided until none of them may hold a point that is nearer than the
@@ -130,14 +144,17 @@ class StoppingRule:
 class _Cube:
     """A cube that contains the surface, or the part of it that is searched.
 
-    half: half the length of its edges."""
+    center: (3,) its center.
+    half: half the length of its edges.
+    """
 
     center: FloatArray
     half: float
 
     @classmethod
     def around(cls, lower: FloatArray, upper: FloatArray) -> _Cube:
-        """The smallest cube around a box, slightly enlarged."""
+        """Return the smallest cube around the box with corners `lower` and `upper`, slightly
+        enlarged."""
         half = 0.5 * float((upper - lower).max()) * (1 + 1e-6)
         half += 1e-12 * float(np.abs([lower, upper]).max())
         return cls(0.5 * (lower + upper), max(half, 1e-30))
@@ -147,12 +164,16 @@ def search(
     surface: TracedSurface, points: FloatArray, known: InitialGuess, descents: DescentMethods,
     tolerance: StoppingRule, progress: Callable[[str], None],
 ) -> SearchResult:  # fmt: skip
-    """Search the points of a level set that are nearest to `points` (n, 3), by branch and bound.
+    """Search the points of a surface that are nearest to `points` (n, 3), by branch and bound.
 
     known: what is already known about the closest points.
     descents: the iterations that lead from a point near the surface to a closest point.
     tolerance: when the search ends.
-    progress: called with a message before each stage."""
+    progress: called with a message before each stage.
+
+    If no box is known to contain the surface, a cube around the queries is searched. Queries whose
+    closest point may lie outside of it are searched again in a larger cube, several times.
+    """
     box = _bounding_box(surface)
     if box is not None:
         if (box[0] > box[1]).any():
@@ -162,28 +183,31 @@ def search(
         )
     closest, lower = known.closest.copy(), np.zeros(len(points))
     rows = np.arange(len(points))
-    half = 0.0
+    margin = 0.0
     for _ in range(_MAX_BOX_GROWTHS):
         if not len(rows):
             break
         x = points[rows]
         root = _Cube.around(x.min(axis=0), x.max(axis=0))
         distances = np.linalg.norm(x - closest[rows], axis=1)
-        half = max(4 * half, 1.0 + 4 * root.half, 1.1 * float(np.nanmax(distances, initial=0.0)))
-        root = _Cube(root.center, root.half + half)
+        # The margin of the cube around the queries. It grows by a factor of four or more.
+        margin = max(
+            4 * margin, 1.0 + 4 * root.half, 1.1 * float(np.nanmax(distances, initial=0.0))
+        )
+        root = _Cube(root.center, root.half + margin)
         start = replace(known.some(rows), closest=closest[rows])
         result = _search_in_batches(surface, root, x, start, descents, tolerance, progress)
         # The surface may continue outside the cube: lower bounds end at its faces.
         face_distance = root.half - np.abs(x - root.center).max(axis=1)
         closest[rows], lower[rows] = result.closest, np.minimum(result.lower_bounds, face_distance)
         distance = np.linalg.norm(x - result.closest, axis=1)
-        rows = rows[~(distance <= half)]
+        rows = rows[~(distance <= margin)]
     return SearchResult(closest, lower)
 
 
 def _bounding_box(surface: TracedSurface) -> tuple[FloatArray, FloatArray] | None:
-    """The corners (lower, upper) of a box that contains the surface; None if no finite one is
-    known."""
+    """Return the corners (lower, upper) of a box that contains the surface; None if no finite one
+    is known."""
     volume = surface.volume
     if volume is None:
         return None
@@ -205,13 +229,18 @@ def _search_in_batches(
 
     guess: what is already known about the closest points of all queries.
     descents: the iterations that lead from a point near the surface to a closest point.
-    tolerance: when the search ends."""
+    tolerance: when the search ends.
+    progress: called with a message before each stage.
+
+    All batches share the same cells. A first search uses few coarse cells, later ones all cells.
+    """
     classifier = CellClassifier(surface)
     max_cells = _max_cells(surface, len(points), tolerance.prove)
     cells_per_point = _CELLS_PER_PROOF if tolerance.prove else _CELLS_PER_POINT
     min_cells = min(max(_MIN_CELLS, int(cells_per_point * len(points))), _MAX_CELLS, max_cells)
     if surface.field.has_jumps:
         min_cells = _MIN_JUMP_CELLS
+    # The cells depend on the surface and the number of queries alone, so all batches share them.
     coarse, cells = _split(classifier, root, min_cells, progress)
     backend, trees = choose_backend("double"), None
     if len(cells):
@@ -219,6 +248,7 @@ def _search_in_batches(
     results: list[SearchResult] = []
     for start in range(0, max(len(points), 1), _BATCH_SIZE):
         rows = slice(start, start + _BATCH_SIZE)
+        # Without proofs cells are not subdivided further.
         limit = max_cells if tolerance.prove else 0
         cell_search = _CellSearch(
             classifier,
@@ -237,8 +267,8 @@ def _search_in_batches(
 
 
 def _max_cells(surface: TracedSurface, count: int, is_proved: bool) -> int:
-    """The largest number of cells into which space is divided for a search of `count` queries.
-    is_proved: whether lower bounds are to be made as large as possible."""
+    """Return the largest number of cells into which space is divided for a search of `count`
+    queries. is_proved: whether lower bounds are to be made as large as possible."""
     if surface.field.has_jumps:
         return _MAX_JUMP_CELLS
     limit = min(max(_MAX_CELLS, count // 2), _MAX_PROOF_CELLS) if is_proved else _MAX_CELLS
@@ -251,20 +281,22 @@ def _split(
     """Divide the cube `root` into cells that may hold the surface.
 
     Each iteration splits the larger half of the cells into eight, until there are at least
-    `min_cells`. If the surface in a cell is in one piece and lies in a slab, then the cell counts
-    as smaller than it is: its size is taken to be a quarter of the slab's thickness.
+    `min_cells`. If the surface in a cell is in one piece and lies in a slab (between two parallel
+    planes), then the cell counts as smaller than it is: its size is taken to be a quarter of the
+    slab's thickness.
 
     Returns the coarse cells of an early iteration, which are few, and the cells of the last one.
     """
     half = root.half / _ROOT_CELLS
-    steps = (2 * np.indices((_ROOT_CELLS,) * 3).reshape(3, -1).T + 1 - _ROOT_CELLS) * half
-    cells = classifier.nonempty_cells(root.center + steps, np.full(len(steps), half))
+    offsets = (2 * np.indices((_ROOT_CELLS,) * 3).reshape(3, -1).T + 1 - _ROOT_CELLS) * half
+    cells = classifier.nonempty_cells(root.center + offsets, np.full(len(offsets), half))
     coarse = cells
     for _ in range(_MAX_SUBDIVISIONS):
         if not 0 < len(cells) < min_cells:
             break
         if len(coarse) < _MIN_COARSE_CELLS:
             coarse = cells
+        # The larger half is split; a flat single piece of surface counts as small.
         sizes = np.where(cells.is_single_piece, 0.25 * cells.thickness, cells.half)
         is_split = sizes >= np.median(sizes)
         children = _subdivide(classifier, cells, is_split)
@@ -276,16 +308,18 @@ def _split(
 def _subdivide(
     classifier: CellClassifier, cells: SurfaceCells, is_split: BoolArray
 ) -> SurfaceCells:
-    """The nonempty children of the cells selected by the mask `is_split` (n,). Each cell has eight
-    children of half its size."""
+    """Return the children of the cells selected by the mask `is_split` (n,), without those that are
+    proved empty. Each cell has eight children of half its size."""
     half = 0.5 * cells.half[is_split]
     center = cells.center[is_split, None] + half[:, None, None] * _CORNERS
     return classifier.nonempty_cells(center.reshape(-1, 3), np.repeat(half, 8))
 
 
 class _CellSearch:
-    """Branch-and-bound search for the points closest to a batch of queries, over cells that cover
-    the surface. Coarse cells are searched first.
+    """Branch-and-bound search for the surface points closest to a batch of queries, over cells that
+    cover the surface. Coarse cells are searched first. A surface point in a cell is a candidate: a
+    descent (Newton's method along the surface) from it may lead to a nearer point than the best one
+    so far.
 
     classifier: proves cells empty, and finds surface points in the others.
     trees: the tree of the coarse cells and that of `cells`; None if there are none.
@@ -309,6 +343,9 @@ class _CellSearch:
         tolerance: float,
         max_cells: int,
     ) -> None:
+        """Store the search's inputs. points: (n, 3) the queries. descents: the iterations that lead
+        from a point near the surface to a closest point. The other parameters are attributes of the
+        class."""
         self.trees = trees
         self.classifier, self.cells, self.points, self.descents = (
             classifier,
@@ -322,7 +359,7 @@ class _CellSearch:
         self.max_cells = max_cells
 
     def run(self, progress: Callable[[str], None]) -> SearchResult:
-        """The closest points and the lower bounds of the distances."""
+        """Search, and return the closest points and the lower bounds of the distances."""
         if not len(self.points):
             return SearchResult(self.closest, self.lower)
         has_jumps = self.classifier.surface.field.has_jumps
@@ -343,24 +380,30 @@ class _CellSearch:
     ) -> None:
         """Search the cells of both trees, and subdivide cells if proofs are wanted.
 
+        coarse, tree: the tree of the coarse cells, and that of all cells.
+        has_jumps: whether f jumps at facets.
+
         For each query the first descent begins at the surface point of the coarse cell with the
         smallest estimated distance; the next ones at surface points of other cells that may hold a
         nearer point. Then all cells that may hold a point nearer than the best one are split and
         searched again, until there are none or too many.
         """
+        # A mark for each cell that may hold a nearer point, if cells are to be split.
         marks = dr.zeros(self.backend.Bool, len(self.cells)) if self.max_cells else None
+        # Functions that jump have no descents in a kernel; expensive ones start in a fine cell.
         if has_jumps or self._is_expensive:
-            tried, ids = self._descend_from_best_start(tree), np.arange(len(self.points))
+            tried_starts, ids = self._descend_from_best_start(tree), np.arange(len(self.points))
             if not has_jumps:
                 self._leave_boundary()
         else:
-            ids, tried = self._search_in_kernel(coarse, tree, marks)
+            ids, tried_starts = self._search_in_kernel(coarse, tree, marks)
             ids = np.union1d(ids, self._leave_boundary())
         for _ in range(_MAX_SUBDIVISIONS):
-            self._improve(tree, ids, [tried[ids]], marks)
+            self._improve(tree, ids, [tried_starts[ids]], marks)
             if marks is None:
                 break
             ids = np.flatnonzero(self._is_unproved())
+            # Split the marked cells, unless no query needs it or there would be too many cells.
             is_split = to_numpy(marks)
             count = int(is_split.sum())
             if not count or not len(ids) or len(self.cells) + 4 * count > self.max_cells:
@@ -370,7 +413,7 @@ class _CellSearch:
             )
             self.cells = SurfaceCells.concatenate([self.cells.select(~is_split), children])
             progress(f"distances: {len(self.cells):,} cells for {len(ids):,} points")
-            tree, tried = CellTree.of(self.backend, self.cells), self.closest
+            tree, tried_starts = CellTree.of(self.backend, self.cells), self.closest
             marks = dr.zeros(self.backend.Bool, len(self.cells))
 
     def _search_in_kernel(
@@ -391,21 +434,24 @@ class _CellSearch:
         tolerance = dr.opaque(backend.Float, self.tolerance)
 
         def compute(x: Vec3, guess_point: Vec3) -> tuple[Real | Vec3, ...]:
-            """For a query x: the best point and its exclusion radius, the lower bound, the surface
-            point where the descent began, the candidates for the next round, and 1 where Newton's
-            method did not converge."""
+            """Return for a query x: the best point and the radius of its ball without nearer
+            points, the lower bound, the surface point where the descent began, the candidates for
+            the next round, and 1 where Newton's method did not converge."""
             real, missing = backend.Float, backend.Array3f(FAR_SENTINEL)
             limit = safe_norm(guess_point - x)
             limit = dr.select(dr.isfinite(limit), limit, FAR_SENTINEL)
             start = coarse.best_start(x, limit)
             y, free, unresolved = self.descents.newton_in_kernel(x, start, limit)
-            has_start, gap = start.x < 0.5 * FAR_SENTINEL, safe_norm(y - x)
+            has_start, end_distance = start.x < 0.5 * FAR_SENTINEL, safe_norm(y - x)
+            # Lanes without a start have nothing to resolve.
             unresolved &= has_start
-            is_nearer = has_start & ~unresolved & (gap < limit)
+            is_nearer = has_start & ~unresolved & (end_distance < limit)
+            # The nearer of the end of the descent and the initial guess, or none.
             point = dr.select(
                 is_nearer, y, dr.select(limit < 0.5 * FAR_SENTINEL, guess_point, missing)
             )
-            distance = dr.select(is_nearer, gap, limit)
+            distance = dr.select(is_nearer, end_distance, limit)
+            # A best distance of 0 on unresolved lanes means that no cell counts as nearer there.
             best = BestCandidate(
                 point, dr.select(unresolved, 0, distance), dr.select(is_nearer, free, 0),
                 dr.select(is_nearer, 1, real(_BOUNDARY_SEPARATION)),
@@ -433,35 +479,35 @@ class _CellSearch:
 
     @staticmethod
     def _rounded(lower: FloatArray, points: FloatArray) -> FloatArray:
-        """Lower bounds (n,) of the distances of `points` (n, 3) that hold in spite of rounding:
-        `lower` (n,) less a bound of its rounding error."""
+        """Return lower bounds (n,) of the distances of `points` (n, 3) that hold in spite of
+        rounding: `lower` (n,) less a bound of its rounding error."""
         return lower * (1 - 1e-12) - 1e-15 * np.abs(points).max(axis=1)
 
     @property
     def _is_expensive(self) -> bool:
         """Whether an evaluation of the field takes longer than a walk through a tree of cells. Then
-        even the first descent starts in a fine cell, near the closest point, to save
-        evaluations."""
+        even the first descent starts in a fine cell, near the closest point, to save evaluations.
+        """
         return self.classifier.surface.field.has_variable_accuracy
 
     def _is_unproved(self) -> BoolArray:
-        """(n,) whether a point may exist that is nearer than the best one by more than the
-        tolerance."""
+        """Return the mask (n,) of queries for which a point may exist that is nearer than the best
+        one by more than the tolerance."""
         return self.lower < self._distance(slice(None)) - self.tolerance
 
     def _distance(self, rows: IntArray | slice) -> FloatArray:
-        """Distances (k,) of the queries `rows` from their best points so far; `FAR_SENTINEL` where
-        there is none."""
+        """Return the distances (k,) of the queries `rows` from their best points so far;
+        `FAR_SENTINEL` where there is none."""
         distances = np.linalg.norm(self.points[rows] - self.closest[rows], axis=1)
         return np.where(np.isnan(distances), FAR_SENTINEL, distances)
 
     def _is_boundary(self, rows: IntArray | slice) -> BoolArray:
-        """(k,) for each of the queries `rows`, whether its best point is still the initial guess
-        and lies on the curve at which the surface ends."""
+        """Return the mask (k,) of those of the queries `rows` whose best point is still the initial
+        guess and lies on the curve at which the surface ends."""
         return self.guess.on_boundary & (self.closest[rows] == self.guess.closest[rows]).all(axis=1)
 
     def _descend_from_best_start(self, tree: CellTree) -> FloatArray:
-        """For each query, descend from the surface point of the cell with the smallest estimated
+        """Descend for each query from the surface point of the cell with the smallest estimated
         distance. Returns these surface points (n, 3), `FAR_SENTINEL` for none."""
         limit = upload_floats(self.backend, self._distance(slice(None)))
         start = to_numpy(tree.best_start(upload_vectors(self.backend, self.points), limit))
@@ -479,6 +525,7 @@ class _CellSearch:
         also continues if the field has jump surfaces (their cells have no tangent planes) or is
         expensive to evaluate. For expensive fields each round tries one candidate only.
 
+        tree: the tree of the cells.
         tried: arrays (k, 3) of surface points at which descents have started already.
         marks: None, or a Bool array in which the cells that may hold a nearer point are marked.
         """
@@ -489,6 +536,7 @@ class _CellSearch:
             if self._is_expensive:
                 starts = starts[:1]
             improved_ids = self._descend_from_candidates(rows, starts)
+            # Queries without a further chance are left out of the next round.
             active = np.isin(rows, improved_ids)
             if self._is_expensive or self.classifier.surface.field.has_jumps:
                 active |= starts[0][:, 0] < 0.5 * FAR_SENTINEL
@@ -498,9 +546,9 @@ class _CellSearch:
             )
 
     def _descend_from_candidates(self, rows: IntArray, starts: Sequence[FloatArray]) -> IntArray:
-        """For each of the queries `rows` (k,), descend from its surface point in each of the arrays
-        `starts`, (k, 3), with `FAR_SENTINEL` for none. Returns those of `rows` whose distance this
-        reduced."""
+        """Descend for each of the queries `rows` (k,) from its surface point in each of the arrays
+        `starts`, (k, 3), with `FAR_SENTINEL` for none. Returns the queries of `rows` whose distance
+        became smaller."""
         old_distance = self._distance(rows)
         start_index, selected = np.nonzero([start[:, 0] < 0.5 * FAR_SENTINEL for start in starts])
         self._descend(rows[selected], np.stack(starts)[start_index, selected])
@@ -509,12 +557,15 @@ class _CellSearch:
     def _closer_candidates(
         self, tree: CellTree, rows: IntArray, skipped: Sequence[FloatArray], marks: Any
     ) -> list[FloatArray]:
-        """For the queries `rows` (k,), find the surface points of cells that may hold a nearer
-        point than the best one (`CellTree.closer_candidates`). Returns them as a list of arrays
-        (k, 3), with `FAR_SENTINEL` for none. It also raises the lower bounds of these queries.
+        """Find for the queries `rows` (k,) the surface points of cells that may hold a nearer point
+        than the best one (`CellTree.closer_candidates`). Also raise the lower bounds of these
+        queries.
 
+        tree: the tree of the cells.
         skipped: arrays (k, 3) of surface points near which no candidates are wanted.
         marks: None, or a Bool array in which the cells that may hold a nearer point are marked.
+
+        Returns the surface points as a list of arrays (k, 3), with `FAR_SENTINEL` for none.
         """
         backend, closest = self.backend, self.closest[rows]
         best = BestCandidate(
@@ -532,15 +583,16 @@ class _CellSearch:
         return [to_numpy(candidate) for candidate in candidates]
 
     def _leave_boundary(self) -> IntArray:
-        """For each query whose best point lies on the curve at which the surface ends, descend
-        along the surface from there. Returns the indices of the queries whose distance became
-        smaller."""
+        """Descend along the surface for each query whose best point lies on the curve at which the
+        surface ends. Returns the indices of the queries whose distance became smaller."""
         ids = np.flatnonzero(self._is_boundary(slice(None)))
         distance = self._distance(ids)
         ids, distance = ids[distance > 0], distance[distance > 0]
-        offset = np.minimum(0.25 * distance, _BOUNDARY_OFFSET * self.tolerance)
-        x = self.points[ids]
-        self._update_best(ids, *self.descents.descend_from_boundary(x, self.closest[ids], offset))
+        aside = np.minimum(0.25 * distance, _BOUNDARY_OFFSET * self.tolerance)
+        queries = self.points[ids]
+        self._update_best(
+            ids, *self.descents.descend_from_boundary(queries, self.closest[ids], aside)
+        )
         return ids[self._distance(ids) < distance]
 
     def _descend(self, ids: IntArray, start: FloatArray) -> None:
@@ -562,7 +614,8 @@ class _CellSearch:
         """
         distances = np.linalg.norm(self.points[rows] - candidates, axis=1)
         improved = np.flatnonzero(distances < self._distance(rows))
-        improved = improved[np.argsort(-distances[improved])]  # the last one stays
+        # In order of falling distance: of several candidates of a query the last one stays.
+        improved = improved[np.argsort(-distances[improved])]
         self.closest[rows[improved]], self.free[rows[improved]] = (
             candidates[improved],
             free[improved],

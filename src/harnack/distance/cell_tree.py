@@ -1,8 +1,9 @@
-"""A tree over cells that may hold a surface. It finds the cells near a point, and bounds of the
-distance of the surface in them.
+"""A tree over cells, cubes that may hold a surface. It finds the cells near a query point, and
+bounds of the distance of the surface in them.
 
 For each cell the surface in it is either unknown or proved to lie in a slab (two parallel planes).
-Some cells also have a known point of the surface.
+Some cells also have a known point of the surface. Where the boundary of the field's domain cuts the
+surface in a curve, the clip curve, cells may have a point of this curve.
 """
 
 from __future__ import annotations
@@ -46,7 +47,8 @@ _CLIP_CURVE_RADIUS = 4.0
 
 @dataclass(frozen=True)
 class SurfaceCells:
-    """Cubes, with a slab and a point of the surface in each where these are known.
+    """Cubes that may hold a surface, the cells, with a slab (two parallel planes) that contains the
+    surface in the cell, and a point of the surface in it, where these are known.
 
     FAR stands for `FAR_SENTINEL`: not known.
 
@@ -54,9 +56,9 @@ class SurfaceCells:
     half: (n,) half the length of an edge.
     surface_point: (n, 3) a point of the surface, no farther from the center than the cell is wide,
         or FAR.
-    normal, offset, thickness: (n, 3), (n,), (n,) the slab: a surface point y in the ball around
-        the cell has |normal . (y - center) - offset| <= thickness. Where no slab is known the
-        thickness is FAR; where no plane approximates the surface the normal is zero.
+    normal, offset, thickness: (n, 3), (n,), (n,) the slab: a surface point y in the ball around the
+        cell has |normal . (y - center) - offset| <= thickness. Where no slab is known the thickness
+        is FAR; where no plane approximates the surface the normal is zero.
     plane_radius: (n,) within this radius about its surface point the surface is nearly that plane.
     curvature: (n,) an upper bound of the surface's curvature there, or FAR.
     clip_point: (n, 3) a point of the clip curve, at which a domain cuts the surface, or FAR.
@@ -76,7 +78,7 @@ class SurfaceCells:
 
     @classmethod
     def unknown(cls, center: FloatArray, half: FloatArray) -> SurfaceCells:
-        """Cubes without slabs and surface points."""
+        """Return cubes without slabs and surface points. center, half: as in the class."""
         n = len(half)
         far, zero = np.full((n, 3), FAR_SENTINEL), np.zeros(n)
         return cls(
@@ -88,26 +90,27 @@ class SurfaceCells:
         return len(self.half)
 
     def select(self, mask: BoolArray) -> SurfaceCells:
-        """The cells that a mask (n,) selects."""
+        """Return the cells that a mask (n,) selects."""
         return SurfaceCells(*(column[mask] for column in vars(self).values()))
 
     @property
     def is_single_piece(self) -> BoolArray:
-        """(n,) whether the slab of a cell shows that the surface in it is in one piece."""
+        """(n,) whether the slab of a cell is so thin that the surface in it is in one piece."""
         return self.thickness < _SINGLE_PIECE_THICKNESS * self.half
 
     @classmethod
     def concatenate(cls, parts: list[SurfaceCells]) -> SurfaceCells:
-        """The cells of all parts, in order."""
+        """Return the cells of all parts, in order."""
         columns = zip(*(vars(part).values() for part in parts), strict=True)
         return cls(*(np.concatenate(column) for column in columns))
 
 
 @dataclass(frozen=True)
 class BestCandidate:
-    """The closest surface point found so far.
+    """The surface point closest to a query that was found so far, one for each lane.
 
-    point: the surface point. distance: its distance from the query.
+    point: the surface point.
+    distance: its distance from the query.
     exclusion_radius: the radius of a ball about `point` that is proved to hold no surface point
         nearer to the query.
     separation_factor: the surface point of another cell is taken to lead to the same closest point,
@@ -122,19 +125,26 @@ class BestCandidate:
 
 @dataclass(frozen=True)
 class CellTree:
-    """A bounding-volume tree over at least one cell that may hold a surface, stored on a
-    backend."""
+    """A bounding-volume tree over at least one cell (a cube that may hold a surface), stored on a
+    backend. Each cell has a record: its box, a slab that contains the surface in it, and a known
+    point of the surface."""
 
     tree: PackedTree
 
     @classmethod
     def of(cls, backend: Backend, cells: SurfaceCells) -> CellTree:
         """Build the tree of the cells. If a cell has a point of the clip curve (in which the
-        boundary of the domain cuts the surface), the tree has a second record for that point."""
-        clip_ids = np.flatnonzero(cells.clip_point[:, 0] < FAR_SENTINEL)
-        count, ids = len(cells), np.concatenate([np.arange(len(cells)), clip_ids])
+        boundary of the domain cuts the surface), the tree has a second record for that point.
+
+        Besides the numbers of `SurfaceCells` a record has an index, a slack by which the estimate
+        of a distance may be too large, and a separation (`_CellRecord`).
+        """
+        clip_rows = np.flatnonzero(cells.clip_point[:, 0] < FAR_SENTINEL)
+        count, cell_of_record = len(cells), np.concatenate([np.arange(len(cells)), clip_rows])
         is_plain = cells.is_single_piece & (cells.clip_point[:, 0] == FAR_SENTINEL)
         separations = np.where(is_plain, _SEPARATION, _SEPARATION_IN_PIECES) * cells.half
+        # How far the surface may be from its plane: by its curvature, but at most to the end of the
+        # slab.
         bulge = 0.15 * cells.curvature * np.square(cells.plane_radius)
         slack = np.where(cells.is_single_piece, np.minimum(cells.thickness, bulge), 0.0)
         records = np.column_stack(
@@ -150,27 +160,30 @@ class CellTree:
                 slack,
                 separations,
             ]
-        )[ids]
-        radius = _CLIP_CURVE_RADIUS * cells.half[clip_ids]
-        bulge = radius * np.minimum(0.25, cells.clip_curvature[clip_ids] * radius)
-        records[count:, 4:7] = cells.clip_point[clip_ids]
+        )[cell_of_record]
+        radius = _CLIP_CURVE_RADIUS * cells.half[clip_rows]
+        bulge = radius * np.minimum(0.25, cells.clip_curvature[clip_rows] * radius)
+        # The records of clip points: another point, no slab, and the index -1.
+        records[count:, 4:7] = cells.clip_point[clip_rows]
         records[count:, 12:] = np.column_stack([
-            np.full(len(clip_ids), -1), radius, bulge, _SEPARATION_IN_PIECES * cells.half[clip_ids],
+            np.full(len(clip_rows), -1), radius, bulge,
+            _SEPARATION_IN_PIECES * cells.half[clip_rows],
         ])  # fmt: skip
-        center, half = cells.center[ids], cells.half[ids, None]
+        center, half = cells.center[cell_of_record], cells.half[cell_of_record, None]
         hierarchy = build_balanced_tree(center, leaf_size=_LEAF_SIZE)
         slot_records = hierarchy.values_in_slots(records)
+        # Empty places of leaves get a record that is infinitely far away.
         slot_records[hierarchy.leaf_slots < 0] = (
             [FAR_SENTINEL] * 3 + [0] + [FAR_SENTINEL] * 4 + [0, 0, 0, 0, -1, 0, 0, 0]
         )
-        levels = node_boxes(hierarchy, center - half, center + half)
-        return cls(pack_tree(backend, hierarchy, levels, slot_records))
+        boxes = node_boxes(hierarchy, center - half, center + half)
+        return cls(pack_tree(backend, hierarchy, boxes, slot_records))
 
     def best_start(self, x: Vec3, limit: Real) -> Vec3:
-        """The surface point at which a search for the closest point to x should start. It is the
-        known surface point of the cell in which the surface has the smallest estimated distance
-        from x (`_CellRecord.estimate`). `FAR_SENTINEL` if no estimate is below `limit`, a length.
-        """
+        """Return the surface point at which a search for the point closest to x should start. It is
+        the known surface point of the cell in which the surface has the smallest estimated distance
+        from x (`_CellRecord.estimate`). It is `FAR_SENTINEL` if no estimate is below `limit`, a
+        length."""
         vector = self.tree.backend.Array3f
 
         def visit_cell(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
@@ -181,6 +194,7 @@ class CellTree:
             is_best = active & (estimate < best)
             return dr.select(is_best, estimate, best), dr.select(is_best, cell.surface_point, point)
 
+        # The surface point of a cell near x limits the walk from the start.
         upper_bound = (1 + 1e-9) * dr.sqrt(squared_distance_in_nearby_leaf(self.tree, x, 4))
         start = fmin(upper_bound, limit), vector(FAR_SENTINEL)
         return self._walk(x, visit_cell, start, lambda state: dr.square(state[0]))[1]
@@ -190,14 +204,17 @@ class CellTree:
     ) -> tuple[Real, list[Vec3]]:
         """Find cells that may hold a point nearer to x than `best`.
 
+        best: the surface point closest to x so far.
+        points: surface points at which searches started already.
+        tolerance: a length; cells that may hold a point nearer by less than this do not count.
+        marks: None, or a Bool array with one entry for each cell. An entry is set for every cell
+            whose lower bound is below best.distance - tolerance, whether its point is skipped or
+            not.
+
         Returns a lower bound of the distance from x to the surface, at most best.distance; and the
         surface points (`FAR_SENTINEL` for none) of the few cells with the smallest estimated
         distance, among those whose lower bound is below best.distance - tolerance. Points that are
-        not separated from `best`, from `points` or from each other (`_SEPARATION`) are skipped. In
-        `marks`, if it is not None, a Bool is set for every cell with such a lower bound, whether
-        its point is skipped or not.
-
-        points: surface points at which searches started already. tolerance: a length.
+        not separated from `best`, from `points` or from each other (`_SEPARATION`) are skipped.
         """
         backend = self.tree.backend
         vector, index = backend.Array3f, backend.UInt32
@@ -207,10 +224,12 @@ class CellTree:
             smaller; mark the cell; and add its surface point to the list of candidates, if it
             qualifies.
 
-            row: the cell's record. state: the lower bound so far, then the list of candidates.
+            row: the cell's record.
+            state: the lower bound so far, then the list of candidates.
             """
             lower, *listed = state
             cell = _CellRecord.of(vector, row)
+            # Cells in the ball about the best point hold no nearer point.
             is_relevant = active & ~cell.is_within(best.point, best.exclusion_radius)
             cell_bound = cell.lower_bound(x)
             is_open_cell = is_relevant & (cell_bound < best.distance - tolerance)
@@ -219,6 +238,8 @@ class CellTree:
                 dr.scatter(marks, backend.Bool(True), cell_index, is_open_cell & cell.is_cell)
             lower = dr.select(is_relevant & cell.is_cell, fmin(lower, cell_bound), lower)
             estimate = cell.estimate(x)
+            # The point is worth a descent if the estimate, less its slack, is below the best
+            # distance.
             is_listed = is_open_cell & (estimate < best.distance + cell.estimate_slack)
             is_listed &= cell.is_separated(best.point, best.separation_factor)
             for other in points:
@@ -249,12 +270,15 @@ class CellTree:
             return tuple(listed)
 
         def may_contain(low: Vec3, high: Vec3) -> Mask:
-            """Whether a box, with the corners `low` and `high`, extends outside of the ball about
-            the best point that is proved to hold no nearer point."""
+            """Return whether a box, with the corners `low` and `high`, extends outside of the ball
+            about the best point that is proved to hold no nearer point."""
             y = best.point
+            # The corner of the box that is farthest from the best point.
             corner = vector(*(fmax(high[k] - y[k], y[k] - low[k]) for k in range(3)))
             return dr.squared_norm(corner) >= best.exclusion_radius * best.exclusion_radius
 
+        # Boxes farther away than the best point are skipped; the list begins with infinite
+        # estimates.
         limit = backend.Float(best.distance)
         empty_list = (
             entry
@@ -263,6 +287,7 @@ class CellTree:
         )
         start = limit, *empty_list
         lower, *listed = self._walk(x, visit_cell, start, lambda state: limit * limit, may_contain)
+        # The points only, without their estimates.
         return lower, listed[1::2]
 
     def _walk(
@@ -271,9 +296,10 @@ class CellTree:
     ) -> LoopValues:  # fmt: skip
         """Traverse the tree from the root, and visit its cells. Returns the final state.
 
-        start: the initial state of the traversal.
+        x: the query.
         visit_cell: a function of a cell's record, the active lanes and the state that returns the
             new state.
+        start: the initial state of the traversal.
         limit: a function of the state; boxes whose squared distance from x is above its result are
             skipped.
         may_contain: a function of the lower and the upper corner of a box that tells whether the
@@ -282,8 +308,8 @@ class CellTree:
         vector = self.tree.backend.Array3f
 
         def visit(node: VisitedNode, state: LoopValues) -> tuple[Mask, LoopValues]:
-            """Whether a node's box is to be visited, and the state after its cells, if it is a
-            leaf."""
+            """Return whether a node's box is to be visited, and the state after its cells, if it is
+            a leaf."""
             low, high = vector(*node.head[:3]), vector(*node.head[3:6])
             offset = dr.select(x < low, low - x, dr.select(x > high, x - high, 0))
             is_near = (dr.squared_norm(offset) < limit(state)) & may_contain(low, high)
@@ -294,9 +320,9 @@ class CellTree:
 
 @dataclass(frozen=True)
 class _CellRecord:
-    """A record of the tree: a cell, or a point of the clip curve in a cell (the curve in which the
-    boundary of the field's domain cuts the surface). Most attributes are those of a cell in
-    `SurfaceCells`; the others are:
+    """A record of the tree: a cell (a cube that may hold the surface), or a point of the clip curve
+    in a cell (the curve in which the boundary of the field's domain cuts the surface). Most
+    attributes are those of a cell in `SurfaceCells`; the others are:
 
     number: the index of the cell; -1 for a point of the clip curve.
     spread: the radius about `surface_point` within which the surface is taken for a plane, or the
@@ -319,8 +345,8 @@ class _CellRecord:
 
     @classmethod
     def of(cls, vector: Any, row: list[Real]) -> _CellRecord:
-        """The record that is stored in a row of 16 numbers, in the order in which `CellTree.of`
-        writes them. vector: the type of 3-vectors."""
+        """Make the record that is stored in a row of 16 numbers, in the order in which
+        `CellTree.of` writes them. vector: the type of 3-vectors."""
         return cls(
             vector(*row[:3]), row[3], vector(*row[4:7]), row[7], vector(*row[8:11]), *row[11:16]
         )
@@ -331,20 +357,21 @@ class _CellRecord:
         return self.number >= 0
 
     def lower_bound(self, x: Vec3) -> Real:
-        """A lower bound of the distance from x to the surface in the cell: the larger of the
-        distances from the cell's box and from its slab."""
+        """Return a lower bound of the distance from x to the surface in the cell: the larger of the
+        distances from the cell's box and from its slab within the ball around the cell."""
         vector = cast("Any", type(x))
         offset = x - self.center
         box_distance = dr.norm(vector(*(fmax(dr.abs(offset[k]) - self.half, 0) for k in range(3))))
         height = dr.dot(offset, self.normal)
-        lateral = dr.norm(dr.fma(vector(-height), self.normal, offset))
+        in_plane_distance = dr.norm(dr.fma(vector(-height), self.normal, offset))
         normal_gap = fmax(dr.abs(height - self.offset) - self.thickness, 0)
-        lateral_gap = fmax(lateral - 1.7321 * self.half, 0)
-        return fmax(box_distance, dr.norm(vector(normal_gap, lateral_gap, 0)))
+        # The ball has the radius sqrt(3) half.
+        in_plane_gap = fmax(in_plane_distance - 1.7321 * self.half, 0)
+        return fmax(box_distance, dr.norm(vector(normal_gap, in_plane_gap, 0)))
 
     def estimate(self, x: Vec3) -> Real:
-        """An estimate of the distance from x to the surface in the cell, not below the proved
-        bound; infinite if no surface point is known.
+        """Return an estimate of the distance from x to the surface in the cell, not below the
+        proved bound; infinite if no surface point is known.
 
         Within `spread` of its point the surface is taken for a plane, and the clip curve for a
         line. The vector from x to the closest point of the plane or line is at right angles to the
@@ -359,10 +386,11 @@ class _CellRecord:
         )
 
     def is_separated(self, y: Vec3, times: Real) -> Mask:
-        """Whether the surface point is at least `times` * `separation` away from y."""
+        """Return the mask of lanes on which the surface point is at least `times` * `separation`
+        away from y."""
         return dr.squared_norm(self.surface_point - y) >= dr.square(times * self.separation)
 
     def is_within(self, y: Vec3, radius: Real) -> Mask:
-        """Whether the whole cell is within a radius of y."""
+        """Return the mask of lanes on which the whole cell is within a radius of y."""
         farthest = dr.abs(y - self.center) + self.half
         return dr.squared_norm(farthest) < radius * radius

@@ -1,4 +1,6 @@
-"""Finds closest points of a level set by descent: onto the level, then along it.
+"""Finds the point of a level set closest to a query x by descent: from a start point onto the level
+set, then along it. f is the function, a point of the level set has f = level, and y is the current
+point of the descent.
 
 The result is a point of the level set, to rounding, at which x - y is normal to the surface and no
 neighbor is nearer to x. It is a *local* minimum of the distance: another part of the surface may be
@@ -54,11 +56,12 @@ _MIN_SINGULARITY_FRACTION = 1e-5
 
 @dataclass(frozen=True)
 class _DescentState:
-    """The state of a descent: a point y, and properties of the field's function f there.
+    """The state of a descent, which moves a point y onto a level set of f and along it: y, and
+    properties of f there.
 
     gradient: grad f(y).
     level_uncertainty: the length by which rounding may have moved the level set at y.
-    smooth_radius: the radius of the ball on which f is smooth.
+    smooth_radius: the radius of the ball about y on which f is smooth.
     """
 
     y: Vec3
@@ -67,13 +70,14 @@ class _DescentState:
     smooth_radius: Real
 
     def parts(self) -> tuple[Any, ...]:
-        """The attributes in the order of the constructor, as the state of a loop."""
+        """Return the attributes in the order of the constructor, as the state of a loop."""
         return self.y, self.gradient, self.level_uncertainty, self.smooth_radius
 
     def flat_after(self, is_flat: Mask, previous: _DescentState) -> _DescentState:
-        """This state, with changes in the lanes `is_flat`, in which both f - level and the gradient
-        are 0, so that the gradient has no direction. There it gets the gradient of the previous
-        state, and an uncertainty of the level that consists of the rounding of coordinates only."""
+        """Return this state, with changes in the lanes `is_flat`, in which both f - level and the
+        gradient are 0, so that the gradient has no direction. There it gets the gradient of the
+        previous state, and an uncertainty of the level that consists of the rounding of coordinates
+        only."""
         epsilon = float(dr.epsilon(type(self.level_uncertainty)))
         rounding = 4 * epsilon * lengths.max_norm(self.y)
         gradient = dr.select(is_flat, previous.gradient, self.gradient)
@@ -85,18 +89,22 @@ class _DescentState:
         )
 
     def where(self, mask: Mask, other: _DescentState) -> tuple[Any, ...]:
-        """The attributes of this state in the lanes of the mask, and of the other state in all
-        other lanes, as a tuple in the order of the constructor."""
+        """Return the attributes of this state in the lanes of the mask, and of the other state in
+        all other lanes, as a tuple in the order of the constructor."""
         pairs = zip(self.parts(), other.parts(), strict=True)
         return tuple(dr.select(mask, first, second) for first, second in pairs)
 
 
 @dataclass(frozen=True)
 class ClosestPointDescent:
-    """Searches for points of a level set that are locally closest to query points, by Newton's
-    method and by descents along the surface.
+    """Searches for points of a level set of f that are locally closest to query points x, by
+    Newton's method and by descents along the surface. y is the current point of a search. The
+    uncertainty of the level is the length by which rounding may have moved the level set.
 
-    field: prepared for the backend."""
+    field: the function f, prepared for the backend.
+    levels: the levels; the one nearest in value counts.
+    has_hessian: whether f knows its second derivatives.
+    """
 
     backend: Backend
     field: Field
@@ -105,19 +113,20 @@ class ClosestPointDescent:
 
     @classmethod
     def of(cls, backend: Backend, field: Field, levels: Levels) -> ClosestPointDescent:
-        """The descent; finds out whether the field has a Hessian."""
+        """Make the descent, and find out whether the field has a Hessian."""
         return cls(backend, field, levels, has_hessian(backend, field))
 
     def newton(self, x: Vec3, start: Vec3, limit: Real) -> tuple[Vec3, Real, Mask, Mask]:
-        """Newton's method for the closest-point equations f(y) = level and (x - y) parallel to grad
-        f(y), in one kernel, from a point `start` near the surface.
+        """Run Newton's method for the closest-point equations f(y) = level and (x - y) parallel to
+        grad f(y), in one kernel, from a point `start` near the surface.
 
-        x: the query. limit: a closest point that is farther from x than this is not pursued.
+        x: the query.
+        limit: a closest point that is farther from x than this is not pursued.
 
         Returns y, to which `finish` adds the last step; the first-order distance of `start` from
-        the level; the mask of the lanes that failed, because the last step was longer than half the
-        radius of the ball in which f is smooth; and the mask of the lanes that stopped early,
-        because their closest point is farther from x than `limit`.
+        the level; the mask of lanes that failed, because the last step was longer than half the
+        radius of the ball in which f is smooth; and the mask of lanes that stopped early, because
+        their closest point is farther from x than `limit`.
 
         Each step combines the step of `descend` along the surface, which follows its curvature,
         with a Newton step to the level; both use derivatives at the same point. Convergence is
@@ -131,14 +140,17 @@ class ClosestPointDescent:
         def body(
             y: Vec3, first_step: Real, last: Real, is_lost: Mask, is_far: Mask, k: Any, active: Mask
         ) -> tuple[Any, ...]:
-            """One step from y.
+            """Make one step from y.
 
             first_step: the first-order distance of the start from the level.
-            last: the length of the step before. k: the number of steps.
+            last: the length of the step before.
             is_lost, is_far: the lanes that failed, and those that stopped at the limit.
+            k: the number of steps.
+            active: whether the search goes on.
             """
             # The rounding error of f takes as long as f itself, and does not matter here.
             sample = dataclasses.replace(self.field.evaluate(y), value_error=0.0)
+            # The step to the level and the step along the surface, both from y.
             residual, state = self._state_at(y, sample)
             move, _ = self._tangential_step(x, state, real(1))
             step = -residual / lengths.safe_norm(state.gradient)
@@ -147,17 +159,19 @@ class ClosestPointDescent:
             length, distance = dr.norm(move), dr.norm(x - y)
             max_length = 0.5 * state.smooth_radius
             is_lost = dr.select(active, length > max_length, is_lost)
-            shrinks = (k > 0) & (length < 0.5 * last)
-            is_far = dr.select(active, shrinks & (distance - 2 * length > limit), is_far)
-            ahead = length * dr.square(length / last)
-            is_near = (
-                shrinks
+            is_shrinking = (k > 0) & (length < 0.5 * last)
+            # If steps halve, the end is within two steps of y.
+            is_far = dr.select(active, is_shrinking & (distance - 2 * length > limit), is_far)
+            # The expected length of the next step.
+            next_length = length * dr.square(length / last)
+            is_last = (
+                is_shrinking
                 & ~is_lost
-                & (ahead <= dr.fma(_NEWTON_TOLERANCE, distance, state.level_uncertainty))
+                & (next_length <= dr.fma(_NEWTON_TOLERANCE, distance, state.level_uncertainty))
             )
             active &= ~is_far & dr.isfinite(length)
             y = dr.select(active, y + dr.select(is_lost, max_length / length, 1) * move, y)
-            active &= ~is_near & (k + 1 < _MAX_NEWTON_STEPS)
+            active &= ~is_last & (k + 1 < _MAX_NEWTON_STEPS)
             return y, first_step, length, is_lost, is_far, k + 1, active
 
         def is_active(*initial: Any) -> Mask:
@@ -170,12 +184,12 @@ class ClosestPointDescent:
         return y, first_step, is_lost, is_far
 
     def finish(self, x: Vec3, y: Vec3) -> tuple[Vec3, Mask, Real]:
-        """Finish a search for the surface point closest to x: one Newton step along the gradient,
-        from the last iterate y onto the level.
+        """Finish a search for the surface point closest to x: make one Newton step along the
+        gradient, from the last iterate y onto the level.
 
-        Returns the end of the step; the mask of the lanes in which it is a local minimum of the
-        distance from x, up to rounding; and the radius of a ball about it in which no point of the
-        surface is nearer to x.
+        Returns the end of the step; the mask of lanes in which it is a local minimum of the
+        distance from x, up to rounding; and the radius of a ball about y in which no point of the
+        surface is nearer to x, 0 if the first is not proved.
 
         Proof that the step, of length s along grad f, ends on the level: it is Newton's step, so f
         differs from the level at its end by at most the remainder, within s, of the Taylor
@@ -188,22 +202,25 @@ class ClosestPointDescent:
         _, is_minimum = self._tangential_step(x, state, self.backend.Float(1), rows)
         gradient_norm = lengths.safe_norm(state.gradient)
         step = -residual / gradient_norm
+        # Rounding is no part of the remainder: the step cannot reduce it.
         exact = dataclasses.replace(sample, value_error=0.0, gradient_error=0.0)
-        arrives = taylor_remainder(exact, dr.abs(step)) <= gradient_norm * state.level_uncertainty
+        # The step ends on the level up to its uncertainty.
+        is_arriving = (
+            taylor_remainder(exact, dr.abs(step)) <= gradient_norm * state.level_uncertainty
+        )
         end, is_short = self._step_to_level(x, residual, state)
-        arrives &= is_short
+        is_arriving &= is_short
         is_found = is_minimum & (
-            self._is_on_level(residual, state) | (self._is_level_resolved(state) & arrives)
+            self._is_on_level(residual, state) | (self._is_level_resolved(state) & is_arriving)
         )
         radius = exclusion_radius(exact, rows, x, y)
         return end, is_found, dr.select(is_found, radius, 0)
 
     def descend(self, x: Vec3, start: Vec3) -> tuple[Vec3, Mask, Mask]:
-        """Descend from `start` to a closest point of x.
+        """Descend from `start` to a point of the surface closest to the query x.
 
-        x: the query. Returns the last point y; the mask of the lanes in which it is a closest point
-        (a local minimum of the distance); and the mask of the lanes in which it is a point of the
-        level set.
+        Returns the last point y; the mask of lanes in which it is a closest point (a local minimum
+        of the distance); and the mask of lanes in which it is a point of the level set.
 
         Let g = grad f(y), n = g/|g|, r = x - y, and t the part of r tangential to the surface; A is
         the Hessian of f, w a tangential vector. The surface near y is y + w - (w.Aw/(2|g|)) n + ..,
@@ -226,18 +243,22 @@ class ClosestPointDescent:
             y: Vec3, g: Vec3, uncertainty: Real, radius: Real,
             factor: Real, on_level: Mask, accepted: Mask, iteration: Any, active: Mask,
         ) -> tuple[Any, ...]:  # fmt: skip
-            """One step along the surface and back to the level, accepted if it leads nearer to x.
+            """Make one step along the surface and back to the level, accepted if it leads nearer to
+            x.
 
             y, g, uncertainty, radius: the parts of the state (`_DescentState`).
             factor: the fraction of Newton's step that is tried.
             on_level, accepted: whether the start led to a level; whether y is a closest point.
             iteration: the number of steps.
+            active: whether the descent goes on.
             """
             current, is_first = _DescentState(y, g, uncertainty, radius), iteration == 0
+            # In iteration 0 the start is first brought to the level, without a move along it.
             move, is_minimum = self._tangential_step(x, current, factor)
             is_minimum &= ~is_first
             goes_on = active & ~is_minimum
             trial, is_arrived = self._to_level(dr.select(is_first, y, y + move), goes_on)
+            # No farther from x than before, up to rounding.
             limit = dr.norm(x - y) * (1 + 8 * self.backend.machine_epsilon) + 4 * uncertainty
             is_better = goes_on & is_arrived & (dr.norm(x - trial.y) <= limit)
             new_factor = dr.select(is_better, fmin(4 * factor, 1), 0.25 * factor)
@@ -271,14 +292,14 @@ class ClosestPointDescent:
         return y, accepted, on_level
 
     def newton_to_level(self, start: Vec3) -> Vec3:
-        """The point of a level to which Newton's method along the gradient converges; NaN where it
-        does not."""
+        """Return the point of a level to which Newton's method along the gradient converges from
+        `start`; NaN where it does not."""
         end, is_found = self._to_level(start, self.backend.Bool(True))
         return dr.select(is_found, end.y, dr.nan)
 
     def noise(self, y: Vec3) -> Real:
-        """A bound of the length by which rounding and approximation may have moved the level set at
-        a point y of it."""
+        """Return a bound of the length by which rounding and approximation may have moved the level
+        set at a point y of it."""
         return self._evaluate(y)[1].level_uncertainty
 
     def last_step(self, x: Vec3, y: Vec3) -> Vec3:
@@ -290,11 +311,12 @@ class ClosestPointDescent:
         return dr.select(is_short & self._is_level_resolved(state), end, dr.nan)
 
     def _step_to_level(self, x: Vec3, residual: Real, state: _DescentState) -> tuple[Vec3, Mask]:
-        """One Newton step from the point of a state to the level, along the gradient. Returns the
-        end of the step; and whether the step is so short that, if its start is closest to x except
-        for the distance from the level, its end is closest to x up to rounding.
+        """Make one Newton step from the point of a state to the level, along the gradient. Returns
+        the end of the step; and whether the step is so short that, if its start is closest to x
+        except for the distance from the level, its end is closest to x up to rounding.
 
-        residual: f - level at the start."""
+        residual: f - level at the start.
+        """
         gradient_norm = lengths.safe_norm(state.gradient)
         step = -residual / gradient_norm
         end = dr.fma(self.backend.Array3f(step / gradient_norm), state.gradient, state.y)
@@ -302,25 +324,32 @@ class ClosestPointDescent:
         return end, dr.abs(step) <= limit
 
     def _evaluate(self, y: Vec3) -> tuple[Real, _DescentState]:
-        """Evaluate the field at y. Returns f - level for the nearest level, and the descent state
-        at y."""
+        """Evaluate f at y. Returns f - level for the nearest level, and the descent state at y."""
         return self._state_at(y, self.field.evaluate(y))
 
     def _state_at(self, y: Vec3, sample: Sample) -> tuple[Real, _DescentState]:
-        """The number f - level for the level nearest in value, and the state of a descent at y.
+        """Return f - level for the level nearest in value, and the state of a descent at y.
 
-        sample: the sample of the field at y."""
+        sample: the sample of f at y.
+
+        f counts as smooth on the largest ball for which its promises imply that; without such a
+        promise, everywhere.
+        """
         real = self.backend.Float
         scale = lengths.max_norm(y)
         epsilon, gradient_norm = self.backend.machine_epsilon, lengths.safe_norm(sample.gradient)
         total_error = dr.fma(8 * epsilon, dr.abs(sample.value), sample.value_error)
+        # Rounding of coordinates, and of f divided by its slope.
         uncertainty = dr.fma(4 * epsilon, scale, total_error / gradient_norm)
         smooth_radius = real(0)
         for promise in sample.all_promises:
             if not promise.implies_smooth:
                 continue
-            radius = real(promise.radius)
-            smooth_radius = fmax(smooth_radius, dr.select(dr.isfinite(radius), radius, 0))
+            promised_radius = real(promise.radius)
+            smooth_radius = fmax(
+                smooth_radius, dr.select(dr.isfinite(promised_radius), promised_radius, 0)
+            )
+        # No promise of smoothness: steps have no limit.
         smooth_radius = dr.select(smooth_radius > 0, smooth_radius, dr.inf)
         residual = real(-self.levels.offset_to_nearest(sample.value))
         return residual, _DescentState(
@@ -329,8 +358,11 @@ class ClosestPointDescent:
 
     @staticmethod
     def _is_on_level(residual: Real, state: _DescentState) -> Mask:
-        """Whether the point of a state is on the level, up to rounding. residual: f - level there.
-        False where rounding errors are so large that nothing can be said."""
+        """Return whether the point of a state is on the level, up to rounding. It is False where
+        rounding errors are so large that nothing can be said.
+
+        residual: f - level there.
+        """
         is_resolved = ClosestPointDescent._is_level_resolved(state)
         return is_resolved & (
             dr.abs(residual) <= 2 * lengths.safe_norm(state.gradient) * state.level_uncertainty
@@ -338,19 +370,22 @@ class ClosestPointDescent:
 
     @staticmethod
     def _is_level_resolved(state: _DescentState) -> Mask:
-        """Whether the position of the level set near the point of a state is not lost in rounding
-        errors."""
+        """Return whether the position of the level set near the point of a state is known in spite
+        of rounding: its uncertainty is at most a sixteenth of the coordinates or of the ball on
+        which f is smooth."""
         size = lengths.max_norm(state.y)
         return state.level_uncertainty <= _MAX_RELATIVE_UNCERTAINTY * fmax(
             size, state.smooth_radius
         )
 
     def _to_level(self, start: Vec3, active: Mask) -> tuple[_DescentState, Mask]:
-        """Newton's method along the gradient, from `start` to the nearest level.
+        """Run Newton's method along the gradient, from `start` to the nearest level. Returns the
+        state at the end, and whether that is on a level to rounding.
+
+        active: mask of lanes that search.
 
         A step is no longer than the radius of the ball on which f is known to be smooth, and is
-        accepted if the result is nearer to a level. Returns the state at the end, and whether that
-        is on a level to rounding.
+        accepted if the result is nearer to a level; else a quarter of it is tried.
 
         If f - level is a power u^m of a smooth function u, grad f is 0 on the surface, and each
         step is only 1 - 1/m times the one before. After `_SIMPLE_ROOT_STEPS` such steps, they are
@@ -363,7 +398,7 @@ class ClosestPointDescent:
             residual: Real, y: Vec3, g: Vec3, uncertainty: Real, radius: Real,
             last: Real, factor: Real, on_level: Mask, iteration: Any, active: Mask,
         ) -> tuple[Any, ...]:  # fmt: skip
-            """One Newton step towards the level, accepted if f is nearer to it.
+            """Make one Newton step towards the level, accepted if f is nearer to it.
 
             residual: f - level at y.
             y, g, uncertainty, radius: the parts of the state (`_DescentState`).
@@ -371,22 +406,25 @@ class ClosestPointDescent:
             factor: the fraction of Newton's step that is tried.
             on_level: whether y is on the level.
             iteration: the number of steps.
+            active: whether the search goes on.
             """
             current, gradient_norm, is_first = (
                 _DescentState(y, g, uncertainty, radius),
                 lengths.safe_norm(g),
                 iteration == 0,
             )
+            # Iteration 0 evaluates the start; later ones try a step from y.
             step = -residual / gradient_norm
-            boost = dr.select(iteration > _SIMPLE_ROOT_STEPS, multiplicity(step, last), 1)
-            length = factor * clamp(boost * step, -radius, radius)
+            step_factor = dr.select(iteration > _SIMPLE_ROOT_STEPS, multiplicity(step, last), 1)
+            length = factor * clamp(step_factor * step, -radius, radius)
             point = dr.fma(vector(length / gradient_norm), g, y)
             new_residual, trial = self._evaluate(dr.select(is_first, y, point))
             is_flat = ~is_first & (new_residual == 0) & (lengths.safe_norm(trial.gradient) == 0)
             trial = trial.flat_after(is_flat, current)
             is_better = active & (is_first | (dr.abs(new_residual) < dr.abs(residual)))
-            boost = dr.select(is_better, fmin(2 * factor, 1), 0.25 * factor)
-            factor = dr.select(is_first, factor, boost)
+            # The fraction for the next step.
+            step_factor = dr.select(is_better, fmin(2 * factor, 1), 0.25 * factor)
+            factor = dr.select(is_first, factor, step_factor)
             on_level |= is_better & self._is_on_level(new_residual, trial)
             active &= ~on_level & (iteration <= _MAX_LEVEL_STEPS) & (factor > _MIN_STEP_FRACTION)
             residual = dr.select(is_better, new_residual, residual)
@@ -415,11 +453,11 @@ class ClosestPointDescent:
     def _tangential_step(
         self, x: Vec3, state: _DescentState, factor: Real, rows: Rows | None = None
     ) -> tuple[Vec3, Mask]:
-        """One step along the surface from a point y of it, toward the point closest to x. Returns
-        the step as a vector, and whether y already is a local minimum of the distance from x. (The
-        formula is derived in `descend`.)
+        """Make one step along the surface from a point y of it, toward the point closest to x.
+        Returns the step as a vector, and whether y already is a local minimum of the distance from
+        x. (The formula is derived in `descend`.)
 
-        state: the point y, and the field there.
+        state: the point y, and f there.
         factor: the fraction of the largest permitted step that is used.
         rows: the rows of the Hessian at y; None if they are not known.
         """
@@ -436,22 +474,28 @@ class ClosestPointDescent:
         eigen = SymmetricEigen2.of(
             dr.fma(height_ratio, uu, 1), dr.fma(height_ratio, vv, 1), height_ratio * uv
         )  # of B
+        # The tangential part of x - y. If it is 0 up to rounding, x - y is normal to the surface.
         tu, tv = dr.dot(to_x, plane.u), dr.dot(to_x, plane.v)
         tangential = dr.sqrt(dr.fma(tu, tu, tv * tv))
         is_normal = tangential <= dr.fma(
             4 * self.backend.machine_epsilon**0.5, distance, 8 * state.level_uncertainty
         )
         is_saddle = is_normal & (eigen.smallest < _INDEFINITE)
+        # Newton's step in the basis of eigenvectors; at a saddle along that of the smaller
+        # eigenvalue.
         along_largest, along_smallest = eigen.coordinates(tu, tv)
         along_largest = along_largest / fmax(dr.abs(eigen.largest), _MIN_EIGENVALUE)
         along_smallest = along_smallest / fmax(dr.abs(eigen.smallest), _MIN_EIGENVALUE)
         along_smallest = dr.select(is_saddle, 0.5 * distance, along_smallest)
         length = dr.sqrt(dr.fma(along_largest, along_largest, along_smallest * along_smallest))
-        limit = factor * dr.select(is_saddle, length, fmin(state.smooth_radius, distance))
-        scale = dr.select(length > 0, fmin(limit / length, 1), 0)
+        # No longer than the ball on which f is smooth and the distance from x allow.
+        max_length = factor * dr.select(is_saddle, length, fmin(state.smooth_radius, distance))
+        scale = dr.select(length > 0, fmin(max_length / length, 1), 0)
+        # The step w = a u + b v along the surface.
         a, b = eigen.combination(scale * along_largest, scale * along_smallest)
         vector = self.backend.Array3f
         drop = a * dr.fma(a, uu, 2 * b * uv) + b * b * vv  # w.Aw
+        # How far the surface bends away from its tangent plane, to second order; at most the step.
         drop = clamp(0.5 * drop / plane.gradient_norm, -scale * length, scale * length)
         tangent_step = dr.fma(vector(a), plane.u, vector(b) * plane.v)
         return dr.fma(vector(-drop), plane.n, tangent_step), is_normal & ~is_saddle
@@ -459,19 +503,21 @@ class ClosestPointDescent:
     def _second_derivatives(
         self, y: Vec3, plane: TangentPlane, length: Real
     ) -> tuple[Real, Real, Real]:
-        """The numbers u.Au, v.Av and u.Av, where A is the Hessian of the field at y, and u and v
-        are the two unit tangents of the plane. If the field has no Hessian, they are computed by
-        central differences of the gradient over sqrt(epsilon) times `length`. Errors of these
-        differences make a descent slower, but not wrong."""
+        """Return the numbers u.Au, v.Av and u.Av, where A is the Hessian of f at y, and u and v are
+        the two unit tangents of the plane.
+
+        If f has no Hessian, they are computed by central differences of the gradient over
+        sqrt(epsilon) times `length`. Errors of these differences make a descent slower, but not
+        wrong.
+        """
         if self.has_hessian:
             return plane.restrict_hessian(self.field.hessian(y))
         vector, count = self.backend.Array3f, self.backend.UInt32
         h = fmax(self.backend.machine_epsilon**0.5 * length, 1e-30)
 
         def body(along_u: Vec3, along_v: Vec3, k: Any) -> tuple[Any, ...]:
-            """Add the term of node k to the central differences. The four nodes are y + h u,
-            y - h u, y + h v and y - h v. An even node begins a difference, an odd node completes
-            it.
+            """Add the term of node k to the central differences. The four nodes are y + h u, y - h
+            u, y + h v and y - h v. An even node begins a difference, an odd node completes it.
 
             along_u, along_v: the derivatives of the gradient along u and v, as far as they are
                 summed.

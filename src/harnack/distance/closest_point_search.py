@@ -1,5 +1,7 @@
-"""Searches the closest points of a surface: among the triangles of a closed mesh, or by branch and
-bound over cells.
+"""Searches the points of a surface that are closest to given query points. The surface is a level
+set of a function f: the points at which f takes a given value, the level. The search goes over the
+triangles of a closed mesh, or over cells (branch and bound). f may jump at facets, such as the
+triangles of a mesh; these form a jump surface.
 
 Every search ends at a root of f - level, at the first hit of a ray, or on a triangle. So the points
 found are points of the surface, and their distances are upper bounds of the true distances. A point
@@ -84,11 +86,12 @@ _MAX_JUMPS_EXAMINED = 16
 
 @dataclass(frozen=True)
 class ClosestPoints:
-    """The closest points of a surface to n query points, and bounds of the distances.
+    """The points of a surface that are closest to n query points, and bounds of their distances. f
+    is the function whose level is the surface.
 
     points: (n, 3) the query points, rounded to the precision in use.
     closest: (n, 3) the closest points of the surface, NaN where none was found.
-    distance: (n,) the distances of the queries from these, NaN likewise.
+    distance: (n,) the distances of the queries from these points; NaN where none was found.
     signed_value: (n,) f - level at the queries, for the level nearest in value.
     lower: (n,) proved lower bounds of the distance.
     violates_promises: (n,) whether a surface point was found, and left out, that is nearer than the
@@ -107,9 +110,11 @@ def find_closest(
     backend: Backend, surface: TracedSurface, levels: Levels, points: Any,
     progress: Callable[[str], None], *, is_proved: bool = False,
 ) -> ClosestPoints:  # fmt: skip
-    """The closest point of a surface to each query point.
+    """Find the closest point of a surface to each query point.
 
+    levels: the levels of the surface, on the backend.
     points: (n, 3) the queries, in any order.
+    progress: called with a message before each stage.
     is_proved: whether cells are subdivided to make `lower` as large as they can prove.
 
     The result is in the order of `points`. The search itself sorts them along a Morton curve, so
@@ -118,6 +123,7 @@ def find_closest(
     x = as_finite_vectors(points, "points")
     order = to_numpy(morton_order(backend, upload_vectors(backend, x), _MORTON_BITS))
     closest = _find_sorted(backend, surface, levels, x[order], progress, is_proved)
+    # The inverse of the permutation `order`.
     rank = np.empty_like(order)
     rank[order] = np.arange(len(order), dtype=order.dtype)
     return ClosestPoints(*(column[rank] for column in vars(closest).values()))
@@ -127,19 +133,26 @@ def _find_sorted(
     backend: Backend, surface: TracedSurface, levels: Levels, points: FloatArray,
     progress: Callable[[str], None], is_proved: bool,
 ) -> ClosestPoints:  # fmt: skip
-    """The closest point of a surface to each of the query points (n, 3), which are sorted along a
-    Morton curve: the work of `find_closest`, with the same parameters."""
-    mesh = LevelTriangles.of(surface)
-    if mesh is not None and mesh.is_complete:
-        return _closest_on_mesh(backend, surface, levels, mesh, points)
+    """Find the closest point of a surface to each of the query points (n, 3), which are sorted
+    along a Morton curve. This is the work of `find_closest`, with the same parameters.
+
+    A surface of triangles alone is searched by a tree of them. For others, points that are known at
+    once (on triangles and other facets, and at boundaries) are the first guess of a search over
+    cells. A found point that is nearer than the proved lower bound, by more than rounding, is
+    refused.
+    """
+    triangles = LevelTriangles.of(surface)
+    if triangles is not None and triangles.is_complete:
+        return _closest_on_mesh(backend, surface, levels, triangles, points)
     evaluator = _QueryEvaluator(backend, surface, levels)
     x, guess, residual, lower, estimate = evaluator.evaluate(points)
-    if mesh is not None:
-        guess = _with_mesh_points(x, guess, mesh)
+    if triangles is not None:
+        guess = _with_mesh_points(x, guess, triangles)
     if surface.field.has_jumps:
         guess = evaluator.with_jump_points(x, guess)
     tolerance = StoppingRule(_TOLERANCE * _size(surface, x), is_proved)
     batch_field = surface.field.for_ray_count(_SAMPLES_PER_POINT * len(x))
+    # Off the facets of a mesh without a clip, f differs from a smooth function by constants.
     smooth = batch_field.without_jumps() if surface.clip_volume is None else None
     if smooth is None:
         result = search(surface, x, InitialGuess(guess, estimate), evaluator, tolerance, progress)
@@ -154,12 +167,15 @@ def _find_sorted(
     # A closest point may be nearer than the proved lower bound: either rounding has moved it off
     # the surface, or a promise of the field does not hold.
     is_below_bound = distance < lower
-    slack = np.zeros(len(x))
-    slack[is_below_bound] = 4 * evaluator.level_uncertainty(result.closest[is_below_bound])
-    slack += _ROUNDING * backend.machine_epsilon * (np.abs(x).max(axis=1, initial=0.0) + lower)
-    is_refused = distance < lower - slack
+    allowed_error = np.zeros(len(x))
+    allowed_error[is_below_bound] = 4 * evaluator.level_uncertainty(result.closest[is_below_bound])
+    allowed_error += (
+        _ROUNDING * backend.machine_epsilon * (np.abs(x).max(axis=1, initial=0.0) + lower)
+    )
+    is_refused = distance < lower - allowed_error
     closest = np.where(is_refused[:, None], np.nan, result.closest)
     distance = np.where(is_refused, np.nan, distance)
+    # The cells may prove more than f at the query alone.
     lower = np.fmin(np.maximum(lower, result.lower_bounds), distance)
     return ClosestPoints(x, closest, distance, residual, lower, is_refused)
 
@@ -173,12 +189,15 @@ def _search_smooth_part(
     progress: Callable[[str], None],
 ) -> SearchResult:
     """Search the part of a surface that does not lie on jump surfaces (the facets across which its
-    field f jumps, such as triangles). The result is merged with closest points on jump surfaces.
+    function f jumps, such as triangles). The result is merged with closest points on jump surfaces.
 
-    smooth: a field without jumps that differs from f by a constant between jump surfaces
+    evaluator: evaluates f and runs descents.
+    smooth: a function without jumps that differs from f by a constant between jump surfaces
         (`JumpSurface.without_jumps`).
     points: (n, 3) the query points.
     known: for each query, a point of the surface on a jump surface, if one is known.
+    tolerance: when the search ends.
+    progress: called with a message before each stage.
 
     Proof of the lower bounds: the surface lies in the union of the level sets of `smooth` and the
     jump surfaces, so it is no nearer than the nearer of the two. A point found on a level set of
@@ -188,13 +207,13 @@ def _search_smooth_part(
     """
     backend, surface = evaluator.backend, evaluator.surface
     smoothed = replace(surface, field=smooth).with_call_cache(begins=True)
-    smooth_job = _QueryEvaluator(backend, smoothed, smoothed.target_levels(backend))
-    estimate = smooth_job.evaluate(points)[-1]
+    smooth_evaluator = _QueryEvaluator(backend, smoothed, smoothed.target_levels(backend))
+    estimate = smooth_evaluator.evaluate(points)[-1]
     result = search(
         smoothed,
         points,
         InitialGuess(known.closest, estimate, on_boundary=False),
-        smooth_job,
+        smooth_evaluator,
         tolerance,
         progress,
     )
@@ -204,29 +223,41 @@ def _search_smooth_part(
     )
     lower = np.maximum(np.minimum(result.lower_bounds, jump_gap - rounding), 0)
     distance, closest = _length(points - known.closest), known.closest.copy()
-    rows = np.flatnonzero(
+    # Only these can improve the result: points nearer than the known ones on jump surfaces.
+    nearer_rows = np.flatnonzero(
         _length(points - result.closest) < np.nan_to_num(distance, nan=np.inf) - rounding
     )
-    candidates = smooth_job.remove_truncation(points[rows], result.closest[rows])
+    candidates = smooth_evaluator.remove_truncation(
+        points[nearer_rows], result.closest[nearer_rows]
+    )
+    # f itself must have the level there, not only `smooth`.
     values = np.asarray(surface.field.value(candidates, precision="double"))
     is_level = np.abs(values[:, None] - surface.level_values).min(axis=1) < _LEVEL_MATCH
-    closest[rows[is_level]] = candidates[is_level]
+    closest[nearer_rows[is_level]] = candidates[is_level]
+    # No jump surface is nearer than the accepted point.
     is_settled = _length(points - closest) <= jump_gap + rounding + tolerance.length
-    is_settled[rows[~is_level]] = False
-    rest = np.flatnonzero(~is_settled)
-    if len(rest):
-        guess = InitialGuess(closest[rest], known.estimate[rest])
-        retry = search(surface, points[rest], guess, evaluator, tolerance, progress)
-        closest[rest], lower[rest] = retry.closest, np.maximum(lower[rest], retry.lower_bounds)
+    is_settled[nearer_rows[~is_level]] = False
+    unsettled_rows = np.flatnonzero(~is_settled)
+    if len(unsettled_rows):
+        guess = InitialGuess(closest[unsettled_rows], known.estimate[unsettled_rows])
+        # Search again with f itself, by rays.
+        retry = search(surface, points[unsettled_rows], guess, evaluator, tolerance, progress)
+        closest[unsettled_rows], lower[unsettled_rows] = (
+            retry.closest,
+            np.maximum(lower[unsettled_rows], retry.lower_bounds),
+        )
     return SearchResult(closest, lower)
 
 
 def _with_singular_points(
     surface: TracedSurface, points: FloatArray, closest: FloatArray
 ) -> FloatArray:
-    """The closest points `closest` (n, 3) of the queries `points`, each replaced by the nearest
-    singular point of the field inside the clip volume if that is nearer. Beside a singular point
-    the surface is a tiny loop, which descents miss."""
+    """Return the closest points of queries, each replaced by the nearest singular point of the
+    field if that is nearer. Beside a singular point the surface is a tiny loop, which descents
+    miss. Singular points outside the clip volume do not count.
+
+    points, closest: (n, 3) the queries, and their closest points so far, NaN for none.
+    """
     singular = surface.field.singular_points
     if surface.clip_volume is not None and len(singular):
         singular = singular[surface.clip_volume.contains_points(singular)]
@@ -243,15 +274,16 @@ def _with_singular_points(
 def _closest_on_mesh(
     backend: Backend, surface: TracedSurface, levels: Levels, mesh: LevelTriangles, points: Any
 ) -> ClosestPoints:
-    """The closest point to each query on a surface that consists of triangles only, with the
+    """Find the closest point to each query on a surface that consists of triangles only, with the
     parameters and the result of `find_closest`. The lower bound is the distance less an allowance
     for rounding.
 
-    mesh: the triangles of the surface."""
+    mesh: the triangles of the surface.
+    """
     prepared, nearest = surface.evaluator(backend), mesh.upload(backend)
 
     def compute(p: Vec3) -> tuple[Real | Vec3, ...]:
-        """The query, its nearest triangle point and the distance, and f - level."""
+        """Return the query, its nearest triangle point and the distance, and f - level."""
         residual = -levels.offset_to_nearest(prepared.evaluate(p).value)
         offset = nearest(p)
         return p, p + offset, safe_norm(offset), residual
@@ -263,8 +295,12 @@ def _closest_on_mesh(
 
 
 def _with_mesh_points(points: FloatArray, guess: FloatArray, mesh: LevelTriangles) -> FloatArray:
-    """The surface points `guess` (n, 3) of the queries `points`, each replaced by the nearest point
-    of the triangles if that is nearer. NaN in `guess` counts as infinitely far."""
+    """Return surface points near queries, each replaced by the nearest point of the triangles if
+    that is nearer.
+
+    points, guess: (n, 3) the queries, and the surface points; NaN counts as infinitely far.
+    mesh: the triangles, which belong to the surface.
+    """
     backend = choose_backend("double")
     nearest = mesh.upload(backend)
     (offset,) = in_batches(backend, lambda p: (nearest(p),), points)  # pyright: ignore
@@ -274,17 +310,18 @@ def _with_mesh_points(points: FloatArray, guess: FloatArray, mesh: LevelTriangle
 
 @dataclass(frozen=True)
 class _QueryEvaluator:
-    """Evaluates one surface's field on a backend and runs the closest-point descents, for arrays of
-    query points.
+    """Evaluates the function f of one surface on a backend, and runs descents from points near the
+    surface to closest points, for arrays of query points. Facets are the triangles or other pieces
+    at which f may jump.
 
     The attributes with an underscore are made from the given ones:
 
-    _field: the field, prepared for the backend.
-    _descent, _exact_descent: the closest-point descent on the level set of that field; and on the
-        level set of the field without truncation errors (None if the field has no such errors).
+    _field: f, prepared for the backend.
+    _descent, _exact_descent: the descent on the level set of f; and on the level set of f without
+        truncation errors (None if f has no such errors).
     _domain, _clip: the field's domain; and the descent to the clip curve, in which the boundary of
         the domain cuts the surface (None without a domain).
-    _tracer: for fields with jumps, the surface prepared for tracing rays in double precision.
+    _tracer: for functions with jumps, the surface prepared for tracing rays in double precision.
     """
 
     backend: Backend
@@ -292,6 +329,8 @@ class _QueryEvaluator:
     levels: Levels
 
     def __post_init__(self) -> None:
+        """Make the attributes with an underscore; `object.__setattr__`, as the dataclass is
+        frozen."""
         backend, field = self.backend, self.surface.evaluator(self.backend)
         assign = object.__setattr__
         assign(self, "_field", field)
@@ -319,17 +358,21 @@ class _QueryEvaluator:
     _tracer: Any = dataclasses.field(init=False)
 
     def evaluate(self, points: Any) -> tuple[FloatArray, ...]:
-        """First estimates at query points.
+        """Evaluate f at query points, and return first estimates of their distances.
 
         Returns the points (n, 3) as rounded to the precision in use; points (n, 3) of the surface
         near them, NaN where none is known; f - level (n,); proved lower bounds (n,) of the
         distance; and its first-order estimates (n,).
+
+        A query on the level is its own surface point; otherwise the nearest point of the curve at
+        which the surface ends is taken, if the field knows it. Outside the domain no lower bound is
+        proved: it is 0.
         """
 
         def compute(p: Vec3) -> tuple[Real | Vec3, ...]:
-            """The query p as rounded; a point of the surface known near it, or NaN; f - level; a
-            proved lower bound of the distance from the level set; and the first-order estimate of
-            that distance."""
+            """Return five results for the query p: p as rounded; a point of the surface known near
+            it, or NaN; f - level; a proved lower bound of the distance from the level set; and the
+            first-order estimate of that distance."""
             sample = self._field.evaluate(p)
             residual = -self.levels.offset_to_nearest(sample.value)
             boundary = self._field.closest_boundary_point(p)
@@ -351,23 +394,26 @@ class _QueryEvaluator:
         x, surface_point, residual, lower, estimate = in_batches(self.backend, compute, points)
         domain = self.surface.field.domain
         if domain is not None and len(x):
+            # Nothing is promised outside the domain.
             lower[~domain.contains_points(x)] = 0
         return x, self._inside_domain_or_nan(surface_point), residual, lower, estimate
 
     def with_jump_points(self, points: FloatArray, guess: FloatArray) -> FloatArray:
-        """The surface points `guess` (n, 3) of the queries `points`, each replaced by a point of
-        the surface on its jump surface if that is nearer. NaN in `guess` counts as infinitely far.
+        """Return surface points near queries, each replaced by a point of the surface on a facet
+        (at which f jumps) if that is nearer.
+
+        points, guess: (n, 3) the queries, and the surface points; NaN counts as infinitely far.
         """
         distance, guess = _length(points - guess), guess.copy()
-        rows = np.flatnonzero(~(distance <= self.distance_to_jumps(points) * (1 + 1e-12)))
-        guess[rows] = self._nearest_face_points(points[rows])
-        rows = rows[np.isnan(guess[rows, 0])]
-        if len(rows):
-            guess[rows] = self._search_facets(points[rows], guess[rows])
+        searched_rows = np.flatnonzero(~(distance <= self.distance_to_jumps(points) * (1 + 1e-12)))
+        guess[searched_rows] = self._nearest_face_points(points[searched_rows])
+        searched_rows = searched_rows[np.isnan(guess[searched_rows, 0])]
+        if len(searched_rows):
+            guess[searched_rows] = self._search_facets(points[searched_rows], guess[searched_rows])
         return guess
 
     def _nearest_face_points(self, points: FloatArray) -> FloatArray:
-        """The nearest points (n, 3) of the triangles across which the field jumps. A point is kept
+        """Return the nearest points (n, 3) of the triangles across which f jumps. A point is kept
         only if a level lies between the values of f right beside it, on both sides of the triangle;
         else it is NaN."""
         mesh, surface = self.surface.field.jump_mesh(), self._tracer
@@ -377,7 +423,7 @@ class _QueryEvaluator:
         real, index = surface.backend.Float, surface.backend.UInt32
 
         def nearest(p: Vec3) -> tuple[Vec3, Any, Vec3]:
-            """The nearest point on a facet, the index of the facet, and its normal."""
+            """Return the nearest point on a facet, the index of the facet, and its normal."""
             no_key, always = (real(-1), index(NO_FACET)), surface.backend.Bool(True)
             facet = surface.field.nearest_facet(p, no_key, real(dr.inf), always)
             return p + facet.offset, facet.facet, facet.normal
@@ -386,6 +432,8 @@ class _QueryEvaluator:
         corners = mesh[0][mesh[1][facet_id.astype(np.int64)]]
         y_within = y + _WITHIN_FACE * (corners.mean(axis=1) - y)
         offset = _BESIDE_FACE * _size(self.surface, points) * normal
+        # f beside the triangle, where the point was moved a little into the triangle to avoid its
+        # edges.
         sides = [
             self.surface.field.value(y_within + k * offset, precision="double") for k in (1, -1)
         ]
@@ -397,7 +445,7 @@ class _QueryEvaluator:
         return closest
 
     def distance_to_jumps(self, points: FloatArray) -> FloatArray:
-        """Distances (n,) of points (n, 3) from the facets across which the field jumps, whether
+        """Return the distances (n,) of points (n, 3) from the facets across which f jumps, whether
         these are part of the surface or not."""
         surface = self._tracer
 
@@ -407,9 +455,9 @@ class _QueryEvaluator:
         return in_batches(surface.backend, compute, points)[0]
 
     def _search_facets(self, points: FloatArray, guess: FloatArray) -> FloatArray:
-        """The closest points (n, 3) that `JumpSurfaceSearch` finds on facets, nearer than `guess`
-        (n, 3); `guess` where it finds none. It examines at most `_MAX_JUMPS_EXAMINED` facets for
-        each query."""
+        """Return the closest points (n, 3) that `JumpSurfaceSearch` finds on facets, nearer than
+        `guess` (n, 3); `guess` where it finds none. It examines at most `_MAX_JUMPS_EXAMINED`
+        facets for each query."""
         coordinates = np.concatenate([points, np.nan_to_num(guess)])
         search = JumpSurfaceSearch(
             self._tracer, max(float(np.abs(coordinates).max(initial=0)), 1e-30), _MAX_JUMPS_EXAMINED
@@ -423,7 +471,8 @@ class _QueryEvaluator:
         return np.where(np.isnan(closest), guess, closest)
 
     def _inside_domain_or_nan(self, points: FloatArray) -> FloatArray:
-        """The points (n, 3), with NaN for those outside the domain, which cuts the surface."""
+        """Return the points (n, 3), with NaN for those outside the field's domain, which cuts the
+        surface."""
         domain = self.surface.field.domain
         if domain is None or not len(points):
             return points
@@ -434,7 +483,7 @@ class _QueryEvaluator:
         self, points: FloatArray, start: FloatArray, limit: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """Find the closest points of the surface to query points, by Newton's method, and by a
-        slower descent where that does not converge. For fields that jump, a compass search with
+        slower descent where that does not converge. For functions that jump, a compass search with
         rays is used instead (`compass_search`).
 
         points: (n, 3) the queries.
@@ -470,6 +519,7 @@ class _QueryEvaluator:
         closest, y, free, is_unfinished, is_far = in_batches(
             self.backend, self._newton_with_float_masks, points, start, limits
         )
+        # Newton's method did not converge there: the slower descent goes on from its last point.
         rows = np.flatnonzero(is_unfinished)
         if len(rows):
             closest[rows], free[rows] = in_batches(
@@ -492,7 +542,8 @@ class _QueryEvaluator:
         """Find the closest points of the surface to queries whose best point so far lies on the
         curve at which the surface ends. Each search starts on the surface beside that curve.
 
-        points: (n, 3) the queries. boundary: (n, 3) the points b on the curve.
+        points: (n, 3) the queries.
+        boundary: (n, 3) the points b on the curve.
         aside: (n,) the distance from b, in the direction of the query, at which f is evaluated. If
             the level is near there to first order, Newton's method leads to the surface, and the
             descent starts there, unless that point lies on the side of b away from the query.
@@ -502,22 +553,24 @@ class _QueryEvaluator:
         """
 
         def arc_to_level(p: Vec3, b: Vec3, lengths: Vec3) -> tuple[Real]:
-            """The first-order distance of the level from the point that lies at the distance
+            """Return the first-order distance of the level from the point that lies at the distance
             lengths.x from b in the direction of p."""
-            way = p - b
-            sample = self._field.evaluate(b + lengths.x / safe_norm(way) * way)
+            to_query = p - b
+            sample = self._field.evaluate(b + lengths.x / safe_norm(to_query) * to_query)
             return (
                 first_order_distance(self.levels.offset_to_nearest(sample.value), sample.gradient),
             )
 
         def near_edge(p: Vec3, b: Vec3, lengths: Vec3) -> tuple[Vec3]:
-            """The surface point to which Newton's method leads from the point that lies at the
-            distance lengths.x from b in the direction of p; NaN if the surface point is on the side
-            of b away from p."""
-            way = p - b
-            y = self._descent.newton_to_level(b + lengths.x / safe_norm(way) * way)
-            towards = dr.dot(way, y - b) > -_MAX_OPPOSING_COSINE * safe_norm(way) * safe_norm(y - b)
-            return (dr.select(towards, y, dr.nan),)
+            """Return the surface point to which Newton's method leads from the point that lies at
+            the distance lengths.x from b in the direction of p; NaN if the surface point is on the
+            side of b away from p."""
+            to_query = p - b
+            y = self._descent.newton_to_level(b + lengths.x / safe_norm(to_query) * to_query)
+            is_on_query_side = dr.dot(to_query, y - b) > -_MAX_OPPOSING_COSINE * safe_norm(
+                to_query
+            ) * safe_norm(y - b)
+            return (dr.select(is_on_query_side, y, dr.nan),)
 
         closest, free = np.full_like(points, np.nan), np.zeros(len(points))
         offsets = np.tile(aside[:, None], 3)
@@ -538,13 +591,13 @@ class _QueryEvaluator:
         return self._inside_domain_or_nan(closest), free
 
     def newton_in_kernel(self, x: Vec3, start: Vec3, limit: Real) -> tuple[Vec3, Real, Mask]:
-        """Newton's method for the closest point to the query x, as part of another kernel.
+        """Run Newton's method for the closest point to the query x, as part of another kernel.
 
-        start: a point near the surface. limit: a closest point farther from x than this need not be
-            found.
+        start: a point near the surface.
+        limit: a closest point farther from x than this need not be found.
 
         Returns the closest point, NaN if none is found; the radius of a ball about it in which no
-        surface point is nearer to x; and the mask of the lanes for which `descend` has to be called
+        surface point is nearer to x; and the mask of lanes for which `descend` has to be called
         afterwards: those in which the method did not converge, or led out of the domain or to its
         boundary.
         """
@@ -556,17 +609,19 @@ class _QueryEvaluator:
         return vector(closest), type(x.x)(free), is_unfinished
 
     def _newton(self, p: Vec3, start: Vec3, limit: Real) -> tuple[Vec3, Vec3, Real, Mask, Mask]:
-        """Newton's method for the surface point closest to p, from the point `start` near the
-        surface.
+        """Run Newton's method for the surface point closest to p, from the point `start` near the
+        surface. A closest point that is farther from p than `limit` need not be found.
 
-        Returns the closest point, NaN if the method does not converge, or converges to a point that
-        is farther from p than the surface near `start`; the last iterate, from which `_descend` can
-        continue; the radius of a ball about the closest point in which no surface point is nearer
-        to p; the mask of the lanes in which the search has to continue; and the mask of the lanes
-        that stopped because their closest point is farther than `limit` from p.
+        Returns five results. The closest point: NaN if the method does not converge, or converges
+        to a point that is farther from p than the surface near `start`. The last iterate, from
+        which `_descend` can continue. The radius of a ball about the closest point in which no
+        surface point is nearer to p. The mask of lanes in which the search has to continue. The
+        mask of lanes that stopped because their closest point is farther than `limit` from p.
         """
         y, first_step, is_lost, is_far = self._descent.newton(p, start, self.backend.Float(limit))
         closest, is_converged, free = self._descent.finish(p, y)
+        # The surface near `start` is about first_step away from it; twice that is safe, with
+        # rounding.
         bound = (safe_norm(p - start) + 2 * first_step) * (1 + 64 * self.backend.machine_epsilon)
         bound = dr.fma(64 * self.backend.machine_epsilon, max_norm(y), bound)
         is_lost |= is_far
@@ -576,19 +631,19 @@ class _QueryEvaluator:
     def _newton_with_float_masks(
         self, p: Vec3, start: Vec3, limit: Vec3
     ) -> tuple[Vec3, Vec3, Real, Real, Real]:
-        """The results of `_newton`, in a form that `in_batches` can pass on: the two masks among
-        them are returned as numbers, 1 for True and 0 for False.
+        """Return the results of `_newton`, in a form that `in_batches` can pass on: the two masks
+        among them are returned as numbers, 1 for True and 0 for False.
 
-        limit: the limit of `_newton`, three times as the components of a vector."""
+        limit: the limit of `_newton`, three times as the components of a vector.
+        """
         one, zero = self.backend.Float(1), self.backend.Float(0)
         *results, is_unfinished, is_far = self._newton(p, start, limit.x)
         return *results, dr.select(is_unfinished, one, zero), dr.select(is_far, one, zero)
 
     def _descend(self, p: Vec3, start: Vec3) -> tuple[Vec3, Real]:
-        """The closest surface point to p that a descent from `start` finds, NaN if the descent does
-        not end on the level; and the radius of a ball about it in which no surface point is nearer
-        to p, 0 if the descent does not converge.
-        """
+        """Descend from `start` to a surface point closest to p. Returns this point, NaN if the
+        descent does not end on the level; and the radius of a ball about it in which no surface
+        point is nearer to p, 0 if the descent does not converge."""
         y, is_converged, on_level = self._descent.descend(p, start)
         return dr.select(on_level, y, dr.nan), dr.select(
             is_converged, self._descent.finish(p, y)[2], 0
@@ -596,7 +651,7 @@ class _QueryEvaluator:
 
     def remove_truncation(self, points: FloatArray, closest: FloatArray) -> FloatArray:
         """Move closest points onto the exact level set. They were found on the level set of an
-        approximate field, a treecode with a truncation error; the exact field sums all terms.
+        approximation of f, a treecode with a truncation error; the exact function sums all terms.
 
         points, closest: (n, 3) the queries, and their closest points, NaN for none.
 
@@ -615,9 +670,12 @@ class _QueryEvaluator:
 
         closest = closest.copy()
         corrected = self._corrected(exact, points[rows], closest[rows])
-        failed = np.flatnonzero(np.isnan(corrected[:, 0]))
-        if len(failed):
-            (corrected[failed],) = in_batches(self.backend, to_level, closest[rows[failed]])
+        failed_rows = np.flatnonzero(np.isnan(corrected[:, 0]))
+        if len(failed_rows):
+            (corrected[failed_rows],) = in_batches(
+                self.backend, to_level, closest[rows[failed_rows]]
+            )
+        # Points that the correction moved out of the domain keep their place.
         is_inside = ~np.isnan(self._inside_domain_or_nan(corrected)[:, 0])
         closest[rows[is_inside]] = corrected[is_inside]
         return closest
@@ -625,23 +683,23 @@ class _QueryEvaluator:
     def _corrected(
         self, exact: ClosestPointDescent, points: FloatArray, closest: FloatArray
     ) -> FloatArray:
-        """The closest points (n, 3) to `points` (n, 3) on the level set of the exact field; NaN
-        where they are not found.
+        """Return the closest points (n, 3) to `points` (n, 3) on the level set of the exact
+        function; NaN where they are not found.
 
-        exact: the descent on the field that sums all terms one by one.
-        closest: (n, 3) the closest points on the level set of the approximate field.
+        exact: the descent on the function that sums all terms one by one.
+        closest: (n, 3) the closest points on the level set of the approximate function.
 
-        The truncation error of the treecode hardly changes along a descent, and costs as much as
-        the whole exact field. So it is computed at the closest point, with its gradient; Newton's
-        method then runs on the approximate field plus this linear correction. This is done twice,
-        as the first correction moves the closest point. A short step to the level of the exact
-        field remains.
+        The truncation error of the treecode hardly changes along a descent, and its computation
+        takes as long as the whole exact function. So it is computed at the closest point, with its
+        gradient; Newton's method then runs on the approximate function plus this linear correction.
+        This is done twice, as the first correction moves the closest point. A short step to the
+        level of the exact function remains.
         """
         approximate = self._descent
 
         def truncation(y: Vec3) -> tuple[Vec3, Vec3]:
-            """The truncation errors of the value (as a vector of equal components) and of the
-            gradient at y."""
+            """Return the truncation errors at y: of the value (as a vector of equal components),
+            and of the gradient."""
             full, sample = exact.field.evaluate(y), approximate.field.evaluate(y)
             vector = self.backend.Array3f
             return vector(full.value - sample.value), vector(full.gradient) - vector(
@@ -649,8 +707,9 @@ class _QueryEvaluator:
             )
 
         def newton(p: Vec3, y: Vec3, value: Vec3, gradient: Vec3) -> tuple[Vec3]:
-            """The closest point to p by Newton's method from y, for the approximate field plus the
-            linear function with this value and gradient at y; NaN if it does not converge."""
+            """Return the closest point to p by Newton's method from y, for the approximate function
+            plus the linear function with this value and gradient at y; NaN if it does not converge.
+            """
             field = _LinearlyShiftedField(approximate.field, y, value.x, gradient)
             descent = replace(approximate, field=field)
             end, _, is_lost, _ = descent.newton(p, y, self.backend.Float(dr.inf))
@@ -663,20 +722,21 @@ class _QueryEvaluator:
         closest, rows = closest.copy(), np.arange(len(closest))
         for _ in range(_TRUNCATION_CORRECTIONS):
             if len(rows):
-                given = (
+                newton_arguments = (
                     points[rows],
                     closest[rows],
                     *in_batches(self.backend, truncation, closest[rows]),
                 )
-                (closest[rows],) = in_batches(self.backend, newton, *given)
+                (closest[rows],) = in_batches(self.backend, newton, *newton_arguments)
+                # Points that were not found are left out of the next correction.
                 rows = rows[~np.isnan(closest[rows, 0])]
         if len(rows):
             (closest[rows],) = in_batches(self.backend, on_level, points[rows], closest[rows])
         return closest
 
     def level_uncertainty(self, points: FloatArray) -> FloatArray:
-        """Bounds (n,), lengths, of how far rounding and approximation may have moved the level set
-        at points (n, 3) that lie on it."""
+        """Return bounds (n,), lengths, of how far rounding and approximation may have moved the
+        level set at points (n, 3) that lie on it."""
         if not len(points):
             return np.zeros(0)
 
@@ -692,14 +752,15 @@ class _LinearlyShiftedField(Field):
 
     The linear function is the truncation error of the field at the anchor, with its gradient, so
     the sum has hardly any truncation error near the anchor. Its stated error is the rounding error
-    of the field alone."""
+    of the field alone.
+    """
 
     def __init__(self, field: Field, anchor: Vec3, value: Real, slope: Vec3) -> None:
         self._field, self._anchor, self._offset, self._slope = field, anchor, value, slope
 
     def evaluate(self, p: Vec3) -> Sample:
-        """The sample of the sum at p. The value error of the field includes its truncation error,
-        which is subtracted here."""
+        """Return the sample of the sum at p. The value error of the field includes its truncation
+        error, which is subtracted here."""
         sample = self._field.evaluate(p)
         shifted = sample.shifted(dr.dot(self._slope, p - self._anchor) + self._offset)
         return replace(
@@ -710,19 +771,20 @@ class _LinearlyShiftedField(Field):
         )
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
+        """Return the rows of the Hessian of the field; the linear function has none."""
         return self._field.hessian(p)
 
 
 def _length(vectors: FloatArray) -> FloatArray:
-    """The lengths (n,) of vectors (n, 3), also where their squares overflow."""
+    """Return the lengths (n,) of vectors (n, 3), also where their squares overflow."""
     x, y, z = vectors.T
     return np.hypot(np.hypot(x, y), z)
 
 
 def _size(surface: TracedSurface, points: FloatArray) -> float:
-    """The size of a surface, a length: the diagonal of the box that is known to contain it. If
-    there is no finite one, the largest extent of the query points (n, 3) along an axis, at least
-    1."""
+    """Return the size of a surface, a length: the diagonal of the box that is known to contain it.
+    If there is no finite one, it is the largest extent of the query points (n, 3) along an axis, at
+    least 1."""
     if surface.volume is not None:
         lower, upper = surface.volume.bounds()
         if np.isfinite([lower, upper]).all():

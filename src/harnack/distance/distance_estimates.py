@@ -1,4 +1,7 @@
-"""`signed_distance`: how far points are from a level set, by four methods."""
+"""`signed_distance`: how far points are from a surface, by four methods; and closest points and
+proved bounds of the distance. The surface consists of the points at which a function f, the field,
+takes given values, the levels.
+"""
 
 from __future__ import annotations
 
@@ -51,7 +54,8 @@ def signed_distance(
     options: TraceOptions | None = None,
     **keywords: Unpack[TraceKeywords],
 ) -> FloatArray:
-    """Signed distances (n,) from points (n, 3) to a surface, negative inside.
+    """Return signed distances (n,) from points (n, 3) to a surface, negative inside. The surface is
+    a level set of a field's function f.
 
     Points with f < level are inside. For winding numbers, clouds and blobs, which are larger inside
     (`Field.is_larger_inside`), points with f > level are inside. (trimesh has the opposite sign.)
@@ -105,20 +109,22 @@ def signed_distance(
     compute = _COMPUTE[method]
 
     def estimate(p: Vec3) -> tuple[Real | Vec3, ...]:
+        """Return the points as rounded, and the estimates or bounds of the chosen method."""
         return p, compute(backend, prepared, levels, p)
 
     x, result = in_batches(backend, estimate, points)
     if method == "lower_bound":
         _check_domain(field, x)
     if field.has_jumps and method != "lower_bound":
+        # These methods do not see facets: the nearest one of the surface is searched for.
         jump_distance = find_closest(backend, traced, levels, x, teller(None)).distance
         result = np.copysign(np.fmin(jump_distance, np.abs(result)), result)
     return _outwards(field) * result
 
 
 def _outwards(field: Field) -> float:
-    """1 or -1: the factor that makes a distance with the sign of f - level negative inside. It is
-    -1 for fields that are larger inside."""
+    """Return the factor, 1 or -1, that makes a distance with the sign of f - level negative inside.
+    It is -1 for fields that are larger inside."""
     return -1.0 if field.is_larger_inside else 1.0
 
 
@@ -133,7 +139,7 @@ def closest_points(
     options: TraceOptions | None = None,
     **keywords: Unpack[TraceKeywords],
 ) -> FloatArray:
-    """The closest points (n, 3) of a level set to `points` (n, 3), found by a search.
+    """Find the closest points (n, 3) of a level set of a field's function to `points` (n, 3).
 
     For the winding number of a closed mesh, and for its solid, they are exact: the level set
     consists of triangles, which are cut where they intersect, and the nearest one is found. For
@@ -153,7 +159,7 @@ def closest_points(
 
 @dataclass(frozen=True)
 class DistanceBounds:
-    """Proved bounds of the distances of points from a surface. The true distance d has lower <= d
+    """Proved bounds of the distances of n points from a surface. The true distance d has lower <= d
     <= upper.
 
     closest_points: (n, 3) points of the surface, NaN where none was found.
@@ -177,7 +183,8 @@ def distance_bounds(
     options: TraceOptions | None = None,
     **keywords: Unpack[TraceKeywords],
 ) -> DistanceBounds:
-    """Distances of points (n, 3) from a level set, with proved lower bounds.
+    """Compute distances of points (n, 3) from a level set of a field's function f, with proved
+    lower bounds.
 
     `lower` is proved by the field's promises (proved bounds of f near a point). These imply that
     some cubic cells of space hold no surface; that in others the surface lies in a slab between two
@@ -211,7 +218,10 @@ def _find(
     none. The surface's clip is made part of the field's domain first.
 
     name: the name of the public function, for messages.
+    progress: called with a message before each stage; None for none.
     is_proved: whether the lower bounds of the result are made as large as can be proved.
+
+    Raises NotImplementedError for a clip or section of a field with jumps.
     """
     if surface.clip_volume is not None:
         if surface.field.has_jumps:
@@ -236,9 +246,10 @@ def _surface(
     options: TraceOptions | None,
     keywords: TraceKeywords,
 ) -> tuple[TracedSurface, Backend]:
-    """The surface to which distances are measured, and the backend to compute them on.
+    """Return the surface to which distances are measured, and the backend to compute them on.
 
     verb: the name of the public function, for messages.
+    surface, options, keywords: the arguments of that function.
 
     Raises:
         TypeError, ValueError: the surface or an option is not valid, or distances do not have such
@@ -260,7 +271,10 @@ def _surface(
 
 def _warn_of_failures(name: str, result: ClosestPoints) -> None:
     """Warn if no surface was found for some queries; and if, for some, the point found is nearer
-    than the field's promises (proved bounds of f near a point) allow, so that they are wrong."""
+    than the field's promises (proved bounds of f near a point) allow, so that they are wrong.
+
+    name: the name of the public function, for messages. result: what its search found.
+    """
     count = len(result.closest)
     unresolved = int(np.isnan(result.closest[:, 0]).sum())
     if unresolved:
@@ -282,7 +296,7 @@ def _warn_of_failures(name: str, result: ClosestPoints) -> None:
 
 
 def _check_domain(field: Field, points: FloatArray) -> None:
-    """Raise a ValueError if a point is outside the field's domain."""
+    """Raise a ValueError if one of the points (n, 3) is outside the field's domain."""
     if field.domain is None or not len(points):
         return
     outside = np.flatnonzero(~field.domain.contains_points(points))
@@ -295,24 +309,24 @@ def _check_domain(field: Field, points: FloatArray) -> None:
 
 
 def _first_order(backend: Backend, field: Field, levels: Levels, p: Vec3) -> Real:
-    """The first-order estimate (f - level)/|grad f| of the distance of p from the level set, with
-    the level nearest in value if there are several. levels: the levels."""
+    """Return the first-order estimate (f - level)/|grad f| of the signed distance of p from the
+    level set, for the level nearest in value."""
     del backend
     sample = field.evaluate(p)
     return first_order_distance(-levels.offset_to_nearest(sample.value), sample.gradient)
 
 
 def _second_order(backend: Backend, field: Field, levels: Levels, p: Vec3) -> Real:
-    """The second-order estimate of the distance of p from the level set, with the sign of f -
-    level. With several levels, that of the level nearest in value. levels: the levels."""
+    """Return the second-order estimate of the signed distance of p from the level set, with the
+    sign of f - level, for the level nearest in value."""
     del backend
     sample, rows = field.evaluate(p), field.hessian(p)
     return second_order_distance(-levels.offset_to_nearest(sample.value), sample.gradient, rows)
 
 
 def _signed_lower_bound(backend: Backend, field: Field, levels: Levels, p: Vec3) -> Real:
-    """The proved lower bound of the distance of p from the level sets of all levels, with the sign
-    of f - level for the level nearest in value. levels: the levels."""
+    """Return the proved lower bound of the distance of p from the level sets of all levels, with
+    the sign of f - level for the level nearest in value."""
     sample = field.evaluate(p)
     residual = -levels.offset_to_nearest(sample.value)
     return dr.copysign(level_distance_lower_bound(backend, field, levels, p, sample), residual)

@@ -1,5 +1,6 @@
-"""A ball about the closest point of a level set to a query, which is proved to hold no point of the
-level set that is nearer to the query."""
+"""A ball about the closest point y of a level set to a query x, which is proved to hold no point of
+the level set that is nearer to the query. f is the function of the level set.
+"""
 
 from __future__ import annotations
 
@@ -29,13 +30,14 @@ epsilon."""
 
 
 def exclusion_radius(sample: Sample, rows: Rows | None, x: Vec3, y: Vec3) -> Real:
-    """Radius of a ball about y in which no surface point is nearer to x than y; 0 if none is
-    proved.
+    """Return the radius of a ball about y in which no surface point is nearer to x than y; 0 if
+    none is proved.
 
     sample: f at y, without rounding errors.
     rows: the rows of the Hessian of f at y; None if it is not known.
     x, y: a query, and a surface point such that x - y is normal to the surface at y.
 
+    Radii that are powers of two times the distance |x - y| are tried, the largest first.
     Proof. Let g = grad f(y), n = g/|g| and x = y + d n with d >= 0; if x is on the side of smaller
     f, take -f for f. Let y + w be a point of the surface with |w| <= r. Let R1 be the bound of the
     Taylor remainder of degree 1 within r. As it falls at least as the square of the radius,
@@ -58,20 +60,22 @@ def exclusion_radius(sample: Sample, rows: Rows | None, x: Vec3, y: Vec3) -> Rea
     for exponent in _RADIUS_EXPONENTS:
         r = fmax(d, 1e-12) * 2.0**exponent
         first_order = taylor_remainder(sample, r) / (r * r)
+        # By the bounds of first and of second order: |x - y - w|^2 is at least d^2 + margin |w|^2.
         margin = 1 - 2 * d * first_order / gradient_norm
         if hessian is not None:
             second_order = taylor_remainder(sample, r, 2) / (r * r)
             c = fmin(first_order, hessian.half_norm + second_order) * r / gradient_norm
             bound = hessian.least_tangential - c * (2 * hessian.across + c * hessian.along)
             margin = fmax(margin, 1 + d / gradient_norm * (bound - 2 * second_order))
+        # Radii are tried from the largest down; the first that is proved stays.
         largest = dr.select((largest == 0) & (margin >= _PROOF_MARGIN), r, largest)
     return largest
 
 
 @dataclass(frozen=True)
 class _HessianBounds:
-    """Bounds of the Hessian H of f at a surface point y. The sign of f is chosen such that the
-    gradient g = |g| n points toward the query x.
+    """Bounds of the Hessian H of a function f at a point y of its level set. The sign of f is
+    chosen such that the gradient g = |g| n points toward the query x.
 
     least_tangential: the smallest eigenvalue in the tangent plane, or 0 if that is positive.
     across: |Hn - (n.Hn) n|.
@@ -86,14 +90,19 @@ class _HessianBounds:
 
     @classmethod
     def of(cls, sample: Sample, rows: Rows, to_query: Vec3) -> _HessianBounds:
-        """The bounds for the sample of f at y. rows: the three rows of the Hessian of f at y.
-        to_query: the vector x - y from y to the query x."""
+        """Compute the bounds for the sample of f at y.
+
+        rows: the three rows of the Hessian of f at y.
+        to_query: the vector x - y from y to the query x.
+        """
         plane = TangentPlane.of(sample.gradient)
         eigen = SymmetricEigen2.of(*plane.restrict_hessian(rows))
+        # With the other sign of f the eigenvalues change signs and places.
         smallest = dr.select(dr.dot(to_query, plane.n) > 0, eigen.smallest, -eigen.largest)
-        hn = matvec(rows, plane.n)
+        h_times_n = matvec(rows, plane.n)
+        # The Frobenius norm is at least the spectral norm.
         squares = dr.squared_norm(rows[0]) + dr.squared_norm(rows[1]) + dr.squared_norm(rows[2])
         return cls(
-            fmin(smallest, 0), safe_norm(dr.cross(hn, plane.n)), dr.abs(dr.dot(hn, plane.n)),
-            0.5 * dr.sqrt(squares),
+            fmin(smallest, 0), safe_norm(dr.cross(h_times_n, plane.n)),
+            dr.abs(dr.dot(h_times_n, plane.n)), 0.5 * dr.sqrt(squares),
         )  # fmt: skip

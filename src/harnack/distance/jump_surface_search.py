@@ -1,9 +1,10 @@
-"""Closest points of surfaces of fields with jump surfaces, such as meshes: on the jump surfaces,
-and by rays.
+"""Closest points of surfaces of functions f with jumps, such as the winding number of a mesh: on
+the facets at which f jumps, and by rays. The surface consists of the points at which f takes a
+given value, the level, and of facets.
 
-A *jump surface* consists of facets across which the field jumps, such as the triangles of a mesh. A
-point of it belongs to the level set if a level lies between the values of f on both sides of it. A
-short ray through the point decides that, by the same arithmetic that traces rays elsewhere.
+A *jump surface* consists of facets across which f jumps, such as the triangles of a mesh. A point
+of it belongs to the surface if a level lies between the values of f on both sides of it. A short
+ray through the point decides that, by the same arithmetic that traces rays elsewhere.
 """
 
 from __future__ import annotations
@@ -48,8 +49,12 @@ NextJump: TypeAlias = "Callable[[tuple[Any, Any], Any, Any], NearestFacet]"
 
 @dataclass(frozen=True)
 class JumpSurfaceSearch:
-    """Search for the closest point of a prepared surface that lies on a jump surface.
+    """Searches for the point of a surface that is closest to a query x and lies on a facet: a flat
+    piece, such as a triangle of a mesh, across which the function f of the surface jumps. A facet
+    belongs to the surface where a level lies between the values of f on its two sides. A probe is a
+    short ray that tests this.
 
+    surface: the surface, prepared on a backend.
     scale: an upper bound of the coordinates that the field computes with, for bounds of rounding
         errors.
     max_facets: the largest number of facets that are examined for each point.
@@ -101,6 +106,7 @@ class JumpSurfaceSearch:
             """
             last = NearestFacet(*state[:5])
             probe, best, nearest, count, active = state[5:]
+            # The next facet is fetched when the probes of the last one are done.
             is_first = active & (probe == 0)
             candidate = next_facet((last.sort_key, last.facet), limit, is_first)
             facet = _select(is_first, candidate, last)
@@ -109,9 +115,11 @@ class JumpSurfaceSearch:
             y = x + facet.offset
             start, end = _probe(vector, probe, facet.normal)
             is_hit, hit_facet, hit_point = self._probe_hits(y, length, start, end, active)
+            # A hit of this facet along its normal is y itself, without the rounding of the ray.
             hit_point = dr.select((hit_facet == facet.facet) & (probe == 0), y, hit_point)
             best = dr.select(is_hit, hit_point, best)
             count = count + dr.select(is_first, index(1), 0)
+            # Inside a facet the ray along the normal decides alone.
             last_probe = facet.is_inner | (probe == len(_EDGES))
             active &= ~is_hit & ~(last_probe & (count >= max_count))
             probe = dr.select(last_probe, index(0), probe + 1)
@@ -132,7 +140,11 @@ class JumpSurfaceSearch:
     ) -> tuple[Mask, Any, Vec3]:
         """Trace the segment from y + scale * start to y + scale * end.
 
-        Returns whether it hits the surface, the facet that it hits, and the hit point.
+        active: mask of lanes that are traced.
+
+        Returns the mask of lanes on which the segment hits the surface, the index of the facet that
+        it hits, and the hit point. A hit counts only if f takes values on both sides of a level
+        around y.
         """
         backend = self.surface.backend
         real, vector = backend.Float, backend.Array3f
@@ -145,22 +157,25 @@ class JumpSurfaceSearch:
         return is_hit, hit.facet, dr.fma(vector(hit.t), direction, o)
 
     def _next_jump(self, x: Vec3) -> NextJump:
-        """Make a function that finds the facets across which the field jumps, one after the other
-        in the order of their distance from x. If the field cannot list its facets, the function
-        finds only the nearest one.
+        """Make a function that finds the facets across which f jumps, one after the other in the
+        order of their distance from x. If the field cannot list its facets, the function finds only
+        the nearest one.
 
         The function takes the sort key and the index of the facet before, the largest distance, and
         the active lanes; it returns the next facet.
         """
         field, backend = self.surface.field, self.surface.backend
         real, index = backend.Float, backend.UInt32
-        probe = field.nearest_facet(x, (real(-1), index(NO_FACET)), real(0), backend.Bool(False))
-        if probe is None:
+        # Asked for no lane, only to learn whether the field can list its facets.
+        first_facet = field.nearest_facet(
+            x, (real(-1), index(NO_FACET)), real(0), backend.Bool(False)
+        )
+        if first_facet is None:
             facet = _nearest_jump_by_differences(backend, field, x)
 
             def single_facet(after: tuple[Real, Any], limit: Real, active: Mask) -> NearestFacet:
-                """The nearest facet if `after` stands for the start of the list, otherwise no
-                facet."""
+                """Return the nearest facet if `after` stands for the start of the list, otherwise
+                no facet."""
                 del active
                 is_first = (after[0] < 0) & (facet.sort_key < limit)
                 sort_key = dr.select(is_first, facet.sort_key, dr.inf)
@@ -170,8 +185,8 @@ class JumpSurfaceSearch:
             return single_facet
 
         def listed_facet(after: tuple[Real, Any], limit: Real, active: Mask) -> NearestFacet:
-            """The facet that follows the facet `after` (its sort key and index) in the field's
-            list, if it is not farther than `limit`."""
+            """Return the facet that follows the facet `after` (its sort key and index) in the
+            field's list, if it is not farther than `limit`."""
             nearest = field.nearest_facet(x, after, limit, active)
             if nearest is None:
                 raise RuntimeError("nearest_sheet tells sheets at some times and not at others")
@@ -181,7 +196,10 @@ class JumpSurfaceSearch:
 
 
 def straddles_level(surface: SurfaceTracer, y: Vec3, radius: Real, active: Mask) -> Mask:
-    """Whether f takes values on both sides of a level within 1.74 radii of y.
+    """Return the mask of lanes on which f takes values on both sides of a level within 1.74 times
+    `radius` of y.
+
+    active: mask of lanes that are tested.
 
     f is evaluated at the corners of a tetrahedron around y and, along its edges, just before each
     jump surface. Two values on different sides of the level prove that the surface crosses the path
@@ -194,12 +212,14 @@ def straddles_level(surface: SurfaceTracer, y: Vec3, radius: Real, active: Mask)
 
     def body(k: Any, lower: Real, upper: Real, active: Mask) -> tuple[Any, ...]:
         """Extend the range [lower, upper] of values of f by two values on edge k of the
-        tetrahedron."""
+        tetrahedron: at its start, and before the first facet on it (or the middle if there is
+        none)."""
         start, end = _probe(vector, k + 1, zero)
         o = dr.fma(vector(radius), start, y)
         edge_norm = dr.norm(end - start)
         direction, edge_length = (end - start) / edge_norm, radius * edge_norm
         start_crossing = JumpCrossing(real(0), index(NO_FACET), real(0), zero)
+        # Up to the first facet on the edge; the two values are taken on the same side of it.
         t = real(field.next_jump(o, direction, start_crossing, edge_length, active).t)
         before_jump = dr.select(t < edge_length, t, 0.5 * edge_length)
         for distance in (real(0), _FRACTION_TO_FACET * before_jump):
@@ -216,21 +236,23 @@ def straddles_level(surface: SurfaceTracer, y: Vec3, radius: Real, active: Mask)
 
 
 def _parts(facet: NearestFacet) -> tuple[Any, ...]:
-    """The attributes of a facet in the order of the constructor, as the state of a loop."""
+    """Return the attributes of a facet in the order of the constructor, as the state of a loop."""
     return facet.sort_key, facet.facet, facet.offset, facet.normal, facet.is_inner
 
 
 def _select(mask: Mask, first: NearestFacet, second: NearestFacet) -> NearestFacet:
-    """The facet `first` in lanes of the mask, `second` elsewhere."""
+    """Return the facet `first` in lanes of the mask, `second` elsewhere."""
     pairs = zip(_parts(first), _parts(second), strict=True)
     return NearestFacet(*(dr.select(mask, a, b) for a, b in pairs))
 
 
 def _probe(vector: Any, index: Any, normal: Vec3) -> tuple[Vec3, Vec3]:
-    """The start and the end of a probe, a segment near the origin along which a ray is traced.
+    """Return the start and the end of a probe, a segment near the origin along which a ray is
+    traced.
 
+    vector: the type of 3-vectors.
     index: 0 for the segment along `normal`; k + 1 for edge k of a tetrahedron about the origin.
-    vector: the type of 3-vectors."""
+    """
     start, end = -normal, normal
     for k, (i, j) in enumerate(_EDGES):
         start = dr.select(index == k + 1, vector(*_CORNERS[i]), start)
@@ -239,14 +261,13 @@ def _probe(vector: Any, index: Any, normal: Vec3) -> tuple[Vec3, Vec3]:
 
 
 def _nearest_jump_by_differences(backend: Backend, field: Field, x: Vec3) -> NearestFacet:
-    """The facet nearest to x, for a field that knows only the distance d(x) from its nearest facet:
-    the facet lies at the distance d in the direction in which d falls fastest.
+    """Return the facet nearest to x, for a field that knows only the distance d(x) from its nearest
+    facet. The facet lies at the distance d in the direction in which d falls fastest.
 
     That direction is computed by central differences over h = r d. Their truncation error is about
-    r^2. Rounding moves d by epsilon s, where s is the size of the coordinates, which adds
-    epsilon s/(r d). With r = (epsilon s/d)^(1/3) both errors are small down to distances of a few
-    rounding errors. At smaller distances any direction serves, as x itself is on the facet to
-    rounding.
+    r^2. Rounding moves d by epsilon s, where s is the size of the coordinates, which adds epsilon
+    s/(r d). With r = (epsilon s/d)^(1/3) both errors are small down to distances of a few rounding
+    errors. At smaller distances any direction serves, as x itself is on the facet to rounding.
     """
     real, vector = backend.Float, backend.Array3f
     d = real(field.distance_to_jumps(x))
@@ -259,6 +280,7 @@ def _nearest_jump_by_differences(backend: Backend, field: Field, x: Vec3) -> Nea
         differences.append(behind - ahead)
     descent = vector(*differences)
     gradient_norm = dr.norm(descent)
+    # At a point with several nearest facets the differences may cancel: then x is returned.
     has_direction = (gradient_norm > 0.2 * h) & (d > 64 * backend.machine_epsilon * size)
     direction = dr.select(has_direction, descent / gradient_norm, vector(1 / math.sqrt(3)))
     offset = dr.select(has_direction, d * direction, 0)
@@ -287,28 +309,31 @@ _HIT_TEST_RADIUS = 1024.0
 
 @dataclass(frozen=True)
 class _HitPlane:
-    """The plane tangent to the surface at the hit of a ray. It consists of the points x + r with
-    r . normal = offset, where x is the query and |normal| = 1. normal = 0 stands for no plane."""
+    """The plane tangent to the surface at the hit of a ray from the query x. It consists of the
+    points x + r with r . normal = offset, where |normal| = 1. normal = 0 stands for no plane."""
 
     normal: Vec3
     offset: Real
 
     @classmethod
     def where(cls, mask: Mask, first: _HitPlane, second: _HitPlane) -> _HitPlane:
-        """The plane `first` in lanes of the mask, `second` elsewhere."""
+        """Return the plane `first` in lanes of the mask, `second` elsewhere."""
         normal = dr.select(mask, first.normal, second.normal)
         return cls(normal, dr.select(mask, first.offset, second.offset))
 
     def is_apart(self, other: _HitPlane) -> Mask:
-        """The mask of the lanes in which both this and the other one are planes (not the
+        """Return the mask of lanes in which both this and the other one are planes (not the
         placeholder for none), and not nearly parallel."""
         return (
             dr.squared_norm(dr.cross(self.normal, other.normal)) > _MIN_PLANE_SINE * _MIN_PLANE_SINE
         )
 
     def nearest_on_line(self, other: _HitPlane) -> Vec3:
-        """The shortest vector from x to the line in which both planes intersect; not finite if they
-        are parallel."""
+        """Return the shortest vector from x to the line in which both planes intersect; not finite
+        if they are parallel.
+
+        It is a combination of the two normals whose inner products with them are the two offsets.
+        """
         vector = cast("Any", type(self.normal))
         cosine = dr.dot(self.normal, other.normal)
         along_normal = vector(self.offset - cosine * other.offset) * self.normal
@@ -317,8 +342,8 @@ class _HitPlane:
         )
 
     def intersection_point(self, second: _HitPlane, third: _HitPlane) -> Vec3:
-        """The vector from x to the point in which three planes intersect; not finite if the three
-        normals are linearly dependent."""
+        """Return the vector from x to the point in which three planes intersect; not finite if the
+        three normals are linearly dependent (Cramer's rule)."""
         vector = cast("Any", type(self.normal))
         a, b, c = self.normal, second.normal, third.normal
         normals = (dr.cross(b, c), dr.cross(c, a), dr.cross(a, b))
@@ -332,9 +357,10 @@ class _HitPlane:
 
 @dataclass(frozen=True)
 class _HitPlanes:
-    """Three planes tangent to the surface, from which a compass search guesses where creases are.
-    The first is the plane at the best point so far. The other two are the planes of the last two
-    hits that are parallel neither to the first plane nor to each other."""
+    """Three planes tangent to the surface at hits of rays from the query x, from which a compass
+    search guesses where creases are. The first is the plane at the best point so far. The other two
+    are the planes of the last two hits that are parallel neither to the first plane nor to each
+    other."""
 
     first: _HitPlane
     second: _HitPlane
@@ -342,11 +368,11 @@ class _HitPlanes:
 
     @classmethod
     def of(cls, parts: tuple[Any, ...]) -> _HitPlanes:
-        """The planes, from a tuple of normals and offsets as `parts` returns it."""
+        """Make the planes from a tuple of normals and offsets, as `parts` returns it."""
         return cls(*(_HitPlane(parts[k], parts[k + 1]) for k in (0, 2, 4)))
 
     def parts(self) -> tuple[Any, ...]:
-        """The three normals and offsets, alternating, as the state of a loop."""
+        """Return the three normals and offsets, alternating, as the state of a loop."""
         return tuple(
             number
             for plane in (self.first, self.second, self.third)
@@ -354,20 +380,27 @@ class _HitPlanes:
         )
 
     def updated(self, plane: _HitPlane, is_hit: Mask, is_best: Mask) -> _HitPlanes:
-        """The planes after another hit.
+        """Return the planes after another hit.
 
         plane: the hit's tangent plane.
         is_hit: the lanes that have this plane.
         is_best: the lanes in which it belongs to the new best point and becomes the first plane.
+
+        If it becomes the first plane, the old first one moves to the second place, unless the two
+        are nearly parallel. Otherwise it becomes the second plane, unless it is nearly parallel to
+        the first. The third place gets the old second plane, unless that is nearly parallel to the
+        new plane.
         """
         first, second, third = self.first, self.second, self.third
         select = _HitPlane.where
         is_apart = first.is_apart(plane)
+        # If the plane becomes the first one.
         if_best = _HitPlanes(
             plane,
             select(is_apart, first, second),
             select(is_apart & second.is_apart(plane), second, third),
         )
+        # If it does not.
         is_new = is_hit & ~is_best & is_apart
         otherwise = _HitPlanes(
             first,
@@ -381,9 +414,9 @@ class _HitPlanes:
         )
 
     def shortest_to_intersection(self, number: Any) -> Vec3:
-        """The shortest vector from x to an intersection of planes: of all three (number 0), of the
-        first and the second (1), of the first and the third (2); or to the first plane alone (3).
-        Not finite where there is no intersection."""
+        """Return the shortest vector from x to an intersection of planes: of all three (number 0),
+        of the first and the second (1), of the first and the third (2); or to the first plane alone
+        (3). It is not finite where there is no intersection."""
         first, second, third = self.first, self.second, self.third
         vector = cast("Any", type(first.normal))
         to_line = dr.select(
@@ -403,12 +436,13 @@ def compass_search(surface: SurfaceTracer, x: Vec3, foot: Vec3) -> Vec3:
     jump surfaces, on curves where a smooth part ends at a jump surface, and on edges that a volume
     cuts.
 
-    In each round, rays leave x in directions tilted by some angle against the direction of the best
-    point. A first hit that is nearer becomes the best point. If no ray of a round improves it, the
-    angle is reduced, down to sqrt(epsilon). To be fast along creases, the tangent planes of hits
-    are stored, and a round begins with rays to the points nearest to x in the intersections of
-    these planes. A hit is accepted only if f takes values on both sides of the level around it
-    (`straddles_level`), so that it is a point of the surface.
+    First, rays in directions all over the sphere are traced. Then, in each round, rays leave x in
+    directions tilted by some angle against the direction of the best point. A first hit that is
+    nearer becomes the best point. If no ray of a round improves it, the angle is reduced, down to
+    sqrt(epsilon). To be fast along creases, the tangent planes of hits are stored, and a round
+    begins with rays to the points nearest to x in the intersections of these planes. A hit is
+    accepted only if f takes values on both sides of the level around it (`straddles_level`), so
+    that it is a point of the surface.
     """
     backend = surface.backend
     real, vector, count = backend.Float, backend.Array3f, backend.UInt32
@@ -428,13 +462,15 @@ def compass_search(surface: SurfaceTracer, x: Vec3, foot: Vec3) -> Vec3:
         angle: the direction of that tilt about d.
         failed: the number of rays of this round, all of which failed.
         ray: the number of the ray.
+        active: whether the search goes on.
         values: the planes of hits, `_HitPlanes.parts`.
         """
-        planes, is_global = _HitPlanes.of(values), ray < _SPHERE_RAYS
+        hit_planes, is_global = _HitPlanes.of(values), ray < _SPHERE_RAYS
+        # The first rays of a round go to intersections of planes, the others are tilted.
         to_planes = ~is_global & (failed < _PLANE_RAYS)
         direction = dr.select(
             to_planes,
-            dr.normalize(planes.shortest_to_intersection(failed)),
+            dr.normalize(hit_planes.shortest_to_intersection(failed)),
             _tilt_direction(d, step, angle),
         )
         direction = dr.select(is_global, _spiral_direction(vector, real(ray)), direction)
@@ -448,11 +484,15 @@ def compass_search(surface: SurfaceTracer, x: Vec3, foot: Vec3) -> Vec3:
         is_nearer &= is_on_surface(surface, point, hit, is_nearer)
         normal = dr.normalize(hit.gradient)
         has_plane = is_hit & dr.isfinite(dr.squared_norm(normal))
+        # The tangent plane at the hit; its distance from x is that of the hit, projected on the
+        # normal.
         plane = _HitPlane(normal, dr.dot(normal, direction) * hit.t)
-        planes = planes.updated(plane, has_plane, has_plane & is_nearer)
+        hit_planes = hit_planes.updated(plane, has_plane, has_plane & is_nearer)
         d, t = dr.select(is_nearer, direction, d), dr.select(is_nearer, hit.t, t)
         foot = dr.select(is_nearer, point, foot)
         failed = dr.select(is_nearer | is_global, count(0), failed + 1)
+        # A round in which all rays failed is over: the next one tilts rays less. After success with
+        # a tilted ray, rays are tilted more.
         is_spent = failed == _PLANE_RAYS + _TILTED_RAYS
         new_step = dr.select(is_spent, _STEP_REDUCTION * step, step)
         step = dr.select(
@@ -461,7 +501,7 @@ def compass_search(surface: SurfaceTracer, x: Vec3, foot: Vec3) -> Vec3:
         angle = dr.select(is_nearer | to_planes | is_global, angle, angle + _GOLDEN_ANGLE)
         failed = dr.select(is_spent, count(0), failed)
         active &= (step > backend.machine_epsilon**0.5) & (ray + 1 < _MAX_RAYS)
-        return d, t, foot, step, angle, failed, ray + 1, active, *planes.parts()
+        return d, t, foot, step, angle, failed, ray + 1, active, *hit_planes.parts()
 
     def is_active(*state: Any) -> Mask:
         return state[7]
@@ -474,10 +514,11 @@ def compass_search(surface: SurfaceTracer, x: Vec3, foot: Vec3) -> Vec3:
 
 
 def is_on_surface(surface: SurfaceTracer, y: Vec3, hit: MarchResult, active: Mask) -> Mask:
-    """Whether the hit y of a ray is a point of the surface: f takes values on both sides of a level
-    around it.
+    """Return the mask of lanes on which the hit y of a ray is a point of the surface: f takes
+    values on both sides of a level around it.
 
-    hit: the result of tracing the ray. active: the lanes to be tested.
+    hit: the result of tracing the ray.
+    active: the lanes to be tested.
 
     A hit alone is no proof near the edge of a jump surface, for two reasons. The gradient is
     unbounded there, so that every point is within the tolerance of any level to first order. And a
@@ -488,9 +529,9 @@ def is_on_surface(surface: SurfaceTracer, y: Vec3, hit: MarchResult, active: Mas
 
 
 def _tilt_direction(d: Vec3, step: Real, angle: Real) -> Vec3:
-    """The unit vector along d + step w. d is a unit vector, and w the unit vector at right angles
-    to d that is given by the angle `angle` (in radians) about d. So `step` is the tangent of the
-    angle between d and the result."""
+    """Return the unit vector along d + step w. d is a unit vector, and w the unit vector at right
+    angles to d that is given by the angle `angle` (in radians) about d. So `step` is the tangent of
+    the angle between d and the result."""
     vector = cast("Any", type(d))
     u, v = orthonormal_basis(d)
     sine, cosine = dr.sincos(angle)
@@ -498,8 +539,8 @@ def _tilt_direction(d: Vec3, step: Real, angle: Real) -> Vec3:
 
 
 def _spiral_direction(vector: Any, n: Real) -> Vec3:
-    """The unit vector with number n of `_SPHERE_RAYS` unit vectors that are spread evenly over the
-    sphere, along a spiral."""
+    """Return the unit vector with number n of `_SPHERE_RAYS` unit vectors that are spread evenly
+    over the sphere, along a spiral. vector: the type of 3-vectors."""
     z = 1 - (2 * n + 1) / _SPHERE_RAYS
     radius = dr.sqrt(1 - z * z)
     sine, cosine = dr.sincos(_GOLDEN_ANGLE * n)

@@ -1,9 +1,10 @@
-"""The level sets of a closed mesh's winding number as triangles, with a tree that finds the nearest
-one.
+"""The level sets of a closed mesh's winding number f as triangles, with a tree that finds the
+nearest one. A triangle belongs to a level set if the level lies between the values of f on its two
+sides.
 
 Off its triangles the winding number of a closed mesh is an integer, so its level sets consist of
-triangles. A triangle belongs to a level as a whole, unless other triangles pass through it: then it
-is cut along them first.
+triangles. A triangle belongs to a level set as a whole, unless other triangles pass through it:
+then it is cut along them first.
 """
 
 from __future__ import annotations
@@ -40,10 +41,13 @@ _SIDE_DISTANCE = 1e-9
 
 @dataclass(frozen=True)
 class LevelTriangles:
-    """The triangles of a level set of a mesh's winding number, in scaled coordinates.
+    """The triangles of a mesh on which a level set of its winding number f lies (f jumps there from
+    one side of the level to the other), in scaled coordinates.
 
     corners: (k, 3, 3) in coordinates of at most about 1; the unscaled corners are center + size
         times these.
+    center, size: (3,) and a power of two, the center and about half the longest side of the mesh's
+        box.
     is_complete: whether the surface consists of these triangles only.
     """
 
@@ -54,12 +58,13 @@ class LevelTriangles:
 
     @classmethod
     def of(cls, surface: TracedSurface) -> LevelTriangles | None:
-        """The triangles of which a surface consists, wholly or in part. The surface is the boundary
-        of a `MeshSolid`, or a level set of the winding number of a mesh, without clip and domain;
-        for other surfaces the result is None.
+        """Return the triangles of which a surface consists, wholly or in part. The surface is the
+        boundary of a `MeshSolid`, or a level set of the winding number of a mesh, without clip and
+        domain; for other surfaces the result is None.
 
         If the surface also has parts off the triangles, as that of a mesh with holes, the result
-        has only those triangles that are proved to belong to the surface as a whole."""
+        has only those triangles that are proved to belong to the surface as a whole.
+        """
         if isinstance(surface.field, MeshSolid) and surface.clip_volume is None:
             if surface.field.domain is not None or any(surface.level_values):
                 return None
@@ -68,21 +73,24 @@ class LevelTriangles:
         mesh = surface.field.jump_mesh()
         if mesh is None or surface.clip_volume is not None or surface.field.domain is not None:
             return None
-        vertices, faces, is_all = mesh
+        vertices, faces, is_integer_off_faces = mesh
         is_jumps_only = surface.field.is_of_sheets_alone(surface.level_values)
         lower, upper = vertices[faces].min(axis=(0, 1)), vertices[faces].max(axis=(0, 1))
         size = float(2.0 ** np.ceil(np.log2(0.5 * (upper - lower).max())))
         center = round_to_single(0.5 * (lower + upper))
         scaled = (vertices - center) / size
+        # The field says that every triangle belongs to the level set, and nothing else.
         if is_jumps_only:
             return cls(scaled[faces], center, size, True)
         tree = _tree(choose_backend("double"), scaled, faces)
         pieces, _ = split_intersecting_faces(tree, scaled, faces)
-        if is_all:
+        # Off the faces of such a mesh f is an integer, so that the triangles are the whole level
+        # set.
+        if is_integer_off_faces:
             on_level = separates_levels(tree, pieces, surface.level_values)
         else:
             on_level = _proved_on_level(surface, center + size * pieces, size)
-        return cls(pieces[on_level], center, size, is_all)
+        return cls(pieces[on_level], center, size, is_integer_off_faces)
 
     def upload(self, backend: Backend) -> Callable[[Vec3], Vec3]:
         """Upload the triangles. Returns a function of points that gives the vector from each to the
@@ -97,7 +105,7 @@ class LevelTriangles:
         del _frame
 
         def nearest(p: Vec3) -> Vec3:
-            """The vector from p to the nearest point of a triangle."""
+            """Return the vector from p to the nearest point of a triangle."""
             x: Any = (vector(p) - center) / size
             limit = initial_squared_distance(tree, x)
             start = real(-1), backend.UInt32(NO_TRIANGLE)
@@ -109,15 +117,18 @@ class LevelTriangles:
 def _tree(
     backend: Backend, vertices: FloatArray, faces: Any, *, slabs: bool = False
 ) -> TriangleTree:
-    """A tree that finds the nearest of some triangles. vertices: (n, 3). faces: (m, 3). slabs:
-    whether its nodes store slabs, between parallel planes, as well as boxes; they bound flat groups
-    of triangles more tightly."""
+    """Return a tree that finds the nearest of some triangles.
+
+    vertices, faces: (n, 3) the vertices, and (m, 3) their indices for each triangle.
+    slabs: whether its nodes store slabs, between parallel planes, as well as boxes; they bound flat
+        groups of triangles more tightly.
+    """
     tree = build_balanced_tree(vertices[faces].mean(axis=1), leaf_size=_LEAF_SIZE)
     return TriangleTree.of(backend, tree, triangle_records(vertices, faces), slabs=slabs)
 
 
 def _proved_on_level(surface: TracedSurface, corners: FloatArray, size: float) -> BoolArray:
-    """(k,) the mask of the triangles that are proved to belong to a level set as a whole.
+    """Return the mask (k,) of triangles that are proved to belong to a level set as a whole.
 
     corners: (k, 3, 3) the corners of triangles through which no other triangle passes.
     size: the size of the mesh, a length.
@@ -133,13 +144,16 @@ def _proved_on_level(surface: TracedSurface, corners: FloatArray, size: float) -
     levels = Levels(tuple(dr.opaque(backend.Float, level) for level in surface.level_values), 1.0)
 
     def clearance(p: Vec3) -> tuple[Any]:
+        """Return the proved radius about p."""
         return (level_distance_lower_bound(backend, smooth_field, levels, p, prepared.evaluate(p)),)
 
     center = corners.mean(axis=1)
     (clearances,) = in_batches(backend, clearance, center)
+    # The ball about the center that contains the triangle.
     radius = np.linalg.norm(corners - center[:, None], axis=2).max(axis=1)
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     length = np.linalg.norm(normal, axis=1, keepdims=True)
+    # f right beside the center, on both sides.
     offset = _SIDE_DISTANCE * size * normal / np.maximum(length, 1e-300)
     side_values = [field.value(center + sign * offset, precision="double") for sign in (1, -1)]
     lower, upper = np.minimum(*side_values), np.maximum(*side_values)

@@ -1,4 +1,8 @@
-"""Curvature of level sets from first and second derivatives, and lines of curvature."""
+"""Curvature of level sets of a function f from its first and second derivatives, and lines of
+curvature: curves on a level set along which it bends most, or least. The principal curvatures at a
+point are the largest and the smallest curvature of the surface in any direction there, and the
+principal directions are those in which they occur.
+"""
 
 from __future__ import annotations
 
@@ -44,8 +48,9 @@ _ROUNDING = 16.0
 
 @dataclass(frozen=True)
 class CurvatureSamples:
-    """Curvatures of the level sets through n points. NaN where the gradient is zero, so that there
-    is no surface, and where the error of the gradient is not less than its length.
+    """Curvatures of the level sets of a function f through n points. NaN where the gradient is
+    zero, so that there is no surface, and where the error of the gradient is not less than its
+    length.
 
     mean: (n,) half the divergence of the normal, 1/length. Its sign is the normal's: a sphere of
         radius r has 1/r if f grows outward, -1/r if f grows inward.
@@ -73,7 +78,8 @@ def curvature(
     options: TraceOptions | None = None,
     **keywords: Unpack[TraceKeywords],
 ) -> CurvatureSamples:
-    """Mean and Gaussian curvature of the level sets of a field through points (n, 3).
+    """Compute the mean and Gaussian curvature of the level sets of a field's function f through
+    points (n, 3).
 
     surface: a field, or a `Surface`. The curvature at a point is that of the level set through the
         point, whatever its level is; levels, clip and section of a `Surface` have no effect.
@@ -100,13 +106,18 @@ def curvature(
     """
     target, choices = surface_and_options("curvature", surface, options, keywords, ("precision",))
     field, backend = target.field, choose_backend(choices.precision or "double")
+    # Fields that are evaluated within a kernel, and fields that are evaluated in batches by tree
+    # sums.
     if not isinstance(field, BatchedField):
         prepared = field.prepare(backend)
 
         def from_field(p: Vec3, acceptance: Real) -> tuple[Real | Vec3, ...]:
-            """The curvatures at p, from the gradient and Hessian that the field computes inside of
-            a kernel (`_Derivatives.curvatures`). acceptance: the acceptance factor of a treecode;
-            the larger it is, the smaller the error."""
+            """Return the curvatures at p, from the gradient and Hessian that the field computes
+            inside of a kernel (`_Derivatives.curvatures`).
+
+            acceptance: the acceptance factor of a treecode; the larger it is, the smaller the
+                error.
+            """
             refined = (
                 prepared.at_accuracy(acceptance) if prepared.has_variable_accuracy else prepared
             )
@@ -118,9 +129,11 @@ def curvature(
         return _refine_accuracy(backend, field, from_field, points, prepared.has_variable_accuracy)
 
     def from_tree(p: Vec3, acceptance: Real) -> tuple[Real | Vec3, ...]:
-        """The curvatures at p, from the tree sums of a field that is evaluated in batches
-        (`_Derivatives.curvatures`). acceptance: the acceptance factor of the treecode; the larger
-        it is, the smaller the error."""
+        """Return the curvatures at p, from the tree sums of a field that is evaluated in batches
+        (`_Derivatives.curvatures`).
+
+        acceptance: the acceptance factor of the treecode; the larger it is, the smaller the error.
+        """
         values = field.values_at(p, 2, acceptance)
         if values.gradient is None or values.hessian is None:
             raise RuntimeError(f"{type(field).__name__}: values_at(x, 2) gave no derivatives")
@@ -140,17 +153,21 @@ def _refine_accuracy(
     points: Any,
     can_refine: bool,
 ) -> CurvatureSamples:
-    """The curvatures at points (n, 3). Where their error is too large, they are evaluated again,
-    with
-    a more accurate treecode: with larger acceptance factors (`_ACCEPTANCE_FACTORS`), by which
-    clusters of terms are expanded as a whole only from farther away.
+    """Return the curvatures at points (n, 3). Where their error is too large, they are evaluated
+    again with a more accurate treecode: with larger acceptance factors (`_ACCEPTANCE_FACTORS`), by
+    which clusters of terms are expanded as a whole only from farther away.
 
     evaluate: a function of points and an acceptance factor that returns the values of
         `_Derivatives.curvatures`.
     can_refine: whether the field's accuracy depends on that factor.
+
+    A mean curvature is accurate enough if its error is at most a thousandth of it, or of 1/(size of
+    the surface). Where the field has no truncation error, nothing is evaluated again.
     """
 
     def with_acceptance(acceptance: float) -> Callable[[Vec3], tuple[Real | Vec3, ...]]:
+        """Return the function `evaluate` of the points alone, with this acceptance factor."""
+
         def compute(p: Vec3) -> tuple[Real | Vec3, ...]:
             return evaluate(p, dr.opaque(backend.Float, acceptance))
 
@@ -160,6 +177,7 @@ def _refine_accuracy(
     if not can_refine:
         return CurvatureSamples(*columns)
     x = np.asarray(points, np.float64)
+    # The allowed error where the mean curvature itself is nearly 0.
     flat_error = _ACCURACY / _size(field, x)
     for acceptance in _ACCEPTANCE_FACTORS[1:]:
         mean, error = columns[0], columns[3]
@@ -168,6 +186,7 @@ def _refine_accuracy(
         rows = np.flatnonzero(~is_accurate & (is_truncated > 0))
         if not rows.size:
             break
+        # Only the rows whose error is too large are evaluated again.
         *refined, is_truncated[rows] = in_batches(backend, with_acceptance(acceptance), x[rows])
         for column, values in zip(columns, refined, strict=True):
             column[rows] = values
@@ -175,8 +194,9 @@ def _refine_accuracy(
 
 
 def _size(field: Field, points: FloatArray) -> float:
-    """The size of a field's surface, a length: the diagonal of the box that is proved to contain
-    it. If there is no finite box, the largest absolute coordinate of the points (n, 3)."""
+    """Return the size of a field's surface, a length: the diagonal of the box that is proved to
+    contain it. If there is no finite box, it is the largest absolute coordinate of the points (n,
+    3)."""
     volume = field.extent((field.default_level,))
     if volume is not None:
         lower, upper = volume.bounds()
@@ -243,6 +263,8 @@ class _Derivatives:
         )
 
         rounding = _ROUNDING * self.backend.machine_epsilon
+        # The deviator is the Hessian less its mean diagonal; `deviator` is its Frobenius norm, and
+        # `eigen_range` is S of the proof.
         mean_diagonal = (x.x + y.y + z.z) / 3
         off_diagonal = dr.square(x.y) + dr.square(x.z) + dr.square(y.z)
         diagonal = (
@@ -253,6 +275,7 @@ class _Derivatives:
         deviator = dr.sqrt(diagonal + 2 * off_diagonal)
         hessian_norm = deviator + math.sqrt(3) * dr.abs(mean_diagonal)
         eigen_range = math.sqrt(2) * deviator + rounding * hessian_norm
+        # c, h, s and e are those of the proof, with rounding.
         c = dr.fma(rounding, plane.gradient_norm, real(self.gradient_error))
         h = dr.fma(rounding, hessian_norm, real(self.hessian_error))
         min_norm = plane.gradient_norm - c
@@ -275,8 +298,8 @@ class _Derivatives:
 
 
 def _or_infinite(is_known: Any, error: Real) -> Real:
-    """An error bound rounded up, so that it stays a bound. Infinity in lanes in which the bound is
-    not known (the mask `is_known` is False) or not finite."""
+    """Return an error bound rounded up, so that it stays a bound. It is infinite in lanes in which
+    the bound is not known (the mask `is_known` is False) or not finite."""
     return dr.select(is_known & dr.isfinite(error), error * (1 + 1e-5), dr.inf)
 
 
@@ -309,7 +332,7 @@ def curvature_lines(
     options: TraceOptions | None = None,
     **keywords: Unpack[TraceKeywords],
 ) -> list[FloatArray]:
-    """The lines of curvature of a level set through seeds (n, 3): n polylines (k, 3), with k >= 1.
+    """Trace the lines of curvature of a level set through seeds (n, 3): n polylines (k, 3), k >= 1.
 
     They are curves on the level set along which it bends most, or least.
 
@@ -351,6 +374,7 @@ def curvature_lines(
         hint = did_you_mean(family, get_args(Family))
         raise ValueError(f"unknown family {family!r}; choose one of {names}{hint}")
     step, length = as_positive(step, "step"), as_positive(length, "length")
+    # Steps on either side of the seed.
     count = math.ceil(length / step)
     if count > _MOST_STEPS:
         raise ValueError(f"length/step asks for {count:,} steps: at most {_MOST_STEPS:,}")
@@ -376,6 +400,7 @@ def curvature_lines(
 @dataclass(frozen=True)
 class _LineState:
     """The state of lines of curvature while they are followed on a surface, one line in each lane.
+    A line of curvature is a curve along which the surface bends most, or least.
 
     x: the current point of the line, on the surface.
     direction: the unit principal direction at x, along which the line goes on.
@@ -391,8 +416,15 @@ class _LineState:
 
 @dataclass(frozen=True)
 class _CurvatureLineTracer:
-    """Follows the lines of curvature of one family. largest: 1 for the lines along the direction of
-    the larger principal curvature, 0 for those along the smaller one."""
+    """Follows lines of curvature on the level set of f = `field`: curves along which the surface
+    bends most, or least. Their tangents are the principal directions, the directions of the larger
+    or of the smaller principal curvature.
+
+    level: the value of f on the surface.
+    step: the arc length of a step.
+    largest: 1 for the lines along the direction of the larger principal curvature, 0 for those
+        along the smaller one.
+    """
 
     backend: Backend
     field: Field
@@ -403,15 +435,23 @@ class _CurvatureLineTracer:
     def follow(self, seeds: FloatArray, count: int) -> tuple[list[FloatArray], list[FloatArray]]:
         """Trace each line from its seed in both directions, by at most `count` steps each.
 
+        seeds: (n, 3) points near the surface.
+
         Returns two lists of n polylines (k, 3), one for each direction; all begin at the seeds,
-        moved onto the surface.
+        moved onto the surface. A polyline is empty if its seed does not reach the surface, or has
+        no principal direction.
+
+        Lanes 0 to n - 1 follow one direction, and lanes n to 2n - 1 the other. The point of each
+        lane after step i is stored at the place 2 n i + lane.
         """
         integer, vector, n = self.backend.UInt32, self.backend.Array3f, len(seeds)
         x = upload_vectors(self.backend, np.concatenate([seeds, seeds]))
         x = self._on_surface(x, _SEED_NEWTON_STEPS)
         direction, is_known = self._direction(x, None)
         lane = dr.arange(integer, 2 * n)
+        # An eigenvector and its negative: the two directions from each seed.
         direction = dr.select(lane < n, direction, -direction)
+        # The points of all lines after all steps.
         points = vector(*(dr.full(self.backend.Float, dr.nan, 2 * n * (count + 1)) for _ in "xyz"))
         dr.scatter(points, x, lane, is_known)
         dr.eval(points, x, direction, is_known)
@@ -426,15 +466,22 @@ class _CurvatureLineTracer:
                 x, direction, step_count, state.active & is_valid & (step_count < max_steps)
             )
 
-        index = dr.zeros(integer, 2 * n)
-        loop_while_active(_LineState(x, direction, index, is_known & True), body, "curvature lines")
+        no_steps = dr.zeros(integer, 2 * n)
+        loop_while_active(
+            _LineState(x, direction, no_steps, is_known & True), body, "curvature lines"
+        )
         point_array = to_numpy(points).reshape(count + 1, 2 * n, 3).astype(np.float64)
+        # Places that were not written are NaN.
         lines = [line[np.isfinite(line).all(axis=1)] for line in point_array.swapaxes(0, 1)]
         return lines[:n], lines[n:]
 
     def _advance(self, state: _LineState) -> tuple[Vec3, Vec3, Mask]:
-        """Follow all lines of curvature by one step of the Runge-Kutta method. Returns the next
-        points; the unit principal directions there; and the mask of the lines that continue."""
+        """Follow all lines of curvature by one step of the Runge-Kutta method of order four, and
+        move their points back to the surface. Returns the next points; the unit principal
+        directions there; and the mask of lines that continue.
+
+        A line ends where it turns by more than 40 degrees in a step, or has no principal direction.
+        """
         x, h = state.x, self.step
         first = state.direction
         second, _ = self._direction(x + 0.5 * h * first, first)
@@ -446,7 +493,7 @@ class _CurvatureLineTracer:
         return end, last, is_known & (dr.dot(first, last) > _MIN_STEP_COSINE)
 
     def _direction(self, x: Vec3, previous: Vec3 | None) -> tuple[Vec3, Mask]:
-        """The unit principal direction at x; and the mask of the lanes in which the line can be
+        """Return the unit principal direction at x; and the mask of lanes in which the line can be
         continued there: the direction is well defined, and the step is short enough for the
         curvature.
 
@@ -458,6 +505,7 @@ class _CurvatureLineTracer:
         direction = u * plane.u + v * plane.v
         if previous is not None:
             direction = dr.select(dr.dot(direction, previous) < 0, -direction, direction)
+        # Times |grad f|: the Hessian was not divided by it.
         max_curvature = fmax(dr.abs(eigen.largest), dr.abs(eigen.smallest))
         is_known = (eigen.largest - eigen.smallest > _UMBILIC * max_curvature) & dr.isfinite(
             dr.norm(direction)
@@ -467,10 +515,11 @@ class _CurvatureLineTracer:
         )
 
     def _on_surface(self, x: Vec3, steps: int) -> Vec3:
-        """The point to which `steps` steps of Newton's method along the gradient lead from x,
-        toward the level set."""
+        """Return the point to which `steps` steps of Newton's method along the gradient lead from
+        x, toward the level set."""
 
         def step(x: Vec3) -> Vec3:
+            """Make one Newton step from x."""
             sample = self.field.evaluate(x)
             gap = sample.value - self.level
             if self.field.period is not None:
@@ -481,8 +530,8 @@ class _CurvatureLineTracer:
 
 
 def _iterate(step: Callable[[Vec3], Vec3], x: Vec3, times: int, backend: Backend) -> Vec3:
-    """The result of applying the function `step` to x `times` times. It is a loop of the kernel, so
-    that the compiled kernel contains the code of `step` only once."""
+    """Apply the function `step` to x `times` times, and return the result. It is a loop of the
+    kernel, so that the compiled kernel contains the code of `step` only once."""
     if times == 1:
         return step(x)
 
@@ -500,19 +549,21 @@ def _iterate(step: Callable[[Vec3], Vec3], x: Vec3, times: int, backend: Backend
 def _join_halves(
     ahead: FloatArray, behind: FloatArray, step: float, clip: Volume | None
 ) -> FloatArray:
-    """Join the two halves of a line of curvature, which both begin at its seed, to one polyline
-    (k, 3).
+    """Join the two halves of a line of curvature, which both begin at its seed, to one polyline (k,
+    3).
 
-    ahead, behind: (i, 3), (j, 3) the halves. step: the arc length of a step.
+    ahead, behind: (i, 3), (j, 3) the halves.
+    step: the arc length of a step.
     clip: the volume at whose boundary the halves are cut; None for no cut.
 
     If `ahead` returns to the seed, the line is closed. Then the result is `ahead` up to there, and
-    it ends with the seed again.
+    it ends with the seed again. It returns where a step passes the seed at a distance below a
+    quarter of `step`, in about the direction of the first step.
     """
     if clip is not None:
         ahead, behind = (_until_exit(half, clip) for half in (ahead, behind))
     if len(ahead) > 3:
-        # The line returns in a step that passes the seed at a distance below a quarter of `step`.
+        # At this fraction of each step it is nearest to the seed.
         moves, to_seed = np.diff(ahead, axis=0), ahead[0] - ahead[:-1]
         fraction = (moves * to_seed).sum(axis=1) / np.maximum((moves * moves).sum(axis=1), 1e-300)
         is_near_seed = np.linalg.norm(to_seed - fraction[:, None] * moves, axis=1) < 0.25 * step
@@ -530,12 +581,12 @@ def _join_halves(
 
 
 def _after_second_step(count: int) -> BoolArray:
-    """(count,) a mask of the points of a line that is False for the first two and True for all
-    others. The first two are near the seed even if the line does not return to it."""
+    """Return a mask (count,) of the steps of a line that is False for the first two and True for
+    all others. The first two are near the seed even if the line does not return to it."""
     return np.arange(count) > 1
 
 
 def _until_exit(line: FloatArray, clip: Volume) -> FloatArray:
-    """The points (k, 3) of a line before the first that is outside the clip volume."""
+    """Return the points (k, 3) of a line before the first that is outside the clip volume."""
     outside = np.flatnonzero(~clip.contains_points(line)) if len(line) else np.zeros(0, int)
     return line[: outside[0]] if outside.size else line

@@ -1,5 +1,6 @@
-"""The geometry of a level set near a point: tangent plane, second derivatives along it, and first-
-and second-order distances."""
+"""The geometry of a level set of a function f near a point: its tangent plane, second derivatives
+along it, and first- and second-order estimates of the distance from the level set.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +33,7 @@ __all__ = [
 
 @dataclass(frozen=True)
 class TangentPlane:
-    """The tangent plane of a level set at a point where grad f is not zero.
+    """The tangent plane of a level set of a function f at a point where grad f is not zero.
 
     gradient_norm: |grad f|.
     n: the unit normal along grad f.
@@ -46,15 +47,15 @@ class TangentPlane:
 
     @classmethod
     def of(cls, gradient: Vec3) -> TangentPlane:
-        """The plane at right angles to a gradient; NaN where that is zero."""
+        """Return the plane at right angles to a gradient; NaN where that is zero."""
         gradient_norm = safe_norm(gradient)
         n = gradient / gradient_norm
         u, v = orthonormal_basis(n)
         return cls(gradient_norm, n, u, v)
 
     def restrict_hessian(self, rows: tuple[Vec3, Vec3, Vec3]) -> tuple[Real, Real, Real]:
-        """The numbers u.Au, v.Av and u.Av for a symmetric 3x3 matrix A, such as a Hessian, where u
-        and v are the unit tangents of the plane. rows: the three rows of A."""
+        """Return the numbers u.Au, v.Av and u.Av for a symmetric 3x3 matrix A, such as a Hessian,
+        where u and v are the unit tangents of the plane. rows: the three rows of A."""
         along_u, along_v = matvec(rows, self.u), matvec(rows, self.v)
         return dr.dot(self.u, along_u), dr.dot(self.v, along_v), dr.dot(self.u, along_v)
 
@@ -62,7 +63,10 @@ class TangentPlane:
 @dataclass(frozen=True)
 class SymmetricEigen2:
     """The eigenvalues and eigenvectors of a symmetric 2x2 matrix. (cosine, sine) is the unit
-    eigenvector of the larger eigenvalue, (-sine, cosine) that of the smaller one."""
+    eigenvector of the larger eigenvalue, (-sine, cosine) that of the smaller one.
+
+    largest, smallest: the two eigenvalues.
+    """
 
     largest: Real
     smallest: Real
@@ -71,23 +75,24 @@ class SymmetricEigen2:
 
     @classmethod
     def of(cls, uu: Real, vv: Real, uv: Real) -> SymmetricEigen2:
-        """The eigenvalues and eigenvector of the matrix ((uu, uv), (uv, vv))."""
+        """Return the eigenvalues and eigenvectors of the matrix ((uu, uv), (uv, vv))."""
         middle, half = 0.5 * (uu + vv), 0.5 * (uu - vv)
         spread = dr.sqrt(dr.fma(half, half, uv * uv))
         s, c = dr.sincos(0.5 * dr.atan2(uv, half))
         return cls(middle + spread, middle - spread, c, s)
 
     def coordinates(self, u: Real, v: Real) -> tuple[Real, Real]:
-        """Coordinates of the vector (u, v) in the basis of eigenvectors; the eigenvector of the
-        larger eigenvalue comes first."""
+        """Return the coordinates of the vector (u, v) in the basis of unit eigenvectors; the
+        eigenvector of the larger eigenvalue comes first."""
         return (
             dr.fma(self.cosine, u, self.sine * v),
             dr.fma(self.cosine, v, -self.sine * u),
         )
 
     def combination(self, along_larger: Real, along_smaller: Real) -> tuple[Real, Real]:
-        """The vector (u, v) whose coordinates in the basis of unit eigenvectors are `along_larger`,
-        for the eigenvector of the larger eigenvalue, and `along_smaller`, for the other."""
+        """Return the vector (u, v) whose coordinates in the basis of unit eigenvectors are
+        `along_larger`, for the eigenvector of the larger eigenvalue, and `along_smaller`, for the
+        other."""
         return (
             dr.fma(self.cosine, along_larger, -self.sine * along_smaller),
             dr.fma(self.sine, along_larger, self.cosine * along_smaller),
@@ -95,7 +100,7 @@ class SymmetricEigen2:
 
 
 def has_hessian(backend: Backend, field: Field) -> bool:
-    """Whether a prepared field knows its second derivatives."""
+    """Return whether a prepared field knows its second derivatives."""
     try:
         field.hessian(backend.Array3f(0))
     except NotImplementedError:
@@ -104,13 +109,14 @@ def has_hessian(backend: Backend, field: Field) -> bool:
 
 
 def matvec(rows: tuple[Vec3, Vec3, Vec3], vector: Vec3) -> Vec3:
-    """The matrix with these rows times a vector."""
+    """Return the product of the matrix with these rows and a vector."""
     return type(vector)(*(dr.dot(row, vector) for row in rows))
 
 
 def first_order_distance(above: Real, gradient: Vec3) -> Real:
-    """The first-order estimate of the signed distance from a level set: above/|grad f|, where
-    above = f - level. Its error is O(d^2) at the distance d from a smooth surface.
+    """Return the first-order estimate of the signed distance of a point x from a level set:
+    above/|grad f|, where above = f - level and the gradient are taken at x. Its error is O(d^2) at
+    the distance d from a smooth surface.
 
     Proof. Let y be the closest point of the level set, N its normal grad f/|grad f|(y), and
     x = y + d N (x - y is normal at the closest point; d has the sign of above). Taylor's formula
@@ -123,11 +129,11 @@ def first_order_distance(above: Real, gradient: Vec3) -> Real:
 
 
 def second_order_distance(above: Real, gradient: Vec3, rows: tuple[Vec3, Vec3, Vec3]) -> Real:
-    """The second-order estimate of the signed distance d of a point x from a level set:
+    """Return the second-order estimate of the signed distance d of a point x from a level set:
     d1/(1 - k d1/2) with above = f - level, d1 = above/|grad f| and k = n.An/|grad f|. Its error is
     O(d^3).
 
-    gradient, rows: grad f at x, and the three rows of the Hessian A there; n is the unit gradient.
+    gradient, rows: g = grad f at x, and the three rows of the Hessian A there; n = g/|g|.
     k tells how fast the slope changes along n; it is not a curvature of the surface.
 
     Proof. With x = y + d N as in `first_order_distance`, Taylor along that line is
@@ -183,7 +189,8 @@ def in_batches(
 
 
 def _check_size(points: Any) -> None:
-    """Raise a ValueError if a finite coordinate of the points is larger than `MAX_COORDINATE`."""
+    """Raise a ValueError if a finite coordinate of the points is larger than `MAX_COORDINATE`.
+    Dr.Jit arrays are not checked."""
     coordinates = None if dr.is_array_v(type(points)) else as_real_array(points, "points")
     if coordinates is None or not coordinates.size:
         return

@@ -1,5 +1,5 @@
-"""Enclosures: proofs of how far a field's function f can move along a path from its value at the
-start.
+"""Enclosures: proofs of how far a function f can change along a path (a ray) from its value at a
+sampled point. They prove lengths of the ray on which f takes none of given values, the levels.
 
 This package exports what all proofs share. The proofs themselves, the classes of enclosures, are
 names of `harnack`; `harnack/__init__.pyi` lists them.

@@ -1,4 +1,6 @@
-"""An enclosure of functions that are not harmonic but have a bounded Laplacian.
+"""An enclosure of functions f that are not harmonic but have a bounded Laplacian on a ball. An
+enclosure bounds how far f can change along a ray from the center p of the ball; so it proves a
+length of the ray on which f takes no level, a value that rays look for.
 
 The talk on Gillespie, Yang, Botsch, Crane 2024 names such functions as future work; the proof below
 and its constant are new in harnack.
@@ -41,7 +43,8 @@ _UNREACHABLE_GAP = 1e18
 
 @dataclass(frozen=True)
 class BoundedLaplacianEnclosure(Enclosure):
-    """An enclosure of f with c <= f <= C and a <= Laplacian f <= b on B(p, R) of space.
+    """An enclosure of f along a ray from p, if c <= f <= C and a <= Laplacian f <= b on the ball
+    B(p, R) of space. q is the length along the ray as a fraction of R.
 
     radius: R.
     max_fall, max_rise: f(p) - c and C - f(p).
@@ -50,9 +53,9 @@ class BoundedLaplacianEnclosure(Enclosure):
 
     Proof for R = 1, at the point x = p + q v for a unit direction v. Let G be the Green function of
     the ball. Then f = h - integral of G Lap f, where h is harmonic with the boundary values of f,
-    so c <= h <= C. As in `HarnackSlopeEnclosure`, the chord of the Poisson kernel gives
-    h(x) <= c + (h(p)-c) A + (h_v(p)/3) B with A = (1+3q^2)/(1-q^2)^2 and B = (3q+q^3)/(1-q^2)^2.
-    Put h = f + integral of G Lap f in all three places:
+    so c <= h <= C. As in `HarnackSlopeEnclosure`, the chord of the Poisson kernel gives h(x) <= c +
+    (h(p)-c) A + (h_v(p)/3) B with A = (1+3q^2)/(1-q^2)^2 and B = (3q+q^3)/(1-q^2)^2. Put h = f +
+    integral of G Lap f in all three places:
 
         f(x) <= c + (f(p)-c) A + (f_v(p)/3) B + integral of K Lap f,
         K = -G(x,.) + A G(p,.) + (B/3) d_v G(p,.).
@@ -66,15 +69,15 @@ class BoundedLaplacianEnclosure(Enclosure):
     Numerically no constant below 0.391 would do, and the logarithm is needed. The bound of f from
     below is that of -f from above, with -C, -b and -a.
 
-    The first crossing of a level is unique. Let w = f(p)-c + m/6, but at least 0; and leave out
-    m q^2/6 if it is negative. Both only raise the bound. As h-c is positive, |h_v(p)|/3 <= h(p)-c,
-    hence |f_v(p)|/3 <= w + 0.1907 l, where 0.1907 bounds the integral of |G(p,.) + d_v G(p,.)/3|.
-    A larger slope is clamped to this. Then the bound of f - f(p), w (A-1) + (f_v/3) B + l kappa +
-    m q^2/6, is convex in q, since A'' >= |B''| and kappa'' >= 0.1907 B'' (checked in the same
-    place), and it is 0 at q = 0.
+    The first crossing of a level is unique. Let w = f(p)-c + m/6, but at least 0; and leave out m
+    q^2/6 if it is negative. Both only raise the bound. As h-c is positive, |h_v(p)|/3 <= h(p)-c,
+    hence |f_v(p)|/3 <= w + 0.1907 l, where 0.1907 bounds the integral of |G(p,.) + d_v G(p,.)/3|. A
+    larger slope is clamped to this. Then the bound of f - f(p), w (A-1) + (f_v/3) B + l kappa + m
+    q^2/6, is convex in q, since A'' >= |B''| and kappa'' >= 0.1907 B'' (checked in the same place),
+    and it is 0 at q = 0.
 
-    Both ends increase with the slope, or stay: the slope enters the upper end as f_v B/3 with
-    B >= 0, and the lower end, which is the upper end of -f negated, in the same way.
+    Both ends increase with the slope, or stay: the slope enters the upper end as f_v B/3 with B >=
+    0, and the lower end, which is the upper end of -f negated, in the same way.
     """
 
     radius: Real
@@ -91,8 +94,8 @@ class BoundedLaplacianEnclosure(Enclosure):
     def from_promise(
         cls, promise: Promise, value: Real, error: Real, slopes: SlopeRange
     ) -> Self | None:
-        """The enclosure from a `BoundedLaplacian`; None for another kind of promise, and if the
-        promise bounds f on one side only.
+        """Return the enclosure from a `BoundedLaplacian`; None for another kind of promise, and if
+        the promise bounds f on one side only.
 
         value, error: f at the center of the ball, and a bound of its error.
         slopes: the range of the derivative of f along the path there.
@@ -113,15 +116,20 @@ class BoundedLaplacianEnclosure(Enclosure):
         laplacian: tuple[Real, Real],
         slopes: SlopeRange,
     ) -> Self:
-        """The enclosure from bounds on a ball.
+        """Return the enclosure from bounds of a function on a ball.
 
+        radius: the radius of the ball.
         ranges: two differences in value: how far the function may fall from its value at the
             center, and how far it may rise.
         laplacian: a lower and an upper bound of its Laplacian on the ball.
         slopes: the range of its derivative along the path at the center.
+
+        A range of the Laplacian that is empty or NaN gives a spread that is NaN, so that nothing is
+        proved.
         """
         half = 0.5 * radius * radius
         lower, upper = half * laplacian[0], half * laplacian[1]
+        # m R^2 and l R^2: both ends were multiplied by R^2/2.
         mean, spread = lower + upper, upper - lower
         # [mean - spread, mean + spread] contains both ends, whatever the roundings.
         rounding = 4 * float(dr.epsilon(type(spread))) if dr.is_array_v(spread) else 0.0
@@ -129,6 +137,8 @@ class BoundedLaplacianEnclosure(Enclosure):
         return cls(radius, *ranges, mean, spread, slopes)
 
     def free_length(self, gaps: LevelGaps) -> Real:
+        """Return the shorter of the lengths on which f is proved not to reach the level above and
+        the level below."""
         above, below = self._conditions(gaps)
         q = fmin(
             largest_free_fraction(above, self.solver_iterations),
@@ -137,6 +147,7 @@ class BoundedLaplacianEnclosure(Enclosure):
         return dr.select(self._is_known(gaps), q * self.radius, 0)
 
     def is_free(self, gaps: LevelGaps, length: Real) -> Mask:
+        """Return the mask of lanes on which f is proved to reach neither level on the length."""
         above, below = self._conditions(gaps)
         q = length / self.radius
         is_inside = (q <= 1) & self._is_known(gaps)
@@ -144,18 +155,18 @@ class BoundedLaplacianEnclosure(Enclosure):
         return (length <= 0) | (is_inside & is_free_fraction(above, q) & is_free_fraction(below, q))
 
     def _is_known(self, gaps: LevelGaps) -> Mask:
-        """A mask of the lanes on which the bounds and the gaps (differences of value to the next
-        levels) are numbers, and neither too large nor too small to divide by."""
+        """Return the mask of lanes on which the bounds and the gaps (differences between f(p) and
+        the next levels) are numbers, and neither too large nor too small to divide by."""
         is_valid = (gaps.below >= 0) & (gaps.above >= 0) & dr.isfinite(self.laplacian_mean)
         for x in (self.max_fall + self.max_rise, self.laplacian_spread):
             is_valid = is_valid & ((x == 0) | (dr.isfinite(1 / x) & dr.isfinite(4 * x)))
         return is_valid
 
     def _conditions(self, gaps: LevelGaps) -> tuple[_GreenCondition, _GreenCondition]:
-        """Two conditions on a length of the path: for f not to reach the level above on it, and for
-        f not to reach the level below.
+        """Return two conditions on a fraction of the radius: for f not to reach the level above on
+        it, and for f not to reach the level below.
 
-        gaps: the differences of value to these levels.
+        gaps: the differences between f(p) and these levels.
         """
         fall, rise, slopes = self.max_fall, self.max_rise, self.slopes
         return (
@@ -164,16 +175,16 @@ class BoundedLaplacianEnclosure(Enclosure):
         )
 
     def _growth(self, gap: Real, u: Real, rise: Real, mean: Real, slope: Real) -> _GreenCondition:
-        """The condition for f not to rise to the level above. With the numbers of -f in place of
-        those of f, it is the condition for f not to fall to the level below.
+        """Return the condition for f not to rise to the level above. With the numbers of -f in
+        place of those of f, it is the condition for f not to fall to the level below.
 
         All numbers of the condition are divided by w + l R^2, with R, l and w as in the proof of
         the class.
 
-        gap: the difference in value to the level.
+        gap: the difference between f(p) and the level.
         u: f(p) - c, how far f may fall on the ball.
         rise: how far f may rise on the ball.
-        mean: m R^2, the mean of the two bounds of the Laplacian times R^2/2.
+        mean: m R^2, the mean of the two bounds of the Laplacian times R^2.
         slope: the largest derivative along the path.
         """
         w = fmax(dr.fma(mean, 1 / 6, u), 0)
@@ -195,8 +206,9 @@ class BoundedLaplacianEnclosure(Enclosure):
 
 @dataclass(frozen=True)
 class _GreenCondition:
-    """The condition w (A-1) + s B + l kappa + m q^2/6 <= d on a fraction q of the radius, for f not
-    to reach a level at the gap d. The symbols are those of `BoundedLaplacianEnclosure`, with R = 1.
+    """The condition for f not to reach a level at the gap d, on a fraction q of the radius: w (A-1)
+    + s B + l kappa + m q^2/6 <= d. The symbols are those of `BoundedLaplacianEnclosure`, with R =
+    1.
 
     Let S = (1-q)^2 (1 + left side), which has no pole, and g = sqrt(1 + d) - 1. The condition is
     sqrt(S) <= (1 + g) (1-q), that is, q k(q) <= g with k = g + 1 + (sqrt(S) - 1)/q.
@@ -215,7 +227,8 @@ class _GreenCondition:
     mean: Real
 
     def expansion_at_zero(self) -> tuple[Real, Real]:
-        # The logarithm, taken at about the root for slope 0.
+        """Return k(0) and about k'(0). No proof relies on them."""
+        # ln(1/q) in kappa, taken at q = sqrt(gap), about the root for slope 0.
         log = clamp(-0.5 * dr.log(fmax(self.gap, 1e-12)), 0, 14)
         first = 3 * self.slope
         quadratic = dr.fma(GREEN_KERNEL_BOUND * self.spread, 2 + log, 5 * self.weight - 2 * first)
@@ -223,7 +236,8 @@ class _GreenCondition:
         return self.gap + 0.5 * first, second
 
     def __call__(self, q: Real) -> Real:
-        """The value k(q), in a form that does not cancel near q = 0."""
+        """Return k(q), in a form that does not cancel near q = 0. Here c is (S - 1)/q + 2, and root
+        is sqrt(S)."""
         s, r, p = q * q, 1 / (1 + q), 1 - q
         log = 2 - dr.log(fmax(q, 1e-30))
         inner = q * dr.fma(self.weight, 5 - s, GREEN_KERNEL_BOUND * self.spread * log)

@@ -1,4 +1,6 @@
-"""Enclosures, which prove how far f can move along a path, and their inputs.
+"""Enclosures, which bound how far a function f can change along a path, and their inputs. f is
+sampled at a point of the path (mostly a ray); F(s) is the change of f at the length s beyond that
+point. A level is a value of f that rays look for; a length is free if f takes no level on it.
 
 - `Enclosure`: the base of all enclosures. A new proof is a class derived from it, in this package.
 - `PathRestriction`: f along a path, for enclosures that use ranges of its derivatives on pieces of
@@ -27,7 +29,8 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class PathPiece:
-    """A piece of a path, with ranges of F' and F'' on it, where F is the function along the path.
+    """A piece of a path, with ranges of the first two derivatives F' and F'' on it. F is the change
+    of the function f along the path, as a function of the length.
 
     length: the length of the piece.
     slope_range: the range of F' on the piece.
@@ -42,7 +45,8 @@ class PathPiece:
 
 
 class PathRestriction(Protocol):
-    """A function f restricted to a path, with computable ranges of its derivatives.
+    """A function f restricted to a path (a ray), with computable ranges of its derivatives along
+    it.
 
     piece_count: the number of pieces into which the path is best cut, found by experiment.
     """
@@ -51,8 +55,8 @@ class PathRestriction(Protocol):
     def piece_count(self) -> int: ...
 
     def derivative_ranges(self, knots: Sequence[Real]) -> tuple[PathPiece, ...]:
-        """Ranges of the derivatives of F(s) = f(path(t+s)) on the pieces between each knot and the
-        next.
+        """Return ranges of the derivatives of F(s) = f(path(t+s)) on the pieces of the path between
+        each knot and the next.
 
         knots: increasing lengths s, the first of them 0.
         """
@@ -61,14 +65,15 @@ class PathRestriction(Protocol):
 
 @runtime_checkable
 class EvaluableRestriction(Protocol):
-    """A function given by a formula along a path, which can be evaluated in any arithmetic."""
+    """A function along a path (a ray) that is given by a formula in x, y and z. It can be evaluated
+    in any arithmetic, such as that of intervals."""
 
     def evaluate_with(self, coordinates: Callable[[Vec3, Vec3], tuple[Any, Any, Any]]) -> Any:
-        """The value of the formula at (x, y, z) = coordinates(p, d).
+        """Return the value of the formula at (x, y, z) = coordinates(p, d), in the arithmetic of
+        these coordinates.
 
         coordinates: a function of the start p and the direction d of the path. It returns the three
-            coordinates along the path as numbers of some arithmetic, such as jets or intervals; the
-            result is a number of that arithmetic.
+            coordinates along the path as numbers of some arithmetic, such as jets or intervals.
         """
         ...
 
@@ -80,7 +85,8 @@ STEP_SAFETY = 1.0 - 1e-6
 
 @dataclass(frozen=True)
 class LevelGaps:
-    """The differences in value, >= 0, between f and the next level below and the next level above.
+    """The differences in value, >= 0, between f at a point and the next level below and the next
+    level above. A level is a value of f that rays look for.
 
     below, above: the two differences; infinite if there is no level on that side.
     is_one_sided: whether at most one of the two is finite on every lane, as with a single level.
@@ -93,22 +99,22 @@ class LevelGaps:
 
     @property
     def nearest(self) -> Real:
-        """The difference in value to the nearest level."""
+        """The difference between f and the nearest level."""
         return fmin(self.below, self.above)
 
     def reduced_by(self, error: Real) -> LevelGaps:
-        """Lower bounds of the gaps, if the value may be wrong by `error`."""
+        """Return lower bounds of the gaps, for a value of f that may be wrong by `error`."""
         below, above = fmax(self.below - error, 0), fmax(self.above - error, 0)
         return LevelGaps(below, above, self.is_one_sided)
 
     def swapped(self) -> LevelGaps:
-        """The gaps of -f: below and above exchanged."""
+        """Return the gaps of -f: below and above exchanged."""
         return LevelGaps(self.above, self.below, self.is_one_sided)
 
 
 @dataclass(frozen=True)
 class SlopeRange:
-    """An interval that contains the derivative of f along a unit direction.
+    """An interval that contains the derivative of a function f along a unit direction at a point.
 
     lower, upper: its ends, in units of f per length.
     """
@@ -118,29 +124,31 @@ class SlopeRange:
 
     @classmethod
     def around(cls, slope: Real, error: Real) -> SlopeRange:
-        """The interval of slopes within `error` of `slope`.
+        """Return the interval of slopes within `error` of `slope`.
 
-        An error that is the Python float 0.0 costs no operation.
+        An error that is the Python float 0.0 adds no operation to the kernel.
         """
         if isinstance(error, float) and error == 0.0:
             return cls(slope, slope)
         return cls(slope - error, slope + error)
 
     def negated(self) -> SlopeRange:
-        """The range of the derivative along the opposite direction: the negated ends, exchanged."""
+        """Return the range of the derivative along the opposite direction: the negated ends,
+        exchanged."""
         return SlopeRange(-self.upper, -self.lower)
 
 
 class Enclosure(abc.ABC):
-    """A proof that F stays within an interval that depends on s, for 0 <= s < reach.
+    """A proof that F stays within an interval that depends on s, for 0 <= s < reach. F(s) =
+    f(path(t+s)) - f(path(t)) is the change of f from its value at a sample, at the length s beyond
+    it. A level is a value of f that rays look for; a length s is free if F takes no level on it.
+    The gaps (`LevelGaps`) are the differences between f at the sample and the next levels below and
+    above.
 
-    F(s) = f(path(t+s)) - f(path(t)) is the movement of f relative to its value at a sample. In this
-    form two large numbers are never subtracted; in float32 rays would stall otherwise.
-
-    Its input are the gaps: the differences in value to the next level below and above
-    (`LevelGaps`). From them an enclosure proves a length free of levels (`free_length`), or decides
-    whether a given length is free (`is_free`). `is_free` takes one evaluation of the proof and no
-    solver; the tracer uses it for the way back from a sample.
+    As F is a change, two large numbers are never subtracted; in single precision rays would stall
+    otherwise. From the gaps an enclosure proves a free length (`free_length`), or decides whether a
+    given length is free (`is_free`). `is_free` takes one evaluation of the proof and no solver; the
+    tracer uses it for the way back from a sample.
 
     Each end of the interval must be an increasing function of the slope at the sample, or constant,
     and every proof says why it is. Then the upper end of a `SlopeRange` gives a bound of F from
@@ -150,18 +158,15 @@ class Enclosure(abc.ABC):
 
     @property
     def reach_growth(self) -> float:
-        """Up to which length the next sample should be bounded, as a multiple of the length proved
-        at this sample.
-
-        The best values were found by experiment.
-        """
+        """The length on which the next sample should be enclosed, as a multiple of the length that
+        was proved free at this sample. The best values were found by experiment."""
         return 2.0
 
     @classmethod
     def from_promise(
         cls, promise: Promise, value: Real, error: Real, slopes: SlopeRange
     ) -> Self | None:
-        """The enclosure that this class proves from a promise (a proved bound of f near the
+        """Return the enclosure that this class proves from a promise (a proved bound of f near the
         sample); None if it does not use promises of that kind.
 
         value: f at the sample.
@@ -175,8 +180,8 @@ class Enclosure(abc.ABC):
     def from_restriction(
         cls, function: PathRestriction, slopes: SlopeRange, length: Real
     ) -> Self | None:
-        """The enclosure that this class proves from ranges of the derivatives of f along the path;
-        None if this class does not use such ranges.
+        """Return the enclosure that this class proves from ranges of the derivatives of f along the
+        path; None if this class does not use such ranges.
 
         function: f along the path.
         slopes: the range of its derivative at the start of the path.
@@ -187,22 +192,33 @@ class Enclosure(abc.ABC):
 
     @abc.abstractmethod
     def free_length(self, gaps: LevelGaps) -> Real:
-        """A length L >= 0 such that f is proved to meet no level for 0 < s < L; NaN proves
-        nothing."""
+        """Return a length L >= 0 such that f is proved to take no level for 0 < s < L. NaN proves
+        nothing.
+
+        gaps: the differences between f at the sample and the next levels.
+        """
 
     def is_free(self, gaps: LevelGaps, length: Real) -> Mask:
-        """Whether f is proved to meet no level for 0 < s < length, a mask."""
+        """Return the mask of lanes on which f is proved to take no level for 0 < s < length.
+
+        gaps: the differences between f at the sample and the next levels.
+        """
         return length <= self.free_length(gaps)
 
     def arrives(self, gaps: LevelGaps, length: Real) -> Mask:
-        """Whether f is proved to take a level for some 0 <= s <= length, a mask."""
+        """Return the mask of lanes on which f is proved to take a level for some 0 <= s <= length.
+        Here it is False: only enclosures that prove a change of at least some size override it.
+
+        gaps: the differences between f at the sample and the next levels.
+        """
         del length
-        return (gaps.above == gaps.above) & False
+        return (gaps.above == gaps.above) & False  # False, as an array of the width of the gaps
 
 
 @dataclass(frozen=True)
 class Levels:
-    """The levels that rays look for: a finite set, repeated with `period` if there is one.
+    """The levels: the values of a function f that rays look for. They are a finite set, repeated
+    with `period` if there is one.
 
     An angle-valued function is known up to multiples of its period. Its levels are then each of the
     values plus every multiple of the period (paper, Alg. 2). The printed algorithm omits a
@@ -218,7 +234,7 @@ class Levels:
     period: float | None = None
 
     def gaps(self, f: Real) -> LevelGaps:
-        """The differences in value between f and the next level below and above.
+        """Return the differences between the value f and the next level below and above.
 
         A difference is infinite if there is no such level. If f is a level, the gap on one side is
         0, and with a period the gap on the other side is at most the period. The gaps are NaN where
@@ -242,6 +258,6 @@ class Levels:
         return LevelGaps(below, above, len(self.values) == 1 and self.period is None)
 
     def offset_to_nearest(self, f: Real) -> Real:
-        """The difference level - f for the level nearest to f."""
+        """Return the difference level - f for the level nearest to the value f."""
         gaps = self.gaps(f)
         return dr.select(gaps.above < gaps.below, gaps.above, -gaps.below)

@@ -1,4 +1,7 @@
-"""Enclosures of functions that are made of several functions, or of one function by a map.
+"""Enclosures of functions that are made of several functions, or of one function by a map. An
+enclosure bounds how far a function can change along a path (a ray) from its value at a sample; so
+it proves a length on which the function takes no level, a value that rays look for. The gaps are
+the differences between the value and the next levels below and above.
 
 - `MaximumEnclosure`, with `NegatedEnclosure` and `ScaledEnclosure`: unions, intersections and
   differences of solids, and solids that were moved and scaled.
@@ -24,11 +27,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class MaximumOperand:
-    """One of the functions f_i of max f_i, at a sample.
+    """One of the functions f_i of max f_i, at a sample, with enclosures of its change along the
+    path.
 
-    min_deficit, max_deficit: bounds, rounding included, of the difference max f_j - f_i at the
-        sample.
-    enclosures: enclosures of the movement of f_i along the path.
+    min_deficit, max_deficit: bounds, rounding included, of the deficit max f_j - f_i at the sample.
+    enclosures: enclosures of the change of f_i along the path.
     """
 
     min_deficit: Real
@@ -50,57 +53,63 @@ class MaximumEnclosure(Enclosure):
     operands: tuple[MaximumOperand, ...]
 
     def free_length(self, gaps: LevelGaps) -> Real:
-        """The shorter of two lengths: the length on which no operand rises to the level above, and
-        the longest length on which some operand is proved not to fall to the level below.
+        """Return the shorter of two lengths: the length on which no operand rises to the level
+        above, and the longest length on which some operand is proved not to fall to the level
+        below.
 
         gaps: the differences between the maximum and these levels. If both are infinite, the result
             is the length on which the enclosures of all operands are valid.
         """
-        infty = type(gaps.above)(dr.inf)
-        rise_length, fall_length = infty, type(gaps.above)(0)
+        infinity = type(gaps.above)(dr.inf)
+        rise_length, fall_length = infinity, type(gaps.above)(0)
         for operand in self.operands:
-            rise, fall = self._gaps(gaps, operand)
-            rise_length = fmin(longest_free_length(operand.enclosures, rise), rise_length)
-            length = longest_free_length(operand.enclosures, fall)
+            rise_gaps, fall_gaps = self._gaps(gaps, operand)
+            rise_length = fmin(longest_free_length(operand.enclosures, rise_gaps), rise_length)
+            length = longest_free_length(operand.enclosures, fall_gaps)
             # An operand that may lie below the level already proves nothing, whatever its slope.
-            fall_length = fmax(dr.select(fall.below > 0, length, 0), fall_length)
-        rise_length = dr.select(gaps.above == dr.inf, infty, rise_length)
-        fall_length = dr.select(gaps.below == dr.inf, infty, fall_length)
+            fall_length = fmax(dr.select(fall_gaps.below > 0, length, 0), fall_length)
+        rise_length = dr.select(gaps.above == dr.inf, infinity, rise_length)
+        fall_length = dr.select(gaps.below == dr.inf, infinity, fall_length)
         free = fmin(rise_length, fall_length)
-        return dr.select(free == dr.inf, self._shared_valid_length(infty), free)
+        return dr.select(free == dr.inf, self._shared_valid_length(infinity), free)
 
     def is_free(self, gaps: LevelGaps, length: Real) -> Mask:
+        """Return the mask of lanes on which, for the given length, no operand rises to the level
+        above, and at least one operand is proved not to fall to the level below."""
+        # Start with True (where the gap is a number), and with whether no level lies below.
         free_above, free_below = gaps.above == gaps.above, gaps.below == dr.inf
         for operand in self.operands:
-            rise, fall = self._gaps(gaps, operand)
-            free_above &= any_is_free(operand.enclosures, rise, length)
-            free_below |= (fall.below > 0) & any_is_free(operand.enclosures, fall, length)
+            rise_gaps, fall_gaps = self._gaps(gaps, operand)
+            free_above &= any_is_free(operand.enclosures, rise_gaps, length)
+            free_below |= (fall_gaps.below > 0) & any_is_free(operand.enclosures, fall_gaps, length)
         return (free_above | (gaps.above == dr.inf)) & free_below
 
-    def _shared_valid_length(self, infty: Real) -> Real:
-        """The length, from the start of the path, on which the enclosures of all operands are
-        valid: the smallest of the lengths that they prove if there is no level.
+    def _shared_valid_length(self, infinity: Real) -> Real:
+        """Return the length, from the start of the path, on which the enclosures of all operands
+        are valid: the smallest of the lengths that they prove if there is no level.
 
-        infty: infinity, as a number of the backend.
+        infinity: infinity, as a number of the backend.
         """
-        length = infty
+        length = infinity
         for operand in self.operands:
-            length = fmin(longest_free_length(operand.enclosures, LevelGaps(infty, infty)), length)
+            length = fmin(
+                longest_free_length(operand.enclosures, LevelGaps(infinity, infinity)), length
+            )
         return length
 
     @staticmethod
     def _gaps(gaps: LevelGaps, operand: MaximumOperand) -> tuple[LevelGaps, LevelGaps]:
-        """The gap by which an operand must rise for the maximum to meet the level above, and the
-        gap by which it must fall for the maximum to meet the level below.
+        """Return the gap by which an operand must rise for the maximum to meet the level above, and
+        the gap by which it must fall for the maximum to meet the level below.
 
         gaps: the differences between the maximum and these levels.
 
         Each of the two results is a `LevelGaps` in which only that one gap may be finite.
         """
-        infty = type(gaps.above)(dr.inf)
+        infinity = type(gaps.above)(dr.inf)
         return (
-            LevelGaps(infty, gaps.above + operand.min_deficit, is_one_sided=True),
-            LevelGaps(fmax(gaps.below - operand.max_deficit, 0), infty, is_one_sided=True),
+            LevelGaps(infinity, gaps.above + operand.min_deficit, is_one_sided=True),
+            LevelGaps(fmax(gaps.below - operand.max_deficit, 0), infinity, is_one_sided=True),
         )
 
 
@@ -130,9 +139,9 @@ class ScaledEnclosure(Enclosure):
 
     Proof. A length s of the path becomes the length speed * s of the mapped path. h differs from a
     level by g if and only if f differs by g/value_factor from the level divided by value_factor. So
-    a length that `inner` proves free for the gaps divided by value_factor is, divided by speed,
-    free here. Both factors have errors of a few roundings; the gaps and the length are shortened by
-    more than that (`STEP_SAFETY`).
+    a length that `inner` proves free of levels for the gaps divided by value_factor is, divided by
+    speed, free here. Both factors have errors of a few roundings; the gaps and the length are
+    shortened by more than that (`STEP_SAFETY`).
     """
 
     inner: Enclosure
@@ -146,22 +155,24 @@ class ScaledEnclosure(Enclosure):
         return self.inner.is_free(self._gaps(gaps), length * self.speed / STEP_SAFETY)
 
     def _gaps(self, gaps: LevelGaps) -> LevelGaps:
-        """The gaps of f (differences of value to the next levels), from those of value_factor *
-        f."""
+        """Return the gaps of f (differences between its value and the next levels), from those of
+        value_factor * f."""
         factor = STEP_SAFETY / self.value_factor
         below, above = _scaled(gaps.below, factor), _scaled(gaps.above, factor)
         return LevelGaps(below, above, gaps.is_one_sided)
 
 
 def _scaled(gap: Real, factor: Real) -> Real:
-    """The gap times a positive factor. A finite gap stays finite, even if the product overflows."""
+    """Return the gap times a positive factor. A finite gap stays finite, even if the product
+    overflows."""
     largest = type(gap)(dr.largest(type(gap)))
     return dr.select(gap == dr.inf, gap, fmin(largest, gap * factor))
 
 
 @dataclass(frozen=True)
 class BranchSample:
-    """One branch phi_j of a multivalued function at a sample, continued along the path.
+    """One branch phi_j of a multivalued function at a sample of a path. Followed along the path,
+    the branch is a smooth function.
 
     slopes: the range of the derivative of |phi_j| along the path at the sample.
     excess: |phi_j| minus the smallest |phi_i| at the sample, minus a bound of its rounding error.
@@ -173,19 +184,19 @@ class BranchSample:
 
 @dataclass(frozen=True)
 class NearestBranchEnclosure(Enclosure):
-    """An enclosure of f = s min_j |phi_j| along a path, where s is the sign of the product of all
-    phi_j.
+    """An enclosure of f = s min_j |phi_j| along a path, where phi_j are the branches of a
+    multivalued function and s is the sign of the product of all phi_j. So f is zero if and only if
+    one of the phi_j is: the level set f = 0 consists of the surfaces of all branches.
 
     Such an f is continuous and single-valued wherever the set of all phi_j is, however the branches
-    are numbered, because s changes only where the minimum is 0. f is zero if and only if one of the
-    phi_j is.
+    are numbered, because s changes only where the minimum is 0.
 
     branches: a sample of each phi_j.
     nearest: the sample of the phi_j with the smallest |phi_j|.
     distance: |f| at the sample.
     is_positive: whether f is positive at the sample.
-    second_derivative_bound: a bound of all |phi_j''| along the path, for continuations without a
-        jump.
+    second_derivative_bound: a bound of all |phi_j''| along the path, if each branch is continued
+        without a jump.
     reach: the length on which this bound holds.
 
     Proof. Let g_j be phi_j or -phi_j, whichever has the sign of f at the start. A g_j falls at most
@@ -199,7 +210,7 @@ class NearestBranchEnclosure(Enclosure):
 
     Then for a level away from zero. f stays below a level f + a as long as |g_i| does, where phi_i
     is the nearest branch at the start. This holds as long as g_i has neither risen by a nor fallen
-    by 2 f + a. So a step is proved free of all branches, not of the nearest one alone, and another
+    by 2 f + a. So a step is proved for all branches, not for the nearest one alone, and another
     branch may become the nearest on the way.
     """
 
@@ -211,23 +222,28 @@ class NearestBranchEnclosure(Enclosure):
     reach: Real
 
     def free_length(self, gaps: LevelGaps) -> Real:
-        """The shortest of the lengths that the two parts of the class's proof give, over all
+        """Return the shortest of the lengths that the two parts of the class's proof give, over all
         branches.
 
         gaps: the differences between f and the next level below and above.
         """
-        towards = dr.select(self.is_positive, gaps.below, gaps.above)
-        away = dr.select(self.is_positive, gaps.above, gaps.below)
-        length = first_reach(away, self.nearest.slopes.upper, self.second_derivative_bound)
+        gap_towards_zero = dr.select(self.is_positive, gaps.below, gaps.above)
+        gap_away = dr.select(self.is_positive, gaps.above, gaps.below)
+        # The nearest branch may neither rise by the gap away from zero nor fall by 2 |f| more than
+        # it.
+        length = first_reach(gap_away, self.nearest.slopes.upper, self.second_derivative_bound)
         length = fmin(
             first_reach(
-                away + 2 * self.distance, -self.nearest.slopes.lower, self.second_derivative_bound
+                gap_away + 2 * self.distance,
+                -self.nearest.slopes.lower,
+                self.second_derivative_bound,
             ),
             length,
         )
+        # Comparisons with NaN are False, so that it proves nothing.
         is_valid = (length >= 0) & (self.distance >= 0)
         for branch in self.branches:
-            gap = fmax(towards + branch.excess, 0)
+            gap = fmax(gap_towards_zero + branch.excess, 0)
             branch_length = first_reach(gap, -branch.slopes.lower, self.second_derivative_bound)
             is_valid &= branch_length >= 0
             length = fmin(length, branch_length)
@@ -243,14 +259,14 @@ _TRIED_FRACTIONS = (0.5, 0.95)
 
 @dataclass(frozen=True)
 class BranchPointEnclosure(Enclosure):
-    """The movement of f = s min_j |h - u_j| near a branch point a, where all branches u_j are close
-    to one value c.
+    """An enclosure of f = s min_j |h - u_j| along a path near a branch point a, where all branches
+    u_j of a multivalued function of the plane are close to one value c. h is the height of a point
+    of space, and s the sign of the product of all h - u_j. So f is 0 on the surfaces h = u_j.
 
-    h is the height of a point of space, s the sign of the product of all h - u_j. The branches pass
-    into each other around the line z = a. Let r be the distance from this line. Within a radius R
-    of it, |u_j - c| <= C r^alpha with alpha > 0, for all branches (up to a period). A parabola
-    proves only short lengths there: second derivatives grow without bound, though the branches
-    hardly move.
+    The branches pass into each other around the line z = a. Let r be the distance from this line.
+    Within a radius R of it, |u_j - c| <= C r^alpha with alpha > 0, for all branches (up to a
+    period). A parabola proves only short lengths there: second derivatives grow without bound,
+    though the branches hardly move.
 
     Proof. Let y = |h - c| at the start, and v the largest rate at which it decreases along the
     path. On a disk of radius r <= R about the line, and for a length L of the path, all |h - u_j|
@@ -282,28 +298,37 @@ class BranchPointEnclosure(Enclosure):
     is_positive: Mask
 
     def free_length(self, gaps: LevelGaps) -> Real:
-        """The longest of the lengths that the class's proof gives for the values of q that are
-        tried; 0 if there is a level farther from zero than f."""
-        towards = dr.select(self.is_positive, gaps.below, gaps.above)
-        away = dr.select(self.is_positive, gaps.above, gaps.below)
-        w = self.distance_to_limit - fmax(self.distance - towards, 0)
-        total = w + self.distance + towards + self.max_fall_rate + self.speed
-        w = dr.select(total == total, w, 0)  # NaN proves nothing
+        """Return the longest of the lengths that the class's proof gives for the values of q that
+        are tried; 0 if there is a level farther from zero than f.
+
+        The path leaves the disk of radius r at the length closest_parameter + sqrt(r^2 -
+        closest_distance^2) of its projection; so the free length is at most that, divided by speed.
+        """
+        gap_towards_zero = dr.select(self.is_positive, gaps.below, gaps.above)
+        gap_away = dr.select(self.is_positive, gaps.above, gaps.below)
+        w = self.distance_to_limit - fmax(self.distance - gap_towards_zero, 0)
+        any_nan = w + self.distance + gap_towards_zero + self.max_fall_rate + self.speed
+        w = dr.select(any_nan == any_nan, w, 0)  # NaN proves nothing
+        # Zero, as an array.
         best = 0 * self.distance_to_limit
         for q in _TRIED_FRACTIONS:
-            power = fmax(q * w / self.constant, 0)
-            radius = dr.power(power, 1 / self.exponent) * _POWER_SAFETY
-            radius = dr.select(dr.isfinite(power) & (radius >= 0), fmin(radius, self.max_radius), 0)
-            chord = (radius - self.closest_distance) * (radius + self.closest_distance)
-            exit_length = self.closest_parameter + dr.sqrt(fmax(chord, 0))
+            radius_power = fmax(q * w / self.constant, 0)
+            radius = dr.power(radius_power, 1 / self.exponent) * _POWER_SAFETY
+            radius = dr.select(
+                dr.isfinite(radius_power) & (radius >= 0), fmin(radius, self.max_radius), 0
+            )
+            squared_half_chord = (radius - self.closest_distance) * (radius + self.closest_distance)
+            exit_length = self.closest_parameter + dr.sqrt(fmax(squared_half_chord, 0))
             exit_length = dr.select(self.speed > 0, exit_length / self.speed, dr.inf)
             length = dr.select(self.max_fall_rate > 0, (1 - q) * w / self.max_fall_rate, dr.inf)
             length = fmin(exit_length, length)
-            inside = (
+            starts_inside = (
                 self.closest_distance * self.closest_distance
                 + self.closest_parameter * self.closest_parameter
                 < radius * radius
             )
-            valid = inside & (w > 0) & (chord > 0) & dr.isfinite(chord)  # squares may overflow
-            best = fmax(dr.select(valid, length, 0), best)
-        return dr.select(away == dr.inf, best * _POWER_SAFETY, 0)
+            is_valid = (
+                starts_inside & (w > 0) & (squared_half_chord > 0) & dr.isfinite(squared_half_chord)
+            )  # squares may overflow
+            best = fmax(dr.select(is_valid, length, 0), best)
+        return dr.select(gap_away == dr.inf, best * _POWER_SAFETY, 0)

@@ -1,12 +1,15 @@
 """The solver that all proofs on a ball share, and `HarmonicBallEnclosure`, for harmonic functions.
+f is a function that is bounded on a ball B(p, R) about a point p of a ray; a length of the ray from
+p on is free if f takes no level (a value that rays look for) on it.
 
-A proof on a ball B(p, R) shows that all lengths up to q R are free of levels if
+A proof on the ball shows that all lengths up to q R are free if
 
     q k(q) <= gap,
 
-where k has no poles on [0, 1] and the gap has no unit. `largest_free_fraction` finds the largest
-such q from below. Large numbers are never subtracted, so the error of q is small relative to q.
-Near a surface the gap is tiny; if only the absolute error of q were small, rays would stall there.
+where k has no poles on [0, 1], and the gap is the difference between f(p) and a level, divided by a
+difference of values so that it has no unit. `largest_free_fraction` finds the largest such q from
+below. Large numbers are never subtracted, so the error of q is small relative to q. Near a surface
+the gap is tiny; if only the absolute error of q were small, rays would stall there.
 """
 
 from __future__ import annotations
@@ -34,28 +37,30 @@ _ROUNDINGS = 16.0
 
 
 class FreeRadiusCondition(Protocol):
-    """A condition q k(q) <= gap which proves that all of [0, q] is free of levels.
+    """A condition q k(q) <= gap for 0 <= q <= 1, with a function k and a number gap >= 0. If it
+    holds, f is proved to take no level on a ray within q times the radius of a ball about its
+    start: all of [0, q] is free.
 
-    q is a length as a fraction of the ball's radius. The product q k(q) crosses the gap at most
-    once on [0, 1], upwards.
+    The product q k(q) crosses the gap at most once on [0, 1], upwards. So if a q satisfies the
+    condition, all smaller ones do.
     """
 
     @property
     def gap(self) -> Real: ...
 
     def __call__(self, q: Real) -> Real:
-        """The value k(q)."""
+        """Return k(q)."""
         ...
 
     def expansion_at_zero(self) -> tuple[Real, Real]:
-        """k(0) and k'(0), which give the first candidate; no proof relies on them."""
+        """Return k(0) and k'(0), or approximations. They give the solver's first candidate; no
+        proof relies on them."""
         ...
 
 
 def condition_rounding(real: Any) -> float:
-    """A bound of the rounding error of the function k in a condition q k(q) <= gap
-    (`FreeRadiusCondition`), which proves a ball's radius times q to be free of levels. It is added
-    to the computed k.
+    """Return a bound of the rounding error of the function k in a condition q k(q) <= gap
+    (`FreeRadiusCondition`). It is added to the computed k.
 
     real: the Dr.Jit type of the numbers, single or double precision.
     """
@@ -63,14 +68,15 @@ def condition_rounding(real: Any) -> float:
 
 
 def is_free_fraction(condition: FreeRadiusCondition, q: Real) -> Mask:
-    """A mask of the lanes on which all of [0, q] is proved free of levels, for fractions q of the
-    ball's radius, 0 <= q <= 1."""
+    """Return the mask of lanes on which a condition proves that f takes no level on all of [0, q],
+    for fractions q of the ball's radius, 0 <= q <= 1."""
     rounding = condition_rounding(type(q))
     return q * (condition(q) + rounding) <= condition.gap * CONDITION_SAFETY
 
 
 def largest_free_fraction(condition: FreeRadiusCondition, rounds: int) -> Real:
-    """The largest fraction q in [0, 1) of the radius that is proved free, found from below.
+    """Return the largest fraction q in [0, 1) of the ball's radius on which a condition proves that
+    f takes no level, found from below.
 
     rounds: the number of iterations. Four come within 1e-5 of the largest q for four balls in five,
         and within a few percent unless the extremal measure is concentrated in 1e-3 of the sphere;
@@ -88,21 +94,34 @@ def largest_free_fraction(condition: FreeRadiusCondition, rounds: int) -> Real:
     previous_q = real(0)
     previous_k, slope = condition.expansion_at_zero()
     q = clamp(_root(gap, previous_k, slope), 0, 1)
+    # The largest q that is proved, and the smallest that failed; the solution lies between.
     safe, low_excess = real(0), -gap  # q k(q) - gap at the ends of the bracket
     unsafe, high_excess = real(1), real(dr.inf)
     for i in range(rounds):
+        # The last candidate, by the chord; without a failed q it is the candidate at hand.
         if i == rounds - 1:
-            t = dr.select(dr.isfinite(high_excess), low_excess / (low_excess - high_excess), 1)
-            q = fmax(safe, dr.select(dr.isfinite(high_excess), dr.fma(t, unsafe - safe, safe), q))
+            chord_fraction = dr.select(
+                dr.isfinite(high_excess), low_excess / (low_excess - high_excess), 1
+            )
+            q = fmax(
+                safe,
+                dr.select(dr.isfinite(high_excess), dr.fma(chord_fraction, unsafe - safe, safe), q),
+            )
             q = q * CONDITION_SAFETY
         # Candidates aim at twice the slack, so that rounding does not fail them.
         k = condition(q) + 2 * rounding
         excess = dr.fma(q, k - rounding, -gap)
         is_free: Mask = excess <= 0
-        better = is_free & (q >= safe)
-        safe, low_excess = dr.select(better, q, safe), dr.select(better, excess, low_excess)
-        worse = ~is_free & (q <= unsafe)
-        unsafe, high_excess = dr.select(worse, q, unsafe), dr.select(worse, excess, high_excess)
+        raises_safe = is_free & (q >= safe)
+        safe, low_excess = (
+            dr.select(raises_safe, q, safe),
+            dr.select(raises_safe, excess, low_excess),
+        )
+        lowers_unsafe = ~is_free & (q <= unsafe)
+        unsafe, high_excess = (
+            dr.select(lowers_unsafe, q, unsafe),
+            dr.select(lowers_unsafe, excess, high_excess),
+        )
         step = q - previous_q
         slope = dr.select(step == 0, 0, (k - previous_k) / step)
         previous_q, previous_k = q, k
@@ -111,7 +130,7 @@ def largest_free_fraction(condition: FreeRadiusCondition, rounds: int) -> Real:
 
 
 def _root(gap: Real, constant: Real, slope: Real) -> Real:
-    """The positive root x of x (constant + slope x) = gap; 1 if there is none."""
+    """Return the positive root x of x (constant + slope x) = gap; 1 if there is none."""
     root = dr.sqrt(fmax(dr.fma(constant, constant, 4 * slope * gap), 0))
     # Two forms of the same root, each used where the other one cancels.
     is_rising = constant > 0
@@ -128,11 +147,12 @@ _RADIUS_SAFETY = 1.0 - 1e-6
 @dataclass(frozen=True)
 class HarmonicBallEnclosure(Enclosure):
     """Base of enclosures of a function f that is harmonic and bounded on a ball B(p, radius) of
-    R^dimension.
+    R^dimension. An enclosure bounds the change of f along a ray from p. The gaps are the
+    differences between f(p) and the next levels (values that rays look for) below and above.
 
     max_fall, max_rise: how far f may fall below, and rise above, its value f(p) on the ball; None
         for a side on which it is not bounded. In this form two large numbers are never subtracted.
-    slopes: the range of the derivative of f along the path at p.
+    slopes: the range of the derivative of f along the ray at p.
     """
 
     radius: Real
@@ -145,8 +165,8 @@ class HarmonicBallEnclosure(Enclosure):
     def from_promise(
         cls, promise: Promise, value: Real, error: Real, slopes: SlopeRange
     ) -> Self | None:
-        """The enclosure from a `HarmonicBall`; None for another kind of promise, and for a ball on
-        which f is not bounded on the sides that this class needs.
+        """Return the enclosure from a `HarmonicBall`; None for another kind of promise, and for a
+        ball on which f is not bounded on the sides that this class needs.
 
         value, error: f at the center of the ball, and a bound of its error.
         slopes: the range of the derivative of f along the path there.
@@ -159,18 +179,20 @@ class HarmonicBallEnclosure(Enclosure):
         return cls(radius, max_fall, max_rise, promise.dimension, slopes)
 
     def is_valid(self, gaps: LevelGaps) -> Mask:
-        """A mask of the lanes on which the bounds and the gaps are numbers, and the bounds large
-        enough to divide by."""
-        valid = (gaps.below >= 0) & (gaps.above >= 0)
+        """Return the mask of lanes on which the bounds and the gaps are numbers, and the bounds
+        large enough to divide by."""
+        can_prove = (gaps.below >= 0) & (gaps.above >= 0)
         for movement in (self.max_fall, self.max_rise):
             if movement is not None:
-                valid &= (movement == 0) | (dr.isfinite(1 / movement) & dr.isfinite(2 * movement))
-        return valid
+                can_prove &= (movement == 0) | (
+                    dr.isfinite(1 / movement) & dr.isfinite(2 * movement)
+                )
+        return can_prove
 
     @classmethod
     def applies_to(cls, dimension: int, is_bounded_below: bool, is_bounded_above: bool) -> bool:
-        """Whether this class has a proof for balls of this dimension, if f is bounded on these
-        sides."""
+        """Return whether this class has a proof for balls of this dimension, if f is bounded on
+        these sides. One bounded side is enough here."""
         del dimension
         return is_bounded_below or is_bounded_above
 
@@ -178,8 +200,8 @@ class HarmonicBallEnclosure(Enclosure):
 def allowed_movement(
     promise: HarmonicBall | BoundedLaplacian, value: Real, error: Real
 ) -> tuple[Real, Real | None, Real | None]:
-    """The radius of the ball on which a promise bounds f, how far f may fall on the ball below its
-    value at the center, and how far it may rise above it.
+    """Return the radius of the ball on which a promise bounds f, how far f may fall on the ball
+    below its value at the center, and how far it may rise above it.
 
     value: f at the center.
     error: a bound of the error of this value.
@@ -194,8 +216,8 @@ def allowed_movement(
     is_valid = promise.radius > 0
 
     def movement(end: Real, sign: float) -> Real | None:
-        """How far f may move to one end of the promised range; None if that end is infinite. It
-        clears the mask `is_valid` where the distance is NaN.
+        """Return how far f may move to one end of the promised range; None if that end is infinite.
+        Where the distance is NaN, the mask `is_valid` is cleared.
 
         end: the upper end, with sign 1, or the lower end, with sign -1.
         """

@@ -1,4 +1,6 @@
-"""Enclosures of functions that are harmonic and bounded on a ball: from the promise `HarmonicBall`.
+"""Enclosures of a function f that is harmonic and bounded on a ball B(p, R) about a point p of a
+ray. They prove a length of the ray on which f takes no level (a value that rays look for). The gap
+to a level is its difference from f(p); q is a length as a fraction of the radius R.
 
 - `HarnackEnclosure`: the published rule, Harnack's inequality from a lower bound alone.
 - `HarnackSlopeEnclosure`: Harnack's inequality that also uses the directional derivative.
@@ -30,33 +32,36 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class HarnackEnclosure(HarmonicBallEnclosure):
-    """Harnack's inequality for u = f - lower > 0 on B(p, R), the same in every direction.
+    """Harnack's inequality for a harmonic u = f - lower > 0 on the ball B(p, R), where `lower` is a
+    bound of f; it is the same in every direction. It bounds f at the fraction q of the radius from
+    p, and so proves a length on which f reaches no level.
 
-    Proof. u is a Poisson integral of a positive measure of mass u(p). Let n be the dimension,
-    q = |y-p|/R, and s the cosine of the angle between y - p and a boundary point. The kernel
-    P(q, s) = (1-q^2)/(1+q^2-2qs)^(n/2) lies between its values at s = -1 and s = 1, so
+    Proof. u is a Poisson integral of a positive measure of mass u(p). Let n be the dimension, q =
+    |y-p|/R, and s the cosine of the angle between y - p and a boundary point. The kernel P(q, s) =
+    (1-q^2)/(1+q^2-2qs)^(n/2) lies between its values at s = -1 and s = 1, so
 
         u(p) (1-q)/(1+q)^(n-1) <= u(y) <= u(p) (1+q)/(1-q)^(n-1).
 
-    The step is the q at which one of the two first reaches a level. With u = f - lower and
-    v = level - lower the root is, in forms that do not cancel near v = u (the printed Eq. 7 does:
-    20 % too long in float32 at |a-1| = 1e-6),
+    The step is the q at which one of the two first reaches a level. With u = f - lower and v =
+    level - lower the root is, in forms that do not cancel near v = u (the printed Eq. 7 does: 20 %
+    too long in float32 at |a-1| = 1e-6),
 
         n = 2:  |v-u| / (u+v)         n = 3:  2 |v-u| / (u + 2v + sqrt(u (u + 8v)))
 
-    and for n = 4 the cubic is solved by Newton's method from the safe side (`_fraction_4d_up`).
-    A level at or below `lower` cannot be reached inside the ball: the step is R. The slope is not
+    and for n = 4 the cubic is solved by Newton's method from the safe side (`_fraction_4d_up`). A
+    level at or below `lower` cannot be reached inside the ball: the step is R. The slope is not
     used.
 
     Source: Gillespie, Yang, Botsch, Crane 2024, Eq. 4-7 (n = 3) and Eq. 27 (n = 4).
     """
 
     def free_length(self, gaps: LevelGaps) -> Real:
+        """Return the length on which Harnack's inequality proves that f takes no level."""
         return dr.select(self.is_valid(gaps), self.radius * self._fraction(gaps), 0)
 
     def _fraction(self, gaps: LevelGaps) -> Real:
-        """The free length divided by the radius. If f is bounded on both sides, it is the larger of
-        the two fractions that the bounds prove."""
+        """Return the free length divided by the radius. If f is bounded on both sides, it is the
+        larger of the two fractions that the bounds prove."""
         lower = upper = None
         if self.max_fall is not None:
             lower = _fraction_from_one_side(self.max_fall, gaps.above, gaps.below, self.dimension)
@@ -70,15 +75,16 @@ class HarnackEnclosure(HarmonicBallEnclosure):
 
 
 def _fraction_from_one_side(u: Real, gap_away: Real, gap_toward: Real, dimension: int) -> Real:
-    """A fraction of the radius that Harnack's inequality proves free, for a positive harmonic
-    function.
+    """Return a fraction of the ball's radius on which Harnack's inequality proves that a positive
+    harmonic function u reaches no level.
 
     u: its value at the center.
     gap_away, gap_toward: the differences from u to the next level above, which is away from 0, and
         to the next level below, toward 0.
+    dimension: that of the ball; 2, 3 or 4.
     """
     growing, falling = _FRACTION_FORMULAS[dimension]
-    # u = 0 forces u to vanish identically: no level is ever reached.
+    # u = 0 forces u to vanish identically: no level is ever reached. Levels below 0 never are.
     up = dr.select((gap_away == dr.inf) | (u <= 0), 1, growing(u, u + gap_away, gap_away))
     v = u - gap_toward
     down = dr.select((v <= 0) | (gap_toward == dr.inf), 1, falling(u, fmax(v, 0), gap_toward))
@@ -86,30 +92,31 @@ def _fraction_from_one_side(u: Real, gap_away: Real, gap_toward: Real, dimension
 
 
 def _fraction_2d(u: Real, v: Real, gap: Real) -> Real:
-    """The fraction q of the radius at which u may first reach a level v, above or below, in the
-    plane.
+    """Return the fraction q of the radius at which a positive harmonic function may first reach a
+    level, above or below, in the plane.
 
-    u, v: the positive function at the center, and the level.
+    u, v: the function at the center, and the level.
     gap: |v - u|.
     """
     return gap / (u + v)
 
 
 def _fraction_3d(u: Real, v: Real, gap: Real) -> Real:
-    # Two square roots, as the product u (u + 8v) may underflow or overflow.
-    """The fraction q of the radius at which u may first reach a level v, above or below, in space.
+    """Return the fraction q of the radius at which a positive harmonic function may first reach a
+    level, above or below, in space.
 
-    u, v: the positive function at the center, and the level.
+    u, v: the function at the center, and the level.
     gap: |v - u|.
     """
+    # Two square roots, as the product u (u + 8v) may underflow or overflow.
     return 2 * gap / (u + 2 * v + dr.sqrt(u) * dr.sqrt(u + 8 * v))
 
 
 def _fraction_4d_up(u: Real, v: Real, gap: Real) -> Real:
-    """The fraction q of the radius at which u may first reach a level v > u in R^4, or slightly
-    less.
+    """Return the fraction q of the radius at which a positive harmonic function may first reach a
+    level v > u in R^4, or slightly less.
 
-    u, v: the positive function at the center, and the level.
+    u, v: the function at the center, and the level.
     gap: v - u.
 
     q solves (1+q)/(1-q)^3 = w with w = v/u. Newton's method approaches it from the safe side, in
@@ -129,10 +136,10 @@ def _fraction_4d_up(u: Real, v: Real, gap: Real) -> Real:
 
 
 def _fraction_4d_down(u: Real, v: Real, gap: Real) -> Real:
-    """The fraction q of the radius at which u may first reach a level v < u in R^4, or slightly
-    less.
+    """Return the fraction q of the radius at which a positive harmonic function may first reach a
+    level v < u in R^4, or slightly less.
 
-    u, v: the positive function at the center, and the level.
+    u, v: the function at the center, and the level.
     gap: u - v.
 
     q solves (1-q)/(1+q)^3 = v/u, and is the root of h(q) = gap - q (u + v (3 + 3q + q^2)), which
@@ -162,15 +169,15 @@ _UNREACHABLE_GAP = 1e18
 
 @dataclass(frozen=True)
 class HarnackSlopeEnclosure(HarmonicBallEnclosure):
-    """Harnack's inequality with the directional derivative, in 2, 3 and 4 dimensions.
-
-    f may be bounded on one side or on both sides.
+    """Harnack's inequality with the directional derivative, for a function f that is harmonic on a
+    ball B(p, R) of R^n, n = 2, 3 or 4, and bounded on one side or on both. It bounds f along a ray
+    from p, at the fraction q of the radius.
 
     Proof. Let u be positive and harmonic on B(p, R) of R^n, v a unit direction and q = t/R. Then
     u(p+tv) is the integral of P(q, s) dnu(s) over s in [-1, 1], where P(q, s) =
-    (1-q^2)/(1+q^2-2qs)^(n/2) and the measure nu >= 0 has the mass u(p) and the first moment
-    R u_v(p)/n (differentiate at q = 0: dP/dq = n s). So the mean of s is m = R u_v/(n u). P is
-    convex in s, hence
+    (1-q^2)/(1+q^2-2qs)^(n/2) and the measure nu >= 0 has the mass u(p) and the first moment R
+    u_v(p)/n (differentiate at q = 0: dP/dq = n s). So the mean of s is m = R u_v/(n u). P is convex
+    in s, hence
 
         u P(q, m) <= u(p+tv) <= u [(1+m)/2 P(q, 1) + (1-m)/2 P(q, -1)]
 
@@ -178,20 +185,20 @@ class HarnackSlopeEnclosure(HarmonicBallEnclosure):
     and by two point masses at the poles. The upper bound is convex in q. The lower bound rises,
     then falls: its derivative has the sign of m q^2 - 2q + m (n = 2), q^3 + m q^2 - 5q + 3m (n = 3)
     or q^3 - 3q + 2m (n = 4), each of which decreases on [0, 1]. So each bound crosses a level at
-    most once in its direction, and if q is free, all smaller q are. For upper - f > 0 the same
-    holds with the negated slope. On each side the better of the two bounds is used.
+    most once in its direction, and if q is free of levels, all smaller q are. For upper - f > 0 the
+    same holds with the negated slope. On each side the better of the two bounds is used.
 
-    Both ends increase with the slope, or stay: the upper one because it grows with m, as
-    P(q, 1) >= P(q, -1); the lower one because P(q, .) increases. For upper - f, whose slope is
-    negated, the ends change places and signs.
+    Both ends increase with the slope, or stay: the upper one because it grows with m, as P(q, 1) >=
+    P(q, -1); the lower one because P(q, .) increases. For upper - f, whose slope is negated, the
+    ends change places and signs.
     """
 
     solver_iterations: ClassVar[int] = 4
     """Rounds of `largest_free_fraction`."""
 
     def free_length(self, gaps: LevelGaps) -> Real:
-        """The shorter of the lengths proved for the level above and for the level below. For each
-        level this is the longest length that one of its conditions proves."""
+        """Return the shorter of the lengths proved for the level above and for the level below. For
+        each level this is the longest length that one of its conditions proves."""
         q = type(gaps.above)(1)
         for alternatives in self._conditions(gaps):
             best = type(q)(0)
@@ -201,8 +208,8 @@ class HarnackSlopeEnclosure(HarmonicBallEnclosure):
         return dr.select(self.is_valid(gaps), q * self.radius, 0)
 
     def is_free(self, gaps: LevelGaps, length: Real) -> Mask:
-        """A mask of the lanes on which, for each of the two levels, at least one condition proves
-        the length free."""
+        """Return the mask of lanes on which, for each of the two levels, at least one condition
+        proves that f does not reach it on the length."""
         q = length / self.radius
         is_covered = q <= 1
         q = clamp(q, 0, 1)
@@ -217,15 +224,20 @@ class HarnackSlopeEnclosure(HarmonicBallEnclosure):
     def _conditions(
         self, gaps: LevelGaps
     ) -> tuple[list[FreeRadiusCondition], list[FreeRadiusCondition]]:
-        """The conditions for f not to reach the level above, and the conditions for f not to reach
-        the level below, as two lists.
+        """Return the conditions for f not to reach the level above, and the conditions for f not to
+        reach the level below, as two lists. For each level it is enough that one of its conditions
+        holds.
 
-        For each level it is enough that one of its conditions holds.
+        gaps: the differences between f(p) and these levels.
+
+        The bound f >= lower gives, with u = f - lower, a chord condition for the level above and a
+        Jensen condition for the level below. The bound f <= upper gives, with u = upper - f, the
+        two with the levels exchanged.
         """
         up: list[FreeRadiusCondition] = []
         down: list[FreeRadiusCondition] = []
         rising = self.slopes
-        for u, slopes, gap_away, away, gap_toward, toward in (
+        for u, slopes, gap_away, conditions_away, gap_toward, conditions_toward in (
             (self.max_fall, rising, gaps.above, up, gaps.below, down),  # u = f - lower
             (self.max_rise, rising.negated(), gaps.below, down, gaps.above, up),  # u = upper - f
         ):
@@ -234,22 +246,25 @@ class HarnackSlopeEnclosure(HarmonicBallEnclosure):
             # u = 0 forces u to vanish identically: no level is ever reached.
             inv_u = dr.select(u > 0, 1 / u, dr.inf)
             scale = self.radius * inv_u / self.dimension
-            upper = dr.select(u > 0, slopes.upper * scale, 0)
-            lower = dr.select(u > 0, slopes.lower * scale, 0)
+            # The mean m of s, at the largest and at the smallest slope.
+            mean_upper = dr.select(u > 0, slopes.upper * scale, 0)
+            mean_lower = dr.select(u > 0, slopes.lower * scale, 0)
             slack = condition_rounding(type(gaps.above))
             # NaN for a slope counts as the worst one, on both sides.
-            m_max, m_min = fmax(fmin(upper + slack, 1), -1), clamp(lower - slack, -1, 1)
-            away.append(
+            m_max, m_min = fmax(fmin(mean_upper + slack, 1), -1), clamp(mean_lower - slack, -1, 1)
+            conditions_away.append(
                 _ChordCondition.of(fmin(gap_away * inv_u, _UNREACHABLE_GAP), m_max, self.dimension)
             )
-            toward.append(_JensenCondition(fmin(gap_toward * inv_u, 1), m_min, self.dimension))
+            conditions_toward.append(
+                _JensenCondition(fmin(gap_toward * inv_u, 1), m_min, self.dimension)
+            )
         return up, down
 
 
 @dataclass(frozen=True)
 class _ChordCondition:
-    """The condition that the upper bound of a positive harmonic u, by the chord of Poisson's
-    kernel, stays below the level above.
+    """The condition that a positive harmonic u, bounded by the chord of Poisson's kernel, does not
+    reach the level above on a fraction q of the radius.
 
     With the symbols of `HarnackSlopeEnclosure` it is (1+m)/2 P(q,1) + (1-m)/2 P(q,-1) <= w with w =
     1 + (gap of u)/u. The left side times (1-q)^K, K = n-1, is B = (1-q)^K + q A/(1+q)^K with a
@@ -267,7 +282,9 @@ class _ChordCondition:
 
     @classmethod
     def of(cls, gap: Real, mean: Real, dimension: int) -> _ChordCondition:
-        """The condition for a gap that is given in units of u."""
+        """Make the condition for a gap that is given in units of u, that is, w - 1. mean,
+        dimension: m and n."""
+        # g = w^(1/K) - 1, in forms that do not cancel for small gaps.
         if dimension == 3:
             gap = gap / (dr.sqrt(1 + gap) + 1)
         elif dimension == 4:
@@ -276,13 +293,15 @@ class _ChordCondition:
         return cls(gap, mean, dimension)
 
     def expansion_at_zero(self) -> tuple[Real, Real]:
+        """Return k(0) and k'(0)."""
         n, k = self.dimension, self.dimension - 1
         first = n * self.mean - k
         second = n * (1 - self.mean) - 0.5 * (k - 1) / (k * k) * first * first
         return self.gap + n * self.mean / k, second
 
     def __call__(self, q: Real) -> Real:
-        """The value k(q), in a form that does not cancel near q = 0."""
+        """Return k(q), in a form that does not cancel near q = 0. Here (B - 1)/q is c - K, and root
+        is B^(1/K); so (root - 1)/q follows from c without a difference of large numbers."""
         m, r, s = self.mean, 1 / (1 + q), q * q
         if self.dimension == 2:
             return self.gap + 2 * (q + m) * r
@@ -300,8 +319,8 @@ class _ChordCondition:
 
 @dataclass(frozen=True)
 class _JensenCondition:
-    """The condition that the lower bound of a positive harmonic u, by Jensen's inequality, stays
-    above the level below.
+    """The condition that a positive harmonic u, bounded by Jensen's inequality, does not reach the
+    level below on a fraction q of the radius.
 
     With the symbols of `HarnackSlopeEnclosure` it is P(q, m) >= 1 - g with g = (gap of u)/u. With D
     = 1+q^2-2qm this is (1-g) D^(n/2) <= 1-q^2, that is, q k(q) <= g with k = (1-g) (D^(n/2) - 1 +
@@ -317,13 +336,14 @@ class _JensenCondition:
     dimension: int
 
     def expansion_at_zero(self) -> tuple[Real, Real]:
+        """Return k(0) and k'(0)."""
         n, m, weight = self.dimension, self.mean, 1 - self.gap
         second = 1 + 0.5 * n * (1 + (n - 2) * m * m)
         return -weight * n * m, dr.fma(weight, second, self.gap)
 
     def __call__(self, q: Real) -> Real:
-        """The value k(q), in a form that does not cancel near q = 0. `rise` is (D^(n/2) - 1 +
-        q^2)/q."""
+        """Return k(q), in a form that does not cancel near q = 0. Here d is D, e is (D - 1)/q, and
+        `rise` is (D^(n/2) - 1 + q^2)/q."""
         e = q - 2 * self.mean
         d = dr.fma(q, e, 1)
         if self.dimension == 2:
@@ -338,16 +358,16 @@ class _JensenCondition:
 
 @dataclass(frozen=True)
 class SphericalCapEnclosure(HarmonicBallEnclosure):
-    """The bound by spherical caps, for f bounded on both sides, in space.
+    """The bound by spherical caps, for a function f that is harmonic on a ball B(p, R) of space and
+    has values between c and C. It bounds f along a ray from p, at the fraction q of the radius.
 
-    Proof. Let f have values in [c, C]. Then f = c + (C-c) g, where g is the Poisson integral of
-    boundary values in [0, 1]. Their mean is p = (f-c)/(C-c), and their first moment along a unit
-    direction v is mu = R f_v/(3 (C-c)). For fixed q the kernel P(q, s) is convex in s. So among
-    densities in [0, 1] with this mass and first moment, the integral of P times the density is
-    largest for the indicator of {s <= s1} and {s >= s2}, because P minus its chord through s1 and
-    s2 is positive exactly there (bathtub principle). These are two spherical caps about v and -v of
-    heights b = p + mu/(1-p) and a = p - mu/(1-p), which depend on p and mu alone. The integral
-    over the caps is elementary. So f is at most
+    Proof. f = c + (C-c) g, where g is the Poisson integral of boundary values in [0, 1]. Their mean
+    is p = (f-c)/(C-c), and their first moment along a unit direction v is mu = R f_v/(3 (C-c)). For
+    fixed q the kernel P(q, s) is convex in s. So among densities in [0, 1] with this mass and first
+    moment, the integral of P times the density is largest for the indicator of {s <= s1} and {s >=
+    s2}, because P minus its chord through s1 and s2 is positive exactly there (bathtub principle).
+    These are two spherical caps about v and -v of heights b = p + mu/(1-p) and a = p - mu/(1-p),
+    which depend on p and mu alone. The integral over the caps is elementary. So f is at most
 
         U = c + (C-c) [1 - (1-q^2)/(2q) (1/s1 - 1/s2)],
         s1^2 = (1-q)^2 + 2qb,   s2^2 = (1+q)^2 - 2qa,
@@ -359,15 +379,14 @@ class SphericalCapEnclosure(HarmonicBallEnclosure):
     The lower bound is that of C - f, negated: p becomes 1-p and mu becomes -mu. |mu| <= p (1-p)
     holds in exact arithmetic and is enforced.
 
-    Both ends increase with the slope, or stay. As the slope grows, weight moves from s = a-1 to
-    s = 1-b, which is no smaller since a + b = 2p <= 2, and P(q, .) increases. For the lower bound
-    the same holds of C - f.
+    Both ends increase with the slope, or stay. As the slope grows, weight moves from s = a-1 to s =
+    1-b, which is no smaller since a + b = 2p <= 2, and P(q, .) increases. For the lower bound the
+    same holds of C - f.
 
     The first crossing of a level is unique. With X = (1+q^2)/(2q), (X-s)^(-3/2) is a Laplace
     transform of exp(-tX) exp(ts), hence totally positive in (q, s) on (0, 1) x (-1, 1) (Karlin
-    1968), hence variation diminishing. U - level is the transform of boundary values with signs
-    (+, -, +). So its signs change at most in this order, and if it starts negative, they change
-    once.
+    1968), hence variation diminishing. U - level is the transform of boundary values with signs (+,
+    -, +). So its signs change at most in this order, and if it starts negative, they change once.
     """
 
     solver_iterations: ClassVar[int] = 4
@@ -375,9 +394,12 @@ class SphericalCapEnclosure(HarmonicBallEnclosure):
 
     @classmethod
     def applies_to(cls, dimension: int, is_bounded_below: bool, is_bounded_above: bool) -> bool:
+        """Return whether the ball is one of space and f is bounded on both sides."""
         return dimension == 3 and is_bounded_below and is_bounded_above
 
     def free_length(self, gaps: LevelGaps) -> Real:
+        """Return the shorter of the lengths on which f is proved not to reach the level above and
+        the level below."""
         up, down = self._conditions(gaps)
         q = fmin(
             largest_free_fraction(up, self.solver_iterations),
@@ -386,6 +408,7 @@ class SphericalCapEnclosure(HarmonicBallEnclosure):
         return dr.select(self.is_valid(gaps), q * self.radius, 0)
 
     def is_free(self, gaps: LevelGaps, length: Real) -> Mask:
+        """Return the mask of lanes on which f is proved to reach neither level on the length."""
         up, down = self._conditions(gaps)
         q = length / self.radius
         is_inside = (q <= 1) & self.is_valid(gaps)
@@ -393,18 +416,23 @@ class SphericalCapEnclosure(HarmonicBallEnclosure):
         return (length <= 0) | (is_inside & is_free_fraction(up, q) & is_free_fraction(down, q))
 
     def _conditions(self, gaps: LevelGaps) -> tuple[_CapCondition, _CapCondition]:
-        """Two conditions on a length of the path: for f not to reach the level above on it, and for
-        f not to reach the level below.
+        """Return two conditions on a fraction of the radius: for f not to reach the level above on
+        it, and for f not to reach the level below.
 
-        gaps: the differences of value to these levels.
+        gaps: the differences between f(p) and these levels.
         """
         fall, rise = self.max_fall, self.max_rise
         assert fall is not None
         assert rise is not None
         inverse = 1 / (fall + rise)
         p, rest = fall * inverse, rise * inverse
-        moment = self.radius * inverse / 3
-        rising, falling = moment * self.slopes.upper, -moment * self.slopes.lower
+        # Times the slope, this is mu; the second condition is that for C - f, whose slope is
+        # negated.
+        moment_per_slope = self.radius * inverse / 3
+        rising, falling = (
+            moment_per_slope * self.slopes.upper,
+            -moment_per_slope * self.slopes.lower,
+        )
         return (
             _two_caps(gaps.above, rise, p, rest, rising),
             _two_caps(gaps.below, fall, rest, p, falling),
@@ -412,21 +440,21 @@ class SphericalCapEnclosure(HarmonicBallEnclosure):
 
 
 def _two_caps(gap: Real, max_rise: Real, p: Real, rest: Real, mu: Real) -> _CapCondition:
-    # Without a range f is constant: no level is ever reached.
-    """The condition for f not to reach the level above, with the symbols of
+    """Return the condition for f not to reach the level above, with the symbols of
     `SphericalCapEnclosure`.
 
-    gap: the difference in value to that level.
+    gap: the difference between f and that level.
     max_rise: C - f at the center.
     p, rest: p and 1 - p.
     mu: the largest first moment.
 
-    If the range of f is a point, f is constant and no level is ever reached.
+    If the range of f is a point, f is constant and no level is ever reached. A level beyond C is
+    not reached, either.
     """
     slack = condition_rounding(type(gap)) * p
-    shift = dr.select(rest > 0, mu / rest, 0) + slack
-    shift = fmax(fmin(shift, p), -p)  # the worst one, p, if the slope is not a number
-    return _CapCondition(dr.select(gap < max_rise, gap / max_rise, 1), p, rest, shift)
+    cap_shift = dr.select(rest > 0, mu / rest, 0) + slack
+    cap_shift = fmax(fmin(cap_shift, p), -p)  # the worst one, p, if the slope is not a number
+    return _CapCondition(dr.select(gap < max_rise, gap / max_rise, 1), p, rest, cap_shift)
 
 
 @dataclass(frozen=True)
@@ -448,13 +476,14 @@ class _CapCondition:
     shift: Real
 
     def expansion_at_zero(self) -> tuple[Real, Real]:
+        """Return k(0) and k'(0)."""
         x, y, rest = self.rest - self.shift, self.rest + self.shift, 1 - self.gap
         second = 2.5 - 0.75 * dr.fma(x, x, y * y) - x * y + 2 * self.shift * self.shift
         return 3 * rest * self.shift, dr.fma(rest, second, self.gap)
 
     def __call__(self, q: Real) -> Real:
-        # s = 1 + q x with x = e/(s+1), as s^2 = 1 + q e.
-        """The value k(q), in a form that does not cancel near q = 0. `rise` is (S - 1 + q^2)/q."""
+        """Return k(q), in a form that does not cancel near q = 0. For each of s1 and s2, s^2 = 1 +
+        q e, so s = 1 + q x with x = e/(s+1). `total` is x1 + x2, and `rise` is (S - 1 + q^2)/q."""
         e1, e2 = q - 2 * (self.rest - self.shift), q + 2 * (self.rest + self.shift)
         one_minus_q, one_plus_q = 1 - q, 1 + q
         s1 = dr.sqrt(dr.fma(one_minus_q, one_minus_q, 2 * q * (self.p + self.shift)))

@@ -1,9 +1,12 @@
-"""Enclosures of the literature for fields that are formulas, for comparison with
-`PiecewiseTaylorEnclosure`.
+"""Enclosures of the literature for functions f that are given by formulas, for comparison with
+`PiecewiseTaylorEnclosure`. An enclosure bounds F(s), the change of f along a path (a ray) from its
+value at the start, at the length s; so it proves a length on which f takes no level, a value that
+rays look for.
 
-Enclosures by parabolas come from the bottom-up arithmetic of `harnack.arithmetic.ParabolaBounds`;
-enclosures by bands, between two lines, come from affine forms and from intervals. All of them prove
-steps. Benchmarks measure how many steps a ray takes with each.
+The formula is evaluated along the path in another arithmetic, operation by operation, which bounds
+f. Bounds by parabolas come from the bottom-up arithmetic of `harnack.arithmetic.ParabolaBounds`;
+bounds by two lines (bands) come from affine forms and from intervals. All of them prove steps.
+Benchmarks measure how many steps a ray takes with each.
 """
 
 from __future__ import annotations
@@ -34,10 +37,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class BottomUpQuadraticEnclosure(ParabolaEnclosure):
-    """The two parabolas that the bottom-up arithmetic of a formula proves.
+    """The two parabolas that bound f along a path, from the bottom-up arithmetic of its formula:
+    every operation is done with parabolas that bound its operands.
 
     Source: Aydinlilar and Zanni 2023, section 6.2. Proof: that of `ParabolaBounds`, then that of
-    `ParabolaEnclosure`.
+        `ParabolaEnclosure`.
     """
 
     degree: ClassVar[int] = 2
@@ -46,9 +50,9 @@ class BottomUpQuadraticEnclosure(ParabolaEnclosure):
     def from_restriction(
         cls, function: PathRestriction, slopes: SlopeRange, length: Real
     ) -> Self | None:
-        """The enclosure of f along a piece of a path, from two parabolas that bound f. They are
-        computed by evaluating the formula of f in the arithmetic of `ParabolaBounds`, operation by
-        operation. None if f has no formula.
+        """Return the enclosure of a function f along a piece of a path. It consists of two
+        parabolas (or lines), found by evaluating the formula of f in the arithmetic of
+        `ParabolaBounds`, operation by operation. The result is None if f has no formula.
 
         function: f as a function of the length along the path.
         slopes: the range of the derivative at the start of the path; not used.
@@ -57,15 +61,16 @@ class BottomUpQuadraticEnclosure(ParabolaEnclosure):
         if not isinstance(function, EvaluableRestriction):
             return None
         parabolas = _parabolas(function, length, cls.degree)
+        # The change of f lies between a s + b s^2 and c s + d s^2.
         (a, b), (c, d) = parabolas.bounds
         return cls(SlopeRange(a, c), 2 * b, 2 * d, length)
 
     def free_length(self, gaps: LevelGaps) -> Real:
-        """The whole length of the path's piece if it is proved free of both levels; otherwise the
-        length that `ParabolaEnclosure` proves.
+        """Return the whole length of the path's piece if f is proved to take neither level on it;
+        otherwise the length that `ParabolaEnclosure` proves.
 
         The whole length is not shortened for rounding: else a ray that misses would need one more
-        sample.
+        sample. The gaps are, instead.
         """
         smaller_gaps = LevelGaps(gaps.below * STEP_SAFETY, gaps.above * STEP_SAFETY)
         is_finite = dr.isfinite(self.slopes.lower + self.slopes.upper)
@@ -77,7 +82,7 @@ class BottomUpQuadraticEnclosure(ParabolaEnclosure):
 
 
 class BottomUpLinearEnclosure(BottomUpQuadraticEnclosure):
-    """The two lines that the bottom-up arithmetic of a formula proves.
+    """The two lines that bound f along a path, from the bottom-up arithmetic of its formula.
 
     Source: Aydinlilar and Zanni 2023, section 5.2.
     """
@@ -90,7 +95,7 @@ class LongestOfEnclosure(Enclosure):
     """Several enclosures of the same function; the longest of the steps that they prove is taken.
 
     Source: Aydinlilar and Zanni 2023, section 4 ("mixed"). There, bounds of derivatives are used if
-    they are tight, and bottom-up arithmetic if they are not.
+        they are tight, and bottom-up arithmetic if they are not.
     """
 
     enclosures: tuple[Enclosure, ...]
@@ -103,7 +108,7 @@ class LongestOfEnclosure(Enclosure):
     def from_restriction(
         cls, function: PathRestriction, slopes: SlopeRange, length: Real
     ) -> Self | None:
-        """All enclosures that the classes in `kinds` prove for f; None if there is none."""
+        """Return all enclosures that the classes in `kinds` prove for f; None if there is none."""
         candidates = [kind.from_restriction(function, slopes, length) for kind in cls.kinds]
         enclosures = tuple(enclosure for enclosure in candidates if enclosure is not None)
         return cls(enclosures) if enclosures else None
@@ -117,7 +122,7 @@ class LongestOfEnclosure(Enclosure):
 
 @dataclass(frozen=True)
 class BandEnclosure(Enclosure):
-    """An enclosure between two lines: for 0 <= s <= reach
+    """An enclosure of F(s), the change of f along a path, between two lines: for 0 <= s <= reach
 
         offsets.lower + slopes.lower s <= F(s) <= offsets.upper + slopes.upper s.
 
@@ -137,7 +142,7 @@ class BandEnclosure(Enclosure):
         return fmax(fmin(up, down), 0)
 
     def _length_below(self, gap: Real, offset: Real, slope: Real) -> Real:
-        """The length on which the line offset + slope s stays below the gap; 0 if nothing is
+        """Return the length on which the line offset + slope s stays below the gap; 0 if nothing is
         proved."""
         no_level = gap == dr.inf
         remaining = gap - offset
@@ -147,9 +152,8 @@ class BandEnclosure(Enclosure):
 
 
 class AffineEnclosure(BandEnclosure):
-    """The band of revised affine arithmetic.
-
-    A part of the length at its start may be proved free although the whole is not.
+    """The two lines that bound f along a path, from revised affine arithmetic. A part of the length
+    at its start may be proved even if the whole is not.
 
     Source: Fryazinov, Pasko and Comninos 2010, as Aydinlilar and Zanni 2023 compare with it.
     """
@@ -158,7 +162,12 @@ class AffineEnclosure(BandEnclosure):
     def from_restriction(
         cls, function: PathRestriction, slopes: SlopeRange, length: Real
     ) -> Self | None:
-        """The band from evaluating the formula with affine forms; None if f is no formula."""
+        """Return the two lines from evaluating the formula of f with affine forms; None if f is no
+        formula.
+
+        An affine form is center + slope e + error, with e from -1 at the start of the path to 1 at
+        its end. So f rises by 2 slope on the length, and starts at center - slope.
+        """
         if not isinstance(function, EvaluableRestriction):
             return None
         form = function.evaluate_with(lambda p, d: AffineForm.along_ray(p, d, length))
@@ -171,8 +180,8 @@ class AffineEnclosure(BandEnclosure):
 
 
 class IntervalEnclosure(BandEnclosure):
-    """The range of interval arithmetic on the whole length: either the whole length is proved free
-    of levels, or nothing is.
+    """The range of f on the whole length, from interval arithmetic: the whole length is proved to
+    hold no level, or nothing is.
 
     Source: Mitchell 1990.
     """
@@ -181,7 +190,8 @@ class IntervalEnclosure(BandEnclosure):
     def from_restriction(
         cls, function: PathRestriction, slopes: SlopeRange, length: Real
     ) -> Self | None:
-        """The band from evaluating the formula with intervals; None if f is no formula."""
+        """Return the range from evaluating the formula of f with intervals; None if f is no
+        formula."""
         if not isinstance(function, EvaluableRestriction):
             return None
         jet = function.evaluate_with(lambda p, d: Jet.along_ray(p, d, 0.0, length, anchored=False))
@@ -190,17 +200,17 @@ class IntervalEnclosure(BandEnclosure):
 
 
 def _parabolas(function: EvaluableRestriction, length: Real, degree: int) -> ParabolaBounds:
-    """The bounds of the function along the path, by lines (degree 1) or parabolas (degree 2)."""
+    """Return bounds of the function along the path, by lines (degree 1) or parabolas (degree 2)."""
     return function.evaluate_with(
         lambda p, d: ParabolaBounds.along_ray(p, d, length, degree=degree)
     )
 
 
 def _value(function: EvaluableRestriction) -> Interval:
-    """The range of f at the start of the path, from the formula evaluated with intervals."""
+    """Return the range of f at the start of the path, from the formula evaluated with intervals."""
 
     def at_start(p: Vec3, direction: Vec3) -> tuple[Jet, Jet, Jet]:
-        """The coordinates of the start of the path."""
+        """Return the coordinates of the start of the path."""
         del direction
         return Jet.at_point(p)
 

@@ -1,4 +1,6 @@
-"""Enclosures by lines and parabolas.
+"""Enclosures by lines and parabolas. An enclosure bounds F(s), the change of a function f along a
+path (a ray) from its value at a sample, at the length s. A level is a value of f that rays look
+for; the gap to it is its difference from f at the sample.
 
 - `ParabolaEnclosure`: between two parabolas. `LipschitzEnclosure` follows from a Lipschitz
   constant, `TaylorEnclosure` from a bound of the second derivatives.
@@ -28,7 +30,8 @@ _ROOT_OF_TWO = math.sqrt(2.0)
 
 @dataclass(frozen=True)
 class ParabolaEnclosure(Enclosure):
-    """An enclosure between two parabolas: for 0 <= s < reach
+    """An enclosure of F(s), the change of f along a path at the length s, between two parabolas:
+    for 0 <= s < reach
 
         slopes.lower s + min_second_derivative s^2/2 <= F(s)
         <= slopes.upper s + max_second_derivative s^2/2.
@@ -63,7 +66,7 @@ class ParabolaEnclosure(Enclosure):
 
 @dataclass(frozen=True)
 class LipschitzEnclosure(ParabolaEnclosure):
-    """The Lipschitz cone: the step of sphere tracing.
+    """The Lipschitz cone, |F(s)| <= K s with a Lipschitz constant K: the step of sphere tracing.
 
     Proof. |F(s)| <= K s for s < radius by the promise. These are parabolas without a second-order
     term, and the step is K^-1 times the smaller gap. Source: Hart 1996, Theorem 1.
@@ -93,7 +96,8 @@ class LipschitzEnclosure(ParabolaEnclosure):
 
 @dataclass(frozen=True)
 class TaylorEnclosure(ParabolaEnclosure):
-    """Taylor's formula with a bound H of the second derivatives.
+    """Taylor's formula for F(s), the change of f along a path, with a bound H of the second
+    derivatives.
 
     Proof. If the slope at the sample is in [low, high], the promise says that F(s) lies between low
     s - H s^2/2 and high s + H s^2/2 for s < radius.
@@ -110,53 +114,61 @@ class TaylorEnclosure(ParabolaEnclosure):
 
 
 def _nan_if_negative(constant: Real) -> Real:
-    """The constant; NaN if it is negative, so that nothing is proved."""
+    """Return the constant of a promise; NaN if it is negative, so that nothing is proved."""
     return dr.select(constant >= 0, constant, dr.nan)
 
 
 def first_reach(gap: Real, slope: Real, curvature: Real) -> Real:
-    """The first s > 0 at which slope s + curvature s^2/2 reaches the gap; infinite if there is
-    none.
+    """Return the first s > 0 at which slope s + curvature s^2/2 reaches the gap; infinite if there
+    is none.
 
     gap: the difference in value to a level, >= 0; infinite if there is no level on this side.
+    curvature: the second derivative of the parabola.
 
-    It is computed in a form whose squares neither overflow nor underflow: near a zero of high
-    order, slope, curvature and gap are all far below the square root of the smallest number.
+    With r = sqrt(slope^2 + 2 curvature gap), s is gap/(slope/2 + r/2) for slope > 0, and (r -
+    slope)/curvature for slope <= 0 < curvature. r is computed from the larger and the smaller of
+    |slope| and sqrt(2 |curvature| gap), in a form whose squares neither overflow nor underflow:
+    near a zero of high order, slope, curvature and gap are all far below the square root of the
+    smallest number.
     """
     no_level = gap == dr.inf  # there is no level on this side
     turns_away = curvature < 0
     gap = _rounded_down_where(turns_away, dr.select(no_level, 0, gap))
-    start_slope, turn_slope = dr.abs(slope), _max_turning_slope(gap, curvature)
-    larger, smaller = fmax(start_slope, turn_slope), fmin(start_slope, turn_slope)
+    slope_size, turn_slope = dr.abs(slope), _max_turning_slope(gap, curvature)
+    larger, smaller = fmax(slope_size, turn_slope), fmin(slope_size, turn_slope)
     ratio = dr.select(larger > 0, smaller / larger, 0)
     root = larger * dr.sqrt(dr.fma(dr.select(turns_away, -ratio, ratio), ratio, 1))
-    straight = dr.select(slope <= 0, dr.select(gap > 0, dr.inf, 0), dr.nan)
-    from_root = dr.select(curvature <= 0, straight, (root - slope) / curvature)
+    # Without an upward curvature and with slope <= 0 the gap is never reached; at a gap of 0 it is
+    # at once.
+    without_root = dr.select(slope <= 0, dr.select(gap > 0, dr.inf, 0), dr.nan)
+    from_root = dr.select(curvature <= 0, without_root, (root - slope) / curvature)
     result = dr.select(slope > 0, gap / (0.5 * slope + 0.5 * root), from_root)
-    return dr.select(no_level | (turns_away & (start_slope < turn_slope)), dr.inf, result)
+    return dr.select(no_level | (turns_away & (slope_size < turn_slope)), dr.inf, result)
 
 
 def _stays_below(gap: Real, slope: Real, curvature: Real, length: Real) -> Mask:
-    """A mask of the lanes on which slope s + curvature s^2/2 <= gap for 0 <= s <= length.
+    """Return the mask of lanes on which slope s + curvature s^2/2 <= gap for 0 <= s <= length.
 
-    The largest value is at an end of the length or, if the parabola rises and then falls, at its
-    vertex.
+    The largest value is at an end of the length or, if the parabola rises and then falls on it, at
+    its vertex.
     """
     half_change = 0.5 * curvature * length
+    # The slope at the end is slope + curvature length.
     turns_back = (slope > 0) & (slope + 2 * half_change < 0)
     max_slope = _max_turning_slope(_rounded_down_where(turns_back, gap), curvature)
     return dr.select(turns_back, slope <= max_slope, (half_change + slope) * length <= gap)
 
 
 def _max_turning_slope(gap: Real, curvature: Real) -> Real:
-    """sqrt(2 |curvature| gap): the slope at the start of a parabola slope s - |curvature| s^2/2
-    whose largest value is the gap. With a smaller slope it turns back before it reaches the gap."""
+    """Return sqrt(2 |curvature| gap): the slope at the start of a parabola slope s - |curvature|
+    s^2/2 whose largest value is the gap. With a smaller slope it turns back before it reaches the
+    gap."""
     return dr.sqrt(dr.abs(curvature)) * (_ROOT_OF_TWO * dr.sqrt(gap))
 
 
 def _rounded_down_where(turns: Mask, gap: Real) -> Real:
-    """The gap, smaller by eight roundings on the lanes of the mask `turns`, and unchanged on all
-    others.
+    """Return the gap, smaller by eight roundings on the lanes of the mask `turns`, and unchanged on
+    all others.
 
     turns: the lanes on which the parabola slope s + curvature s^2/2 bends away from the level, so
         that it may turn back before it. If its vertex is close to the level, rounding would decide
@@ -168,7 +180,8 @@ def _rounded_down_where(turns: Mask, gap: Real) -> Real:
 
 @dataclass(frozen=True)
 class ConvexityEnclosure(Enclosure):
-    """F(s) >= slopes.lower s for all s >= 0, because f is convex along the path.
+    """The bound F(s) >= slopes.lower s for all s >= 0, for a function f that is convex along the
+    path; F is the change of f along it.
 
     Proof. A convex function lies above its tangents. So f does not fall to a level at a gap g below
     before s = g/|slope|, and never if it rises at the start. Nothing is proved about levels above.
@@ -192,13 +205,13 @@ _PI_BELOW = 3.14159
 
 @dataclass(frozen=True)
 class SphereArcEnclosure(Enclosure):
-    """|F - slope psi| <= curvature psi^2/2, where psi is the angle traveled along the path's image,
-    a circle.
+    """The bound |F - slope psi| <= curvature psi^2/2, where psi is the angle traveled along the
+    path's image, a circle, and F is the change of f. It is for functions of points on the sphere
+    S^3.
 
-    It is for functions of points on the sphere S^3. By stereographic projection a line of space
-    becomes a circle on S^3. A function that is a trigonometric polynomial on the circle has a
-    bounded second derivative by its angle, from one end of the line to the other. A step in this
-    angle, taken back to the line, may be infinite.
+    By stereographic projection a line of space becomes a circle on S^3. A function that is a
+    trigonometric polynomial on the circle has a bounded second derivative by its angle, from one
+    end of the line to the other. A step in this angle, taken back to the line, may be infinite.
 
     slopes: the range of the derivative of f along the path, by length, where it starts.
     curvature: a bound of the second derivative of f by the angle, on the whole circle.
@@ -228,8 +241,8 @@ class SphereArcEnclosure(Enclosure):
     squared_radius: Real
 
     def free_length(self, gaps: LevelGaps) -> Real:
-        """The length of the line that is proved free of both levels; infinite if no level is ever
-        met.
+        """Return the length of the line on which f is proved to take neither level; infinite if no
+        level is ever met.
 
         The symbols are those of the proof of the class: `square_sum` is S = c^2 + t^2,
         `length_per_angle` is dt/da = S/(2c) at the start, and `half_angle` is half the smallest

@@ -1,4 +1,8 @@
-"""Enclosures of f along a path from ranges of its first two derivatives on pieces of the path."""
+"""Enclosures of a function f along a path (a ray) from ranges of its first two derivatives on
+pieces of the path. An enclosure bounds F(s), the change of f from its value at the start of the
+path, at the length s. The gap to a level (a value that rays look for) is its difference from f at
+the start.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +25,8 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class PiecewiseTaylorEnclosure(Enclosure):
-    """An enclosure from ranges of F' and F'' on successive pieces of the path.
+    """An enclosure of F(s), the change of f along a path at the length s, from ranges of F' and F''
+    on successive pieces of the path.
 
     slopes: the range of F' at s = 0.
     pieces: the pieces, in their order along the path.
@@ -35,7 +40,7 @@ class PiecewiseTaylorEnclosure(Enclosure):
     one sample may prove much of a ray.
 
     Source: new in harnack. One piece is the linear and the quadratic Taylor form together
-    (Aydinlilar and Zanni 2023, section 6.1).
+        (Aydinlilar and Zanni 2023, section 6.1).
     """
 
     slopes: SlopeRange
@@ -45,7 +50,10 @@ class PiecewiseTaylorEnclosure(Enclosure):
     def from_restriction(
         cls, function: PathRestriction, slopes: SlopeRange, length: Real
     ) -> Self | None:
-        """The enclosure from ranges on a few pieces of the path up to `length`.
+        """Return the enclosure from ranges on a few pieces of the path up to `length`.
+
+        function: f along the path.
+        slopes: the range of its derivative at the start.
 
         The first two pieces are equally long; each of the others is twice as long as the one before
         it.
@@ -56,7 +64,7 @@ class PiecewiseTaylorEnclosure(Enclosure):
 
     @classmethod
     def _piece_count(cls, function: PathRestriction) -> int:
-        """The number of pieces into which the path is divided."""
+        """Return the number of pieces into which the path is divided."""
         return function.piece_count
 
     @property
@@ -64,8 +72,9 @@ class PiecewiseTaylorEnclosure(Enclosure):
         return max(2.0, float(len(self.pieces)))
 
     def free_length(self, gaps: LevelGaps) -> Real:
-        """The shorter of the lengths on which F does not reach the level above and the level
+        """Return the shorter of the lengths on which F does not reach the level above and the level
         below."""
+        # With a single level, one side is enough: the one with the finite gap.
         if gaps.is_one_sided:
             rises = gaps.below == dr.inf
             reach, is_free = self._free_on_pieces(fmin(gaps.above, gaps.below), rises)
@@ -79,7 +88,7 @@ class PiecewiseTaylorEnclosure(Enclosure):
         return dr.select(is_free, reach, reach * STEP_SAFETY)
 
     def arrives(self, gaps: LevelGaps, length: Real) -> Mask:
-        """Whether f is proved to take a level for some 0 <= s <= length.
+        """Return the mask of lanes on which f is proved to take a level for some 0 <= s <= length.
 
         Proof. On the first piece F' is known, so F is continuous, and F(s) is at most s times the
         upper end of the range of F'. If that end is negative, F falls to the level below by s =
@@ -91,24 +100,24 @@ class PiecewiseTaylorEnclosure(Enclosure):
         return falls | (first.slope_range.lower * reach >= gaps.above)
 
     def _free_on_pieces(self, gap: Real, rises: Mask | bool) -> tuple[Real, Mask]:
-        """The length on which F does not reach the level above, or the level below.
+        """Return the length on which F does not reach the level above, or the level below, and the
+        mask of lanes on which this is the length of all pieces.
 
         gap: the difference in value to that level.
         rises: True for the level above. Otherwise -F is bounded in place of F.
 
-        Returns the first s at which the bound of F reaches the gap, or the length of all pieces if
-        there is no such s; and a mask of the lanes on which there is none.
+        The length ends at the first s at which the bound of F reaches the gap.
         """
 
         def one_sided(upper: Real, lower: Real) -> Real:
-            """The largest value for F (`upper`) or, if the level is below, the largest value for -F
-            (-`lower`)."""
+            """Return the largest value for F (`upper`) or, if the level is below, the largest value
+            for -F (-`lower`)."""
             return dr.select(rises, upper, -lower)
 
         slope = one_sided(self.slopes.upper, self.slopes.lower)
         no_level = gap == dr.inf
         remaining = dr.select(no_level, 0, gap)  # the rest of the gap at the start of the piece
-        total = type(gap)(0)
+        free_so_far = type(gap)(0)
         is_free = gap >= 0  # and not NaN
         for piece in self.pieces:
             max_slope = one_sided(piece.slope_range.upper, piece.slope_range.lower)
@@ -117,9 +126,9 @@ class PiecewiseTaylorEnclosure(Enclosure):
                 remaining, slope, max_slope, curvature, piece.length
             )
             reach = dr.select(no_level, piece.length, reach)
-            total = dr.select(is_free, total + reach, total)
+            free_so_far = dr.select(is_free, free_so_far + reach, free_so_far)
             is_free &= reach >= piece.length
-        return total, is_free
+        return free_so_far, is_free
 
     @classmethod
     def _advance_piece(
@@ -132,11 +141,12 @@ class PiecewiseTaylorEnclosure(Enclosure):
         max_slope, curvature: the largest F' and F'' on the piece.
         length: the length of the piece.
 
-        Returns the largest F' at the end of the piece, the part of the length that is proved free,
-        and the gap that remains at the end.
+        Returns the largest F' at the end of the piece, the part of the length on which the gap is
+        not reached, and the gap that remains at the end.
         """
         # A range that is NaN is unknown.
         slope = dr.select((slope <= max_slope) | dr.isnan(max_slope), slope, max_slope)
+        # The lengths on which the line and the parabola stay below the gap. A NaN slope gives 0.
         by_line = dr.select(max_slope > 0, gap / max_slope, dr.select(max_slope <= 0, dr.inf, 0))
         by_line = dr.select(gap > 0, by_line, 0)
         by_parabola = first_reach(gap, slope, curvature)
@@ -151,56 +161,62 @@ class PiecewiseTaylorEnclosure(Enclosure):
 
 
 class SinglePieceEnclosure(PiecewiseTaylorEnclosure, abc.ABC):
-    """Base of the enclosures of the literature that use ranges on the whole length as one piece."""
+    """Base of the enclosures of the literature that use ranges of the derivatives of f on the whole
+    length of a path, as one piece."""
 
     @classmethod
     def _piece_count(cls, function: PathRestriction) -> int:
+        """Return 1."""
         del function
         return 1
 
 
 class QuadraticTaylorEnclosure(SinglePieceEnclosure):
-    """The parabola from the slope at the start and the range of F''.
+    """The parabola that bounds f along a path, from the slope at the start and the range of F'' (F
+    is the change of f).
 
     Source: Aydinlilar and Zanni 2023, section 6.1. Proof: that of `PiecewiseTaylorEnclosure`,
-    without the line.
+        without the line.
     """
 
     @classmethod
     def _advance_piece(
         cls, gap: Real, slope: Real, max_slope: Real, curvature: Real, length: Real
     ) -> tuple[Real, Real, Real]:
+        """Advance the parabola over the piece; the largest slope on the piece is not used."""
         del max_slope
         return super()._advance_piece(gap, slope, type(gap)(dr.inf), curvature, length)
 
 
 class LinearTaylorEnclosure(SinglePieceEnclosure):
-    """The line from the range of F' on the whole length.
+    """The line that bounds f along a path, from the range of F' on the whole length (F is the
+    change of f).
 
     Source: Aydinlilar and Zanni 2023, section 4.1, with the exact range. Proof: that of
-    `PiecewiseTaylorEnclosure`, without the parabola.
+        `PiecewiseTaylorEnclosure`, without the parabola.
     """
 
     @classmethod
     def _advance_piece(
         cls, gap: Real, slope: Real, max_slope: Real, curvature: Real, length: Real
     ) -> tuple[Real, Real, Real]:
+        """Advance the line over the piece; the second derivative is not used."""
         del slope, curvature
         return super()._advance_piece(gap, max_slope, max_slope, type(gap)(0), length)
 
 
 class SegmentTracingEnclosure(SinglePieceEnclosure):
-    """The cone of the largest |F'| on the length: segment tracing.
+    """The cone |F(s)| <= K s, where F is the change of f along a path and K bounds |F'| on its
+    length: segment tracing.
 
-    Source: Galin, Guerin, Paris and Peytavie 2020; Aydinlilar and Zanni 2023, equation 10. Proof:
-    |F(s)| <= K s, where K bounds |F'| on the length.
+    Source: Galin, Guerin, Paris and Peytavie 2020; Aydinlilar and Zanni 2023, equation 10.
     """
 
     @classmethod
     def from_restriction(
         cls, function: PathRestriction, slopes: SlopeRange, length: Real
     ) -> Self | None:
-        """The enclosure from the largest |F'| on the whole length."""
+        """Return the enclosure from the largest |F'| on the whole length."""
         (piece,) = function.derivative_ranges([0.0, length])
         max_slope = fmax(piece.slope_range.upper, -piece.slope_range.lower)
         interval = SlopeRange(-max_slope, max_slope)

@@ -1,4 +1,5 @@
-"""Promises: proved bounds of a field's function f near a point, in every direction.
+"""Promises: proved bounds of a field's function f near a point p, in every direction. For example,
+a promise says that f stays within a range on the ball of some radius about p.
 
 A promise is stated in the field's own units and must be *true*: every step that the tracer takes
 relies on it. Enclosures (bounds of f along a path) are derived from promises, once the slope along
@@ -41,7 +42,9 @@ _SECOND_DERIVATIVE_BOUND, _SECOND_DERIVATIVE_BOUND_4D, _FIRST_DERIVATIVE_BOUND =
 
 @dataclass(frozen=True)
 class Promise(abc.ABC):
-    """Base of all kinds of promises about a function f near a point p.
+    """A proved bound of a function f near a point p, the promise: base of all kinds. A promise
+    holds at all points within its `radius` of p; value stands for f(p), and f_v for the derivative
+    of f along a unit vector v.
 
     A subclass is a frozen dataclass of its numbers. `radius` is the distance from p within which
     the promise holds.
@@ -67,7 +70,7 @@ class Promise(abc.ABC):
 
     @abc.abstractmethod
     def movement_bounds(self, value: Any, slopes: SlopeRange, length: Any) -> tuple[Any, Any]:
-        """Lower and upper bound of f(y) - f(p) for a point y along a direction from p.
+        """Return a lower and an upper bound of f(y) - f(p) for a point y along a direction from p.
 
         value: f(p).
         slopes: the range of the derivative of f along the direction at p.
@@ -77,9 +80,8 @@ class Promise(abc.ABC):
         """
 
     def taylor_remainder_bound(self, value: Real, length: Real, degree: int = 1) -> Real:
-        """A bound of |f(y) - T(y)| for |y - p| <= length; infinite if the promise implies none.
-
-        T is the Taylor polynomial of f about p.
+        """Return a bound of |f(y) - T(y)| for |y - p| <= length, where T is the Taylor polynomial
+        of f about p; infinite if the promise implies none.
 
         value: f(p).
         degree: the degree of T, 1 or 2. As the length decreases, the bound decreases at least as
@@ -89,7 +91,8 @@ class Promise(abc.ABC):
         return dr.inf
 
     def implied_lipschitz(self, value: Real) -> Lipschitz | None:
-        """A Lipschitz promise that follows from this promise; None if none does.
+        """Return a Lipschitz constant of f on a ball about p that follows from this promise, as a
+        `Lipschitz`; None if none follows.
 
         value: f(p).
         """
@@ -97,42 +100,44 @@ class Promise(abc.ABC):
         return None
 
     def implied_second_derivative_bound(self, value: Real) -> tuple[Real, Real] | None:
-        """A bound of |f_vv| for all unit vectors v that holds everywhere in a ball, and the radius
-        of the ball.
-
-        None if the promise implies no such bound. (`taylor_remainder_bound` is smaller: it is about
-        the Taylor polynomial at p alone.)
+        """Return a bound of the second derivatives |f_vv|, for all unit vectors v, that holds
+        everywhere in a ball about p, and the radius of that ball; None if the promise implies no
+        such bound.
 
         value: f(p).
+
+        `taylor_remainder_bound` is smaller, as it is about the Taylor polynomial at p alone.
         """
         del value
 
     def weakened_for_linear_maps(self, value: Real) -> Promise:
-        """A weaker promise, of a kind that every linear map A of space preserves.
+        """Return a weaker promise, of a kind that every linear map A of space preserves.
+
+        value: f(p).
 
         If f makes a promise of such a kind, then x -> f(A x) makes a promise of the same kind with
         other numbers (`linearly_mapped`). Harmonic functions and bounds of the Laplacian are
         preserved by similarities only. So HarmonicBall returns a TaylorRemainder, and
         BoundedLaplacian a Lipschitz promise. All other kinds return themselves.
-
-        value: f(p).
         """
         del value
         return self
 
     def scaled(self, factor: Real) -> Self:
-        """The promise of factor * f, factor > 0."""
+        """Return the promise of factor * f, for factor > 0."""
+        # A number whose unit contains that of f is multiplied; the power is 1.
         return self.map_numbers(lambda number, of_f, _: number * factor if of_f else number)
 
     def shifted(self, offset: Real) -> Self:
-        """The promise of f + offset."""
+        """Return the promise of f + offset. The range of f itself, the first pair of
+        `interval_pairs`, is shifted."""
         numbers = {
             name: getattr(self, name) + offset for pair in self.interval_pairs[:1] for name in pair
         }
         return dataclasses.replace(self, **numbers)
 
     def negated(self) -> Self:
-        """The promise of -f."""
+        """Return the promise of -f: the ends of each range are negated and exchanged."""
         numbers = {
             name: -getattr(self, opposite)
             for lower, upper in self.interval_pairs
@@ -141,10 +146,11 @@ class Promise(abc.ABC):
         return dataclasses.replace(self, **numbers)
 
     def space_scaled(self, size: Real) -> Self:
-        """The promise that x -> f(x / size) makes at the point size * p."""
+        """Return the promise that x -> f(x / size) makes at the point size * p. A number with the
+        unit (length)^j is multiplied by size^j."""
 
         def rescaled(number: Real, power: int) -> Real:
-            """number * size^power."""
+            """Return number * size^power."""
             if power == 0:
                 return number
             return number * size if power > 0 else number / _power(size, -power)
@@ -152,13 +158,15 @@ class Promise(abc.ABC):
         return self.map_numbers(lambda number, _, power: rescaled(number, power))
 
     def linearly_mapped(self, stretch: Real) -> Self:
-        """The promise of x -> f(A x) for a linear map A.
+        """Return the promise of x -> f(A x) for a linear map A, at the point that A maps to p.
 
         stretch: A stretches no length by more than this factor.
+
+        A number with the unit (length)^j is divided by stretch^j: lengths shrink, and slopes grow.
         """
 
         def rescaled(number: Real, power: int) -> Real:
-            """number / stretch^power, for power <= 1."""
+            """Return number / stretch^power, for power <= 1."""
             if power > 0:
                 return number / stretch
             for _ in range(-power):
@@ -168,7 +176,7 @@ class Promise(abc.ABC):
         return self.map_numbers(lambda number, _, power: rescaled(number, power))
 
     def map_numbers(self, change: Callable[[Any, int, int], Any]) -> Self:
-        """A promise of the same kind with other numbers.
+        """Return a promise of the same kind with other numbers.
 
         change: a function (number, i, j) -> new number, where the number's unit is (unit of f)^i
             (length)^j.
@@ -177,25 +185,27 @@ class Promise(abc.ABC):
         return dataclasses.replace(self, **numbers)
 
     def select(self, mask: Mask, other: Self) -> Self:
-        """The promise `other`, which is of the same kind, on the lanes of the mask; this promise on
-        all other lanes."""
+        """Return the promise `other`, which is of the same kind, on the lanes of the mask, and this
+        promise on all other lanes."""
         numbers: dict[str, Any] = {}
         for name, *_ in self.units:
             new, old = getattr(other, name), getattr(self, name)
+            # Equal Python numbers stay Python numbers: code asks whether they are infinite while a
+            # kernel is recorded.
             is_same = isinstance(new, float) and isinstance(old, float) and new == old
             numbers[name] = old if is_same else dr.select(mask, new, old)
         return dataclasses.replace(self, **numbers)
 
 
 def _power(number: Real, exponent: int) -> Real:
-    """number^exponent for an integer exponent >= 1."""
+    """Return number^exponent for an integer exponent >= 1."""
     return number if exponent == 1 else number * _power(number, exponent - 1)
 
 
 @dataclass(frozen=True)
 class HarmonicBall(Promise):
-    """f extends to a harmonic function on the ball B(p, radius) of R^dimension, with bounded
-    values.
+    """The promise that f extends to a harmonic function on the ball B(p, radius) of R^dimension,
+    with values between `lower` and `upper`.
 
     If f has a period, the promise is about the continuous function that equals `Sample.value` at p
     and f elsewhere up to multiples of the period.
@@ -215,27 +225,29 @@ class HarmonicBall(Promise):
     holds_outside_domain = True
 
     def movement_bounds(self, value: Any, slopes: SlopeRange, length: Any) -> tuple[Any, Any]:
+        """Return the bounds of f(y) - f(p) on the ball: those of f, less f(p)."""
         return self.lower - value, self.upper - value
 
     def taylor_remainder_bound(self, value: Real, length: Real, degree: int = 1) -> Real:
-        """A bound of |f(y) - T(y)| for |y - p| <= length, where T is the Taylor polynomial of f
-        about p.
+        """Return a bound of |f(y) - T(y)| for |y - p| <= length, where T is the Taylor polynomial
+        of f about p; infinite beyond the ball, or if f is not bounded.
 
         value: f(p).
         degree: the degree of T, 1 or 2.
 
         Proof for a harmonic f >= c on a ball of radius R in n dimensions. f - c is the integral of
         Poisson's kernel P(q, s), q = length/R, with a measure of mass f(p) - c. P is the sum over l
-        of the zonal harmonics, which are all largest at s = 1. Those of degree 0 and 1 give the
-        value and the gradient. The sum of all others is at most P - 1 - n q at s = 1, in absolute
-        value, where P = (1 + q)/(1 - q)^(n - 1). So the error is at most this number times f(p) -
-        c. The same holds for C - f with f <= C, and the smaller of the two bounds is returned. For
-        degree 2, the harmonic of degree 2 is left out, too: at s = 1 it is 2, 5 and 9 times q^2 for
-        n = 2, 3 and 4.
+        of the zonal harmonics of degree l, which are all largest at s = 1. Those of degree 0 and 1
+        give the value and the gradient. The sum of all others is at most P - 1 - n q at s = 1, in
+        absolute value, where P = (1 + q)/(1 - q)^(n - 1). So the error is at most this number times
+        f(p) - c. The same holds for C - f with f <= C, and the smaller of the two bounds is
+        returned. For degree 2, the harmonic of degree 2 is left out, too: at s = 1 it is 2, 5 and 9
+        times q^2 for n = 2, 3 and 4.
         """
         mass = fmin(value - self.lower, self.upper - value)
         q = length / self.radius
-        remainder = {
+        # P - 1 - n q, less the term of degree 2, as a fraction: by (dimension, degree).
+        remainder_per_mass = {
             (2, 1): 2 * q * q / (1 - q),
             (3, 1): q * q * (5 - 3 * q) / dr.square(1 - q),
             (4, 1): q * q * (9 - q * (11 - 4 * q)) / (dr.square(1 - q) * (1 - q)),
@@ -243,15 +255,17 @@ class HarmonicBall(Promise):
             (3, 2): q * q * q * (7 - 5 * q) / dr.square(1 - q),
             (4, 2): q * q * q * (16 - q * (23 - 9 * q)) / (dr.square(1 - q) * (1 - q)),
         }[self.dimension, degree]
-        return dr.select((q < 1) & (mass < dr.inf), mass * remainder, dr.inf)
+        return dr.select((q < 1) & (mass < dr.inf), mass * remainder_per_mass, dr.inf)
 
     def implied_lipschitz(self, value: Real) -> Lipschitz | None:
-        """A Lipschitz promise on half the ball; None if f is not bounded on both sides.
+        """Return a Lipschitz constant of f on half the ball; None if f is not bounded on both
+        sides.
 
         Proof. Let f be within M of a constant on a ball of radius r in R^n. At the center f_v is
         n/r times the mean of f s over the sphere, where s is the cosine of the angle to v. So |f_v|
         is at most n M/r times the mean of |s|: 1.28, 1.5 and 1.7 M/r for n = 2, 3, 4. Points within
-        R/2 are centers of balls of radius R/2, on which M is half of upper - lower.
+        R/2 are centers of balls of radius R/2, on which M is half of upper - lower. With r = R/2
+        this is 1.7 (upper - lower)/R.
         """
         if _is_infinite(self.lower) or _is_infinite(self.upper):
             return None
@@ -260,7 +274,7 @@ class HarmonicBall(Promise):
         )
 
     def weakened_for_linear_maps(self, value: Real) -> Promise:
-        """A `TaylorRemainder` on half the ball.
+        """Return a `TaylorRemainder` on half the ball: a bound of the second derivatives.
 
         Proof in space (and so in the plane). At the center of a ball of radius R, f_vv is R^-2
         times the mean of 5 (3 s^2 - 1) f over the sphere, where s is the cosine of the angle to v.
@@ -280,12 +294,12 @@ class HarmonicBall(Promise):
         )
 
     def implied_second_derivative_bound(self, value: Real) -> tuple[Real, Real] | None:
-        """A bound of |f_vv| for all unit vectors v on half the ball, and the radius R/2 of that
-        half; None if f is not bounded on both sides.
+        """Return a bound of |f_vv| for all unit vectors v on half the ball, and the radius R/2 of
+        that half; None if f is not bounded on both sides.
 
         Proof: that of `weakened_for_linear_maps`, at the centers of balls of radius R/2. In R^4,
-        where f_vv is R^-2 times the mean of 6 (4 s^2 - 1) f, the mean of the positive part of this
-        kernel is 9 sqrt(3)/(2 pi) = 2.48, which is half the mean of its absolute value.
+            where f_vv is R^-2 times the mean of 6 (4 s^2 - 1) f, the mean of the positive part of
+            this kernel is 9 sqrt(3)/(2 pi) = 2.48, which is half the mean of its absolute value.
         """
         if _is_infinite(self.lower) or _is_infinite(self.upper):
             return None
@@ -294,14 +308,14 @@ class HarmonicBall(Promise):
         return 1.0001 * constant * self._span(value) / (half * half), half
 
     def _span(self, value: Real) -> Real:
-        """upper - lower, the length of the range of f on the ball, computed as (upper - value) +
-        (value - lower). With value = f(p) between the two, both terms are at least 0."""
+        """Return upper - lower, the length of the range of f on the ball, computed as (upper -
+        value) + (value - lower). With value = f(p) between the two, both terms are at least 0."""
         return (self.upper - value) + (value - self.lower)
 
 
 @dataclass(frozen=True)
 class BoundedLaplacian(Promise):
-    """f and its Laplacian stay within ranges on the ball B(p, radius) of space.
+    """The promise that f and its Laplacian stay within ranges on the ball B(p, radius) of space.
 
     f is continuously differentiable there, and its Laplacian is a bounded function, which may jump.
 
@@ -326,15 +340,16 @@ class BoundedLaplacian(Promise):
     holds_outside_domain = True
 
     def movement_bounds(self, value: Any, slopes: SlopeRange, length: Any) -> tuple[Any, Any]:
+        """Return the bounds of f(y) - f(p) on the ball: those of f, less f(p)."""
         return self.lower - value, self.upper - value
 
     def implied_lipschitz(self, value: Real) -> Lipschitz:
-        """A Lipschitz promise on half the ball.
+        """Return a Lipschitz constant of f on half the ball.
 
-        Proof. Points within R/2 are centers of balls of radius r = R/2. On such a ball f = h -
-        integral of G Laplacian f, where G is the Green function and h is harmonic with the boundary
-        values of f, which are between lower and upper. So |h_v| <= 3/2 (upper - lower)/(2 r), and
-        the integral of |d_v G| is 3 r/8.
+        Proof. Let R be the radius. Points within R/2 are centers of balls of radius r = R/2. On
+        such a ball f = h - integral of G Laplacian f, where G is the Green function and h is
+        harmonic with the boundary values of f, which are between lower and upper. So |h_v| <= 3/2
+        (upper - lower)/(2 r), and the integral of |d_v G| is 3 r/8.
         """
         half = 0.5 * self.radius
         max_laplacian = fmax(dr.abs(self.laplacian_lower), dr.abs(self.laplacian_upper))
@@ -342,13 +357,16 @@ class BoundedLaplacian(Promise):
         return Lipschitz(1.0001 * max_slope, half)
 
     def weakened_for_linear_maps(self, value: Real) -> Promise:
+        """Return a Lipschitz constant of f on half the ball."""
         return self.implied_lipschitz(value)
 
     def linearly_mapped(self, stretch: Real) -> BoundedLaplacian:
-        """The promise of x -> f(A x) for a similarity A.
+        """Return the promise of x -> f(A x) for a similarity A, at the point that A maps to p.
 
-        The Laplacian of f(A x) is that of f times the square of the factor by which A stretches
-        lengths. This factor is `stretch` up to some roundings.
+        stretch: the factor by which A stretches lengths, up to some roundings.
+
+        The Laplacian of f(A x) is that of f times the square of the exact factor. So its range is
+        widened by a few roundings first.
         """
         slack = 5e-6 * (dr.abs(self.laplacian_lower) + dr.abs(self.laplacian_upper))
         lower, upper = self.laplacian_lower - slack, self.laplacian_upper + slack
@@ -358,7 +376,8 @@ class BoundedLaplacian(Promise):
 
 @dataclass(frozen=True)
 class Lipschitz(Promise):
-    """|f(y) - f(p)| <= constant * |y - p| for every y with |y - p| < radius (default: all y).
+    """The promise that |f(y) - f(p)| <= constant * |y - p| for every y with |y - p| < radius
+    (default: all y).
 
     If the field has a domain, this holds for every such y in the domain. Without a radius the
     constant must be the same at every point of the field.
@@ -371,16 +390,19 @@ class Lipschitz(Promise):
     implies_smooth = False
 
     def movement_bounds(self, value: Any, slopes: SlopeRange, length: Any) -> tuple[Any, Any]:
+        """Return the bounds of f(y) - f(p): constant times length, on both sides."""
         movement = self.constant * length
         return -movement, movement
 
     def implied_lipschitz(self, value: Real) -> Lipschitz:
+        """Return this promise."""
         return self
 
 
 @dataclass(frozen=True)
 class TaylorRemainder(Promise):
-    """|f(y) - f(p) - grad f(p).(y-p)| <= constant |y-p|^2/2 for every y with |y-p| < radius.
+    """The promise that |f(y) - f(p) - grad f(p).(y-p)| <= constant |y-p|^2/2 for every y with |y-p|
+    < radius.
 
     If the field has a domain, this holds for every such y in the domain. Without a radius the
     constant must be the same at every point of the field; it then bounds all second derivatives.
@@ -396,16 +418,20 @@ class TaylorRemainder(Promise):
     units = (("constant", 1, -2), ("radius", 0, 1), ("cubic_constant", 1, -3))
 
     def movement_bounds(self, value: Any, slopes: SlopeRange, length: Any) -> tuple[Any, Any]:
+        """Return the bounds of f(y) - f(p): the slope times the length, and constant length^2/2 to
+        both sides."""
         curved = 0.5 * self.constant * length * length
         return slopes.lower * length - curved, slopes.upper * length + curved
 
     def implied_second_derivative_bound(self, value: Real) -> tuple[Real, Real] | None:
-        """The constant, which bounds |f_vv| for all unit vectors v, and the infinite radius, if the
-        promise has no radius: then it holds at every point. Otherwise None."""
+        """Return the constant, which bounds |f_vv| for all unit vectors v, and the infinite radius,
+        if the promise has no radius: then it holds at every point. Otherwise return None."""
         del value
         return (self.constant, self.radius) if _is_infinite(self.radius) else None
 
     def taylor_remainder_bound(self, value: Real, length: Real, degree: int = 1) -> Real:
+        """Return the bound of |f(y) - T(y)| that the promise states for the degree 1 or 2 of the
+        Taylor polynomial T; infinite beyond its radius."""
         if degree == 2 and _is_infinite(self.cubic_constant):
             return dr.inf
         factor = 0.5 * self.constant if degree == 1 else self.cubic_constant * length / 6
@@ -413,6 +439,6 @@ class TaylorRemainder(Promise):
 
 
 def _is_infinite(end: Any) -> bool:
-    """Whether `end` is an infinite Python float, which is known while a kernel is being
+    """Return whether `end` is an infinite Python float, which is known while a kernel is being
     recorded."""
     return isinstance(end, float) and math.isinf(end)

@@ -1,5 +1,8 @@
-"""The choice of enclosures, by name or by class, and the longest length that several of them
-prove."""
+"""The choice of enclosures, by name or by class, and the longest length that several of them prove.
+An enclosure bounds how far a function f can change along a path (a ray) from its value at a sample.
+It proves a length of the path to be free: f takes no level (a value that rays look for) on it. Most
+enclosures are derived from promises, proved bounds of f near the sample.
+"""
 
 from __future__ import annotations
 
@@ -70,8 +73,9 @@ _NAMES_USING_RANGES = [
 
 @dataclass(frozen=True)
 class EnclosureKinds:
-    """Classes of enclosures in an order. For each promise the first class that can use it is
-    chosen.
+    """Classes of enclosures in an order. An enclosure bounds the change of a function f along a
+    path; most are derived from a promise, a proved bound of f near a point. For each promise the
+    first class that can use it is chosen.
 
     kinds: the classes, the sharpest first. A later class would only prove less from the same
         promise.
@@ -85,11 +89,11 @@ class EnclosureKinds:
     def from_restriction(
         self, function: PathRestriction, slopes: SlopeRange, length: Real
     ) -> tuple[Enclosure, ...]:
-        """The enclosure of a function from ranges of its derivatives along the path, as a tuple of
-        one.
+        """Return the enclosure of a function from ranges of its derivatives along the path, as a
+        tuple of one. It is made by the first class that uses such ranges; the tuple is empty if no
+        class does.
 
-        It is made by the first class that uses such ranges; the tuple is empty if no class does.
-
+        function: the function along the path.
         slopes: the range of the derivative at the start of the path.
         length: the length of the path on which the enclosure is wanted.
         """
@@ -108,15 +112,16 @@ class EnclosureKinds:
         slopes: SlopeRange,
         ray_promises: tuple[Lipschitz, ...] = (),
     ) -> tuple[Enclosure, ...]:
-        """The enclosures of f along a direction, one for each promise that a class can use.
+        """Return the enclosures of f along a direction, one for each promise that a class can use.
 
         promises, alternative_promises, ray_promises: proved bounds of f near the point, as in
-            `Sample`.
+            `Sample`. Those in `ray_promises` hold along this direction only.
         value, error: f at the point, and a bound of its error.
         slopes: the range of the derivative of f along the direction.
 
         Raises:
-            ValueError: no class of enclosures can use any of the promises.
+            ValueError: no class of enclosures can use any of the promises other than
+                `ray_promises`.
         """
         promises = promises + alternative_promises if self.uses_alternative_promises else promises
         enclosures = [
@@ -131,7 +136,7 @@ class EnclosureKinds:
     def _enclosure(
         self, promise: Promise, value: Real, error: Real, slopes: SlopeRange
     ) -> Enclosure | None:
-        """The enclosure of the first class that can use the promise; None if no class can."""
+        """Return the enclosure of the first class that can use the promise; None if none can."""
         for kind in self.kinds:
             enclosure = kind.from_promise(promise, value, error, slopes)
             if enclosure is not None:
@@ -141,7 +146,7 @@ class EnclosureKinds:
     def _nothing_applies_message(
         self, promises: tuple[Promise, ...], value: Real, error: Real, slopes: SlopeRange
     ) -> str:
-        """The text of the error that none of these classes of enclosures can use the field's
+        """Return the text of the error that none of these classes of enclosures can use the field's
         promises. It names the choices of the option `enclosures` that can use them.
 
         promises, value, error, slopes: as for `from_promises`.
@@ -156,6 +161,7 @@ class EnclosureKinds:
                 f"{', '.join(_NAMES_USING_RANGES)}"
             )
         promised = " and ".join(sorted({type(promise).__name__ for promise in promises}))
+        # The names whose first, sharpest class can use one of the promises.
         usable = [
             f'"{name}"'
             for name, (sharpest, *_) in _KINDS_BY_NAME.items()
@@ -188,7 +194,8 @@ EnclosureChoice: TypeAlias = (
 
 
 def choose_enclosures(enclosures: EnclosureChoice = None) -> EnclosureKinds:
-    """The classes of enclosures for the option `enclosures` of other functions.
+    """Return the classes of enclosures for the option `enclosures` of other functions. An enclosure
+    bounds the change of a function along a ray, so that it proves steps.
 
     enclosures: a name, one or several classes of enclosures, or None for all that are worth their
         time.
@@ -225,6 +232,7 @@ def choose_enclosures(enclosures: EnclosureChoice = None) -> EnclosureKinds:
                 f"{did_you_mean(enclosures, _KINDS_BY_NAME)}"
             )
         return EnclosureKinds(_KINDS_BY_NAME[enclosures])
+    # A single class, or several.
     classes = cast("Any", enclosures) if isinstance(enclosures, Iterable) else (enclosures,)
     kinds: tuple[Any, ...] = tuple(classes)
     if not kinds or not all(_is_proof(kind) for kind in kinds):
@@ -237,12 +245,14 @@ def choose_enclosures(enclosures: EnclosureChoice = None) -> EnclosureKinds:
 
 
 def _is_proof(kind: Any) -> bool:
-    """Whether `kind` is a class of enclosures that can be instantiated."""
+    """Return whether `kind` is a class of enclosures that can be instantiated."""
     return isinstance(kind, type) and issubclass(kind, Enclosure) and not inspect.isabstract(kind)
 
 
 def longest_free_length(enclosures: tuple[Enclosure, ...], gaps: LevelGaps) -> Real:
-    """The longest length that any of the enclosures proves free.
+    """Return the longest length on which any of the enclosures proves that f takes no level.
+
+    gaps: the differences between f and the next levels.
 
     Each length is proved, so their maximum is. It is at least 0, even if an enclosure gives NaN.
     """
@@ -253,7 +263,8 @@ def longest_free_length(enclosures: tuple[Enclosure, ...], gaps: LevelGaps) -> R
 
 
 def any_is_free(enclosures: tuple[Enclosure, ...], gaps: LevelGaps, length: Real) -> Mask:
-    """Whether at least one of the enclosures proves the length free."""
+    """Return the mask of lanes on which at least one of the enclosures proves that f takes no level
+    on the length. gaps: the differences between f and the next levels."""
     is_free = length <= 0
     for enclosure in enclosures:
         is_free |= enclosure.is_free(gaps, length)

@@ -1,11 +1,12 @@
-"""Determines the branch of f along rays if samples give f only modulo 1. The branch is the integer
-that has to be added to a sample.
+"""Determines the branch of f along rays, if samples give f only modulo 1. Here f is the winding
+number of a mesh: samples from octree cells lack an unknown integer, the branch, which has to be
+added. The true levels are the values of f at which rays hit; the periodic levels are all numbers
+that differ from a true level by an integer.
 
 Samples without a branch (`Sample.branch_unknown`) come from octree cells that expand the solid
-angle of the boundary of a mesh; f is the winding number of the mesh. The periodic levels are all
-numbers that differ from a level by an integer. On a step that is proved free of the periodic
-levels, f stays between the same two of them. At a triangle of the mesh f jumps by a known integer.
-So the last accepted value determines the branch at the next point.
+angle of the boundary of the mesh. On a step that is proved to meet no periodic level, f stays
+between the same two of them. At a triangle of the mesh f jumps by a known integer. So the last
+accepted value determines the branch at the next point.
 """
 
 from __future__ import annotations
@@ -31,8 +32,8 @@ _MAX_CHANGE, _MAX_ERROR = 0.25, 0.125
 
 @dataclass(frozen=True)
 class BranchTracker:
-    """Finds the branch of samples of f that are known only modulo 1: the integer that has to be
-    added.
+    """Finds the branch of samples that give f only modulo 1: the integer that has to be added. f is
+    the winding number of a mesh, and it jumps by integers at facets (triangles).
 
     levels: the true levels, at which rays hit. The periodic levels are all numbers that differ from
         a true level by an integer.
@@ -50,34 +51,37 @@ class BranchTracker:
     ) -> tuple[RaySample, Mask]:
         """Add the branch, an integer, to the samples that lack it.
 
-        Returns the samples, and a mask of lanes on which the branch is certain even if f is within
-        its error of a periodic level (a number that differs from a level by an integer).
+        Returns the samples, and a mask of rays on which the branch is certain even if f is within
+        its error of a periodic level (a number that differs from a true level by an integer).
 
-        look: the samples at the trial points, with their enclosures (intervals that provably
+        ray_sample: the samples at the trial points, with enclosures (intervals that are proved to
             contain the change of f along the ray).
-        before: f at the last accepted point, behind the facet (a triangle at which f jumps) if the
-            point lies on one. On rays without an accepted point it is 0 and only tells between
-            which periodic levels f lies.
-        step: the distance from the trial point back to that point.
+        before: f at the last accepted point; behind the facet (a triangle at which f jumps) if the
+            point lies on one. On rays without an accepted point it is an approximate value, or 0,
+            and only tells between which periodic levels f lies.
+        step: the distance from the trial point back to the last accepted point.
         total_error: a bound of the error of the sampled f.
 
         Proof. (1) Suppose the sample proves that f changes by less than a quarter on the way back
         to the accepted point. Both values have errors below an eighth, since samples with larger
         errors are not accepted (`gaps`). So the true value is the one nearest to `before` among
         those that differ from the sample by an integer. (2) Otherwise the way to an accepted trial
-        point is free of periodic levels. So f lies between the same two of them as `before`, and
-        the fractional part of the sample determines it. If the way is not proved free, the point is
+        point holds no periodic level. So f lies between the same two of them as `before`, and the
+        fractional part of the sample determines it. If this is not proved of the way, the point is
         not accepted, whatever its value. If f is within its error of a periodic level, the point is
         accepted only by (1).
         """
         sample, level = ray_sample.sample, self.levels.values[0]
         value, branch = sample.value - level, dr.floor(before - level)
         in_branch = level + (branch + (value - dr.floor(value)))
+        # The value for case (1); `in_branch` is that for case (2).
         nearest = sample.value + dr.round(before - sample.value)
+        # An array of the width of `step`.
         change = 0 * step + _MAX_CHANGE
         is_near = any_is_free(ray_sample.backward, LevelGaps(change, change), step) & (
             total_error < _MAX_ERROR
         )
+        # 0 stands for no accepted point.
         is_near &= before != 0
         value = dr.select(is_near, nearest, in_branch)
         shift = dr.select(sample.branch_unknown, value - sample.value, 0)
@@ -86,31 +90,32 @@ class BranchTracker:
     def gaps(
         self, sample: Sample, is_modulo: Mask, is_sure: Mask, total_error: Real
     ) -> tuple[LevelGaps, Mask, Mask]:
-        """The differences between f and the levels below and above it for which the next step is
-        solved, and two masks.
-
-        By default these are the differences to the neighboring periodic levels (numbers that differ
-        from a level by an integer). On lanes of the mask `passes` they are those to the neighboring
-        true levels. These are lanes on which a periodic level that is no true level is near, or the
-        error of f is large.
-
-        The first mask returned holds the lanes of `passes` whose sample was given with its branch.
-        The second holds the lanes whose point has to be sampled again with the branch.
+        """Return the differences between f and the levels below and above it for which the next
+        step is solved, and two masks.
 
         sample: the samples, with the branch added.
-        is_modulo: lanes whose sample gave f only modulo 1.
-        is_sure: lanes on which the branch is certain even if f is within its error of a periodic
-            level.
+        is_modulo: mask of rays whose sample gave f only modulo 1.
+        is_sure: mask of rays on which the branch is certain even if f is within its error of a
+            periodic level (the mask that `resolve` returns).
         total_error: a bound of the error of the sampled f.
+
+        Mostly the differences are those to the neighboring periodic levels (numbers that differ
+        from a true level by an integer). On some rays, in `passes_level`, they are those to the
+        neighboring true levels: where the nearest periodic level is close and is no true level, or
+        where the error of f is large.
+
+        The first mask returned holds the rays in `passes_level` whose sample was given with its
+        branch. The second holds the rays whose point has to be sampled again with the branch.
 
         A ray passes a periodic level that is no true level by samples with known branch. A step
         from such a sample may cross that level, so the next sample needs a known branch, too.
         """
         periodic, true = self._periodic_levels.gaps(sample.value), self.levels.gaps(sample.value)
         near = fmax(2 * total_error, _NEAR_LEVEL)
-        passes = (periodic.nearest < near) & (periodic.nearest < 0.5 * true.nearest)
-        passes |= ~(total_error < _MAX_ERROR)
-        down = dr.select(passes, true.below, periodic.below)
-        up = dr.select(passes, true.above, periodic.above)
-        unsure = passes | (~is_sure & (periodic.nearest < 2 * total_error))
-        return LevelGaps(down, up), passes & ~is_modulo, unsure & is_modulo
+        passes_level = (periodic.nearest < near) & (periodic.nearest < 0.5 * true.nearest)
+        # Written so that an error that is NaN counts as large.
+        passes_level |= ~(total_error < _MAX_ERROR)
+        down = dr.select(passes_level, true.below, periodic.below)
+        up = dr.select(passes_level, true.above, periodic.above)
+        unsure = passes_level | (~is_sure & (periodic.nearest < 2 * total_error))
+        return LevelGaps(down, up), passes_level & ~is_modulo, unsure & is_modulo

@@ -1,15 +1,16 @@
-"""Derivatives of hits, by implicit differentiation at the hit.
+"""Derivatives of hits, by implicit differentiation at the hit. A ray o + t d hits the surface f =
+level at t; f is the function of the field, and theta are its parameters.
 
-The marching loop itself is not differentiated: such a derivative would depend on where the loop
-    stopped. The equation of the hit, f(o + t d; theta) = level, determines t as a function of the
-    parameters theta:
+The loop that finds the hit is not differentiated: such a derivative would depend on where the loop
+stopped. The equation of the hit, f(o + t d; theta) = level, determines t as a function of o, d,
+level and theta:
 
     dt = (dlevel - df|_t) / (grad f . d).
 
 Here df|_t is the change of f at a fixed t, by changes of o, d and theta. The trace runs without
 derivatives, and this derivative is attached to its t, by the gradient of a sample at the hit. A hit
-on a facet of a field with jumps lies on a plane n . (o + t d) = const, whatever the level: dt = -(n
-. (do + t dd))/(n . d).
+on a facet (a flat piece of surface at which f jumps) lies on a plane n . (o + t d) = const,
+whatever the level: dt = -(n . (do + t dd))/(n . d).
 
 So no derivative passes through `evaluate`, which may run a recorded loop. If a derivative would be
 lost, an error is raised: for arguments by `validation` and `Field.__new__`, for results by
@@ -45,7 +46,7 @@ _PARAMETER_FREE: FieldCache[bool] = FieldCache()
 
 
 def needs_derivatives(prepared: SurfaceTracer, o: Vec3, d: Vec3) -> bool:
-    """Whether rays, levels or the field's parameters have derivatives enabled.
+    """Return whether rays, levels or the field's parameters have derivatives enabled.
 
     o, d: (3,) origins and directions of the rays.
 
@@ -58,31 +59,35 @@ def needs_derivatives(prepared: SurfaceTracer, o: Vec3, d: Vec3) -> bool:
     if not _PARAMETER_FREE.get(field, None, lambda: is_plain_data(vars(field))):
         field.refuse_hidden_parameters()
     parameters = prepared.field.parameters()
-    of_field = any(dr.grad_enabled(p) for p in parameters)
-    if of_field and prepared.field.has_jumps:
+    field_has_derivatives = any(dr.grad_enabled(p) for p in parameters)
+    if field_has_derivatives and prepared.field.has_jumps:
         name = type(prepared.field).__name__
         raise NotImplementedError(
             f"hits of a field with jumps cannot be differentiated by its parameters: detach "
             f"those of this {name} (derivatives by rays and levels are attached)"
         )
-    rest: list[Any] = [o, d, *prepared.levels.values]
-    return of_field or any(dr.grad_enabled(p) for p in rest)
+    rays_and_levels: list[Any] = [o, d, *prepared.levels.values]
+    return field_has_derivatives or any(dr.grad_enabled(p) for p in rays_and_levels)
 
 
 class _NoDerivative(dr.CustomOp):
-    """The identity, for a result whose derivative is not known. In reverse mode it raises an error.
-    Forward mode goes from parameters to all that depends on them, needed or not, so the derivative
-    is NaN there."""
+    """The identity, as a Dr.Jit operation, for a result whose derivative is not known. In reverse
+    mode its derivative raises an error. Forward mode goes from parameters to all that depends on
+    them, needed or not, so the derivative is NaN there."""
 
     def eval(self, value: Any, result_name: str, sources: list[Any]) -> Any:
+        """Return `value`, and keep its name for the message. sources: the arrays on which it
+        depends."""
         del sources
         self._result_name = result_name
         return value
 
     def forward(self) -> None:
+        """Make the forward derivative NaN."""
         self.set_grad_out(self.grad_out() + dr.nan)
 
     def backward(self) -> None:
+        """Raise NotImplementedError, unless the result is not used."""
         if dr.any(self.grad_out() != 0, axis=None):  # it is zero for a result that is not used
             raise NotImplementedError(
                 f"{self._result_name} of hits cannot be differentiated, only t and position can: "
@@ -93,11 +98,11 @@ class _NoDerivative(dr.CustomOp):
 def refuse_derivative(
     prepared: SurfaceTracer, o: Vec3, d: Vec3, result_name: str, value: Any
 ) -> Any:
-    """The array `value`, with an error if its derivative is requested: its derivative is not known,
-    and zero would be wrong. In forward mode the derivative is NaN.
+    """Return the array `value`, which raises an error if its derivative is requested: it is not
+    known, and zero would be wrong. In forward mode the derivative is NaN.
 
-    o, d: (3,) origins and directions of the rays. result_name: the name of the result, for
-        the message.
+    o, d: (3,) origins and directions of the rays.
+    result_name: the name of the result, for the message.
     """
     sources = [o, d, *prepared.levels.values, *prepared.field.parameters()]
     return dr.custom(_NoDerivative, value, result_name, sources)
@@ -106,36 +111,38 @@ def refuse_derivative(
 def attach_derivatives(
     prepared: SurfaceTracer, o: Vec3, d: Vec3, end: MarchResult, normal: Vec3
 ) -> tuple[Real, Vec3]:
-    """The ray parameters t of hits, refined up to rounding, with derivatives attached; and the
-    normals (3,) at these points.
+    """Return the ray parameters t of hits, refined up to rounding, with derivatives attached; and
+    the normals (3,) at these points.
 
-    o, d: (3,) origins and directions of the rays, possibly with derivatives. end: how the rays
-        ended.
+    o, d: (3,) origins and directions of the rays, possibly with derivatives.
+    end: how the rays ended.
     normal: (3,) the unit normals of the trace, which are kept if there is no hit.
 
-    Normals carry no derivative, which would need the Hessian. At hits on facets, t is exact already
-    and does not depend on the level.
+    Newton's method first moves t to the level. Then -change/slope is the derivative of t, where
+    `change` is a zero whose derivative is that of f - level at fixed t. Normals carry no
+    derivative, which would need the Hessian. At hits on facets, t is exact already and does not
+    depend on the level.
     """
-    t, hit, prepared = end.t, end.status == int(RayStatus.HIT), prepared.hit_surface(end)
+    t, is_hit, prepared = end.t, end.status == int(RayStatus.HIT), prepared.hit_surface(end)
     if prepared.field.has_jumps:
         t = _on_plane(prepared, o, d, end)
-        hit &= ~end.at_jump
+        is_hit &= ~end.at_jump
     backend = prepared.backend
     with dr.suspend_grad():
-        t_hit = dr.select(hit, t, 0)
+        t_hit = dr.select(is_hit, t, 0)
         origin, direction = dr.detach(o), dr.detach(d)
         steps = _NEWTON_STEPS
         if prepared.field.has_variable_accuracy:
             # Truncation is as large as the tolerance, and its derivative may be much larger.
             steps = _NEWTON_STEPS_OF_SUMS
-            detail = dr.select(hit, backend.Float(EXACT), 0)
+            detail = dr.select(is_hit, backend.Float(EXACT), 0)
             prepared = replace(prepared, field=prepared.field.at_accuracy(detail))
         for _ in range(steps):
             x = dr.fma(backend.Array3f(t_hit), direction, origin)
             sample = prepared.sample(x)
             offset = prepared.levels.offset_to_nearest(sample.value)
             slope = dr.dot(sample.gradient, direction)
-            step = dr.select(hit & (slope != 0), offset / slope, 0)
+            step = dr.select(is_hit & (slope != 0), offset / slope, 0)
             # A grazing ray may have no root to converge to; stay near the proved point.
             limit = 4 * prepared.tolerance.distance
             t_hit = t_hit + dr.clip(step, -limit, limit)
@@ -143,20 +150,22 @@ def attach_derivatives(
         sample = prepared.sample(x)
         slope = dr.dot(sample.gradient, direction)
         length = norm(sample.gradient)
-        normal = dr.select(hit & (length > 0), sample.gradient / length, normal)
+        normal = dr.select(is_hit & (length > 0), sample.gradient / length, normal)
         dr.eval(t_hit, x, slope, normal)
     point = dr.fma(backend.Array3f(t_hit), d, o)
+    # x is the same point without derivatives.
     change = dr.dot(sample.gradient, point - x)
     if any(dr.grad_enabled(parameter) for parameter in prepared.field.parameters()):
+        # f depends on parameters, too: its own derivative has all of them.
         value = prepared.field.differentiable_value(point)
         change = value - dr.detach(value)
     change = change - _change_of_nearest(prepared, sample.value)
-    return dr.select(hit, _with_derivative(t_hit, change, slope, hit), t), normal
+    return dr.select(is_hit, _with_derivative(t_hit, change, slope, is_hit), t), normal
 
 
 def _on_plane(prepared: SurfaceTracer, o: Vec3, d: Vec3, end: MarchResult) -> Real:
-    """The ray parameters t; at hits on facets with the derivative of the intersection with the
-    facet's plane."""
+    """Return the ray parameters t. At hits on facets, they have the derivative of the intersection
+    with the facet's plane."""
     with dr.suspend_grad():
         t_hit = dr.select(end.at_jump, end.t, 0)
         slope = dr.dot(end.gradient, dr.detach(d))
@@ -166,20 +175,24 @@ def _on_plane(prepared: SurfaceTracer, o: Vec3, d: Vec3, end: MarchResult) -> Re
 
 
 def _with_derivative(t: Real, change: Real, slope: Real, is_attached: Mask) -> Real:
-    """t with the derivative of -change/slope on lanes of `is_attached`, infinite or NaN if the
-    slope is 0 there. change: a zero with a derivative. slope: the derivative of f along the ray."""
+    """Return t with the derivative of -change/slope on lanes of `is_attached`; infinite or NaN if
+    the slope is 0 there.
+
+    change: a zero with a derivative.
+    slope: the derivative of f along the ray.
+    """
     return dr.replace_grad(t, -change * dr.select(is_attached, 1 / slope, 0))
 
 
 def _change_of_nearest(prepared: SurfaceTracer, f: Real) -> Real:
-    """level - detach(level) for the level nearest to f on each lane: a zero that carries the
+    """Return level - detach(level) for the level nearest to f on each lane: a zero that carries the
     derivative of this level."""
     nearest, change = dr.inf, prepared.backend.Float(0)
     for level in prepared.levels.values:
         with dr.suspend_grad():
             single = Levels((dr.detach(level),), prepared.levels.period)
             gap = single.gaps(f).nearest
-            closer = gap < nearest
-            nearest = dr.select(closer, gap, nearest)
-        change = dr.select(closer, level - dr.detach(level), change)
+            is_nearest = gap < nearest
+            nearest = dr.select(is_nearest, gap, nearest)
+        change = dr.select(is_nearest, level - dr.detach(level), change)
     return change

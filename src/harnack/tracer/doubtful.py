@@ -1,4 +1,6 @@
-"""Distances of the surface from hits that may be due to rounding alone.
+"""Distances of the surface from hits that may be due to rounding alone. f is the function whose
+level is the surface, and a hit is a point of a ray at which |f - level| is within a tolerance or
+within the error of f.
 
 Suppose that grad f is 0 on the surface, for example where two sheets of it meet. Then f - level
 behaves as c u^m, with u the distance from the surface and m > 1. Rounding hides the surface there
@@ -34,7 +36,7 @@ _DIRECTION_COUNT = 6
 
 @dataclass(frozen=True)
 class Doubtful:
-    """Hits around which the surface is searched for, with one entry for each hit.
+    """Hits around which the surface is searched for, as arrays with one entry for each hit.
 
     position: (3,) the hit.
     normal: (3,) unit vector along the gradient of f.
@@ -50,13 +52,16 @@ class Doubtful:
 
 @dataclass(frozen=True)
 class _SearchState:
-    """The state of the search around each hit.
+    """The state of the search for the surface around each hit. Samples of f are taken in rounds: in
+    six directions from the hit, at a distance that grows from round to round. Where f comes nearer
+    to the level along the gradient and then turns back, the point at which it turns is searched
+    for.
 
     distance: the distance of the next sample from the hit.
-    way: the index of the direction of the next sample, 0 to 5.
-    above, below: whether a sample was surely above, and surely below the level.
-    low, high, low_slope, high_slope: two lengths along the gradient between which f turns back from
-        the level, and the slopes of f there.
+    way: the index of the direction of the next sample, 0 to 5; 0 and 1 are along the gradient.
+    above, below: whether some sample was surely above, and some surely below the level.
+    low, high, low_slope, high_slope: two lengths along the gradient between which f turns back, and
+        the slopes of f there.
     searches: whether the point at which f turns back is being searched for.
     may_turn: whether such a point may still be found.
     sample_count: the number of samples so far.
@@ -80,8 +85,8 @@ class _SearchState:
 
 
 def seen_distance(backend: Backend, field: Field, levels: Levels, hits: Doubtful) -> Real:
-    """A distance from each hit within which the surface was found, at least `hits.distance`; inf if
-    it was not found within a sixteenth of the size of coordinates.
+    """Return a distance from each hit within which the surface was found, at least `hits.distance`;
+    inf if it was not found within a sixteenth of the size of coordinates.
 
     Proof. Two cases count as found. (1) At one sampled point f is certainly above the level, and at
     another one certainly below: the differences exceed the bounds of its error. All points lie
@@ -97,47 +102,57 @@ def seen_distance(backend: Backend, field: Field, levels: Levels, hits: Doubtful
     smallest = 4 * backend.machine_epsilon * hits.size
 
     def offset_of(sample: Any) -> tuple[Real, Real, Mask]:
-        """f minus the level, the bound of its error, and whether it is certain on which side of the
-        level f is."""
-        x, error = (
+        """Return f minus the level, the bound of its error, and whether it is certain on which side
+        of the level f is."""
+        offset, error = (
             sample.value - level,
             value_error_bound(sample, safe_norm(sample.gradient), hits.size),
         )
         if period is None:
-            return x, error, dr.abs(x) > error
-        x = x - period * dr.round(x / period)
-        return x, error, (dr.abs(x) > error) & (dr.abs(x) < _MAX_PERIOD_FRACTION * period)
+            return offset, error, dr.abs(offset) > error
+        offset = offset - period * dr.round(offset / period)
+        return (
+            offset,
+            error,
+            (dr.abs(offset) > error) & (dr.abs(offset) < _MAX_PERIOD_FRACTION * period),
+        )
 
+    # Two axes at right angles to the gradient.
     normal, vector = hits.normal, backend.Array3f
     axis = dr.select(dr.abs(normal.x) < 0.6, vector(1, 0, 0), vector(0, 1, 0))
-    across = safe_normalize(dr.cross(normal, axis))
-    second = dr.cross(normal, across)
-    x, _, is_sure = offset_of(at_hit)
-    side = dr.select(x > 0, backend.Float(1), -1)
+    first_axis = safe_normalize(dr.cross(normal, axis))
+    second_axis = dr.cross(normal, first_axis)
+    offset, _, is_sure = offset_of(at_hit)
+    # Multiplied by this sign, a slope < 0 leads towards the level.
+    side = dr.select(offset > 0, backend.Float(1), -1)
 
     def sample_once(now: _SearchState) -> _SearchState:
-        """The state after one more sample: in the next of six directions, or at the point at which
-        f may turn back."""
-        direction = dr.select(now.way < 2, hits.normal, dr.select(now.way < 4, across, second))
+        """Take one more sample: in the next of six directions, or at the point at which f may turn
+        back. Returns the state after it."""
+        direction = dr.select(
+            now.way < 2, hits.normal, dr.select(now.way < 4, first_axis, second_axis)
+        )
         direction = dr.select((now.way & 1) == 0, direction, -direction)
         length = dr.select(now.searches, _turning_point(now), now.distance)
         sample = field.evaluate(dr.fma(type(direction)(length), direction, hits.position))
-        x, error, is_sure = offset_of(sample)
-        above, below = now.above | (is_sure & (x > 0)), now.below | (is_sure & (x < 0))
+        offset, error, is_sure = offset_of(sample)
+        above, below = now.above | (is_sure & (offset > 0)), now.below | (is_sure & (offset < 0))
         slope = side * dr.dot(sample.gradient, direction)
         first_slope = side * dr.dot(at_hit.gradient, direction)
-        is_seen = (above & below) | (now.searches & (dr.abs(x) <= error))
+        is_seen = (above & below) | (now.searches & (dr.abs(offset) <= error))
         # Does f turn back from the level in this direction?
-        turns = now.may_turn & ~now.searches & (now.way < 2)
-        turns &= (first_slope < 0) & (slope > sample.gradient_error)
+        is_turning = now.may_turn & ~now.searches & (now.way < 2)
+        is_turning &= (first_slope < 0) & (slope > sample.gradient_error)
+        # The part of the interval in which the slope changes sign is kept.
         is_low = now.searches & (slope < 0)
-        is_high = turns | (now.searches & ~is_low)
-        low = dr.select(turns, 0, dr.select(is_low, length, now.low))
+        is_high = is_turning | (now.searches & ~is_low)
+        low = dr.select(is_turning, 0, dr.select(is_low, length, now.low))
         high = dr.select(is_high, length, now.high)
-        goes_on = turns | (now.searches & (high - low > smallest))
-        stays = goes_on & ~is_seen
-        way_index = dr.select(stays, now.way, (now.way + 1) % _DIRECTION_COUNT)
-        is_round = ~stays & (way_index == 0)
+        goes_on = is_turning | (now.searches & (high - low > smallest))
+        keeps_way = goes_on & ~is_seen
+        # Next direction; after the last one, the distance grows.
+        way_index = dr.select(keeps_way, now.way, (now.way + 1) % _DIRECTION_COUNT)
+        is_round = ~keeps_way & (way_index == 0)
         distance = dr.select(is_round & ~is_seen, _DISTANCE_GROWTH * now.distance, now.distance)
         return _SearchState(
             distance=distance,
@@ -146,9 +161,9 @@ def seen_distance(backend: Backend, field: Field, levels: Levels, hits: Doubtful
             below=below,
             low=low,
             high=high,
-            low_slope=dr.select(turns, first_slope, dr.select(is_low, slope, now.low_slope)),
+            low_slope=dr.select(is_turning, first_slope, dr.select(is_low, slope, now.low_slope)),
             high_slope=dr.select(is_high, slope, now.high_slope),
-            searches=stays,
+            searches=keeps_way,
             may_turn=now.may_turn & ~(now.searches & ~goes_on),
             sample_count=now.sample_count + 1,
             is_found=is_seen,
@@ -157,16 +172,17 @@ def seen_distance(backend: Backend, field: Field, levels: Levels, hits: Doubtful
 
     zero, yes, no = backend.Float(0), backend.Bool(True), backend.Bool(False)
     begin = _SearchState(
-        hits.distance, backend.UInt32(0), is_sure & (x > 0), is_sure & (x < 0), zero, zero, zero,
-        zero, no, yes, backend.UInt32(0), no, yes,
+        hits.distance, backend.UInt32(0), is_sure & (offset > 0), is_sure & (offset < 0),
+        zero, zero, zero, zero, no, yes, backend.UInt32(0), no, yes,
     )  # fmt: skip
     end = loop_while_active(begin, sample_once, "harnack doubtful hits")
     return dr.select(end.is_found, end.distance, dr.inf)
 
 
 def _turning_point(now: _SearchState) -> Real:
-    """The length along the gradient at which f may turn back from the level: by the secant through
-    the slopes at `low` and `high`, and by bisection, in turns."""
+    """Return the length along the gradient at which f may turn back from the level: by the secant
+    through the slopes at `low` and `high`, and by bisection, in turns. If the secant leaves the
+    interval, it is halved."""
     fraction = now.low_slope / (now.low_slope - now.high_slope)
     by_secant = ((now.sample_count & 1) == 0) & (fraction > 0) & (fraction < 1)
     return dr.fma(dr.select(by_secant, fraction, 0.5), now.high - now.low, now.low)

@@ -1,6 +1,12 @@
-"""The function `trace`, which gives the hits of rays with a surface, and its result `Hits`.
+"""The function `trace`, which finds the first hits of rays with a surface, and its result `Hits`.
+The surface consists of the points at which a function f, the field, takes one of given values, the
+levels. f may jump at facets, flat pieces of surface such as the triangles of a mesh.
 
 NumPy rays give NumPy arrays, Dr.Jit rays give Dr.Jit arrays, and tensors give tensors.
+
+A hit is doubtful where rounding hides the surface: then the distance of the surface is searched for
+(`doubtful`). With `backend="webgpu"` another device traces the rays, and its hits are compared with
+those of Dr.Jit.
 """
 
 from __future__ import annotations
@@ -54,7 +60,8 @@ _DOUBT_FRACTION, _DOUBT_ROUNDINGS, _SHEET_COUNT, _SEARCH_TOLERANCES = 0.5, 64, 3
 
 @dataclass(frozen=True)
 class Hits:
-    """How n rays ended, as NumPy arrays or, if the rays were Dr.Jit arrays or tensors, as these.
+    """How n rays o + t d ended, as NumPy arrays or, if the rays were Dr.Jit arrays or tensors, as
+    these. f is the function of the field, and the surface is where f takes the level.
 
     is_hit: (n,) mask of rays that hit. Rays that ran out of steps have a finite t as well, so
         `isfinite(t)` is no such mask.
@@ -122,7 +129,8 @@ def trace(
     options: TraceOptions | None = None,
     **keywords: Unpack[TraceKeywords],
 ) -> Hits:
-    """First hits of rays with a level set of a field. No hit is missed: every step is proved.
+    """Find the first hits of rays with a level set of a field's function f: the points at which f
+    takes a given value, the level. No hit is missed: every step is proved.
 
     surface: a field; or a `Surface`, with its levels, clip, section and largest component. A
         `Surface` with a `side` raises an error: the faces of a solid where its clip cuts it are no
@@ -137,7 +145,7 @@ def trace(
         place of `options`: `trace(field, o, d, level=2.0, tolerance=1e-6)`.
 
     Arrays of float64 are traced in double precision and give such arrays, other arrays in single
-    precision, unless `precision` says otherwise. To find further crossings behind the first hit,
+    precision, unless `precision` says otherwise. To find further crossings beyond the first hit,
     use `crossings`.
 
     With Dr.Jit rays, t and position carry derivatives with respect to rays, level, and vertices of
@@ -151,11 +159,11 @@ def trace(
     proved for Dr.Jit's own backends only. So at each call up to 4,096 of the rays are traced by
     Dr.Jit, too, and the results of the device must agree.
 
-    On processors, if there are at least 4,096 rays and successive rays differ much, rays are traced
-    by few lanes that share a queue, unless samples are cheap (`Field.is_cheap`). This gives the
-    same hits, bit by bit, in about half the time. If only the `largest` component is traced, a ray
-    is out of steps if it starts so far away that its coordinates are rounded by more than a small
-    part of a cell.
+    On CPUs, if there are at least 4,096 rays and successive rays differ much, rays are traced by
+    few lanes that share a queue, unless evaluations of f are cheap (`Field.is_cheap`). This gives
+    the same hits, bit by bit, in about half the time. If only the `largest` component is traced, a
+    ray is out of steps if it starts so far away that its coordinates are rounded by more than a
+    small part of a cell.
 
     Raises:
         TypeError, ValueError: shapes that do not match, NaN, directions of length zero, an empty or
@@ -181,24 +189,26 @@ def trace(
 
 
 def _as_tensors(hits: Hits) -> Hits:
-    """The hits with all arrays as tensors."""
+    """Return the hits with all Dr.Jit arrays as tensors."""
     n = dr.width(hits.status)
     return Hits(*(array_to_tensor(array, (n,)) for array in vars(hits).values()))
 
 
 def _trace(surface: TracedSurface, rays: RayBatch) -> Hits:
-    """The hits as Dr.Jit arrays. They carry derivatives if the rays are Dr.Jit arrays and rays,
-    levels or field have derivatives enabled."""
+    """Trace rays, and return their hits as Dr.Jit arrays. The arrays carry derivatives if the rays
+    were given as Dr.Jit arrays, and rays, levels or field have derivatives enabled."""
     backend, o, d, count = rays.backend, rays.origin, rays.direction, rays.count
     prepared = surface.for_rays(count).prepare(backend, many_rays=count >= _MIN_RAYS_FOR_CELLS)
     if not prepared.field.is_cheap and _are_scattered(backend, dr.detach(o), dr.detach(d)):
         prepared = replace(prepared, uses_ray_queue=True)
+    # The trace itself has no derivatives; they are attached to its results.
     with dr.suspend_grad():
         end, hits, doubt = _first_hits(prepared, *(dr.detach(array) for array in rays.arrays))
         if doubt is not None:
             hits = _with_searched_distances(prepared, hits, doubt)
     if not rays.is_numpy and needs_derivatives(prepared, o, d):
         t, normal = attach_derivatives(prepared, o, d, end, hits.normal)
+        # Results without a known derivative raise an error if it is used.
         normal, value, uncertainty = (
             refuse_derivative(prepared, o, d, name, array)
             for name, array in (
@@ -214,60 +224,68 @@ def _trace(surface: TracedSurface, rays: RayBatch) -> Hits:
 
 
 def _are_scattered(backend: Backend, o: Vec3, d: Vec3) -> bool:
-    """Whether there are many rays on a processor, and successive rays differ much, unlike the rays
-    of a camera.
+    """Return whether there are many rays on a CPU and successive rays differ much, unlike the rays
+    of a camera. Then tracing with a queue of rays is faster.
 
     o, d: (3,) origins and unit directions of the rays.
 
-    In a packet of a processor, most of such rays would wait for the longest one. Measured:
-    reflected rays, and chords through curves, clouds and unions of shapes, take half the time with
-    a queue; a camera's rays take a fifth more.
+    A CPU traces packets of successive rays together, and most of such rays would wait for the
+    longest one. Measured: reflected rays, and chords through curves, clouds and unions of shapes,
+    take half the time with a queue; a camera's rays take a fifth more.
     """
     count = dr.width(o, d)
     if count < _MIN_RAYS_FOR_CELLS or dr.backend_v(d) != dr.JitBackend.LLVM:
         return False
+    # Compare about 4096 rays with their successors.
     step = (count - 1) // min(count - 1, _SAMPLED_RAYS)
-    first = dr.arange(backend.UInt32, (count - 1) // step) * dr.opaque(backend.UInt32, step)
+    indices = dr.arange(backend.UInt32, (count - 1) // step) * dr.opaque(backend.UInt32, step)
 
     def gather(rays: Vec3, rows: Any) -> FloatArray:
-        """Rows (n, 3) of some of the rays."""
+        """Return the vectors (n, 3) of the rays with the indices `rows`. A single vector belongs to
+        all rays."""
         index = rows if dr.width(rays) > 1 else 0 * rows
         return to_numpy(dr.gather(backend.Array3f, rays, index)).astype(np.float64)
 
     with np.errstate(over="ignore", invalid="ignore"):  # in rays that are not finite
-        starts, steps = gather(o, first), gather(o, first) - gather(o, first + 1)
-        turns = gather(d, first) - gather(d, first + 1)
-        turn = np.square(turns).sum(axis=1).mean() > _MAX_TURN**2
+        starts, origin_changes = gather(o, indices), gather(o, indices) - gather(o, indices + 1)
+        direction_changes = gather(d, indices) - gather(d, indices + 1)
+        turns_much = np.square(direction_changes).sum(axis=1).mean() > _MAX_TURN**2
+        # The mean square of the distance of two random origins.
         spread = 2 * starts.var(axis=0).sum()
-        return bool(turn or np.square(steps).sum(axis=1).mean() > _MAX_STRAY**2 * spread > 0)
+        return bool(
+            turns_much or np.square(origin_changes).sum(axis=1).mean() > _MAX_STRAY**2 * spread > 0
+        )
 
 
 def _first_hits(
     prepared: SurfaceTracer, o: Vec3, d: Vec3, near: Real, far: Real
 ) -> tuple[MarchResult, Hits, _DistanceDoubt | None]:
-    """Trace rays o + t d from t = near to t = far. Returns the ends of rays, the same data as
-    `Hits` without derivatives, and the doubt about the hits. The doubt is None if no hit can be
-    doubtful."""
+    """Trace rays o + t d from t = near to t = far, without derivatives.
+
+    Returns the ends of rays as the tracer gives them; the `Hits` made from them; and what is known
+    of hits that may be due to rounding alone. The last is None if there can be no such hits.
+    """
     backend = prepared.backend
     end = prepared.first_hit(o, d, near, far)
-    hit = end.status == int(RayStatus.HIT)
+    is_hit = end.status == int(RayStatus.HIT)
     length = norm(end.gradient)
-    normal = dr.select(hit & (length > 0), end.gradient / length, 0)
+    normal = dr.select(is_hit & (length > 0), end.gradient / length, 0)
     index = dr.full(backend.Int32, -1, dr.width(end.status))
     if prepared.field.has_jumps:
         index = dr.reinterpret_array(backend.Int32, end.facet)  # NO_FACET becomes -1
     if end.patch is not None:
         index = dr.reinterpret_array(backend.Int32, end.patch)
-    smooth = hit & ~end.at_jump
+    is_smooth_hit = is_hit & ~end.at_jump
     # Where the gradient is NaN its length has no bound (`tracer.steep`).
-    uncertain = smooth & (end.tolerance_excess > 0) & (length == length)
-    uncertainty = dr.select(uncertain, end.tolerance_excess / length, 0)
+    # Rounding adds the length excess / |grad f| to the distance of the surface.
+    is_uncertain = is_smooth_hit & (end.tolerance_excess > 0) & (length == length)
+    uncertainty = dr.select(is_uncertain, end.tolerance_excess / length, 0)
     doubt = None
     # Other hits are at a root, or were tested on the other side of the level.
     if end.side is None and not prepared.field.is_steep:
         doubt = _DistanceDoubt.of(prepared, o, end.t, length, uncertainty)
-        farther = _SHEET_COUNT * doubt.distance - doubt.tolerance
-        uncertainty = dr.select(doubt.is_doubtful, farther, uncertainty)
+        doubtful_uncertainty = _SHEET_COUNT * doubt.distance - doubt.tolerance
+        uncertainty = dr.select(doubt.is_doubtful, doubtful_uncertainty, uncertainty)
     position = _positions(o, d, end.t)
     hits = Hits(end.t, position, normal, end.value, end.evaluations, end.status, index, uncertainty)
     return end, hits, doubt
@@ -278,7 +296,9 @@ def _first_hits(
 
 @dataclass(frozen=True)
 class _DistanceDoubt:
-    """How far the surface may be from hits because of rounding, with one entry for each hit.
+    """How far the surface may be from hits because rounding hides it, with one entry for each hit.
+    A hit is doubtful if rounding adds much to the first-order distance |f - level| / |grad f| of
+    the surface: where grad f is nearly 0, this estimate is too short.
 
     size: a bound of the coordinates on the ray up to the hit.
     tolerance: the tolerance as a length.
@@ -295,9 +315,10 @@ class _DistanceDoubt:
     def of(
         cls, prepared: SurfaceTracer, o: Vec3, t: Real, steepness: Real, uncertainty: Real
     ) -> _DistanceDoubt:
-        """The doubt about hits.
+        """Determine which hits are doubtful, and their first-order distances.
 
-        o, t: origins (3,) and ray parameters. steepness: |grad f| at the hits.
+        o, t: origins (3,) and ray parameters of the hits.
+        steepness: |grad f| at the hits.
         uncertainty: the length that rounding adds to the tolerance, to first order.
         """
         t = dr.select(dr.isfinite(t), t, 0)
@@ -311,8 +332,12 @@ class _DistanceDoubt:
 
 @dataclass(frozen=True)
 class _SearchedHits:
-    """Hits around which the surface is searched for, and as `part` the index of the patch that each
-    ray hit."""
+    """The hits around which the surface is searched for, as a dataclass of arrays for
+    `compute_on_active`.
+
+    doubtful: the hits.
+    part: the index of the patch that each ray hit, for a field that is a union of patches.
+    """
 
     doubtful: Doubtful
     part: Any
@@ -320,26 +345,33 @@ class _SearchedHits:
 
 @dataclass(frozen=True)
 class _SearchDistance:
-    """The distance from a hit within which the surface was found, as a record for
+    """The distance from a hit within which the surface was found, as a dataclass for
     `compute_on_active`."""
 
     length: Real
 
 
 def _with_searched_distances(prepared: SurfaceTracer, hits: Hits, doubt: _DistanceDoubt) -> Hits:
-    """The hits, with each large uncertainty replaced: the surface is searched for around the hit,
-    and the new uncertainty is the distance within which it was found, less the tolerance. All
-    arrays are evaluated. If there is no large uncertainty, nothing is searched."""
+    """Return the hits, with the uncertainty of the most doubtful ones replaced. Around each of
+    these the surface is searched for; its new uncertainty is the distance within which the surface
+    was found, less the tolerance.
+
+    doubt: which hits are doubtful, and the distances at which the search begins. Only distances of
+        more than 8 tolerances are searched.
+
+    All arrays of the hits are evaluated. If there is no such hit, nothing is searched.
+    """
     backend, field = prepared.backend, prepared.field
     is_far = doubt.is_doubtful & (doubt.distance > _SEARCH_TOLERANCES * doubt.tolerance)
-    has_far = dr.zeros(backend.UInt32, 1)
-    dr.scatter(has_far, 1, 0, is_far)
-    dr.eval(has_far, *vars(hits).values())
-    if not has_far[0]:
+    # Whether any hit is searched, without a kernel of its own: lanes of `is_far` write a 1.
+    any_far = dr.zeros(backend.UInt32, 1)
+    dr.scatter(any_far, 1, 0, is_far)
+    dr.eval(any_far, *vars(hits).values())
+    if not any_far[0]:
         return hits
 
     def search(hit: _SearchedHits) -> _SearchDistance:
-        """The distance within which the surface was found."""
+        """Return the distance within which the surface was found."""
         sampled = field
         if field.has_patches:
             sampled = field.patch(dr.reinterpret_array(backend.UInt32, hit.part))
@@ -357,7 +389,7 @@ def _with_searched_distances(prepared: SurfaceTracer, hits: Hits, doubt: _Distan
 
 
 def _positions(o: Vec3, d: Vec3, t: Real) -> Vec3:
-    """The points (3,) at parameters t of rays, NaN where t is not finite."""
+    """Return the points o + t d (3,); NaN where t is not finite (no hit)."""
     return dr.select(dr.isfinite(t), dr.fma(type(o)(t), d, o), dr.nan)
 
 
@@ -365,9 +397,15 @@ def _positions(o: Vec3, d: Vec3, t: Real) -> Vec3:
 
 
 def _trace_on_device(surface: TracedSurface, rays: RayBatch) -> Hits:
-    """The hits as NumPy arrays, traced by WebGPU. rays: at least one ray, in single precision."""
+    """Trace rays on another device, by WebGPU, and return the hits as NumPy arrays.
+
+    rays: at least one ray, in single precision.
+
+    Raises RuntimeError if the device's hits of a sample of the rays differ from those of Dr.Jit.
+    """
     count = rays.count
     prepared = surface.prepare(rays.backend, many_rays=count >= _MIN_RAYS_FOR_CELLS)
+    # A device needs every array at full width: single numbers are repeated for each ray.
     lanes = {
         name: array + dr.zeros(type(array), count)
         for name, array in zip(("o", "d", "near", "far"), rays.arrays, strict=True)
@@ -375,14 +413,14 @@ def _trace_on_device(surface: TracedSurface, rays: RayBatch) -> Hits:
     dr.eval(lanes)
 
     def compute(o: Vec3, d: Vec3, near: Real, far: Real) -> dict[str, Any]:
-        """The hits by name, for rays o + t d from t = near to t = far."""
+        """Return the arrays of `Hits` by name, for rays o + t d from t = near to t = far."""
         return vars(_first_hits(prepared, o, d, near, far)[1])
 
     directions = to_numpy(lanes["d"])
 
     def differences(rows: IntArray, expected: Arrays, computed: Arrays) -> str:
-        """A message on how the device's hits of some rays differ from the expected ones; "" if they
-        agree."""
+        """Return a message on how the device's hits of some rays differ from the expected ones; ""
+        if they agree. rows: the indices of these rays."""
         pair = Hits(**expected), Hits(**computed)
         return _compare_hits(*pair, directions[rows], surface.hit_tolerance)
 
@@ -408,20 +446,23 @@ _MAX_COUNT_CHANGE = 0.03
 def _compare_hits(
     expected: Hits, actual: Hits, directions: FloatArray, tolerance: HitTolerance
 ) -> str:
-    """A message on how a device's hits of n rays differ from the expected ones by more than
+    """Return a message on how a device's hits of n rays differ from the expected ones by more than
     rounding explains; "" if they do not.
 
-    directions: (n, 3) unit directions of the rays. tolerance: of the hits.
+    expected, actual: the hits by Dr.Jit and by the device.
+    directions: (n, 3) unit directions of the rays.
+    tolerance: the tolerance of hits.
 
     A ray that runs along the surface within the tolerance may hit it anywhere there, miss it, or
-    run out of steps. Such rays may differ.
+    run out of steps. Such rays may differ. The device must agree in the status of rays, then in the
+    places of hits, in the normals, and in the number of evaluations.
     """
-    hit, both = expected.is_hit | actual.is_hit, expected.is_hit & actual.is_hit
+    hit, hit_both = expected.is_hit | actual.is_hit, expected.is_hit & actual.is_hit
     normal = cast("FloatArray", np.where(expected.is_hit[:, None], expected.normal, actual.normal))
     cosine = np.abs((normal * directions).sum(axis=1))
     differs = expected.status != actual.status
-    unproved = np.maximum(expected.status, actual.status) == int(RayStatus.OUT_OF_STEPS)
-    may_differ = unproved | (hit & (cosine < _GRAZING))
+    is_undecided = np.maximum(expected.status, actual.status) == int(RayStatus.OUT_OF_STEPS)
+    may_differ = is_undecided | (hit & (cosine < _GRAZING))
     if (differs & ~may_differ).any() or differs.sum() > _MAX_OUTLIERS * len(differs):
         k = int(np.flatnonzero(differs)[0])
         return (
@@ -429,18 +470,25 @@ def _compare_hits(
             f"{RayStatus(expected.status[k]).name} here, {RayStatus(actual.status[k]).name} there"
         )
     t = expected.t
-    allowed = tolerance.distance + tolerance.per_length * np.where(both, t, 0)
+    allowed = tolerance.distance + tolerance.per_length * np.where(hit_both, t, 0)
     with np.errstate(invalid="ignore"):
-        offset = np.where(both, np.abs(actual.t - t), 0) * np.maximum(cosine, _GRAZING)
-    rounding = 64 * np.finfo(np.float32).eps * np.where(both, 1 + np.abs(t), 1)
+        # The distance across the surface between the two hits of a ray.
+        offset = np.where(hit_both, np.abs(actual.t - t), 0) * np.maximum(cosine, _GRAZING)
+    # t has single precision.
+    rounding = 64 * np.finfo(np.float32).eps * np.where(hit_both, 1 + np.abs(t), 1)
     if (offset > 2 * allowed + rounding).mean() > _MAX_OUTLIERS:
         return (
             f"hits lie up to {offset.max():.2g} off the surface, and {allowed.max():.2g} is asked"
         )
-    if both.any() and np.quantile((offset - rounding)[both] / allowed[both], 0.9) > _MAX_OFFSET:
+    if (
+        hit_both.any()
+        and np.quantile((offset - rounding)[hit_both] / allowed[hit_both], 0.9) > _MAX_OFFSET
+    ):
         return "hits lie elsewhere, if within the tolerance"
-    turns = np.linalg.norm(actual.normal - expected.normal, axis=1)[both & (cosine >= _GRAZING)]
-    if turns.size and np.quantile(turns, 0.9) > _MAX_NORMAL_CHANGE:
+    normal_changes = np.linalg.norm(actual.normal - expected.normal, axis=1)[
+        hit_both & (cosine >= _GRAZING)
+    ]
+    if normal_changes.size and np.quantile(normal_changes, 0.9) > _MAX_NORMAL_CHANGE:
         return "normals differ"
     counts, actual_counts = (result.evaluations.astype(np.float64) for result in (expected, actual))
     if np.abs(actual_counts - counts).sum() > _MAX_COUNT_CHANGE * (counts + 1).sum() + 2:
@@ -449,7 +497,7 @@ def _compare_hits(
 
 
 def _no_hits(rays: RayBatch) -> Hits:
-    """The `Hits` of no rays, as the kind of arrays that the rays have."""
+    """Return the `Hits` of no rays, as the kind of arrays that the rays have."""
     backend = rays.backend
     number, vector = dr.zeros(backend.Float, 0), dr.zeros(backend.Array3f, 0)
     count = dr.zeros(backend.UInt32, 0)
@@ -461,10 +509,10 @@ def _no_hits(rays: RayBatch) -> Hits:
 
 
 def _as_numpy(hits: Hits, n: int) -> Hits:
-    """The hits of n rays as NumPy arrays."""
+    """Return the hits of n rays as NumPy arrays."""
 
     def flat(array: Any) -> Any:
-        """An array as a NumPy array with n rows."""
+        """Return an array as a NumPy array with n rows; a single row is repeated."""
         values: Any = to_numpy(array) if dr.is_array_v(type(array)) else array
         return np.broadcast_to(values, (n, *values.shape[1:])).copy()
 

@@ -1,9 +1,11 @@
-"""`JumpTracer`: traces rays through fields with jumps, such as the winding number of a mesh. The
-flat pieces of surface at which such a field jumps (triangles) are called facets.
+"""`JumpTracer`: traces rays through functions f with jumps, such as the winding number of a mesh.
+The flat pieces of surface at which such a function jumps (triangles) are called facets. The surface
+consists of the points at which f takes a given value, the level, and of the facets with a level
+between the values of f on their two sides.
 
-A ray is cut into intervals at the facets that it crosses. On each interval the field is continuous,
-and `March` traces the ray. At each crossing of a facet, the values before and behind it are
-compared with the level.
+A ray is cut into intervals at the facets that it crosses. On each interval f is continuous, and
+`March` traces the ray. At each crossing of a facet, the values before and behind it are compared
+with the level.
 
 The crossings come from a query of this package and not from Embree, for two reasons. Whether a ray
 passes an edge must be decided by the same bits for both triangles of the edge and for the sum over
@@ -41,14 +43,15 @@ _COARSE_FRACTION = 1e-4
 
 @dataclass(frozen=True)
 class JumpTraceState:
-    """The state of rays through a field with jumps.
+    """The state of rays through a function f with jumps at facets (triangles), between two
+    intervals of the march.
 
-    offset: the initial offset of the field at the start of the ray (`Field.initial_offset`) plus
-        all jumps since.
+    offset: a number from which the field makes f on an interval (`Field.continuation`): that at the
+        start of the ray (`Field.initial_offset`) plus all jumps since.
     behind: the crossing of a facet that was passed last.
     march: the state of the march.
-    reported_facet: for rays that look for crossings, the index of the facet that is reported for
-        the last crossing; None for other rays.
+    reported_facet: for rays that look for crossings of the level, the index of the facet that is
+        reported for the last one; None for other rays.
     """
 
     offset: Real
@@ -64,9 +67,10 @@ class JumpTraceState:
 
 @dataclass(frozen=True)
 class _CoincidentJumps:
-    """Crossings of several facets at the same point of a ray, up to rounding.
+    """The sum of the crossings of several facets at the same point of a ray, up to rounding, while
+    they are added one by one.
 
-    jump: the sum of the jumps of f at them.
+    jump: the sum of the jumps of f at the facets.
     t, last: the ray parameter and the facet index of the last crossing.
     up, normal_up: the index and normal (3,) of the first facet at which f jumps up; NO_FACET if
         there is none.
@@ -89,17 +93,18 @@ class _CoincidentJumps:
 
 @dataclass(frozen=True)
 class JumpTracer:
-    """Traces rays o + t d, start <= t <= end, through a field with jumps. The flat pieces of
-    surface at which the field jumps are called facets.
+    """Traces rays o + t d, start <= t <= end, through a function f with jumps. The flat pieces of
+    surface at which f jumps are called facets. They cut each ray into intervals, on which f is
+    continuous.
 
-    march: marches rays through the continuous intervals between facets.
-    field: the field with jumps.
+    march: marches rays through the intervals.
+    field: the function f.
     path: the rays.
 
-    A smooth hit is a point within the tolerance of the level set of the function that continues the
-    field from its interval beyond the facets. The level set of the field itself may end at a facet.
-    Within the tolerance of such an end, a ray may hit the continued level set although the facet
-    cuts it off. That happens mostly near singular edges, where gradients grow without limit.
+    A smooth hit is a point within the tolerance of the level set of the function that continues f
+    from its interval beyond the facets. The level set of f itself may end at a facet. Within the
+    tolerance of such an end, a ray may hit the continued level set although the facet cuts it off.
+    That happens mostly near singular edges, where gradients grow without limit.
     """
 
     march: March
@@ -110,10 +115,14 @@ class JumpTracer:
 
     @property
     def backend(self) -> Backend:
+        """The backend of the march."""
         return self.march.backend
 
     def run(self, state: MarchState) -> tuple[MarchState, Any]:
-        """The end state of rays, and the index of the facet that each ray hit, NO_FACET for none.
+        """Trace rays until all have ended. Returns their end state, and the index of the facet that
+        each ray hit, NO_FACET for none.
+
+        state: the `MarchState` of rays that have not moved yet.
 
         Proof that no hit is missed. The crossings of facets come in order, so the intervals between
         them cover the ray. On each interval `march` samples a continuous function up to and
@@ -127,13 +136,14 @@ class JumpTracer:
         return self.finish(loop_while_active(self.begin(state), self.advance, "harnack intervals"))
 
     def begin(self, state: MarchState) -> JumpTraceState:
-        """The state of this tracer for rays that have not moved yet. No facet (a piece of a surface
-        at which f jumps) has been crossed.
+        """Return the tracer's own state (a `JumpTraceState`) of rays that have not moved yet and
+        have crossed no facet.
 
         state: the `MarchState` of the same rays, before their first sample.
         """
         real, vector, count = self.backend.Float, self.backend.Array3f, self.backend.UInt32
         o, d = self.path.origin, self.path.direction
+        # A little before the start, so that a facet at the very start is crossed.
         before = real(self.start * (1 - self.backend.machine_epsilon) - 1e-30)
         offset = real(self.field.initial_offset(o, d, before, state.active))
         start = JumpCrossing(before, count(NO_FACET), real(0), vector(0))
@@ -141,8 +151,11 @@ class JumpTracer:
         return JumpTraceState(offset, start, state, reported)
 
     def finish(self, outer: JumpTraceState) -> tuple[MarchState, Any]:
-        """The end of rays as a `MarchState`, and the index of the facet that each ray hit, NO_FACET
-        for none."""
+        """Return the end state of rays as a `MarchState`, and the index of the facet that each ray
+        hit, NO_FACET for none.
+
+        outer: the tracer's own state when no ray is active any more.
+        """
         count, end = self.backend.UInt32, outer.march
         at_facet = end.status == HIT_AT_JUMP
         status = dr.select(at_facet, count(int(RayStatus.HIT)), end.status)
@@ -151,17 +164,23 @@ class JumpTracer:
         return dataclasses.replace(end, status=status), facet
 
     def advance(self, outer: JumpTraceState) -> JumpTraceState:
-        """The state after each active ray has marched one interval: to the next facet, to the end
-        of the ray, or to a hit before that."""
+        """March each active ray through one interval: to the next facet, to the end of the ray, or
+        to a hit before that. Returns the state after it.
+
+        outer: the tracer's own state before.
+
+        A ray that has passed a facet goes on with the next interval, unless it has used all of its
+        steps. A ray on which the order of facets is uncertain ends as out of steps.
+        """
         count = self.backend.UInt32
         o, d = self.path.origin, self.path.direction
         behind, now = outer.behind, outer.march
         ahead, last, unclear = self._merge_coincident(
             self._next(behind, self.end, now.active), now.active
         )
-        out = count(int(RayStatus.OUT_OF_STEPS))
+        out_of_steps = count(int(RayStatus.OUT_OF_STEPS))
         now = dataclasses.replace(
-            now, status=dr.select(unclear, out, now.status), active=now.active & ~unclear
+            now, status=dr.select(unclear, out_of_steps, now.status), active=now.active & ~unclear
         )
         has_facet = ahead.facet != NO_FACET
         stop = dr.select(has_facet, ahead.t, self.end)
@@ -170,16 +189,20 @@ class JumpTracer:
         if now.contact is not None and self.march.hysteresis is not None:
             samples_end = self.march.hysteresis.must_sample_end(now.contact, stop)
             goes_on |= samples_end & (now.proved_to < stop)
+        # The interval is marched to compare the facet at its end with the level, even if its steps
+        # are proved.
         active = now.active & (has_facet | goes_on)
         step = fmin(self.march.over_relaxation * now.proved_step, stop - now.proved_to)
         now = dataclasses.replace(now, trial_step=step, active=active)
+        # The function that is f on this interval and continues it beyond the facets.
         field = self.field.continuation(o, d, behind, ahead, outer.offset)
         now = self.march.advance(field, self.path, stop, now, ahead)
+        # A march that ends at a facet as a miss has passed it.
         passed = active & has_facet & (now.status == int(RayStatus.MISS))
         if now.contact is not None:
             return self._after_jump(outer, now, ahead, last, passed, active & has_facet)
-        spent = passed & (now.evaluations >= self.march.max_steps)
-        status = dr.select(spent, out, now.status)
+        used_all_steps = passed & (now.evaluations >= self.march.max_steps)
+        status = dr.select(used_all_steps, out_of_steps, now.status)
         # Of several facets at a point, a hit reports `ahead`; a ray that passes goes on from
         # `last`.
         crossing = JumpCrossing(
@@ -191,7 +214,7 @@ class JumpTracer:
         return JumpTraceState(
             dr.select(passed, outer.offset + ahead.jump, outer.offset),
             crossing,
-            dataclasses.replace(now, status=status, active=passed & ~spent),
+            dataclasses.replace(now, status=status, active=passed & ~used_all_steps),
         )
 
     def _after_jump(
@@ -203,19 +226,23 @@ class JumpTracer:
         passed: Mask,
         stopped: Mask,
     ) -> JumpTraceState:
-        """The state, after an interval, of rays that look for crossings. A ray that has crossed the
-        level at a facet has passed this facet, and the caller may make it active again.
+        """Return the state after an interval for rays that look for crossings of the level. A ray
+        that has crossed the level at a facet has passed this facet, and the caller may make it
+        active again.
 
         previous: the state before the interval.
         now: the march at the end of the interval.
         ahead, last: the merged crossing at the end of the interval, and the last of the crossings
-            that were merged.
-        passed: mask of the rays that have passed the facet without crossing the level.
-        stopped: mask of the rays whose interval ends at a facet.
+            that were merged, from which the ray goes on.
+        passed: mask of rays that have passed the facet without crossing the level.
+        stopped: mask of rays whose interval ends at a facet.
         """
-        spent = passed & (now.evaluations >= self.march.max_steps)
-        status = dr.select(spent, self.backend.UInt32(int(RayStatus.OUT_OF_STEPS)), now.status)
+        used_all_steps = passed & (now.evaluations >= self.march.max_steps)
+        status = dr.select(
+            used_all_steps, self.backend.UInt32(int(RayStatus.OUT_OF_STEPS)), now.status
+        )
         is_past = passed | (stopped & (now.status == HIT_AT_JUMP))
+        # Rays that are past the facet go on from the last merged crossing.
         behind = JumpCrossing(
             dr.select(is_past, last.t, previous.behind.t),
             dr.select(is_past, last.facet, previous.behind.facet),
@@ -225,7 +252,7 @@ class JumpTracer:
         return JumpTraceState(
             dr.select(is_past, previous.offset + ahead.jump, previous.offset),
             behind,
-            dataclasses.replace(now, status=status, active=passed & ~spent),
+            dataclasses.replace(now, status=status, active=passed & ~used_all_steps),
             dr.select(is_past, ahead.facet, previous.reported_facet),
         )
 
@@ -235,8 +262,8 @@ class JumpTracer:
         """Merge all crossings of facets at the same t, up to rounding, into one whose jump is the
         sum of their jumps.
 
-        Returns the merged crossing, the last of the crossings that were merged (from which the ray
-        goes on), and a mask of lanes on which it is uncertain whether the crossings are at the same
+        Returns the merged crossing; the last of the crossings that were merged, from which the ray
+        goes on; and a mask of lanes on which it is uncertain whether the crossings are at the same
         point.
 
         first: the first of the crossings.
@@ -254,29 +281,34 @@ class JumpTracer:
         real, count = self.backend.Float, self.backend.UInt32
         size = max_norm(self.path.origin)
         tolerance = _COINCIDENT_ROUNDINGS * self.backend.machine_epsilon * (size + first.t)
+        # A rounding across the facet is a length of rounding / sine along the ray.
         sine = fmax(dr.abs(dr.dot(first.normal, self.path.direction)), real(_MIN_SINE))
+        # Further crossings up to this t may be at the same point.
         limit = fmax(fmin(first.t + tolerance / sine, self.end), first.t)
 
         def add_next(now: _CoincidentJumps) -> _CoincidentJumps:
-            """The sums after the next crossing, if that is at the same point."""
+            """Add the next crossing to the sums, if it is at the same point."""
             crossing = self._next(
                 JumpCrossing(now.t, now.last, 0.0, first.normal), limit, now.active
             )
             # Facets at an angle to each other are merged only at exactly the same t.
-            parallel = dr.abs(dr.dot(crossing.normal, first.normal)) > _MIN_COSINE
-            same = now.active & (crossing.facet != NO_FACET) & ((crossing.t == first.t) | parallel)
-            new_up = same & (crossing.jump > 0) & (now.up == NO_FACET)
-            new_down = same & (crossing.jump < 0) & (now.down == NO_FACET)
+            is_parallel = dr.abs(dr.dot(crossing.normal, first.normal)) > _MIN_COSINE
+            is_same_point = (
+                now.active & (crossing.facet != NO_FACET) & ((crossing.t == first.t) | is_parallel)
+            )
+            new_up = is_same_point & (crossing.jump > 0) & (now.up == NO_FACET)
+            new_down = is_same_point & (crossing.jump < 0) & (now.down == NO_FACET)
             return _CoincidentJumps(
-                jump=now.jump + dr.select(same, crossing.jump, 0),
-                t=dr.select(same, crossing.t, now.t),
-                last=dr.select(same, crossing.facet, now.last),
+                jump=now.jump + dr.select(is_same_point, crossing.jump, 0),
+                t=dr.select(is_same_point, crossing.t, now.t),
+                last=dr.select(is_same_point, crossing.facet, now.last),
                 up=dr.select(new_up, crossing.facet, now.up),
                 down=dr.select(new_down, crossing.facet, now.down),
                 normal_up=dr.select(new_up, crossing.normal, now.normal_up),
                 normal_down=dr.select(new_down, crossing.normal, now.normal_down),
-                folded=now.folded | (same & parallel & (crossing.jump * first.jump < 0)),
-                active=same,
+                folded=now.folded
+                | (is_same_point & is_parallel & (crossing.jump * first.jump < 0)),
+                active=is_same_point,
             )
 
         no_facet = count(NO_FACET)
@@ -292,24 +324,26 @@ class JumpTracer:
             active=self.backend.Bool(active) & (first.facet != NO_FACET),
         )
         total = loop_while_active(start, add_next, "together")
+        # The first facet whose jump has the sign of the sum gives index and normal.
         up, down = total.jump > 0, total.jump < 0
         facet = dr.select(up, total.up, dr.select(down, total.down, first.facet))
         normal = dr.select(up, total.normal_up, dr.select(down, total.normal_down, first.normal))
         behind = JumpCrossing(total.t, total.last, first.jump, first.normal)
-        unclear = total.folded & (total.jump == 0)
-        unclear &= tolerance > _COARSE_FRACTION * (self.end - self.start)
-        return JumpCrossing(first.t, facet, real(total.jump), normal), behind, unclear
+        is_unclear = total.folded & (total.jump == 0)
+        # Only where rounding is no small part of the ray.
+        is_unclear &= tolerance > _COARSE_FRACTION * (self.end - self.start)
+        return JumpCrossing(first.t, facet, real(total.jump), normal), behind, is_unclear
 
     def _next(self, behind: JumpCrossing, end: Real, active: Mask) -> JumpCrossing:
-        """The next crossing of a facet after `behind`, as arrays of this backend. If there is none
-        up to the parameter `end`, its t is inf and its facet NO_FACET."""
+        """Return the next crossing of a facet after the crossing `behind`, as arrays of this
+        backend. If there is none up to the parameter `end`, its t is inf and its facet NO_FACET."""
         real, vector, count = self.backend.Float, self.backend.Array3f, self.backend.UInt32
         ahead = self.field.next_jump(self.path.origin, self.path.direction, behind, end, active)
-        valid = real(ahead.t) <= end
-        valid &= count(ahead.facet) != NO_FACET
+        is_valid = real(ahead.t) <= end
+        is_valid &= count(ahead.facet) != NO_FACET
         return JumpCrossing(
-            dr.select(valid, real(ahead.t), dr.inf),
-            dr.select(valid, count(ahead.facet), count(NO_FACET)),
-            dr.select(valid, real(ahead.jump), 0),
+            dr.select(is_valid, real(ahead.t), dr.inf),
+            dr.select(is_valid, count(ahead.facet), count(NO_FACET)),
+            dr.select(is_valid, real(ahead.jump), 0),
             vector(*ahead.normal),
         )

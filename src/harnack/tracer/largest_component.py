@@ -1,4 +1,8 @@
-"""Finds cells that contain the largest connected component of a level set, or of a solid."""
+"""Finds cells of a grid that contain the largest connected component of a surface. The surface
+consists of the points at which a function f, the field, takes one of given values, the levels; or
+it is a solid {low <= f <= high}. Components are told apart by cells between them that are proved to
+hold no point of the surface.
+"""
 
 from __future__ import annotations
 
@@ -36,11 +40,12 @@ _CELLS: FieldCache[OccupancyGrid] = FieldCache()
 def largest_component_cells(
     field: Field, levels: tuple[float, ...], volume: Volume | None, solid: _Ends | None, across: int
 ) -> OccupancyGrid:
-    """A grid of cells, with those marked that contain the largest component of a level set in a
-    volume, or of a solid {low <= f <= high} in it. The largest component is the one with the
+    """Return a grid of cells, with those marked that contain the largest component of a level set
+    in a volume, or of a solid {low <= f <= high} in it. The largest component is the one with the
     largest sum of projected areas along x, y and z.
 
-    levels: the values of the level set.
+    levels: the values of f on the level set.
+    volume: the volume that contains the surface.
     solid: (low, high); None for the level set itself.
     across: the number of cells along the longest side of the box of the volume.
 
@@ -64,7 +69,7 @@ def largest_component_cells(
         raise ValueError("largest needs a surface with bounds: give it a clip, such as a ball")
 
     def build() -> OccupancyGrid:
-        """The cells, computed anew."""
+        """Compute the cells anew."""
         return _build_cells(field.with_levels(levels), levels, volume, solid, across)
 
     if field.parameters():  # they may change in place
@@ -75,25 +80,27 @@ def largest_component_cells(
 def _build_cells(
     field: Field, levels: tuple[float, ...], volume: Volume, solid: _Ends | None, across: int
 ) -> OccupancyGrid:
-    """The cells of `largest_component_cells`, which describes the parameters."""
-    beyond = _distance_beyond(volume)
-    to_domain = _projection_to_domain(field)
+    """Compute the cells of `largest_component_cells`, which describes the parameters. There is no
+    marked cell if the volume is empty or a single point."""
+    distance_beyond = _distance_beyond(volume)
+    project_to_domain = _projection_to_domain(field)
     in_solid = None if solid is None else _inside_solid(field, solid)
-    to_levels = clearance_function(field, levels, "double")
+    distance_to_levels = clearance_function(field, levels, "double")
 
     def clearance(points: FloatArray) -> FloatArray:
-        """Lower bounds (n,) of the distances of points (n, 3) from the level set, or from the
-        volume if that is farther; 0 inside the solid. They hold also for points outside the field's
-        domain."""
-        clearances = np.maximum(beyond(points), 0.0)
-        inner, distances = to_domain(points)
-        finite = np.isfinite(distances)
-        if not finite.any():
+        """Return lower bounds (n,) of the distances of points (n, 3) from the level set, or from
+        the volume if that is farther; 0 inside the solid. They hold also for points outside the
+        field's domain."""
+        clearances = np.maximum(distance_beyond(points), 0.0)
+        inner, distances = project_to_domain(points)
+        is_finite = np.isfinite(distances)
+        if not is_finite.any():
             return clearances
-        length = to_levels(inner[finite]) - distances[finite]
+        length = distance_to_levels(inner[is_finite]) - distances[is_finite]
         if in_solid is not None:
-            length[in_solid(inner[finite])] = 0.0
-        clearances[finite] = np.maximum(clearances[finite], length)
+            length[in_solid(inner[is_finite])] = 0.0
+        # Both are lower bounds for the part of the surface in the volume, so the larger one holds.
+        clearances[is_finite] = np.maximum(clearances[is_finite], length)
         return clearances
 
     lower, upper = (np.array(end, np.float64) for end in volume.bounds())
@@ -108,17 +115,19 @@ def _refuse_if_unproved(
     field: Field, levels: tuple[float, ...], solid: _Ends | None, cells: OccupancyGrid
 ) -> None:
     """Raise ValueError if most of the marked cells have centers far from the surface, to first
-    order."""
+    order: |f - level| > 4 |grad f| cell sizes. Centers in the solid or outside the domain do not
+    count as far."""
     centers = cells.occupied_centers()
     if field.domain is not None:
         centers = centers[field.domain.contains_points(centers)]
     if not len(centers):
         return
     gap, slope, value = _samples(field, levels)(centers)
-    far = gap > _FAR_CELLS * cells.cell_size * slope
+    # To first order the surface is gap/slope away.
+    is_far = gap > _FAR_CELLS * cells.cell_size * slope
     if solid is not None:
-        far &= ~((value >= solid[0]) & (value <= solid[1]))
-    if far.sum() > _MAX_FAR_FRACTION * len(far):
+        is_far &= ~((value >= solid[0]) & (value <= solid[1]))
+    if is_far.sum() > _MAX_FAR_FRACTION * len(is_far):
         raise ValueError(
             f"largest: with {round(max(cells.shape))} cells along the longest side, most cells of "
             f"this {type(field).__name__} could not be proved empty, so that its components cannot "
@@ -127,48 +136,52 @@ def _refuse_if_unproved(
 
 
 def _projection_to_domain(field: Field) -> Callable[[FloatArray], tuple[FloatArray, FloatArray]]:
-    """A function `project` of points (n, 3). It returns points (n, 3) in the field's domain near
-    them, and the distances (n,) between the two; the distance is inf if no such point was found.
+    """Return a function `project` of points (n, 3). It returns points (n, 3) in the field's domain
+    near them, and the distances (n,) between the two; the distance is inf if no such point was
+    found.
 
-    The field's promises (proved bounds of f near a point) need not hold outside its domain. If the
-    returned point is at least c away from a set, the given point is at least c minus the distance
-    away from it.
+    The proved bounds of f need not hold outside its domain. If the returned point is at least c
+    away from a set, the given point is at least c minus the distance away from it.
     """
     domain = None if field.is_global else field.domain
     backend = choose_backend("double")
     prepared = None if domain is None else domain.prepare(backend)
 
     def project(points: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Points (n, 3) in the domain near the given ones, and the distances (n,) between the
-        two."""
+        """Return points (n, 3) in the domain near the given ones, and the distances (n,) between
+        the two."""
         distances = np.zeros(len(points))
         if domain is None or prepared is None:
             return points, distances
-        outside = ~domain.contains_points(points)
-        if not outside.any():
+        is_outside = ~domain.contains_points(points)
+        if not is_outside.any():
             return points, distances
-        x = points[outside]
-        p = to_vector3(backend, x)
-        depth = (1 + 1e-9) * to_numpy(prepared.signed_distance(p)) + 1e-12 * np.abs(x).max()
-        y = x - depth[:, None] * to_numpy(prepared.outward_normal(p))
+        points_outside = points[is_outside]
+        uploaded = to_vector3(backend, points_outside)
+        # A little farther than the boundary, because of rounding.
+        depth = (1 + 1e-9) * to_numpy(prepared.signed_distance(uploaded)) + 1e-12 * np.abs(
+            points_outside
+        ).max()
+        moved = points_outside - depth[:, None] * to_numpy(prepared.outward_normal(uploaded))
         inner = points.copy()
-        inner[outside] = y
-        length = 1.000001 * np.linalg.norm(x - y, axis=1)
-        distances[outside] = np.where(domain.contains_points(y), length, np.inf)
+        inner[is_outside] = moved
+        # Rounded up, so that the distance is an upper bound.
+        length = 1.000001 * np.linalg.norm(points_outside - moved, axis=1)
+        distances[is_outside] = np.where(domain.contains_points(moved), length, np.inf)
         return inner, distances
 
     return project
 
 
 def _distance_beyond(volume: Volume) -> Callable[[FloatArray], FloatArray]:
-    """A function of points (n, 3) that returns lower bounds (n,) of their distances from the
+    """Return a function of points (n, 3) that returns lower bounds (n,) of their distances from the
     volume; they are negative inside the volume."""
     backend = choose_backend("double")
     prepared = volume.prepare(backend)
 
     def beyond(points: FloatArray) -> FloatArray:
-        """Lower bounds (n,) of the distances of points (n, 3) from the volume, with a margin for
-        rounding."""
+        """Return lower bounds (n,) of the distances of points (n, 3) from the volume, with a margin
+        for rounding."""
         distance = to_numpy(prepared.signed_distance(to_vector3(backend, points)))
         rounding = 64 * float(np.finfo(np.float64).eps) * (1 + float(np.abs(points).max()))
         return np.broadcast_to(distance, len(points)) - rounding
@@ -179,15 +192,15 @@ def _distance_beyond(volume: Volume) -> Callable[[FloatArray], FloatArray]:
 def _samples(
     field: Field, levels: tuple[float, ...]
 ) -> Callable[[FloatArray], tuple[FloatArray, FloatArray, FloatArray]]:
-    """A function of points (n, 3) that returns three arrays (n,): the differences between f and the
-    nearest level, |grad f|, and f."""
+    """Return a function of points (n, 3) that returns three arrays (n,): the differences between f
+    and the nearest level, |grad f|, and f."""
     backend = choose_backend("double")
     prepared = field.prepare(backend)
     targets = Levels(tuple(dr.opaque(backend.Float, level) for level in levels), field.period)
 
     def samples(points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """The difference between f and the nearest level, |grad f|, and f, each (n,), at points (n,
-        3)."""
+        """Return the difference between f and the nearest level, |grad f|, and f, each (n,), at
+        points (n, 3)."""
         sample = prepared.evaluate(to_vector3(backend, points))
         arrays = (targets.gaps(sample.value).nearest, safe_norm(sample.gradient), sample.value)
         gap, slope, value = (np.broadcast_to(to_numpy(array), len(points)) for array in arrays)
@@ -197,13 +210,13 @@ def _samples(
 
 
 def _inside_solid(field: Field, solid: _Ends) -> Callable[[FloatArray], BoolArray]:
-    """A function of points (n, 3) that returns the mask (n,) of points with low <= f <= high, where
-    solid = (low, high)."""
+    """Return a function of points (n, 3) that returns the mask (n,) of points with low <= f <=
+    high, where solid = (low, high)."""
     backend = choose_backend("double")
     prepared = field.prepare(backend)
 
     def within(points: FloatArray) -> BoolArray:
-        """The mask (n,) of points (n, 3) in the solid."""
+        """Return the mask (n,) of points (n, 3) in the solid."""
         value = to_numpy(prepared.evaluate(to_vector3(backend, points)).value)
         return np.broadcast_to((value >= solid[0]) & (value <= solid[1]), len(points))
 
@@ -211,9 +224,9 @@ def _inside_solid(field: Field, solid: _Ends) -> Callable[[FloatArray], BoolArra
 
 
 def validate_component_cells(largest: object) -> int:
-    """The value of the option `largest` as a number: 0 if it is False, 128 if it is True, else the
-    number itself. It is the number of cells along the longest side of the box, by which components
-    are told apart; 0 keeps all components.
+    """Return the number of cells along the longest side of the box by which components are told
+    apart, from the option `largest`: 0 if it is False (all components are kept), 128 if it is True,
+    else the number itself.
 
     Raises:
         TypeError: neither a truth value nor an integer.

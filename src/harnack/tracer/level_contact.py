@@ -1,11 +1,14 @@
-"""The rules by which a point of a ray counts as a hit or as a crossing, and the ways in which a ray
-can end.
+"""The rules by which a point of a ray counts as a hit of the surface or as a crossing, and the ways
+in which a ray can end. f is a function of space, and the surface consists of the points at which f
+takes one of given values, the levels. f may jump at flat pieces of surface, called facets (such as
+the triangles of a mesh); a facet belongs to the surface if a level lies between the values of f on
+its two sides.
 
-- First hits: a ray ends where f is within the `HitTolerance` of a level, or at a facet (a flat
-piece of surface at which f jumps) if a level lies between the values on its two sides
-(`test_jump`).
-- Crossings: a ray goes on behind the level. `Contact` is its state near the level that it reached
-last, and `Hysteresis` is the rule by which each crossing is counted once.
+- First hits: a ray ends where f is within the `HitTolerance` of a level, or at a facet that belongs
+  to the surface (`test_jump`).
+- Crossings: a ray goes on, and f must pass to the other side of the level. A ray is in contact with
+  a level from where it reaches it until f has left the tolerance around it. `Contact` is the state
+  of a ray in contact, and `Hysteresis` is the rule by which each crossing is counted once.
 
 A level that a ray has reached counts as lying a tolerance beyond its true place until f has left
 the tolerance around it. All crossings of a ray are found in this way, and so are hits that require
@@ -36,7 +39,7 @@ if TYPE_CHECKING:
 
 
 class RayStatus(enum.IntEnum):
-    """The ways in which a ray can end."""
+    """How a ray ended: without a hit, with a hit, or undecided."""
 
     MISS = 0
     """The ray is proved to meet no level between t_min and t_max."""
@@ -48,7 +51,8 @@ class RayStatus(enum.IntEnum):
 
 @dataclass(frozen=True)
 class HitTolerance:
-    """How close to a level a point must be to count as a hit.
+    """How close to the surface a point of a ray must be to count as a hit. f is the function whose
+    level is the surface, and t the ray parameter, a length.
 
     distance: a length. A point is a hit if |f - level| <= distance * |grad f|. To first order this
         is its distance from the surface (paper, Sec. 3.1.2); the exceptions are below.
@@ -56,16 +60,16 @@ class HitTolerance:
         tolerance grows with the size of the pixel on the surface.
     value: in units of f. A point is also a hit if |f - level| <= value, whatever the gradient.
 
-    Steep fields. |grad f| may be unbounded, for example beside a vertical tangent or a pole of a
+    Steep functions. |grad f| may be unbounded, for example beside a vertical tangent or a pole of a
     formula (`Field.is_steep`). Then |f - level| / |grad f| is no distance. A point is a hit there
     only if f is proved to take the level within the tolerance, by its slope or by its values
     nearby, or up to the rounding of the point.
 
     Creases and spikes. At creases |grad f| jumps but is bounded. A crease at which f comes as near
-    to the level in value counts as a hit, even if f does not take the level. So do spikes and steps
-    that are narrower than the tolerance, such as those of tanh(1e6 x) - y and of 0.5 + exp(-(1e5
-    x)^2). Some fields that are no formulas have poles, such as clouds of dipoles: rays that pass a
-    pole within the tolerance count as hits of every level.
+    to the level as a hit must counts as a hit, even if f does not take the level. So do spikes and
+    steps that are narrower than the tolerance, such as those of tanh(1e6 x) - y and of 0.5 +
+    exp(-(1e5 x)^2). Some fields that are no formulas have poles, such as clouds of dipoles: rays
+    that pass a pole within the tolerance count as hits of every level.
 
     Rounding. If rounding leaves the distance to the level uncertain by more than the tolerance,
     this uncertainty takes the place of the tolerance. It is about 1e-6 of the size of coordinates
@@ -86,17 +90,20 @@ class HitTolerance:
             raise ValueError("tolerance must be positive: a level set is never met exactly")
 
     def prepare(self, backend: Backend) -> PreparedHitTolerance:
-        """This tolerance as kernel parameters of a backend, so that another tolerance compiles no
-        new kernel."""
+        """Return this tolerance as Dr.Jit numbers of a backend that kernels take as parameters. So
+        another tolerance compiles no new kernel."""
         numbers = (self.distance, self.per_length, self.value)
         return PreparedHitTolerance(*(dr.opaque(backend.Float, number) for number in numbers))
 
 
 @dataclass(frozen=True)
 class PreparedHitTolerance:
-    """A `HitTolerance` as kernel parameters of a backend.
+    """A `HitTolerance` as Dr.Jit numbers that kernels take as parameters. f is the function whose
+    level is the surface.
 
-    distance: a length. per_length: added to it for each unit of t. value: in units of f.
+    distance: a length.
+    per_length: added to `distance` for each unit of the ray parameter t.
+    value: a difference of values of f.
     """
 
     distance: Real
@@ -104,7 +111,8 @@ class PreparedHitTolerance:
     value: Real
 
     def value_tolerance(self, gradient_norm: Real, t: Real) -> Real:
-        """The largest |f - level| at a hit at ray parameter t, where |grad f| = gradient_norm."""
+        """Return the largest |f - level| at a hit at ray parameter t, where |grad f| =
+        gradient_norm."""
         return fmax(gradient_norm * dr.fma(t, self.per_length, self.distance), self.value)
 
 
@@ -114,15 +122,16 @@ HIT_AT_JUMP = max(RayStatus) + 1
 
 @dataclass(frozen=True)
 class JumpTest:
-    """The result of comparing a sample with the facet at the end of its interval of the ray. A
-    facet is a flat piece of surface at which f jumps.
+    """The comparison of a trial point of each ray with the facet at the end of the ray's interval.
+    A facet is a flat piece of surface at which f jumps. The ray hits it if a level lies between the
+    values of f on its two sides.
 
     has_crossing: whether the interval ends at a facet.
-    at_crossing: whether, further, the sample is accepted and lies at that facet.
-    is_hit: whether, further, a level lies between the values of f before and behind the facet, up
-        to the total error of f.
-    gaps: the differences between f and the next levels below and above it; behind the facet on
-        lanes of `at_crossing`, else at the sample.
+    at_crossing: whether, in addition, the trial point is accepted and lies at that facet.
+    is_hit: whether, in addition, a level lies between the values of f before and behind the facet,
+        up to the error of f.
+    gaps: the differences between f and the next levels below and above it. On lanes of
+        `at_crossing`, f is taken behind the facet.
     normal: (3,) unit normal of the facet.
     """
 
@@ -133,8 +142,11 @@ class JumpTest:
     normal: Vec3
 
     def mark(self, status: Any, gradient: Vec3) -> tuple[Any, Vec3]:
-        """The given status and gradient; on rays that hit the facet they are replaced by
-        HIT_AT_JUMP and the facet's normal."""
+        """Return `status` and `gradient`, replaced by HIT_AT_JUMP and the facet's normal on rays
+        that hit the facet.
+
+        status: the `RayStatus` of rays. gradient: (3,) the gradient of f.
+        """
         marked = type(status)(dr.select(self.is_hit, HIT_AT_JUMP, status))
         return marked, dr.select(self.is_hit, self.normal, gradient)
 
@@ -145,10 +157,11 @@ def test_jump(
     """Compare f before and behind a facet with the levels. A facet is a flat piece of surface at
     which f jumps.
 
-    ahead: the crossing at the end of the interval of the ray; its facet is NO_FACET if there is
-        none.
-    there: mask of lanes whose samples are accepted and lie at that crossing.
-    value: f there, before the jump, known up to `total_error`.
+    ahead: the crossing of the facet at the end of the interval of the ray; its `facet` is NO_FACET
+        if there is none.
+    there: mask of rays whose trial point is accepted and lies at that crossing.
+    value: f there, before the jump.
+    total_error: a bound of the error of `value`.
 
     The facet belongs to the surface if a level lies between the values on its two sides. A level
     within `total_error` of either value counts as between them. Such a facet belongs to the surface
@@ -161,6 +174,7 @@ def test_jump(
     at_crossing = has_crossing & there
     behind = value + dr.select(at_crossing, ahead.jump, 0)
     low, high = fmin(value, behind) - total_error, fmax(value, behind) + total_error
+    # The next level above the lower value is no farther than the higher value.
     is_hit = at_crossing & (levels.gaps(low).above <= high - low)
     return JumpTest(has_crossing, at_crossing, is_hit, levels.gaps(behind), ahead.normal)
 
@@ -188,11 +202,11 @@ _ROOT_ITERATIONS = 4
 
 @dataclass(frozen=True)
 class Contact:
-    """The contact of each ray with the level that it reached last. A ray is in contact as long as f
-    is within the tolerance of that level.
+    """The contact of each ray with the level that it reached last. A ray is in contact from where f
+    comes within the tolerance of a level until f has left the tolerance around it.
 
-    side: the side of the level on which the ray is: 1 if f is larger, -1 if f is smaller; 0 as long
-        as all samples were at the level at which the ray started. If the ray is not in contact, it
+    side: on which side of the level the ray came: 1 if f was larger, -1 if smaller, 0 if all
+        samples so far were at the level at which the ray started. If the ray is not in contact, it
         only matters whether side is 0.
     is_touching: whether the ray is in contact, or may still be.
     root: the ray parameter at which f last took the level, between two samples on different sides
@@ -215,17 +229,18 @@ class Contact:
 
     @classmethod
     def none(cls, backend: Backend) -> Contact:
-        """The state of a ray before its first sample: no contact."""
+        """Return the contact of rays before their first sample: none."""
         zero = backend.Float(0)
         return cls(zero, backend.Bool(False), zero, backend.Array3f(0), zero, zero, zero, zero)
 
 
 @dataclass(frozen=True)
 class AcceptedPoint:
-    """A sample at an accepted point of a ray.
+    """A sample of f at a point of each ray that the march has accepted, because no level lies
+    before it on the ray.
 
-    t, value, gradient, slope: the ray parameter of the point; f, its gradient (3,) and its
-        derivative along the ray there.
+    t, value, gradient: the ray parameter of the point, f, and its gradient (3,).
+    slope: the derivative of f along the ray.
     before: (t, value, slope, gradient) of the accepted point before it.
     excess: by how much |f - level| at these two points may exceed what the tolerance allows, if the
         error of f is larger than the tolerance; else 0.
@@ -249,14 +264,25 @@ class AcceptedPoint:
 
 @dataclass(frozen=True)
 class Hysteresis:
-    """The rule by which contacts of rays with a level begin, count as crossings, and end.
+    """The rule by which the contact of a ray with a level begins, counts as a crossing, and ends. A
+    ray is in contact with a level from where it reaches it until f has left the tolerance around
+    it. During contact the level counts as lying a tolerance *beyond* its true place, as seen from
+    the side from which the ray came: the moved level.
 
     A ray that looks for first hits ends where f is within the tolerance of a level. A ray that goes
     on must leave the surface with a proof, and a crossing must not be counted several times because
-    of rounding or because the ray runs along the surface. So a ray that has reached a level is in
-    contact with it until f has left the tolerance around it. During contact the level counts as
-    lying a tolerance *beyond* its true place, as seen from the side of the ray (hysteresis). Then f
-    always differs from the moved level, and steps stay long.
+    of rounding or because the ray runs along the surface. With the moved level, f always differs
+    from it, and steps stay long.
+
+    levels: all levels.
+    spacing: the difference between the two closest levels; inf for a single level.
+    is_free_before, is_free_after: whether the extent of the surface proves that the ray meets no
+        level before the interval that is marched, and after it. Then f stays on one side of each
+        level there, and at that end of the interval it need differ from the level by no more than
+        its error.
+    start: the ray parameter at which the interval begins.
+    rounding: the distance from a facet, at which f jumps, by which rounding may move a ray that
+        starts on it.
 
     Let W be the largest of the tolerances in value (`band`) at the samples of a contact. The
     guarantees are:
@@ -264,7 +290,7 @@ class Hysteresis:
     1. *Nothing is missed.* If f is farther than W from a level on one side at some point of the
     ray, and on the other side at a later point, there is a crossing between the two points. Proof:
     consider a ray in contact, on the side of larger values. It is proved not to take the value
-    `level - band`, by the same steps that prove a ray without contact free of a level
+    `level - band`, by the same steps that prove that a ray without contact meets no level
     (`March.advance`); band is that of the last sample. So f > level - W as long as no crossing was
     noticed. Before the contact, f was proved not to take the level at all. Beside a pole the band
     grows with the slope of f, and may become larger than all later values of f. So the band of a
@@ -272,13 +298,15 @@ class Hysteresis:
     (`_MIN_BAND_RATIO`), or if the two samples are at most `_SHORT_STEP` tolerances apart
     (`may_reach`). A step that fails this test is made shorter, and so is a step to a sample without
     a finite error bound, for example where an exponential overflows.
+
     2. *Nothing is counted twice.* A crossing is noticed at a point where f is proved to be on the
     other side of the level: it differs from the level by `band/2`, which is more than its error.
     The next crossing is noticed only where f is proved to be on the first side again. So crossings
     of a level alternate in direction, and between two noticed crossings f takes the level. A ray
     that starts within the tolerance of a level is on neither side until a sample differs from the
     level by half the tolerance: leaving the level is no crossing.
-    3. *Nothing sticks.* In contact, f differs from the moved level by `band/2` or more, up to its
+
+    3. *Steps stay long.* In contact, f differs from the moved level by `band/2` or more, up to its
     error. So the difference that steps are solved for is at least a fifth of the band.
 
     Periodic f. Before contact, f lies between two neighboring periodic levels. In contact, f is
@@ -286,16 +314,6 @@ class Hysteresis:
     than a period wide, so the value modulo the period tells where in the window f is. (An enclosure
     that reaches back from a point assumes the window at that point. It shares a point with the
     interval proved before, so both are in the same window.)
-
-    levels: all levels.
-    spacing: the difference between the two closest levels; inf for a single level.
-    is_free_before, is_free_after: whether the extent of the surface proves that the ray meets no
-        level before the interval that is marched, and behind it. Then f stays on one side of each
-        level there, and at that end of the interval it need differ from the level by no more than
-        its error.
-    start: the ray parameter at which the interval begins.
-    rounding: the distance from a facet, at which f jumps, by which rounding may move a ray that
-        starts on it.
     """
 
     levels: Levels
@@ -313,142 +331,188 @@ class Hysteresis:
         start: Real,
         rounding: Real,
     ) -> Hysteresis:
-        """The rule for these levels. free: the masks `is_free_before` and `is_free_after` of the
-        class: whether no level lies on the ray before and behind the interval that is marched."""
+        """Make the rule for given levels, and compute their spacing.
+
+        free: the masks `is_free_before` and `is_free_after` of the class: whether no level lies on
+            the ray before and after the interval that is marched.
+        start, rounding: as in the class.
+        """
         period = levels.period
         spacing: Real = dr.inf if period is None else period
         for k, level in enumerate(levels.values):
             for earlier in levels.values[:k]:
                 gap = dr.abs(level - earlier)
                 if period is not None:
+                    # Reduce the difference modulo the period: to the distance of the nearest copies
+                    # of the levels.
                     gap = gap - period * dr.floor(gap / period)
                     gap = fmin(gap, period - gap)
+                # A level that is given twice has no spacing from itself.
                 spacing = fmin(spacing, dr.select(gap > 0, gap, dr.inf))
         return cls(levels, spacing, *free, start, rounding)
 
     def contact_tolerance(self, within: Real) -> Real:
-        """The difference between f and a level below which contact begins: `within`, the value
-        tolerance of a hit, or a quarter of the spacing of levels if that is less."""
+        """Return the difference between f and a level below which contact begins.
+
+        within: the largest |f - level| at a hit. The result is `within`, or a quarter of the
+            spacing of levels if that is less.
+        """
         return fmin(within, _MAX_BAND_OF_SPACING * self.spacing)
 
     def band(self, within: Real, rounding: Real) -> Real:
-        """The tolerance in value around a level: `within`, the value tolerance of a hit, or 8 times
-        the bound `rounding` of the rounding error of f if that is more; but at most a quarter of
-        the spacing of levels."""
+        """Return the band: the tolerance in value around a level that f must leave to end the
+        contact.
+
+        within: the largest |f - level| at a hit. rounding: a bound of the rounding error of f.
+
+        The band is the larger of `within` and 8 times `rounding`, but at most a quarter of the
+        spacing of levels, so that it is certain which level was reached.
+        """
         return fmin(
             fmax(within, _MIN_BAND_ROUNDINGS * rounding), _MAX_BAND_OF_SPACING * self.spacing
         )
 
     def may_reach(self, now: Contact, band: Real, step: Real, tolerance: Real) -> Mask:
-        """Mask of rays on which the band (tolerance in value) of the last sample may count for a
-        step to a point. Rays without contact are in the mask.
+        """Return the mask of rays that may take a step to a trial point although they are in
+        contact: the band (tolerance in value) of the last sample is not much larger than that at
+        the trial point, or the step is short. Rays without contact are in the mask.
 
         now: the contact at the last sample.
-        band: the band at the point.
+        band: the band at the trial point.
         step: the length of the step.
-        tolerance: the hit tolerance at the point, a length.
+        tolerance: the hit tolerance at the trial point, a length.
         """
         comparable = now.band * _MIN_BAND_RATIO <= band
         return ~now.is_touching | comparable | (step <= _SHORT_STEP * tolerance)
 
     def must_sample_end(self, now: Contact, end: Real) -> Mask:
-        """Mask of rays that must sample their end even if they are proved free up to it. In
-        contact, a ray is proved free only of a level that counts as lying a band beyond its true
-        place, so it may still cross the true level. end: the ray parameter at which it ends."""
+        """Return the mask of rays that must sample their end even if the march has proved the way
+        to it. In contact, only the moved level is proved not to lie on this way; so the ray may
+        still cross the true level.
+
+        now: the contact of rays.
+        end: the ray parameter at which they end.
+        """
         return now.is_touching & (self.is_free_after | (end < dr.inf))
 
     def gaps(
         self, contact: Contact, value: Real, gaps: LevelGaps, band: Real, part: float = 1.0
     ) -> LevelGaps:
-        """The differences between f and the next levels below and above it. In contact, the levels
-        are moved: the level that was reached counts as lying the fraction `part` of the band beyond
-        its place, and the steps end within the same fraction of half the way to the next level.
+        """Return the differences between f and the next levels below and above it. For a ray in
+        contact, the levels are moved, so that f differs from them.
 
-        value: f. gaps: the differences to the true levels. band: the tolerance in value.
+        value: f.
+        gaps: the differences to the true levels; they are returned for rays without contact.
+        band: the tolerance in value.
+        part: a fraction. The level that was reached counts as lying `part * band` beyond its true
+            place. The next level on the other side, from which the ray came, counts as lying `part`
+            times half the spacing away from the level reached.
         """
-        x, far_gap = -self.levels.offset_to_nearest(value), part * _MAX_APPROACH * self.spacing
+        offset, far_gap = -self.levels.offset_to_nearest(value), part * _MAX_APPROACH * self.spacing
         band = part * band
+        # From the level reached, the moved levels are this far below and above it.
         below = dr.select(contact.side < 0, far_gap, band)
         above = dr.select(contact.side > 0, far_gap, band)
         return LevelGaps(
-            dr.select(contact.is_touching, fmax(below + x, 0), gaps.below),
-            dr.select(contact.is_touching, fmax(above - x, 0), gaps.above),
+            dr.select(contact.is_touching, fmax(below + offset, 0), gaps.below),
+            dr.select(contact.is_touching, fmax(above - offset, 0), gaps.above),
         )
 
     def update(self, now: Contact, active: Mask, accepted: AcceptedPoint) -> tuple[Contact, Mask]:
-        """The contact behind an accepted point, and the mask of rays that have crossed the level.
+        """Update the contact of each ray at an accepted point. Returns the new contact and the mask
+        of rays that have crossed the level.
 
-        now: the contact before. active: mask of rays with an accepted point. accepted: that point.
+        now: the contact before.
+        active: mask of rays that have an accepted point.
+        accepted: that point.
+
+        A crossing is counted where f is on the other side of the level than the ray came from, by
+        more than half the band and more than the error of f. (At an end of the interval beyond
+        which no level lies, more than the error is enough.) A contact begins at a point that is
+        near enough for a hit, and ends where f is farther from the level than the band. Inactive
+        rays keep their contact.
         """
-        x = -self.levels.offset_to_nearest(accepted.value)
-        touching = now.is_touching
-        side = dr.select(touching, now.side, self._side(now, accepted, x))
+        # f minus the nearest level: positive on the side of larger values.
+        offset = -self.levels.offset_to_nearest(accepted.value)
+        was_touching = now.is_touching
+        side = dr.select(was_touching, now.side, self._side(now, accepted, offset))
 
         # The root, if f has changed sides since the last point.
         t, value, slope, gradient = accepted.before
-        x_before = -self.levels.offset_to_nearest(value)
-        passes = active & touching & (side * x_before > 0) & (side * x <= 0)
+        offset_before = -self.levels.offset_to_nearest(value)
+        changes_side = active & was_touching & (side * offset_before > 0) & (side * offset <= 0)
         fraction = cubic_root(
-            x_before, x, (accepted.t - t) * slope, (accepted.t - t) * accepted.slope
+            offset_before, offset, (accepted.t - t) * slope, (accepted.t - t) * accepted.slope
         )
-        begins = active & ~touching & accepted.is_near
+        begins = active & ~was_touching & accepted.is_near
         root = dr.select(
-            passes, t + fraction * (accepted.t - t), dr.select(begins, accepted.t, now.root)
+            changes_side, t + fraction * (accepted.t - t), dr.select(begins, accepted.t, now.root)
         )
         at_root = dr.select(begins, accepted.gradient, now.gradient)
-        at_root = dr.select(passes, dr.lerp(gradient, accepted.gradient, fraction), at_root)
-        excess = dr.select(passes | begins, accepted.excess, now.tolerance_excess)
-        before = dr.select(passes, t, dr.select(begins, accepted.t, now.before))
-        behind = dr.select(passes | begins, accepted.t, now.after)
+        at_root = dr.select(changes_side, dr.lerp(gradient, accepted.gradient, fraction), at_root)
+        excess = dr.select(changes_side | begins, accepted.excess, now.tolerance_excess)
+        before = dr.select(changes_side, t, dr.select(begins, accepted.t, now.before))
+        after = dr.select(changes_side | begins, accepted.t, now.after)
 
         # Is f far enough beyond the level to have crossed it, or has it left the band?
-        is_first = (now.side == 0) & ~touching
-        stays = (is_first & self.is_free_before) | (accepted.is_end & self.is_free_after)
-        least_offset = dr.select(stays, 0, _CROSSED_FRACTION * accepted.band)
-        is_off = dr.abs(x) > fmax(least_offset, accepted.total_error)
-        crosses = active & touching & is_off & (side * x < 0)
+        is_first = (now.side == 0) & ~was_touching
+        # At a free end of the interval f cannot come back, so there f need differ from the level by
+        # no more than its error.
+        stays_on_side = (is_first & self.is_free_before) | (accepted.is_end & self.is_free_after)
+        least_offset = dr.select(stays_on_side, 0, _CROSSED_FRACTION * accepted.band)
+        is_off = dr.abs(offset) > fmax(least_offset, accepted.total_error)
+        crosses = active & was_touching & is_off & (side * offset < 0)
+        # A ray that started at the level is now on a side, without a crossing.
         settles = active & is_off & (side == 0)
-        side = dr.select(settles | crosses, dr.select(x > 0, type(x)(1), -1), side)
-        is_touching = dr.select(touching, dr.abs(x) <= accepted.band, accepted.is_near)
+        side = dr.select(settles | crosses, dr.select(offset > 0, type(offset)(1), -1), side)
+        is_touching = dr.select(was_touching, dr.abs(offset) <= accepted.band, accepted.is_near)
         return Contact(
             dr.select(active, side, now.side),
-            dr.select(active, is_touching, touching),
+            dr.select(active, is_touching, was_touching),
             root,
             at_root,
             excess,
             before,
-            behind,
+            after,
             dr.select(active, accepted.band, now.band),
         ), crosses
 
     def update_at_jump(
         self, now: Contact, active: Mask, accepted: AcceptedPoint, ahead: JumpCrossing, d: Vec3
     ) -> tuple[Contact, Mask]:
-        """The contact behind the facet `ahead`, at which f jumps, and the mask of rays that cross
-        the level by this jump.
+        """Update the contact of each ray at a facet, where f jumps. Returns the contact behind the
+        facet and the mask of rays that cross the level by this jump.
 
         now, accepted: the contact and the sample at an accepted point just before the facet.
-        active: mask of the rays that pass a facet.
-        d: (3,) the unit direction of the ray.
+        active: mask of rays that pass a facet.
+        ahead: the crossing of the facet.
+        d: (3,) unit direction of the ray.
 
-        A field with jumps has a single level here. A ray that starts on a facet is on neither side
-        of the level.
+        A function with jumps has a single level here. A ray that starts on a facet, up to rounding,
+        is on neither side of the level.
         """
-        x = -self.levels.offset_to_nearest(accepted.value)
-        one = type(x)(1)
-        side = dr.select(now.is_touching, now.side, dr.select(x > 0, one, -1))
-        starts = dr.abs(dr.dot(ahead.normal, d)) * (accepted.t - self.start) <= self.rounding
-        side = dr.select(starts, 0, side)
-        behind = x + ahead.jump
-        passes = active & (side * x > 0) & (side * behind <= 0)
-        begins = active & ~now.is_touching & (dr.abs(behind) <= accepted.band)
-        is_off = dr.abs(behind) > fmax(_CROSSED_FRACTION * accepted.band, accepted.total_error)
-        crosses = active & is_off & (side * behind < 0)
-        side = dr.select(is_off, dr.select(behind > 0, one, -1), side)
-        at_facet = passes | begins
+        # f minus the level, before the facet and behind it.
+        offset = -self.levels.offset_to_nearest(accepted.value)
+        one = type(offset)(1)
+        side = dr.select(now.is_touching, now.side, dr.select(offset > 0, one, -1))
+        # The distance of the start from the facet's plane.
+        starts_on_facet = (
+            dr.abs(dr.dot(ahead.normal, d)) * (accepted.t - self.start) <= self.rounding
+        )
+        side = dr.select(starts_on_facet, 0, side)
+        offset_behind = offset + ahead.jump
+        # The jump changes sides, brings f near the level, or is far enough beyond it to count.
+        changes_side = active & (side * offset > 0) & (side * offset_behind <= 0)
+        begins = active & ~now.is_touching & (dr.abs(offset_behind) <= accepted.band)
+        is_off = dr.abs(offset_behind) > fmax(
+            _CROSSED_FRACTION * accepted.band, accepted.total_error
+        )
+        crosses = active & is_off & (side * offset_behind < 0)
+        side = dr.select(is_off, dr.select(offset_behind > 0, one, -1), side)
+        at_facet = changes_side | begins
         return Contact(
             dr.select(active, side, now.side),
-            dr.select(active, dr.abs(behind) <= accepted.band, now.is_touching),
+            dr.select(active, dr.abs(offset_behind) <= accepted.band, now.is_touching),
             dr.select(at_facet, accepted.t, now.root),
             dr.select(at_facet, ahead.normal, now.gradient),
             dr.select(at_facet, 0, now.tolerance_excess),
@@ -457,33 +521,35 @@ class Hysteresis:
             dr.select(active, accepted.band, now.band),
         ), crosses
 
-    def _side(self, now: Contact, point: AcceptedPoint, x: Real) -> Real:
-        """The side from which a ray without contact comes to the nearest level: 1 if f is larger
+    def _side(self, now: Contact, point: AcceptedPoint, offset: Real) -> Real:
+        """Return from which side a ray without contact comes to the nearest level: 1 if f is larger
         there, -1 if it is smaller, 0 if the side is not known.
 
-        now: the state before the point. x: f at the point minus the level.
+        now: the contact before the point.
+        offset: f at the point minus the level.
 
-        The ray was proved free of levels, so a real-valued f is on the side of the last accepted
-        value. If f is periodic, the last value may lie on either side of the level. Then the
-        present value decides, or the slope of f if the present value equals the level up to its
-        error.
+        The ray met no level before, so a real-valued f is on the side of the last accepted value.
+        If f is periodic, the last value may lie on either side of the level. Then the present value
+        decides, or the slope of f if the present value equals the level up to its error. The side
+        is not known while all samples of the ray were near a level.
         """
         if self.levels.period is None:
-            is_above = point.before[1] > point.value - x
+            is_above = point.before[1] > point.value - offset
         else:
-            is_above = dr.select(dr.abs(x) > point.total_error, x > 0, point.slope < 0)
+            is_above = dr.select(dr.abs(offset) > point.total_error, offset > 0, point.slope < 0)
         # 0 stays only for a ray of which every sample so far was near a level.
         is_known = (now.side != 0) | ~point.is_near
-        return dr.select(is_known, dr.select(is_above, type(x)(1), -1), 0)
+        return dr.select(is_known, dr.select(is_above, type(offset)(1), -1), 0)
 
 
 @dataclass(frozen=True)
 class _Bisection:
-    """The state of bisection on each ray. f takes the level between the ray parameters `before` and
-    `behind`.
+    """The state of bisection on each ray, which narrows the interval in which f takes the level.
 
-    t, gradient: the next point to sample, and the gradient (3,) at the last one.
-    looks: the number of samples so far.
+    before, behind: the ends of the interval, as ray parameters; f is on different sides of the
+        level there.
+    t: the next point to sample. gradient: (3,) the gradient of f at the last one.
+    sample_count: the number of samples so far.
     active: whether bisection goes on.
     """
 
@@ -499,39 +565,44 @@ def refine_crossing(
     field: Field, levels: Levels, tolerance: PreparedHitTolerance, path: Ray, contact: Contact,
     active: Mask,
 ) -> tuple[Real, Vec3, Any]:  # fmt: skip
-    """Refine crossings of rays with a level by bisection.
+    """Find where rays cross the level more exactly, by bisection where needed.
 
     Returns the roots (ray parameters), the gradients (3,) of f there, and the number of
     evaluations.
 
-    contact: the crossings. Each has two points on different sides of the level, and as root that of
-        the cubic through their values and slopes.
+    contact: the crossings. Each has two points on different sides of the level, and a first
+        approximation of the root: that of the cubic through their values and slopes.
+    active: mask of rays with a crossing.
 
     The cubic is a bad approximation of f if f has a crease between the two points. So f is
-    evaluated at its root. If f differs from the level there by more than the tolerance and its
-    error, bisection narrows the interval, with f on different sides of the level at its ends.
+    evaluated at the root of the cubic. If it differs from the level there by more than the
+    tolerance and its error, bisection narrows the interval between the two points. It ends at a
+    point within the tolerance, or where the interval is as short as rounding.
     """
+    # 1 if f is larger than the level before the crossing. (Contact has the side after it.)
     side = -contact.side
     count = dr.uint32_array_t(type(contact.root))
     smallest = 4 * float(dr.epsilon(type(contact.root)))
 
     def bisect(now: _Bisection) -> _Bisection:
-        """One sample at the point t, and the half of the interval in which the level lies."""
+        """Sample f at the point t, and keep the half of the interval in which f takes the level."""
         sample, size = field.evaluate(path.point(now.t)), max_norm(path.origin) + now.t
-        x, steepness = -levels.offset_to_nearest(sample.value), safe_norm(sample.gradient)
-        near = dr.abs(x) <= fmax(
+        offset, steepness = -levels.offset_to_nearest(sample.value), safe_norm(sample.gradient)
+        is_near = dr.abs(offset) <= fmax(
             tolerance.value_tolerance(steepness, now.t), value_error_bound(sample, steepness, size)
         )
-        is_before = side * x > 0
+        # The half in which f changes sides.
+        is_before = side * offset > 0
         before = dr.select(is_before, now.t, now.before)
         behind = dr.select(is_before, now.behind, now.t)
-        goes_on = ~near & (behind - before > smallest * size)
-        is_first = near & (now.sample_count == 0)
+        goes_on = ~is_near & (behind - before > smallest * size)
+        # If the cubic's root is good, its gradient stays.
+        is_good_root = is_near & (now.sample_count == 0)
         return _Bisection(
             before,
             behind,
             dr.select(goes_on, 0.5 * (before + behind), now.t),
-            dr.select(is_first, now.gradient, sample.gradient),
+            dr.select(is_good_root, now.gradient, sample.gradient),
             now.sample_count + 1,
             now.active & goes_on,
         )
@@ -544,23 +615,27 @@ def refine_crossing(
 
 
 def cubic_root(start: Real, end: Real, slope: Real, end_slope: Real) -> Any:
-    """A root in [0, 1] of a cubic that changes sign between 0 and 1. It is found by Newton's
-    method, with bisection if a step leaves the interval in which the sign changes.
+    """Return a root in [0, 1] of a cubic that changes sign between 0 and 1.
 
     start, end: the values of the cubic at 0 and 1, of different signs.
-    slope, end_slope: its derivatives there.
+    slope, end_slope: its derivatives at 0 and 1.
+
+    Four steps of Newton's method, from the root of the chord. Where a step leaves the interval in
+    which the sign changes, this interval is halved instead.
     """
-    # start + slope u + b u^2 + c u^3
+    # The cubic is start + slope u + b u^2 + c u^3.
     b = 3 * (end - start) - 2 * slope - end_slope
     c = slope + end_slope - 2 * (end - start)
     low, high = type(start)(0), type(start)(1)
+    # Start at the root of the chord.
     u = start / (start - end)
     for _ in range(_ROOT_ITERATIONS):
         value = dr.fma(dr.fma(dr.fma(c, u, b), u, slope), u, start)
         rate = dr.fma(dr.fma(3 * c, u, 2 * b), u, slope)
-        before = (value > 0) == (start > 0)
-        low, high = dr.select(before, u, low), dr.select(before, high, u)
+        # Keep the part in which the sign changes.
+        is_before_root = (value > 0) == (start > 0)
+        low, high = dr.select(is_before_root, u, low), dr.select(is_before_root, high, u)
         next_u = u - value / rate
-        inside = (next_u >= low) & (next_u <= high)
-        u = dr.select(inside, next_u, 0.5 * (low + high))
+        is_inside = (next_u >= low) & (next_u <= high)
+        u = dr.select(is_inside, next_u, 0.5 * (low + high))
     return dr.clip(u, 0, 1)

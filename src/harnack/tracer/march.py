@@ -1,18 +1,22 @@
-"""The marching loop, the only one of the tracer. It finds the first point of each ray at which a
-field takes a level, with a proof of every step.
+"""The loop that steps along rays (the march), the only one of the tracer. f is a function of space;
+the surface consists of the points at which f takes one of given values, the levels. The march finds
+the first point of each ray on the surface, and proves of every step that it passes no level.
 
-The loop depends neither on the kind of field nor on the kind of proof. It samples a field f along
-the ray. Each sample brings enclosures, intervals that provably contain the change of f along the
-ray, and they tell on which length the ray meets no level.
+The loop depends neither on the kind of function nor on the kind of proof. At a trial point of the
+ray it evaluates f: a sample. Each sample comes with enclosures. An enclosure is an interval that is
+proved to contain the change of f along the ray up to a given distance; so it proves that a length
+of the ray meets no level. A trial point is accepted if the ray is proved to meet no level before
+it.
 
 Trial steps are aimed: a step is longer than the proved length, but it ends just short of the point
-    at which f is predicted to reach a level. Without this, half of the samples near the surface
-    were rejected. The prediction comes from the cubic through the last two values and slopes for
-    smooth fields, and from the slope alone for approximate fields.
+at which f is predicted to reach a level. Without this, half of the samples near the surface were
+rejected. For functions without truncation error, the prediction comes from the cubic through the
+last two values and slopes; for others, from the slope alone.
 
-The state of the march is a record, which `backend.loops` takes apart and puts together for Dr.Jit's
-loop. For fields with jumps, the march also compares the value at the end of its interval with the
-jump there. `jump_tracer.JumpTracer`, which goes from jump to jump, calls the march.
+The state of the march is a dataclass of arrays, which `backend.loops` takes apart and puts together
+for Dr.Jit's loop. For functions that jump at facets (triangles), `jump_tracer.JumpTracer` cuts the
+ray at the facets and calls the march for each interval. The march then also compares f on both
+sides of the facet at the end of the interval with the levels.
 """
 
 from __future__ import annotations
@@ -80,25 +84,26 @@ _RETRY_FRACTION = 0.125
 
 @dataclass(frozen=True)
 class MarchState:
-    """The state of rays during the march, with one entry for each ray.
+    """The state of the march, as arrays with one entry for each ray. f is the function whose levels
+    rays look for. A trial point is accepted if no level lies on the ray before it.
 
-    proved_to: the ray parameter of the last accepted point; f takes no level on the ray up
-        to there.
-    proved_step: a length from there on which f takes no level, either.
-    trial_step: the length from there to the next trial point.
-    enclosure_reach: the length on which the next sample should enclose the change of f.
-    value, gradient: f and its gradient (3,) at `proved_to`; behind the jump, if f jumps there.
-    tolerance_excess: by how much |f - level| at `proved_to` may exceed what the tolerance allows,
-        because of rounding.
+    proved_to: the ray parameter of the last accepted point; no level lies on the ray up to there.
+    proved_step: a length from that point on which no level lies, either.
+    trial_step: the length from that point to the next trial point.
+    enclosure_reach: the length of the ray on which the next sample should bound the change of f.
+    value, gradient: f and its gradient (3,) at `proved_to`. If f jumps there, the value behind the
+        jump.
+    tolerance_excess: by how much |f - level| at `proved_to` may exceed the hit tolerance, because
+        of rounding.
     evaluations: the number of evaluations of f so far.
-    accuracy_scale: the accuracy scale of the next sample (`Field.at_accuracy`), larger for more
-        accurate samples; None for fields with a single accuracy (Dr.Jit records a loop twice if a
-        state in it never changes).
-    status: the `RayStatus` of rays that have ended.
+    accuracy_scale: the accuracy scale of the next sample (`Field.at_accuracy`); larger is more
+        accurate. None if f has a single accuracy. (Then a number would never change, and Dr.Jit
+        records a loop twice if a part of its state never changes.)
+    status: how the ray ended, a `RayStatus`.
     active: whether the ray goes on.
-    contact: for rays that end only where they cross a level, the level that they reached last: from
-        which side they reached it, and whether f is still within the tolerance of it. None for rays
-        that end where they reach a level.
+    contact: for rays that end only where f has passed to the other side of a level, a `Contact`:
+        which level the ray reached last, from which side, and whether f is still within the
+        tolerance of this level. None for rays that end where they reach a level.
     """
 
     proved_to: Real
@@ -125,12 +130,14 @@ class MarchState:
         has_detail: bool,
         crosses: bool = False,
     ) -> MarchState:
-        """The state at the start of rays, before the first sample.
+        """Return the state of rays before their first sample.
 
-        start, end: the ray parameters between which rays are traced; rays without start < end are
+        start, end: the ray parameters between which rays are traced. Rays without start < end are
             not active.
-        has_detail: whether the field has variable accuracy.
-        crosses: whether rays end where they have crossed a level, and not where they reach it.
+        active: mask of rays that are traced.
+        has_detail: whether the accuracy of samples can be chosen (`accuracy_scale`).
+        crosses: whether rays end only where f has passed to the other side of a level, and not
+            where they reach the level.
         """
         real, vector, count = backend.Float, backend.Array3f, backend.UInt32
         return cls(
@@ -151,29 +158,33 @@ class MarchState:
 
 @dataclass(frozen=True)
 class _TrialSample:
-    """The sample at the trial point of each ray, and quantities that are derived from it.
+    """What is known at the trial point of each ray: the sample of f, its distance from the levels
+    in value, and whether the point can be a hit. All entries are arrays with one entry for each
+    ray.
 
     t: the ray parameter of the trial point.
-    at_end: whether the ray, or its interval before the next jump of f, ends there.
-    coordinate_size: a bound of the absolute values of coordinates on the ray up to there.
-    unproved_length: the length before the point that no step has proved free of levels yet.
-    on_ray: the sample of f there, with its enclosures (intervals that provably contain the change
-        of f along the ray).
-    gradient_norm: the length of the gradient there.
-    gaps: the differences between f and the next levels below and above; in contact with a level, to
-        levels that the hysteresis has moved.
+    at_end: whether the ray, or its interval up to the next jump of f, ends at the trial point.
+    coordinate_size: a bound of the absolute values of coordinates on the ray up to t.
+    unproved_length: the length of the ray before the trial point that is not yet proved to hold no
+        level.
+    on_ray: the sample of f at t, with its enclosures (intervals that contain the change of f along
+        the ray in front of and behind t).
+    gradient_norm: |grad f| at t.
+    gaps: the differences between f and the next levels below and above it. For a ray in contact
+        with a level (`Hysteresis`), the levels are moved.
     total_error: a bound of the rounding and truncation error of f.
-    value_tolerance: the largest |f - level| at a hit; in contact, half of it.
-    band: in contact, the tolerance in value around a level (`Hysteresis.band`); else
-        `value_tolerance`.
-    is_near: whether a level is near enough for a hit.
-    accepts_unknown_side: whether the point may be accepted although rounding hides on which side of
-        a level it lies.
+    value_tolerance: the largest |f - level| at a hit; half of it for a ray in contact.
+    band: for rays that look for crossings, the tolerance in value around a level
+        (`Hysteresis.band`); else `value_tolerance`.
+    is_near: whether f is so near to a level that the point is a hit if it is accepted.
+    accepts_unknown_side: whether the point may be accepted although the error of f hides on which
+        side of the level it lies.
     excess: by how much |f - level| may exceed `value_tolerance`, because of rounding.
-    is_smooth: whether value and slope at two points predict f.
-    passes_branch_level, needs_branch: for samples that gave f only modulo an integer, the two masks
-        that `BranchTracker.gaps` returns; else None.
-    steep: bounds that rest on ranges of values of f; None for fields whose slopes are bounded.
+    is_smooth: whether values and slopes at two points predict f.
+    passes_branch_level, needs_branch: for functions whose samples may lack an unknown integer, the
+        two masks that `BranchTracker.gaps` returns; else None.
+    steep: bounds of f that come from ranges of its values, for functions whose slope has no bound;
+        else None.
     extra_evaluations: the number of evaluations of f besides that at the trial point.
     """
 
@@ -202,10 +213,16 @@ class _TrialSample:
         return self.on_ray.sample.value
 
     def gaps_after_jump(self, behind: LevelGaps) -> LevelGaps:
-        """The differences between f behind a jump and the next levels, for a field whose samples
-        give f only modulo 1. The jump is an integer, so the differences to levels modulo 1 stay as
-        they are. On lanes of `passes_branch_level` the differences are to true levels and are
-        replaced by those in `behind`."""
+        """Return the differences between f behind a jump and the next levels, for a function whose
+        samples may lack an unknown integer.
+
+        behind: the differences between f behind the jump and the next true levels.
+
+        Mostly `gaps` holds differences to periodic levels (all numbers that differ from a level by
+        an integer). The jump is an integer, so these stay as they are. On lanes of
+        `passes_branch_level` it holds differences to true levels, which change at the jump; there
+        `behind` replaces them.
+        """
         down = dr.select(self.passes_branch_level, behind.below, self.gaps.below)
         return replace(
             self.gaps,
@@ -216,22 +233,26 @@ class _TrialSample:
 
 @dataclass(frozen=True)
 class March:
-    """The parameters of the march: the levels, the hit tolerance and the lengths of trial steps.
+    """The fixed parameters of the march, which steps along rays to the first point at which f takes
+    a level. A trial point of a ray is accepted if the ray is proved to meet no level before it. A
+    trial step is the length from the last accepted point to the next trial point.
 
-    max_steps: the number of evaluations of f after which a ray is out of steps.
+    levels: the values of f that rays look for.
+    tolerance: how near to a level f must be at a hit.
+    max_steps: the number of evaluations of f after which a ray ends as out of steps.
     over_relaxation: trial steps are at most this many times as long as proved steps.
-    hysteresis: for rays that end where they have crossed a level, the rule by which a crossing is
-        counted; None for rays that end where they reach a level.
-    cone_radius: for cones that end where they come near a level (`pixel_cones`), their radius per
-        unit of t; None for rays.
-    occupied: for rays that end where they reach a level, a grid of cells. Outside of its marked
-        cells there is no level, not even for the function that continues f behind a jump. None if
-        no cells are known.
-    ray_end: the ray parameter at which rays with `occupied` end.
-    only_component: whether levels may lie outside of the marked cells, but do not belong to the
+    hysteresis: for rays that end where f has passed to the other side of a level, the rule that
+        counts such crossings; None for rays that end where they reach a level.
+    cone_radius: if cones are marched instead of rays (`pixel_cones`), their radius per unit of t; a
+        cone ends where it comes near a level. None for rays.
+    occupied: a grid of cells with marks, for rays that end where they reach a level. Outside of the
+        marked cells there is no level, not even of the function that continues f behind a jump.
+        None if no such cells are known.
+    ray_end: the ray parameter at which rays end if `occupied` is given.
+    only_component: if true, levels may lie outside of the marked cells, but do not belong to the
         surface.
-    branch_tracker: finds the integer that is missing in samples that give f only modulo 1; None if
-        there are no such samples.
+    branch_tracker: finds the missing integer of samples that give f only modulo 1; None if there
+        are no such samples.
     """
 
     backend: Backend
@@ -276,7 +297,7 @@ class March:
 
         Hits. At a hit, |f - level| is at most the tolerance less the truncation error of f, or at
         most twice the rounding error of f if that is larger. If the level is nearer to f than the
-        error of f, the trial point may lie behind the root, by less than the tolerance. Then it is
+        error of f, the trial point may lie beyond the root, by less than the tolerance. Then it is
         a hit (`_refined_accuracy`), so no root is passed. If it is no hit, because the error is
         large, then no enclosure that reaches back makes it accepted, and no step from it is proved,
         as it is not known on which side of the point the level lies.
@@ -296,7 +317,7 @@ class March:
         cone grows by that much, unless the level is never met and f moves away from it faster than
         the cone grows.
 
-        With `occupied`, the part of the ray behind a proved step is skipped, too, as far as it lies
+        With `occupied`, the part of the ray beyond a proved step is skipped, too, as far as it lies
         in cells that contain no level (`EmptySpaceGrid.empty_run` has the proof).
 
         With `only_component`, levels outside of the marked cells belong to other components of the
@@ -306,7 +327,7 @@ class March:
         """
 
         def one_trial(now: MarchState) -> MarchState:
-            """One more trial point of each ray."""
+            """Return the state after one more trial point of each ray."""
             return self.next_trial(field, path, end, now, ahead)
 
         return loop_while_active(state, one_trial, "harnack")
@@ -319,20 +340,33 @@ class March:
         now: MarchState,
         ahead: JumpCrossing | None = None,
     ) -> MarchState:
-        """The state after one more trial point of each ray. Parameters and proof are those of
-        `advance`, whose loop calls this; now: the state before."""
+        """Sample one more trial point of each ray, and return the state after it.
+
+        now: the state before. The other parameters and the proof are those of `advance`, whose loop
+            calls this function.
+
+        If the point is accepted, the ray moves there. Otherwise it stays, and tries a shorter step
+        (`fallback`) or, if the sample was too coarse, the same step with a more accurate sample.
+        """
         trial = self._sample_trial(field, path, end, now, ahead)
         if self.hysteresis is not None and now.contact is not None:
             trial = self._apply_hysteresis(trial, self.hysteresis, now.contact)
         accepted, accuracy, too_coarse = self._accept(field, trial, now, ahead)
+        # A trial point at the proved step needs no proof, so it is the next one if this one is
+        # rejected.
         fallback = now.proved_step
         if self.hysteresis is not None and now.contact is not None:
+            # In contact, a step that leads to a point with a much smaller band is rejected, and so
+            # is one to a point without an error bound. Then even the proved step is too long: it is
+            # shortened.
             tolerance = dr.fma(trial.t, self.tolerance.per_length, self.tolerance.distance)
-            reaches = self.hysteresis.may_reach(now.contact, trial.band, now.trial_step, tolerance)
-            reaches &= ~now.contact.is_touching | dr.isfinite(trial.total_error)
+            band_reaches = self.hysteresis.may_reach(
+                now.contact, trial.band, now.trial_step, tolerance
+            )
+            band_reaches &= ~now.contact.is_touching | dr.isfinite(trial.total_error)
             shorter = fmin(now.proved_step, _RETRY_FRACTION * now.trial_step)
-            fallback = dr.select(reaches | too_coarse, now.proved_step, shorter)
-            accepted &= reaches
+            fallback = dr.select(band_reaches | too_coarse, now.proved_step, shorter)
+            accepted &= band_reaches
 
         # Is the trial point a hit, a facet, or a crossing?
         is_hit, gaps_ahead, jump = accepted & trial.is_near, trial.gaps, None
@@ -343,17 +377,20 @@ class March:
             gaps_ahead = (
                 jump.gaps if trial.passes_branch_level is None else trial.gaps_after_jump(jump.gaps)
             )
+        # Trial steps aim at other levels than those that proofs use only if the ray counts
+        # crossings.
         aim_gaps, contact, value = gaps_ahead, now.contact, trial.value
         if self.hysteresis is not None and now.contact is not None:
             contact, is_hit, jump, value = self._update_contact(
                 trial, self.hysteresis, now.contact, path, now, accepted, ahead, jump
             )
-            arguments = contact, value, self.levels.gaps(value), trial.band
+            contact_arguments = contact, value, self.levels.gaps(value), trial.band
             gaps_ahead, aim_gaps = (
-                self.hysteresis.gaps(*arguments),
-                self.hysteresis.gaps(*arguments, CONTACT_AIM),
+                self.hysteresis.gaps(*contact_arguments),
+                self.hysteresis.gaps(*contact_arguments, CONTACT_AIM),
             )
         elif jump is not None and ahead is not None:
+            # A ray that passes the facet goes on with the value behind it.
             value = value + dr.select(jump.at_crossing & ~jump.is_hit, ahead.jump, 0)
 
         # The step from the trial point.
@@ -361,15 +398,18 @@ class March:
         next_step = self._next_trial_step(
             proved, trial.on_ray, aim_gaps, now, path, trial.is_smooth
         )
-        forward = proved
+        extended_step = proved
         if self.occupied is not None:
-            forward, next_step = self._skip_empty_cells(
-                self.occupied, path, end, trial, accepted, forward, next_step
+            extended_step, next_step = self._skip_empty_cells(
+                self.occupied, path, end, trial, accepted, extended_step, next_step
             )
+        # With cells, the step goes on over empty ones; the next enclosures depend on the proof of f
+        # alone.
         reach = self._next_reach(now, trial, end, proved, contact, is_hit)
-        proved_step = dr.select(accepted, forward, fallback)
+        proved_step = dr.select(accepted, extended_step, fallback)
         is_free = self._is_free(now, trial, end, accepted, proved_step, contact)
         if jump is not None:
+            # An interval that ends at a facet must be sampled there, whatever its steps prove.
             is_free = dr.select(jump.has_crossing, jump.at_crossing, is_free)
         evaluations = now.evaluations + 1 + trial.extra_evaluations
         status = self._status(is_hit, is_free)
@@ -396,13 +436,20 @@ class March:
     def _sample_trial(
         self, field: Field, path: Ray, end: Real, now: MarchState, ahead: JumpCrossing | None
     ) -> _TrialSample:
-        """Sample f at the trial point of each ray, `trial_step` behind the last accepted point, and
-        derive all of a `_TrialSample`. ahead: the facet at the end of the interval, for a field
-        with jumps."""
+        """Evaluate f at the trial point of each ray, and derive all quantities of a `_TrialSample`.
+
+        end: the ray parameter at which the ray, or its interval before the next jump, ends.
+        now: the state of the march; the trial point lies `trial_step` beyond its last accepted
+            point.
+        ahead: for a function with jumps, the crossing of the facet at the end of the interval; else
+            None.
+        """
         real = self.backend.Float
         t = now.proved_to + now.trial_step
         if ahead is not None or now.contact is not None:  # the end exactly
             t = dr.select(now.trial_step >= end - now.proved_to, end, t)
+        # Choose the accuracy. If samples may lack their branch (an unknown integer) and no tracker
+        # adds it, an accuracy scale of at least 1 makes them have it.
         scaled, tracker, is_modulo = field, self.branch_tracker, None
         if now.accuracy_scale is not None and field.has_variable_accuracy:
             needs_branch = field.has_unknown_branch and tracker is None
@@ -420,6 +467,7 @@ class March:
             error = value_error_bound(ray_sample.sample, gradient_norm, size)
             ray_sample, is_sure = tracker.resolve(ray_sample, now.value, now.trial_step, error)
         sample = ray_sample.sample
+        # How far f is from the levels, and how well it is known.
         gaps = self.levels.gaps(sample.value)
         gap, total_error = gaps.nearest, value_error_bound(sample, gradient_norm, size)
         if tracker is not None and is_modulo is not None and is_sure is not None:
@@ -432,6 +480,7 @@ class March:
             length = fmin(now.enclosure_reach, end - t)
             steep = SteepPlace.at(field, self.levels, path, t, length, sample)
             total_error = total_error if steep.error is None else steep.error
+        # A proved lower bound of |grad f|: the tolerance in value is the tolerance times this.
         steepness = fmax(gradient_norm - sample.gradient_error, real(0))
         if ray_sample.slope_error is not None:  # the gradient is at least as long as its projection
             steepness = fmax(dr.abs(ray_sample.slope) - ray_sample.slope_error, steepness)
@@ -445,6 +494,7 @@ class March:
             if field.is_steep:  # otherwise f would have to change by more than it does
                 reach = dr.fma(t, self.tolerance.per_length, self.tolerance.distance)
                 change = largest_change(field, path.point(t), sample.value, reach)
+                # No crossing needs a larger change of f than its values allow within the tolerance.
                 within = fmax(fmin(within, change), self.tolerance.value)
             within = self.hysteresis.contact_tolerance(within)
         # Where not even the gradient is known, no hit is due to rounding.
@@ -491,49 +541,63 @@ class March:
         is_near: Mask,
         touches: Mask,
     ) -> tuple[Mask, Any]:
-        """Mask of points at which f really takes the level nearby, and the number of evaluations
-        that this test took. It is for fields whose slopes are not bounded.
+        """Return the mask of points at which f is proved to take the level nearby, and the number
+        of evaluations that this test took. It is for functions whose slope has no bound: there a
+        small |f - level| does not show that f takes the level.
 
-        gaps: the differences between f at the point and the next levels.
+        t: the ray parameters of the points; ray_sample: the samples there.
+        gaps: the differences between f at the point and the next levels below and above.
         size: a bound of the coordinates.
-        is_near: mask of points that count as near a level, by the slope of f or because rounding of
-            the point may hide the level.
-        touches: whether f may equal the level up to rounding.
+        is_near: mask of points to be tested: those near a level by the slope of f, and those where
+            rounding of the point may hide the level.
+        touches: mask of points at which f may equal the level up to rounding.
 
-        The test asks whether f takes the level within the tolerance, or within twice the rounding
-        of the point. It does if the enclosures (intervals that contain the change of f along the
-        ray) prove it, or if a sample of f lies at the level or on its other side (`steep.beyond`).
+        f must take the level within the hit tolerance, or within twice the rounding of the point if
+        that is larger. This is proved by the enclosures of f along the ray, or by a sample at the
+        level or on its other side (`steep.beyond`). A point at which |f - level| is within the
+        tolerance `value` always counts.
         """
         sample, p = ray_sample.sample, path.point(t)
         tolerance = dr.fma(t, self.tolerance.per_length, self.tolerance.distance)
         slack = 8 * self.backend.machine_epsilon * size
         reach = fmax(tolerance, 2 * slack)
-        proved = gaps.nearest <= self.tolerance.value
+        is_proved = gaps.nearest <= self.tolerance.value
+        # The change of f along the ray may prove that it takes the level.
         for enclosure in ray_sample.forward:
-            proved |= enclosure.arrives(gaps, reach)
+            is_proved |= enclosure.arrives(gaps, reach)
+        # Otherwise samples are taken along the gradient and along the ray.
         toward = down_or_up(sample.gradient, gaps, path.direction)
-        ways = (toward, safe_norm(sample.gradient)), (path.direction, ray_sample.slope)
-        unsure = is_near & ~proved
-        passed, evaluations = beyond(
+        directions_and_slopes = (
+            (toward, safe_norm(sample.gradient)),
+            (path.direction, ray_sample.slope),
+        )
+        is_unsure = is_near & ~is_proved
+        is_beyond, evaluations = beyond(
             self.backend,
             field,
             self.levels,
             gaps,
             p,
-            ways,
+            directions_and_slopes,
             sample.value,
             reach,
             touches,
-            unsure,
+            is_unsure,
         )
-        return is_near & (proved | passed), evaluations
+        return is_near & (is_proved | is_beyond), evaluations
 
     def _apply_hysteresis(
         self, trial: _TrialSample, hysteresis: Hysteresis, contact: Contact
     ) -> _TrialSample:
-        """The same sample with gaps, the differences between f and the next levels, to levels that
-        the hysteresis has moved. The band (the tolerance in value around a level) includes all
-        rounding of f; otherwise a ray would get stuck in a crease."""
+        """Return the trial sample as a ray that looks for crossings needs it: the levels are moved
+        (`Hysteresis.gaps`), and tolerances are those for contact.
+
+        hysteresis, contact: the rule that counts crossings, and the level that each ray reached
+            last.
+
+        The band (the tolerance in value around a level) includes all rounding of f; otherwise a ray
+        would get stuck in a crease.
+        """
         band = hysteresis.band(
             trial.value_tolerance, trial.total_error - trial.on_ray.sample.truncation_error
         )
@@ -552,31 +616,40 @@ class March:
     def _accept(
         self, field: Field, trial: _TrialSample, now: MarchState, ahead: JumpCrossing | None
     ) -> tuple[Mask, Real | None, Mask]:
-        """Three arrays. The mask of trial points that are accepted: no level lies before them, and
-        their sample is not too coarse. The accuracy scale of the next sample. The mask of samples
-        that were too coarse."""
+        """Decide which trial points are accepted: no level lies before them on the ray, and their
+        sample is not too coarse.
+
+        Returns the mask of accepted points, the accuracy scale of the next sample (larger is more
+        accurate), and the mask of samples that were too coarse.
+
+        field: the function before its accuracy is chosen. now: the state before the trial.
+        ahead: for a function with jumps, the facet at the end of the interval; else None.
+        """
+        # Up to the proved step no level lies on the ray. Beyond it, an enclosure that reaches back
+        # from the trial point has to prove the rest, and the side of the level has to be known.
         accepted = now.trial_step <= now.proved_step
         if self.over_relaxation > 1:
             knows_side = trial.accepts_unknown_side | (trial.gaps.nearest > trial.total_error)
-            proved = any_is_free(
+            is_proved = any_is_free(
                 trial.on_ray.backward,
                 trial.gaps.reduced_by(trial.total_error),
                 trial.unproved_length,
             )
-            accepted |= knows_side & proved
+            accepted |= knows_side & is_proved
         is_known = dr.isfinite(trial.total_error)  # without an error bound nothing is free
         if trial.steep is not None:  # values prove the next step
             is_known = is_known | (now.trial_step <= now.proved_step)
         if now.accuracy_scale is None or not field.has_variable_accuracy:
             return accepted & is_known, now.accuracy_scale, self.backend.Bool(False)
         truncation, coarsest = trial.on_ray.sample.truncation_error, field.coarsest_accuracy
-        deciding = self._deciding_gap(trial.value, ahead, trial.at_end)
+        smallest_gap = self._deciding_gap(trial.value, ahead, trial.at_end)
         accuracy = fmax(now.accuracy_scale, coarsest)
         finer, too_coarse = _refined_accuracy(
-            accuracy, deciding, trial.total_error, truncation, trial.value_tolerance
+            accuracy, smallest_gap, trial.total_error, truncation, trial.value_tolerance
         )
         coarser = _next_accuracy(accuracy, trial.gaps.nearest, truncation, coarsest)
         if trial.passes_branch_level is not None and trial.needs_branch is not None:
+            # Only accepted points need this: others are left for a shorter step.
             too_coarse |= trial.needs_branch & accepted  # others go back in any case
             coarser = dr.select(
                 trial.passes_branch_level, fmax(accuracy, 1), coarser
@@ -596,17 +669,23 @@ class March:
         ahead: JumpCrossing | None,
         jump: JumpTest | None,
     ) -> tuple[Contact, Mask, JumpTest | None, Real]:
-        """The contact with a level behind the trial point, the mask of rays that have crossed the
-        level, the comparison with the facet at the end of the interval, and f behind that facet.
+        """Update the contact of each ray with a level after the trial point, and at the facet there
+        if f jumps.
 
-        now: the state before the trial point.
+        hysteresis: the rule that counts crossings. contact, now: the contact and the state before
+            the trial point.
         accepted: mask of accepted trial points.
-        ahead, jump: for a field with jumps, the facet at the end of the interval and its comparison
-            with the level; else None.
+        ahead, jump: for a function with jumps, the facet at the end of the interval and its
+            comparison with the levels; else None.
+
+        Returns the new contact, the mask of rays that have crossed the level before the facet, the
+        comparison with the facet, and f behind it. In the comparison, `is_hit` marks rays that
+        cross the level by the jump.
         """
         value = trial.value
         previous = now.proved_to, now.value, dr.dot(now.gradient, path.direction), now.gradient
         is_last = trial.at_end if jump is None else trial.at_end & ~jump.has_crossing
+        # Only an error of f larger than the tolerance makes the crossing uncertain.
         excess = dr.select(
             trial.total_error > trial.value_tolerance, fmax(trial.excess, now.tolerance_excess), 0
         )
@@ -626,16 +705,27 @@ class March:
         return contact, crosses, jump, value
 
     def _proved_step(self, trial: _TrialSample, gaps: LevelGaps, contact: Contact | None) -> Real:
-        """The length from the trial point on which no level lies. gaps: the differences between f
-        there and the next levels. contact: the contact with a level behind the point; None if rays
-        end at levels."""
+        """Return the length of the ray beyond the trial point that is proved to hold no level.
+
+        gaps: the differences between f at the trial point, or behind the jump there, and the next
+            levels.
+        contact: the contact with a level after the point; None if rays end at levels.
+
+        For cones, the step is also limited by the growth of the cone. It is 0 where the error of f
+        is as large as its distance from a level.
+        """
         growth = _GROWTH_FRACTION * trial.gaps.nearest
+        # A tenth of the gap is kept for the growth of the cone.
         if self.cone_radius is not None:
             gaps = gaps.reduced_by(growth)
         forward = longest_free_length(trial.on_ray.forward, gaps.reduced_by(trial.total_error))
         if self.cone_radius is not None:
+            # The smallest number avoids 0/0. A step is at most as long as the cone needs to grow by
+            # the tenth.
             slope, smallest = trial.on_ray.slope, float(dr.smallest(self.backend.Float))
             widening = fmax(self.cone_radius * trial.gradient_norm, smallest)
+            # How fast f moves away from the nearer level. If that is faster than the cone grows,
+            # and no level is ever met, the step needs no limit.
             leaving = dr.select(trial.gaps.below <= trial.gaps.above, slope, -slope)
             endless = (forward == dr.inf) & (leaving >= widening)
             forward = dr.select(endless, forward, fmin(forward, growth / widening))
@@ -654,24 +744,33 @@ class March:
         end: Real,
         point: _TrialSample,
         accepted: Mask,
-        forward: Real,
-        trial: Real,
+        proved_step: Real,
+        trial_step: Real,
     ) -> tuple[Real, Real]:
-        """The proved step and the trial step, extended over the empty cells that follow the proved
-        step.
+        """Extend the proved step and the trial step over the cells beyond the proved step that hold
+        no level.
 
-        point: the sample at the trial point, and `accepted` the mask of lanes on which it was
+        occupied: the grid of cells. end: the ray parameter at which rays end.
+        point: the sample at the trial point, and `accepted` the mask of rays on which it was
             accepted.
-        forward, trial: the proved step and the trial step from there.
+        proved_step, trial_step: the two steps from the trial point.
+
+        Returns the two steps. The proved step is inf if the ray ends before the next cell that may
+        hold a level.
         """
-        free_to = dr.select(accepted, point.t + forward, self.ray_end)
+        free_to = dr.select(accepted, point.t + proved_step, self.ray_end)
         free_to = occupied.end_of_empty_run(path.origin, path.direction, free_to, self.ray_end)
-        forward = fmax(forward, dr.select(free_to >= self.ray_end, dr.inf, free_to - point.t))
-        trial = fmax(trial, forward)
+        proved_step = fmax(
+            proved_step, dr.select(free_to >= self.ray_end, dr.inf, free_to - point.t)
+        )
+        trial_step = fmax(trial_step, proved_step)
         if self.only_component:
-            target = path.point(point.t + fmin(trial, end - point.t))
-            trial = dr.select(occupied.cell(target).empty_distance > 0, forward, trial)
-        return forward, trial
+            # With `only_component`, a trial step may not end in a cell without a mark.
+            target = path.point(point.t + fmin(trial_step, end - point.t))
+            trial_step = dr.select(
+                occupied.cell(target).empty_distance > 0, proved_step, trial_step
+            )
+        return proved_step, trial_step
 
     def _next_reach(
         self,
@@ -682,16 +781,22 @@ class March:
         contact: Contact | None,
         is_hit: Mask,
     ) -> Real:
-        """The length on which the next sample should enclose the change of f: a multiple of the
-        proved step `proved`, or a third of the present length if no step was proved. A ray that has
-        just left a level, or hit it, gets the rest of the ray again."""
+        """Return the length of the ray on which the next sample should bound the change of f.
+
+        It is a multiple of `proved`, the proved step. If no step was proved, it is a third of the
+        present length. A ray that has just left a level, or hit it, gets the rest of the ray up to
+        `end`.
+
+        contact: the contact with a level after the trial point; None if rays end at levels.
+        is_hit: mask of trial points that are hits.
+        """
         # After a step of zero, the next enclosures need reach only a third as far: bisection.
         candidate = fmin(now.enclosure_reach, end - trial.t)
         shorter = dr.select(dr.isfinite(candidate), candidate / 3, 1 + 16 * trial.coordinate_size)
         reach = dr.select(proved > 0, trial.on_ray.reach_growth * proved, shorter)
         if now.contact is not None and contact is not None:  # off the surface: the whole ray again
-            leaves = now.contact.is_touching & ~contact.is_touching
-            reach = dr.select(leaves | is_hit, end - trial.t, reach)
+            leaves_level = now.contact.is_touching & ~contact.is_touching
+            reach = dr.select(leaves_level | is_hit, end - trial.t, reach)
         return reach
 
     def _is_free(
@@ -703,7 +808,15 @@ class March:
         proved_step: Real,
         contact: Contact | None,
     ) -> Mask:
-        """Mask of rays on which no level lies up to their end."""
+        """Return the mask of rays on which no level lies up to their end.
+
+        accepted: mask of accepted trial points. proved_step: the proved step from there, or from
+            the last accepted point on other rays.
+        contact: the contact after the trial point; None if rays end at levels.
+
+        Rays without an end count as free from a very large t on. A ray in contact must sample its
+        end (`Hysteresis.must_sample_end`).
+        """
         farthest = float(dr.largest(self.backend.Float)) ** _MISS_EXPONENT
         proved_to = dr.select(accepted, trial.t, now.proved_to)
         is_free = proved_to + proved_step >= dr.select(end == dr.inf, farthest, end)
@@ -719,33 +832,37 @@ class March:
         rounding: Real,
         ray_sample: RaySample,
         gradient_norm: Real,
-        size: Real,
+        length_scale: Real,
         end: Real,
     ) -> Mask:
-        """Mask of trial points at which a level is near enough in value for a hit, as `advance`
-        states.
+        """Return the mask of trial points at which f is near enough to a level for a hit, as
+        `advance` states.
 
         gap: the difference between f and the nearest level.
         within: the largest such difference that the tolerance allows.
         total_error, rounding: bounds of the error of f, and of its part due to rounding.
-        size: a bound of the coordinates.
+        ray_sample, gradient_norm: the sample of f at the point, and |grad f|.
+        length_scale: a bound of the coordinates.
+        end: the ray parameter at which the ray ends.
 
         A point is no hit if rounding leaves the distance to the surface uncertain by more than a
-            sixteenth of a length L: the size of the coordinates or, if larger, the radius of the
-            ball in which f is proved to be smooth. On a ray without an end, there is a second
-            condition. If only rounding brings the point near the level, it is no hit if rounding
-            leaves t uncertain by more than L. Otherwise, far enough away, rounding would make a hit
-            of every ray parallel to the surface.
+        sixteenth of a length L: the size of the coordinates or, if larger, the radius of the ball
+        in which f is proved to be smooth. On a ray without an end, there is a second condition. If
+        only rounding brings the point near the level, it is no hit if rounding leaves t uncertain
+        by more than L. Otherwise, far enough away, rounding would make a hit of every ray parallel
+        to the surface.
         """
         sample = ray_sample.sample
-        near = gap <= fmax(within - sample.truncation_error, 2 * rounding)
+        is_close = gap <= fmax(within - sample.truncation_error, 2 * rounding)
         for promise in sample.promises:
             radius = promise.radius
-            size = fmax(dr.select(dr.isfinite(radius), radius, 0), size)
+            length_scale = fmax(dr.select(dr.isfinite(radius), radius, 0), length_scale)
+        # By how much |f - level| may exceed the tolerance. Divided by a slope, this is a length:
+        # the uncertainty of t along the ray, and of the distance to the surface.
         excess = gap + total_error - within
         may_hit = (gap <= within - sample.truncation_error) | (end < dr.inf)
-        may_hit |= excess <= dr.abs(ray_sample.slope) * size
-        return near & may_hit & (excess <= _LARGEST_UNCERTAINTY * gradient_norm * size)
+        may_hit |= excess <= dr.abs(ray_sample.slope) * length_scale
+        return is_close & may_hit & (excess <= _LARGEST_UNCERTAINTY * gradient_norm * length_scale)
 
     def _next_trial_step(
         self,
@@ -756,34 +873,45 @@ class March:
         path: Ray,
         is_smooth: bool,
     ) -> Real:
-        """The length of the next trial step, at least the proved step `forward`.
+        """Return the length of the next trial step, at least the proved step `forward`.
 
-        The trial step is longer by over-relaxation, but does not pass the point at which f is
-        predicted to reach a level. The prediction may be wrong without harm: a trial point is
-        accepted only if an enclosure of the change of f, back to the proved length, proves it.
+        The trial step is up to `over_relaxation` times as long, but does not pass the point at
+        which f is predicted to reach a level. A wrong prediction does no harm: a trial point is
+        accepted only if an enclosure of f that reaches back from it proves the rest of the step.
 
+        forward, ray_sample: the proved step from the trial point, and the sample of f there.
         gaps: the differences between f and the next levels.
         now: the state at the last accepted point.
         is_smooth: whether value and slope at the last accepted point help to predict f. They do not
-            for an approximate field, whose truncation error differs from point to point.
+            if f has a truncation error, which differs from point to point.
+
+        Let r = |slope|, g be the difference to the level towards which f moves, and c its second
+        derivative towards that level. With is_smooth, f is predicted to reach the level at the
+        first x > 0 with r x + c x^2/2 = g, which is 2g/(r + sqrt(r^2 + 2 c g)); nowhere if the root
+        is not real. Else it is g/r.
         """
         slope = ray_sample.slope
-        rate, gap = dr.abs(slope), dr.select(slope > 0, gaps.above, gaps.below)
+        slope_size, gap = dr.abs(slope), dr.select(slope > 0, gaps.above, gaps.below)
         if is_smooth:
-            second = dr.mulsign(self._second_derivative(ray_sample, now, path), slope)
-            root = dr.fma(rate, rate, 2 * second * gap)
-            target = _TRIAL_AIM * dr.select(root >= 0, 2 * gap / (rate + dr.sqrt(root)), dr.inf)
+            second_derivative = dr.mulsign(self._second_derivative(ray_sample, now, path), slope)
+            discriminant = dr.fma(slope_size, slope_size, 2 * second_derivative * gap)
+            target = _TRIAL_AIM * dr.select(
+                discriminant >= 0, 2 * gap / (slope_size + dr.sqrt(discriminant)), dr.inf
+            )
         else:
-            target = _AIM_BY_SLOPE * dr.select(rate > 0, gap / rate, dr.inf)
+            target = _AIM_BY_SLOPE * dr.select(slope_size > 0, gap / slope_size, dr.inf)
         return fmin(self.over_relaxation * forward, fmax(target, forward))
 
     def _second_derivative(self, ray_sample: RaySample, now: MarchState, path: Ray) -> Real:
-        """The second derivative at the trial point, along the ray, of the cubic that has the values
-        and slopes of f at the trial point and at the last accepted point; 0 if no point was
-        accepted before.
+        """Return the second derivative of a cubic along the ray, taken at the trial point. The
+        cubic has the values and slopes of f at the trial point and at the last accepted point. The
+        result is 0 if no point was accepted before.
 
-        With h the distance of the two points, D the difference quotient, and s0 and s the slopes at
-        the accepted and the trial point, it is 2 (2s + s0 - 3D)/h (Hermite).
+        ray_sample: the sample at the trial point. now: the state at the last accepted point.
+
+        Let h be the distance of the two points, D the difference quotient, and s0 and s the slopes
+        at the accepted and the trial point. The derivative is 2 (2s + s0 - 3D)/h (Hermite). For a
+        periodic f, D uses the multiple of the period that agrees best with the slopes.
         """
         h, slope, slope_before = (
             now.trial_step,
@@ -798,14 +926,18 @@ class March:
         return dr.select(has_before, 2 * (2 * slope + slope_before - 3 * rise / h) / h, 0)
 
     def _status(self, is_hit: Mask, is_free: Mask) -> Any:
-        """The `RayStatus` with which a ray ends: HIT on lanes of `is_hit`, MISS on other lanes of
-        `is_free`, else OUT_OF_STEPS."""
+        """Return the `RayStatus` of rays: HIT on lanes of `is_hit`, MISS on other lanes of
+        `is_free` (the rest of the ray is proved to hold no level), else OUT_OF_STEPS."""
         ended = dr.select(is_free, int(RayStatus.MISS), int(RayStatus.OUT_OF_STEPS))
         return self.backend.UInt32(dr.select(is_hit, int(RayStatus.HIT), ended))
 
     def _deciding_gap(self, value: Real, ahead: JumpCrossing | None, at_end: Mask | None) -> Real:
-        """The difference between f and the nearest level; at a jump of f, the smaller of the
-        differences before and behind it. ahead: the facet at the end of the interval, or None."""
+        """Return the difference between f and the nearest level. Where a trial point lies at a
+        facet, at which f jumps, it is the smaller of the differences before and behind the jump.
+
+        value: f before the jump. at_end: mask of points at the end of the interval. ahead: the
+            facet there, or None.
+        """
         gap = self.levels.gaps(value).nearest
         if ahead is not None:
             gap_behind = self.levels.gaps(value + ahead.jump).nearest
@@ -816,20 +948,19 @@ class March:
 def _refined_accuracy(
     scale: Real, gap: Real, total_error: Real, truncation: Real, within: Real
 ) -> tuple[Real, Mask]:
-    """The accuracy scale with which a sample is repeated, and a mask of samples that are too
-    coarse.
+    """Return the accuracy scale with which each sample is repeated (larger is more accurate), and
+    the mask of samples that are too coarse and so have to be repeated.
 
     scale, total_error, truncation: the accuracy scale, total error and truncation error of the
         sample.
     gap: the difference between f and the nearest level.
     within: the largest such difference at a hit.
 
-    A sample is too coarse if its error shortens the step much or decides whether the point is a
+    A sample is too coarse if its error shortens the step much, or decides whether the point is a
     hit. It is not too coarse if its truncation error is a small part of `within`, or of the
     rounding error, which a higher accuracy does not reduce. With this allowance the march still
-    arrives at hits: its steps end where f is as near to a level as `total_error`, and 1.25
-    total_error is less than the difference that makes a hit (within - truncation, or twice the
-    rounding).
+    arrives at hits: its steps end where `gap` is as small as `total_error`, and 1.25 total_error is
+    less than the difference that makes a hit (within - truncation, or twice the rounding).
     """
     rounding = total_error - truncation
     allowed = fmax(
@@ -839,17 +970,21 @@ def _refined_accuracy(
     too_coarse = (
         (gap < _REFINE_BELOW * total_error) & (truncation > allowed) & (scale < _MAX_ACCURACY)
     )
+    # The truncation error falls as a power of the scale: so the scale for this target follows.
     target = fmax(_TRUNCATION_OF_GAP * gap, _TRUNCATION_OF_ALLOWED * allowed)
     factor = clamp(dr.power(truncation / target, 1 / _TRUNCATION_ORDER), *_REFINEMENT_LIMITS)
     return fmin(fmax(scale * factor, 1), _MAX_ACCURACY), too_coarse
 
 
 def _next_accuracy(scale: Real, gap: Real, truncation: Real, coarsest: float) -> Real:
-    """The accuracy scale of the next sample: 0, the coarsest, or at least 1, and at most `scale`.
+    """Return the accuracy scale of the next sample (larger is more accurate): 0, which means the
+    coarsest, or else at least 1. It is at most `scale`.
 
-    scale, gap, truncation: of this sample, the accuracy scale, the difference between f and the
-        nearest level, and the truncation error.
+    scale, truncation: the accuracy scale and the truncation error of this sample.
+    gap: the difference between f and the nearest level; the next truncation error may be a fifth of
+        it.
     coarsest: the accuracy scale that 0 stands for.
     """
+    # The truncation error falls as a power of the scale.
     target = scale * dr.power(truncation / (_COARSE_FRACTION * gap), 1 / _TRUNCATION_ORDER)
     return dr.select(target > coarsest, fmin(fmax(target, 1), scale), 0)

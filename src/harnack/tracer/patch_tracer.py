@@ -5,11 +5,10 @@ Each patch lies in its box, and `March` traces rays to it as to any level set. A
 hit of all patches.
 
 The patches cannot be marched as one field: no single function has all of them as its level set, and
-    for the faces of a polygon mesh each step would evaluate every face. So a ray marches its
-    patches one after another, in the order in which it enters their boxes. A tree of the boxes
-    gives this order. At any time different lanes may be in different patches. All patches read
-    their edges from one table (`RecordTable.view`), so the compiled kernel is the same for every
-    mesh.
+for the faces of a polygon mesh each step would evaluate every face. So a ray marches its patches
+one after another, in the order in which it enters their boxes. A tree of the boxes gives this
+order. At any time different lanes may be in different patches. All patches read their edges from
+one table (`RecordTable.view`), so the compiled kernel is the same for every mesh.
 """
 
 from __future__ import annotations
@@ -34,12 +33,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class PatchTraceState:
-    """The state of rays through a union of patches.
+    """The state of rays through a union of patches, each with a box of its own. A ray marches the
+    patches one after another, in the order in which it enters their boxes.
 
     enter, box: the ray parameter at which the ray entered the last box, and the index of this box.
     t: the ray parameter of the nearest hit so far; without a hit the end of the ray; for a ray out
         of steps, the parameter up to which no surface lies.
-    value, gradient, excess, status: the results of the march that gave this t (`MarchState`).
+    value, gradient, excess, status: the results of the march that gave this t (see `MarchState`).
     evaluations: the number of evaluations of functions in all marches so far.
     part: the index of the patch that was hit, NO_PATCH for none.
     active: whether the ray may meet further patches.
@@ -76,7 +76,10 @@ class PatchTracer:
     any_hit: bool = False
 
     def run(self, state: MarchState) -> tuple[MarchState, Any]:
-        """The end state of rays, and the index of the patch that each ray hit, NO_PATCH for none.
+        """Trace rays until all have ended. Returns their end state, and the index of the patch that
+        each ray hit, NO_PATCH for none.
+
+        state: the `MarchState` of rays that have not moved yet.
 
         Proof that no hit is missed. Each patch lies in its box, and the boxes come in the order in
         which the ray enters them. In each box the ray marches from its entry to its exit, or to the
@@ -89,7 +92,10 @@ class PatchTracer:
         return self.finish(end_state)
 
     def begin(self, state: MarchState) -> PatchTraceState:
-        """The state of rays before they enter the first box. state: the state at their start."""
+        """Return the tracer's own state (a `PatchTraceState`) of rays that have entered no box yet.
+
+        state: the `MarchState` of the same rays, before their first sample.
+        """
         real, count = self.march.backend.Float, self.march.backend.UInt32
         return PatchTraceState(
             enter=real(-1),
@@ -105,8 +111,11 @@ class PatchTracer:
         )
 
     def finish(self, walk: PatchTraceState) -> tuple[MarchState, Any]:
-        """The end of rays as a `MarchState`, and the index of the patch that each ray hit, NO_PATCH
-        for none."""
+        """Return the end state of rays as a `MarchState`, and the index of the patch that each ray
+        hit, NO_PATCH for none.
+
+        walk: the tracer's own state when no ray is active any more.
+        """
         backend = self.march.backend
         before = MarchState.at(backend, self.start, self.end, walk.active, has_detail=False)
         end = dataclasses.replace(
@@ -122,8 +131,14 @@ class PatchTracer:
         return end, walk.part
 
     def advance(self, walk: PatchTraceState) -> PatchTraceState:
-        """The state after each active ray has marched one more patch: the next one whose box it
-        enters before the first hit so far. Rays without such a patch end."""
+        """March each active ray through one more patch: the next one whose box it enters before the
+        first hit so far. Returns the state after it.
+
+        walk: the tracer's own state before.
+
+        Rays without such a patch end; their nearest hit, if any, is the first. A ray that runs out
+        of steps in a patch ends there.
+        """
         backend, path = self.march.backend, self.path
         after = PatchEntry(walk.enter, walk.enter, walk.box)
         entry = self.field.next_patch(
@@ -132,25 +147,29 @@ class PatchTracer:
         active = walk.active & (entry.patch != NO_PATCH)
         start, end = fmax(entry.enter, self.start), fmin(entry.leave, walk.t)
         patch = self.field.patch(dr.select(active, entry.patch, 0))
-        spent = active & (walk.evaluations >= self.march.max_steps)
-        now = MarchState.at(backend, start, end, active & ~spent, has_detail=False)
+        used_all_steps = active & (walk.evaluations >= self.march.max_steps)
+        now = MarchState.at(backend, start, end, active & ~used_all_steps, has_detail=False)
         now = dataclasses.replace(now, evaluations=backend.UInt32(walk.evaluations))
         now = self.march.advance(patch, path, backend.Float(end), now)
-        out = backend.UInt32(int(RayStatus.OUT_OF_STEPS))
-        hit = active & (now.status == int(RayStatus.HIT))
-        lost = spent | (active & (now.status == int(RayStatus.OUT_OF_STEPS)))
-        ended = hit | lost
-        sampled = active & (ended | (walk.part == NO_PATCH))
-        goes_on = active & ~ended if self.any_hit else active & ~lost
+        out_of_steps = backend.UInt32(int(RayStatus.OUT_OF_STEPS))
+        is_hit = active & (now.status == int(RayStatus.HIT))
+        is_undecided = used_all_steps | (active & (now.status == int(RayStatus.OUT_OF_STEPS)))
+        has_ended = is_hit | is_undecided
+        # Rays without a hit keep the value of the last patch.
+        takes_value = active & (has_ended | (walk.part == NO_PATCH))
+        # After a hit, a patch whose box is entered before it may still be nearer.
+        goes_on = active & ~has_ended if self.any_hit else active & ~is_undecided
         return PatchTraceState(
             enter=entry.enter,
             box=entry.patch,
-            t=dr.select(hit, now.proved_to, dr.select(lost, start, walk.t)),
-            value=dr.select(sampled, now.value, walk.value),
-            gradient=dr.select(ended, now.gradient, walk.gradient),
-            excess=dr.select(ended, now.tolerance_excess, walk.excess),
+            t=dr.select(is_hit, now.proved_to, dr.select(is_undecided, start, walk.t)),
+            value=dr.select(takes_value, now.value, walk.value),
+            gradient=dr.select(has_ended, now.gradient, walk.gradient),
+            excess=dr.select(has_ended, now.tolerance_excess, walk.excess),
             evaluations=dr.select(active, now.evaluations, walk.evaluations),
-            status=dr.select(hit, now.status, dr.select(lost, out, walk.status)),
-            part=dr.select(hit, entry.patch, dr.select(lost, NO_PATCH, walk.part)),
+            status=dr.select(
+                is_hit, now.status, dr.select(is_undecided, out_of_steps, walk.status)
+            ),
+            part=dr.select(is_hit, entry.patch, dr.select(is_undecided, NO_PATCH, walk.part)),
             active=goes_on,
         )

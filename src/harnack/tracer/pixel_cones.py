@@ -1,5 +1,6 @@
 """Pixel cones: tests whether a surface may cover a part of a pixel although the ray through its
-middle misses it.
+middle misses it. The cone around this ray has the radius of the pixel; f is the function whose
+level is the surface.
 
 The cover of a surface is the surface moved outwards by the radius of the cone (Thomas et al. 1989;
 Hart 1996, Section 3). A cone is covered in part if its ray enters the cover and leaves it again on
@@ -49,11 +50,11 @@ _NEGLIGIBLE = 1e-12
 @dataclass(frozen=True)
 class _CoverState:
     """The state of a ray in the cover, the layer around the surface whose thickness is the radius
-    of the cone.
+    of the cone around the ray. The height is the distance of a point of the ray over the surface,
+    to first order, in radii of the cone; it is negative behind the surface.
 
-    t, height, slope: the ray parameter of the last sample, the height over the surface there in
-        radii of the cone, and the derivative of the height along the ray. The height is negative
-        behind the surface.
+    t, height, slope: the ray parameter of the last sample, the height there, and the derivative of
+        the height along the ray.
     step: the length from there to the next sample.
     sample_count: the number of samples so far.
     active: whether the ray goes on.
@@ -69,7 +70,8 @@ class _CoverState:
 
 @dataclass(frozen=True)
 class PixelCones:
-    """Cones around rays o + t d, |d| = 1, that may touch a level set.
+    """Cones around rays o + t d, |d| = 1, that may touch a level set of a function f. The cover is
+    the layer around the surface whose thickness is the radius of the cone.
 
     prepared: the tracer of the level set.
     radius: the radius of a cone per unit of t.
@@ -87,15 +89,18 @@ class PixelCones:
     solid: tuple[Real, Real] | None = None
 
     def partially_covered(self, t_max: Real, active: Mask) -> tuple[Mask, Any]:
-        """The mask of cones that the surface covers in part but not completely, and the number of
-        evaluations of the field. Only the first passage of each ray through the cover that begins
-        before t_max is examined. The cover is the layer around the surface whose thickness is the
-        radius of the cone.
+        """Find the cones that the surface covers in part but not completely. Returns their mask and
+        the number of evaluations of f.
+
+        t_max: only the first passage of each ray through the cover that begins before it is
+            examined.
+        active: mask of cones that are tested.
 
         A ray marches to the cover with proofs (`March.advance`). Levels then count as nearer in
         value by |grad f| times the radius. So a proved step keeps the ray a radius off the surface,
         to first order. Within the cover steps are predicted and not proved. That can only miss a
-        second surface within the cover of the first.
+        second surface within the cover of the first. A ray that has used all samples in the cover
+        counts as covered in part.
         """
         backend, prepared = self.prepared.backend, self.prepared
         real = backend.Float
@@ -108,18 +113,20 @@ class PixelCones:
         margin = (
             _START_MARGIN_APPROXIMATE if prepared.field.has_variable_accuracy else _START_MARGIN
         )
+        # The march ends a small margin outside of the cover: the tolerance grows with the cone.
         tolerance = PreparedHitTolerance(real(0), margin * self.radius, real(0))
-        options = prepared.levels, tolerance, prepared.max_steps, prepared.over_relaxation
-        march = March(backend, *options, cone_radius=self.radius)
+        march_options = prepared.levels, tolerance, prepared.max_steps, prepared.over_relaxation
+        march = March(backend, *march_options, cone_radius=self.radius)
         now = march.advance(prepared.field, path, real(end), state)
         is_hit = now.status == int(RayStatus.HIT)
         begin = dr.select(is_hit, now.proved_to, 0)
         gap = prepared.levels.offset_to_nearest(now.value)
+        # The level that was reached, and 1 or -1 if the ray comes from larger or smaller f.
         level, side = now.value + gap, dr.select(gap < 0, real(1), -1)
 
         def sample_at(t: Real) -> tuple[Real, Real]:
-            """The height over the surface at parameters t, in radii of the cone, and its derivative
-            along the ray."""
+            """Return the height over the surface at parameters t, in radii of the cone, and its
+            derivative along the ray."""
             field = (
                 prepared.field
                 if now.accuracy_scale is None
@@ -128,34 +135,38 @@ class PixelCones:
             sample = field.evaluate(dr.fma(backend.Array3f(t), self.direction, self.origin))
             return self._height(sample.value, sample.gradient, t, side, level)
 
-        def body(last: _CoverState) -> _CoverState:
-            """The state after one more sample within the cover."""
+        def sample_once(last: _CoverState) -> _CoverState:
+            """Take one more sample within the cover. Returns the state after it."""
             t = last.t + last.step
             height, slope = sample_at(t)
             step = _next_step(
                 height, slope, (slope - last.slope) / last.step, _MAX_STEP_RATIO * last.step
             )
             count = last.sample_count + 1
-            off = (height >= _END_HEIGHT) & (slope >= 0)
-            over = (height <= -1) | off | (count >= _MAX_SAMPLES) | (t >= t_end)
+            # The passage ends behind the surface, off the cover, or where its samples are used up.
+            has_left = (height >= _END_HEIGHT) & (slope >= 0)
+            is_over = (height <= -1) | has_left | (count >= _MAX_SAMPLES) | (t >= t_end)
             step = fmax(step, _MIN_STEP * self.radius * t)
-            return _CoverState(t, height, slope, step, count, last.active & ~over)
+            return _CoverState(t, height, slope, step, count, last.active & ~is_over)
 
         height, slope = self._height(now.value, now.gradient, begin, side, level)
         first = _next_step(height, slope, real(0), _MAX_FIRST_STEP * self.radius * begin)
         none = backend.UInt32(0)
         passage = _CoverState(begin, height, slope, first, none, is_hit & (height > -1))
-        passage = loop_while_active(passage, body, "harnack cover")
+        passage = loop_while_active(passage, sample_once, "harnack cover")
         return is_hit & ~(passage.height <= -1), now.evaluations + passage.sample_count
 
     def _height(
         self, value: Real, gradient: Vec3, t: Real, side: Real, level: Real
     ) -> tuple[Real, Real]:
-        """The height over the surface, in radii of the cone, and its derivative along the ray.
+        """Return the height over the surface, in radii of the cone, and its derivative along the
+        ray.
 
         value, gradient, t: f, its gradient (3,) and the ray parameter of a sample.
         side, level: the level, and 1 or -1 if the ray comes to it from larger or smaller f. They
             are not used for a solid.
+
+        The height is inf where the gradient or t is 0.
         """
         period = self.prepared.levels.period
         offset = value - level
@@ -166,13 +177,15 @@ class PixelCones:
             low, high = self.solid
             height = fmax(low - value, value - high)
             side = dr.select(low - value > value - high, -1, type(value)(1))
+        # The radius of the cone, as a difference of f.
         radius = safe_norm(gradient) * self.radius * t
         has_slope = radius > 0
         slope = dr.select(has_slope, side * dr.dot(gradient, self.direction) / radius, 0)
         return dr.select(has_slope, height / radius, dr.inf), slope
 
     def _clip(self) -> tuple[Real, Real]:
-        """The interval (start, end) of ray parameters on which the cones can touch the surface.
+        """Return the interval (start, end) of ray parameters on which the cones can touch the
+        surface.
 
         The surface's extent is enlarged about a point m in it by a factor, until it contains all
         points within the radius of the cone. (Here the ray is shrunk instead, which is equivalent.)
@@ -183,6 +196,8 @@ class PixelCones:
         start, end = real(0), real(dr.inf)
         if self.bounding_balls is not None and self.prepared.volume is not None:
             middle, depth, size = self.bounding_balls
+            # The distance at which a cone can be last near the extent, with a margin for its radius
+            # there.
             farthest = (safe_norm(middle - self.origin) + size) * (1 + 2 * self.radius)
             factor = 1 + self.radius * farthest / depth
             o = (self.origin - middle) / factor + middle
@@ -194,21 +209,27 @@ class PixelCones:
 
 
 def _next_step(height: Real, slope: Real, second_derivative: Real, longest: Real) -> Real:
-    """The length of the next step of a ray in the cover, at most `longest`: to where the cone is
-    predicted to be lowest over the surface, to a radius behind the surface, or to the outside of
+    """Return the length of the next step of a ray in the cover, at most `longest`: to where the ray
+    is predicted to be lowest over the surface, to a radius behind the surface, or to the outside of
     the cover, whichever comes first.
 
     height, slope, second_derivative: the height over the surface in radii of the cone, and its
         first and second derivatives along the ray.
+
+    If the height falls, it reaches -1 after (height + 1)/|slope| at this slope, and is lowest after
+    |slope|/second_derivative. If it rises by r = `rest` to the outside, this takes 2r/(slope +
+    sqrt(slope^2 + 2 r second_derivative)). Steps go a little beyond these points.
     """
     real = cast("Any", type(height))
-    to_behind = (height + 1 + _AIM_MARGIN) / fmax(-slope, real(_NEGLIGIBLE))
-    lowest = dr.select(
+    length_to_behind = (height + 1 + _AIM_MARGIN) / fmax(-slope, real(_NEGLIGIBLE))
+    length_to_lowest = dr.select(
         second_derivative > _NEGLIGIBLE,
         (1 + _AIM_MARGIN) * -slope / fmax(second_derivative, real(_NEGLIGIBLE)),
         dr.inf,
     )
     rest = fmax(_END_HEIGHT + _AIM_MARGIN - height, real(0))
-    root = dr.sqrt(slope * slope + 2 * fmax(second_derivative, real(0)) * rest)
-    outward = 2 * rest / fmax(slope + root, real(_NEGLIGIBLE))
-    return fmin(dr.select(slope < 0, fmin(to_behind, lowest), outward), longest)
+    end_slope = dr.sqrt(slope * slope + 2 * fmax(second_derivative, real(0)) * rest)
+    length_to_outside = 2 * rest / fmax(slope + end_slope, real(_NEGLIGIBLE))
+    return fmin(
+        dr.select(slope < 0, fmin(length_to_behind, length_to_lowest), length_to_outside), longest
+    )

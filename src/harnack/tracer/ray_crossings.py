@@ -1,5 +1,8 @@
-"""The function `crossings`, which gives all points at which rays cross a surface, and its result
-`RayCrossings`.
+"""The function `crossings`, which finds all points at which rays cross a surface, and its result
+`RayCrossings`. The surface consists of the points at which a function f, the field, takes one of
+given values, the levels. A crossing is a point of a ray at which f passes to the other side of a
+level. f may also jump past a level at a facet, a flat piece of surface such as a triangle of a
+mesh.
 
 `find_crossings` finds the crossings of each ray one after another while a kernel is recorded.
 `RayCrossings` is the result for users: NumPy arrays for NumPy rays, Dr.Jit arrays for Dr.Jit rays.
@@ -50,7 +53,8 @@ _HONORED = (
 
 @dataclass(frozen=True)
 class CrossingArrays:
-    """The first k crossings of n rays, as Dr.Jit arrays. Crossing j of ray i is at i k + j in
+    """The first k crossings of n rays with a surface, as Dr.Jit arrays. A crossing is a point at
+    which a function f passes to the other side of a level. Crossing j of ray i is at i k + j in
     arrays of n k entries.
 
     t: (n k) ray parameters; inf if a ray has fewer crossings.
@@ -62,7 +66,7 @@ class CrossingArrays:
     end: (n) the ray parameter up to which the ray was followed; inf if it was followed to its end.
     evaluations: (n) the number of evaluations of f.
     status: (n) a `RayStatus`: MISS if the ray has no further crossings, HIT if it has k,
-        OUT_OF_STEPS if the ray behind `end` is not known.
+        OUT_OF_STEPS if the ray beyond `end` is not known.
     """
 
     t: Real
@@ -77,9 +81,10 @@ class CrossingArrays:
 
 @dataclass(frozen=True)
 class _SearchState:
-    """The state of rays that look for crossings, and the number of crossings that each has found.
+    """The state of rays that look for crossings with a surface, and the number of crossings that
+    each has found.
 
-    march: the state of the march; None for a field with jumps.
+    march: the state of the march, which steps along rays with proofs; None for a field with jumps.
     sheets: for a field with jumps, the state of `JumpTracer`, which includes the state of the
         march; else None.
     count: the number of crossings so far.
@@ -96,13 +101,13 @@ class _SearchState:
 
     @property
     def now(self) -> MarchState:
-        """The state of the march, for all kinds of fields."""
+        """The state of the march, for fields with and without jumps."""
         state = self.march if self.sheets is None else self.sheets.march
         assert state is not None
         return state
 
     def with_march(self, now: MarchState, count: Any) -> _SearchState:
-        """This state with another state of the march and another number of crossings."""
+        """Return this state with another state of the march and another number of crossings."""
         if self.sheets is None:
             return _SearchState(now, None, count)
         return _SearchState(None, dataclasses.replace(self.sheets, march=now), count)
@@ -111,16 +116,17 @@ class _SearchState:
 def find_crossings(
     prepared: SurfaceTracer, o: Vec3, d: Vec3, t_min: Real, t_max: Real, k: int
 ) -> CrossingArrays:
-    """The first k crossings of rays o + t d, |d| = 1, for t_min <= t <= t_max.
+    """Find the first k crossings of rays o + t d, |d| = 1, for t_min <= t <= t_max.
 
     `Hysteresis`, the rule by which a crossing is counted, states the guarantees and proves them. A
     ray is marched from one crossing to the next without a new start: what is known of f at a
-    crossing is used behind it, and the ray may reach and leave levels any number of times.
+    crossing is used after it, and the ray may reach and leave levels any number of times.
     """
     backend = prepared.backend
     real, vector, count = backend.Float, backend.Array3f, backend.UInt32
     march, path, start, end, state = prepared.begin_march(o, d, t_min, t_max, True, crosses=True)
     n = max(dr.width(array) for array in (path.origin, path.direction, start, end))
+    # Crossing j of ray i is at i k + j.
     first_slot = dr.arange(count, n) * k
     # The loop scatters into these arrays, so they must lie in memory before it is recorded.
     t, side = dr.full(real, dr.inf, n * k), dr.zeros(real, n * k)
@@ -130,9 +136,9 @@ def find_crossings(
     tracer = JumpTracer(march, prepared.field, path, start, end)
 
     def advance(now: _SearchState) -> _SearchState:
-        """The state after each active ray has gone to its next crossing, to the next jump of f, or
-        to its end. A crossing is written to the arrays outside, in the next free place of its
-        ray."""
+        """Bring each active ray to its next crossing, to the next jump of f, or to its end. Returns
+        the state after it. A crossing is written to the arrays outside, in the next free place of
+        its ray."""
         next_state, facet = now, None
         if now.sheets is None:
             after = march.advance(prepared.field, path, end, now.now)
@@ -142,10 +148,11 @@ def find_crossings(
             after, facet = tracer.finish(walk)
         contact = after.contact
         assert contact is not None
-        ended = now.active & (after.status == int(RayStatus.HIT))
-        is_crossing = ended
+        is_at_crossing = now.active & (after.status == int(RayStatus.HIT))
+        # If the surface consists of facets only, other crossings do not count.
+        is_crossing = is_at_crossing
         if facet is not None and prepared.field.only_sheets:
-            is_crossing = ended & (facet != NO_FACET)
+            is_crossing = is_at_crossing & (facet != NO_FACET)
         slot = first_slot + now.count
         dr.scatter(t, contact.root, slot, is_crossing)
         dr.scatter(side, contact.side, slot, is_crossing)
@@ -155,7 +162,9 @@ def find_crossings(
         if facet is not None:
             dr.scatter(facets, facet, slot, is_crossing)
         crossings = now.count + dr.select(is_crossing, count(1), 0)
-        goes_on = ended & (crossings < k)
+        # A ray with fewer than k crossings goes on, unless its rest is already proved to hold no
+        # level.
+        goes_on = is_at_crossing & (crossings < k)
         status = dr.select(goes_on, count(int(RayStatus.MISS)), after.status)
         if now.sheets is None:
             undecided = after.proved_to + after.proved_step < end
@@ -175,11 +184,17 @@ def find_crossings(
         begin = _SearchState(None, tracer.begin(state), dr.zeros(count, n))
     walk = loop_while_active(begin, advance, "harnack crossings")
     final = walk.now
-    rays, zero = dr.arange(count, n * k) // k, real(0)
+    ray_indices, zero = dr.arange(count, n * k) // k, real(0)
     roots = Contact(side, backend.Bool(False), t, gradient, zero, before, behind, zero)
-    origins, directions = gather_vectors(backend, o, rays), gather_vectors(backend, d, rays)
-    t, gradient, samples = prepared.refined_crossings(origins, directions, roots, dr.isfinite(t))
-    evaluations = final.evaluations + dr.block_reduce(dr.ReduceOp.Add, samples, k)
+    # Each crossing gets the ray to which it belongs, and is refined.
+    origins, directions = (
+        gather_vectors(backend, o, ray_indices),
+        gather_vectors(backend, d, ray_indices),
+    )
+    t, gradient, extra_evaluations = prepared.refined_crossings(
+        origins, directions, roots, dr.isfinite(t)
+    )
+    evaluations = final.evaluations + dr.block_reduce(dr.ReduceOp.Add, extra_evaluations, k)
     traced_to = dr.select(final.status == int(RayStatus.MISS), dr.inf, final.proved_to)
     return CrossingArrays(
         t, gradient, facets, side, walk.count, traced_to, evaluations, final.status
@@ -188,7 +203,8 @@ def find_crossings(
 
 @dataclass(frozen=True)
 class RayCrossings:
-    """The first k crossings of n rays with the level set, in the order along each ray.
+    """The first k crossings of n rays with a level set of a function f, in the order along each
+    ray. A crossing is a point at which f passes to the other side of the level.
 
     They are NumPy arrays; tensors if the rays were tensors; Dr.Jit arrays if the rays were Dr.Jit
     arrays. The latter are flat: crossing j of ray i is at i k + j.
@@ -205,10 +221,10 @@ class RayCrossings:
         0 for no crossing.
     count: (n,) the number of crossings, at most k.
     traced_to: (n,) the ray parameter up to which the ray was followed: inf if it was followed to
-        its end; else the point just behind the last crossing at which this crossing was noticed, or
+        its end; else the point just beyond the last crossing at which this crossing was noticed, or
         the point at which the ray ran out of steps.
     status: (n,) a `RayStatus`. MISS: the ray is proved to have no other crossings. HIT: there are k
-        crossings, and the rest of the ray was not examined. OUT_OF_STEPS: the ray behind
+        crossings, and the rest of the ray was not examined. OUT_OF_STEPS: the ray beyond
         `traced_to` is not known.
     evaluations: (n,) the number of evaluations of the field.
     """
@@ -237,7 +253,8 @@ def crossings(
     options: TraceOptions | None = None,
     **keywords: Unpack[TraceKeywords],
 ) -> RayCrossings:
-    """The first crossings of rays with a level set of a field, in the order along each ray.
+    """Find the first crossings of rays with a level set of a field's function f, in the order along
+    each ray. A crossing is a point at which f passes to the other side of the level.
 
     If f goes farther than the tolerance to both sides of the level, the crossing is not missed, and
     no crossing is counted twice. If a ray touches a level without passing to its other side, or
@@ -283,7 +300,7 @@ def crossings(
 
 
 def _check_count(max_crossings: Any) -> int:
-    """`max_crossings` as an int of at least 1; TypeError or ValueError otherwise."""
+    """Return `max_crossings` as an int of at least 1. Raises TypeError or ValueError otherwise."""
     try:
         k = operator.index(max_crossings)
     except TypeError:
@@ -299,14 +316,16 @@ def _check_count(max_crossings: Any) -> int:
 def trace_crossings(
     surface: TracedSurface, rays: RayBatch, k: int, *, differentiable: bool
 ) -> RayCrossings:
-    """The first k crossings of each ray as a `RayCrossings` of Dr.Jit arrays. differentiable:
-    whether t and positions are to carry derivatives, if rays, levels or field have derivatives
-    enabled."""
+    """Find the first k crossings of each ray, and return them as a `RayCrossings` of Dr.Jit arrays.
+
+    differentiable: whether t and positions are to carry derivatives, if rays, levels or field have
+        derivatives enabled.
+    """
     backend, o, d = rays.backend, rays.origin, rays.direction
     prepared = surface.prepare(backend, crosses=True)
     with dr.suspend_grad():
-        o0, d0, near, far = (dr.detach(array) for array in rays.arrays)
-        found = find_crossings(prepared, o0, d0, near, far, k)
+        detached_o, detached_d, near, far = (dr.detach(array) for array in rays.arrays)
+        found = find_crossings(prepared, detached_o, detached_d, near, far, k)
         is_found = dr.isfinite(found.t)
         length = norm(found.gradient)
         normal = dr.select(length > 0, found.gradient / length, 0)
@@ -316,6 +335,7 @@ def trace_crossings(
     t, end = found.t, found.end
     if differentiable and needs_derivatives(prepared, o, d):
         with dr.suspend_grad():
+            # The crossings as if each were the end of a ray of its own.
             status = dr.select(is_found, backend.UInt32(int(RayStatus.HIT)), int(RayStatus.MISS))
             zero = dr.zeros(backend.Float, dr.width(t))
             ends = MarchResult(t, zero, found.gradient, zero, zero, status, found.sheet, found.side)
@@ -325,29 +345,30 @@ def trace_crossings(
     position = dr.select(dr.isfinite(t), dr.fma(backend.Array3f(t), d, o), dr.nan)
     side = backend.Int32(found.side)
     index = dr.reinterpret_array(backend.Int32, found.sheet)  # NO_FACET becomes -1
-    of_rays = found.count, end, found.status, found.evaluations
-    hits = RayCrossings(t, position, normal, index, side, *of_rays)
+    ray_results = found.count, end, found.status, found.evaluations
+    hits = RayCrossings(t, position, normal, index, side, *ray_results)
     dr.eval(*vars(hits).values())
     return hits
 
 
 def empty_crossings(backend: Backend) -> RayCrossings:
-    """The `RayCrossings` of no rays, as Dr.Jit arrays."""
+    """Return the `RayCrossings` of no rays, as Dr.Jit arrays."""
     number, vector = dr.zeros(backend.Float, 0), dr.zeros(backend.Array3f, 0)
     count, side = dr.zeros(backend.UInt32, 0), dr.zeros(backend.Int32, 0)
     return RayCrossings(number, vector, vector, side, side, count, number, count, count)
 
 
 def crossings_to_numpy(hits: RayCrossings, n: int, k: int) -> RayCrossings:
-    """The crossings of n rays, k for each, as NumPy arrays of shapes (n, k, ...) and (n,)."""
+    """Return the crossings of n rays, k for each, as NumPy arrays (n, k, ...) and (n,)."""
 
     def each(array: Any) -> Any:
-        """An array of crossings as a NumPy array (n, k, ...)."""
+        """Return an array of crossings as a NumPy array (n, k, ...)."""
         values = to_numpy(array)
         return values.reshape(n, k, *values.shape[1:])
 
     def of_ray(array: Any) -> Any:
-        """An array of rays as a NumPy array (n,)."""
+        """Return an array with one entry for each ray as a NumPy array (n,); a single entry is
+        repeated."""
         return np.broadcast_to(to_numpy(array), (n,)).copy()
 
     return RayCrossings(

@@ -1,4 +1,6 @@
-"""`RayBatch`: the rays of a call, as users give them, checked and on a backend."""
+"""`RayBatch`: the rays o + t d of a call, as users give them, checked and on a backend. The
+direction d becomes a unit vector, so that the ray parameter t is a length.
+"""
 
 from __future__ import annotations
 
@@ -20,12 +22,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class RayBatch:
-    """Rays o + t d, t_min <= t <= t_max, |d| = 1, on a backend.
+    """The rays o + t d, t_min <= t <= t_max, |d| = 1, of one call, as Dr.Jit arrays of a backend.
 
-    count: the number of rays; each array has this width, or 1.
+    count: the number of rays; each array has this width, or 1 if all rays share its entry.
     is_numpy: whether the rays came as NumPy arrays; then results are NumPy arrays, too, else Dr.Jit
         arrays.
-    is_tensor: whether results are to be tensors.
+    is_tensor: whether results are to be Dr.Jit tensors.
     """
 
     backend: Backend
@@ -41,7 +43,7 @@ class RayBatch:
     def of(
         cls, origins: Any, directions: Any, t_min: Any, t_max: Any, precision: Precision | None
     ) -> RayBatch:
-        """The rays of the arguments of `trace` and `crossings`.
+        """Make the rays from the arguments of `trace` or `crossings`, and check them.
 
         precision: "single" or "double"; None for that of the input. Dr.Jit arrays have a precision.
             Other rays are double if origins or directions are arrays of float64, else single.
@@ -50,8 +52,8 @@ class RayBatch:
             TypeError, ValueError: shapes that do not match, numbers that are not finite, directions
                 of length zero, an empty or negative interval; a precision beside Dr.Jit arrays.
         """
-        is_of_tensors = any(is_tensor(array) for array in (origins, directions))
-        if is_of_tensors:
+        has_tensors = any(is_tensor(array) for array in (origins, directions))
+        if has_tensors:
             origins, directions = (
                 tensor_to_vectors(array, name) if is_tensor(array) else array
                 for array, name in ((origins, "origins"), (directions, "directions"))
@@ -60,17 +62,19 @@ class RayBatch:
                 tensor_to_array(end, name) if is_tensor(end) else end
                 for end, name in ((t_min, "t_min"), (t_max, "t_max"))
             )
-        on_device = [array for array in (origins, directions) if dr.is_array_v(type(array))]
-        if on_device and precision is not None:
+        drjit_arrays = [array for array in (origins, directions) if dr.is_array_v(type(array))]
+        if drjit_arrays and precision is not None:
             raise ValueError("precision follows Dr.Jit rays; give it only with NumPy ones")
-        if on_device:
-            backend = backend_of(on_device[0])
+        if drjit_arrays:
+            backend = backend_of(drjit_arrays[0])
         else:
             backend = choose_backend(precision or precision_of_input(origins, directions))
         o, d, near, far = _uploaded(backend, origins, directions, t_min, t_max)
+        # An empty array makes the whole call empty; others have one entry or as many as there are
+        # rays.
         widths = [dr.width(array) for array in (o, d, near, far)]
         count = max(widths) if min(widths) > 0 else 0
-        return cls(backend, o, d, near, far, count, not on_device, is_of_tensors)
+        return cls(backend, o, d, near, far, count, not drjit_arrays, has_tensors)
 
     @property
     def arrays(self) -> tuple[Vec3, Vec3, Real, Real]:
@@ -81,8 +85,9 @@ class RayBatch:
 def _uploaded(
     backend: Backend, origins: Any, directions: Any, t_min: Any, t_max: Any
 ) -> tuple[Vec3, Vec3, Real, Real]:
-    """Origins, unit directions, t_min and t_max as arrays of a backend, checked. Raises ValueError
-    for arrays that do not match or are no rays."""
+    """Return origins, unit directions, t_min and t_max as Dr.Jit arrays of a backend. Raises
+    ValueError for arrays whose lengths do not match, or that are no rays. Directions are
+    normalized."""
     o = as_kernel_parameters(to_vector3(backend, origins, "origins"))
     d = as_kernel_parameters(to_vector3(backend, directions, "directions"))
     near, far = to_float(backend, t_min, "t_min"), to_float(backend, t_max, "t_max")
@@ -94,6 +99,7 @@ def _uploaded(
             raise ValueError(f"{name} has {length} entries, the others have {n}; give 1 or {n}")
     if not n:
         return o, d, near, far
+    # Reading the values of Dr.Jit arrays would evaluate them, so these are not checked.
     if not dr.is_array_v(type(directions)):
         _check_numpy_rays(to_numpy(max_norm(d)), to_numpy(near), to_numpy(far))
     if not dr.is_array_v(type(origins)):
@@ -103,8 +109,11 @@ def _uploaded(
 
 
 def _check_numpy_rays(lengths: FloatArray, near: FloatArray, far: FloatArray) -> None:
-    """Raise ValueError for directions of length zero, a negative t_min, and t_max < t_min. lengths:
-    (n,) largest absolute coordinates of the directions. near, far: (n,) t_min and t_max."""
+    """Raise ValueError for directions of length zero, a negative t_min, and t_max < t_min.
+
+    lengths: (n,) largest absolute coordinates of the directions.
+    near, far: (n,) t_min and t_max.
+    """
     zero = np.flatnonzero(~(lengths >= np.finfo(lengths.dtype).smallest_normal))
     if zero.size:
         raise ValueError(

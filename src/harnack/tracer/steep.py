@@ -1,6 +1,8 @@
-"""Hits and steps of rays in fields whose slope has no bound (`Field.is_steep`).
+"""Tests and bounds for rays through functions f whose slope has no bound (`Field.is_steep`). A
+level is a value of f that rays look for; the surface is where f takes it. Usually |f - level| /
+|grad f| estimates the distance to the surface. Here it does not, so hits and steps rest on ranges
+of the values of f instead.
 
-|f - level| / |grad f| estimates the distance to the level only if f is nearly linear up to there.
 Beside a vertical tangent or a pole f may bend by any amount. For example, the slope of sqrt(|x|) +
 0.5 at x = 1e-6 is 500, so the level 0 should be 0.001 away, but f never takes it. So before a point
 counts as a hit, f is sampled on the other side of the level. Steps that slopes do not prove may be
@@ -8,8 +10,8 @@ proved by ranges of values (`arithmetic.values`).
 
 The same holds for a formula that is steep only within the rounding of coordinates, such as max(-1,
 min(1, 1e9 y)), whose slope is 0 on both sides. At a rounded point near y = 0, a level lies within
-the error of f, and no step is proved. Such a ray hits if f is found on the other side of the level,
-and is undecided otherwise.
+the error of f, and no step is proved. Such a ray hits if f is found on the other side of the level;
+otherwise it ends as out of steps.
 """
 
 from __future__ import annotations
@@ -43,8 +45,8 @@ _CONTINUITY_FACTOR = 1024.0
 
 
 def values_between(field: Field, p: Vec3, q: Vec3, slack: Real | None = None) -> Values | None:
-    """The range of values of a field on the box with corners p and q, enlarged by `slack` on all
-    sides; None for a field that is no formula of ranges of coordinates."""
+    """Return the range of values of a field on the box with corners p and q, enlarged by `slack` on
+    all sides. The result is None if the field has no formula that takes ranges of coordinates."""
     coordinates = Values.between(p, q, slack)
     formula: Any = getattr(field, "formula", None)
     if formula is None:
@@ -57,9 +59,9 @@ def values_between(field: Field, p: Vec3, q: Vec3, slack: Real | None = None) ->
 
 
 def largest_change(field: Field, p: Vec3, value: Real, reach: Real) -> Real:
-    """A bound of |f(y) - f(p)| for |y - p| <= `reach`; infinite if none is known.
+    """Return a bound of |f(y) - f(p)| for |y - p| <= `reach`; inf if none is known. value: f(p).
 
-    Beside a vertical tangent, |grad f| times a length is a larger number, which may exceed all
+    Beside a vertical tangent this is much less than |grad f| times `reach`, which may exceed all
     changes of f anywhere: |grad f| of |x y|^(1/3) - z at x = 1e-10 is 1e5.
     """
     values = values_between(field, p, p, reach)
@@ -71,18 +73,18 @@ def largest_change(field: Field, p: Vec3, value: Real, reach: Real) -> Real:
 
 @dataclass(frozen=True)
 class SteepPlace:
-    """What ranges of values of f prove at a trial point of a ray.
+    """What ranges of the values of f prove at a trial point of a ray and on the length of the ray
+    beyond it, where f is a function whose slope has no bound.
 
-    error: a bound of the error of f there, from the rounding of f and of the point; inf if no bound
-        is known. (|grad f| times the rounding of the point is no bound here.) None for fields
-        without a formula of their values.
-    is_level: whether f at the exact point may be a level. It may if f is proved to be continuous
-        there, and the level lies in the range of f around the rounded point, or so near to this
-        range that rounding may keep a ray from coming nearer. It does not prove that f takes the
-        level; `beyond` tests that.
-    free: a length of the path on which f does not take a level, because it stays away from levels
-        or has no value at all; 0 if no length is proved.
-    ahead: the length of the path on which values were bounded.
+    error: a bound of the error of f at the point, from the rounding of f and of the point; inf if
+        no bound is known. (|grad f| times the rounding of the point is no bound here.) None for
+        functions without a formula of their values.
+    is_level: whether f may equal a level at the exact point. For this f must be continuous there,
+        and the level must lie in the range of f around the rounded point, or just outside of it.
+        This does not prove that f takes the level; `beyond` tests that.
+    free: a length of the ray beyond the point on which f does not take a level, because it stays
+        away from levels or has no value at all; 0 if no length is proved.
+    ahead: the length of the ray beyond the point on which values were bounded.
     fall, rise: bounds of how far f falls and rises on that length from its value at the point; inf
         if no bound is known.
     """
@@ -98,18 +100,18 @@ class SteepPlace:
     def at(
         cls, field: Field, levels: Levels, path: Ray, t: Real, ahead: Real, sample: Sample
     ) -> SteepPlace:
-        """The bounds at the parameter t of rays.
+        """Compute the bounds at the parameter t of rays.
 
-        ahead: the length of the path on which values are bounded.
-        sample: the sample at t.
+        ahead: the length of the ray beyond t on which values are bounded.
+        sample: the sample of f at t.
 
         Proof of the error. The exact point differs from the rounded point by at most `slack` in
         each coordinate. So it lies in a box around the rounded point, and f there lies in the range
-        of f on this box.
+        of f on this box. With one level, only the error towards it counts.
 
-        Proof of the length. All points of the path on this length lie in the box around its two
-        ends, rounding included. All values of f in the box lie in its range, and the range contains
-        no level.
+        Proof of the free length. All points of the ray on this length lie in the box around its two
+        ends, enlarged by rounding. All values of f in the box lie in its range, and the range
+        contains no level.
         """
         p, value = path.point(t), sample.value
         real = cast("Any", type(t))
@@ -120,47 +122,55 @@ class SteepPlace:
         if at_point is None or on_path is None:
             return cls(None, t < t, real(0), real(0), real(dr.inf), real(dr.inf))
         below, above = value - at_point.value.lower, at_point.value.upper - value
-        valid = (below >= 0) & (above >= 0) & ~at_point.jumps
+        is_valid = (below >= 0) & (above >= 0) & ~at_point.jumps
         gaps = levels.gaps(value)
         is_below = gaps.below < gaps.above
-        near = dr.select(is_below, below, above)
-        far = dr.select(is_below, above, below)
-        # Steps that are shorter than a rounding of t do not advance the ray. Beside a pole f
-        # changes far more on the other side.
-        is_level = (gaps.nearest <= near) | (
-            (gaps.nearest <= _GAP_FACTOR * near) & (far <= _MAX_ASYMMETRY * near)
+        error_to_level = dr.select(is_below, below, above)
+        error_away = dr.select(is_below, above, below)
+        # Steps that are shorter than a rounding of t do not advance the ray, so it may stop a
+        # little before the level is in range. At a pole, where f changes far more on the other
+        # side, this is not allowed.
+        is_level = (gaps.nearest <= error_to_level) | (
+            (gaps.nearest <= _GAP_FACTOR * error_to_level)
+            & (error_away <= _MAX_ASYMMETRY * error_to_level)
         )
-        error = near if gaps.is_one_sided else fmax(near, far)
-        error = dr.select(valid & dr.isfinite(error), error, dr.inf)
+        error = error_to_level if gaps.is_one_sided else fmax(error_to_level, error_away)
+        error = dr.select(is_valid & dr.isfinite(error), error, dr.inf)
         is_free = on_path.nowhere
         if levels.period is None:
             # A bound that is NaN stands for an infinite bound.
-            misses = t == t
+            misses_levels = t == t
             for level in levels.values:
-                misses &= (on_path.value.lower > level) | (on_path.value.upper < level)
-            is_free = is_free | misses
+                misses_levels &= (on_path.value.lower > level) | (on_path.value.upper < level)
+            is_free = is_free | misses_levels
         free = dr.select(is_free, ahead, 0)
         fall, rise = value - on_path.value.lower, on_path.value.upper - value
-        return cls(error, is_level & valid, free, ahead, fall, rise)
+        return cls(error, is_level & is_valid, free, ahead, fall, rise)
 
     def free_of(self, gaps: LevelGaps) -> Real:
-        """The length `ahead` of the path if f changes on it by less than `gaps`, the differences to
-        the next levels below and above; 0 otherwise. It serves levels at other places than those of
-        `free`: a ray that looks for crossings moves the level that it has reached
-        (`Hysteresis`)."""
+        """Return the length `ahead` of the ray if f is proved to change on it by less than `gaps`,
+        else 0.
+
+        gaps: the differences between f and the next levels below and above. They need not be those
+            of `free`: a ray that looks for crossings moves the level that it has reached
+            (`Hysteresis`).
+        """
         return dr.select((self.fall < gaps.below) & (self.rise < gaps.above), self.ahead, 0)
 
 
 @dataclass(frozen=True)
 class _SearchState:
-    """The state of the test `beyond` for each point.
+    """The state of the test `beyond`, with one entry for each point p. The test samples f at other
+    points q to find one at a level or on its other side. If the first samples do not decide, it
+    searches along the first direction for the point where f comes nearest to a level.
 
-    looks, sides: the number of all samples, and of those after the search along the first
-        direction.
+    count: the number of all samples so far.
+    side_count: the number of samples after the search.
     passed: whether a sample was at a level or on its other side.
     active: whether the test goes on.
-    low, high: two lengths along the first direction between which f comes nearest to a level.
-    inner, least: a length between them, and the difference between f and the level there.
+    low, high: lengths along the first direction between which f comes nearest to a level.
+    inner: the best length between them.
+    least_gap: the difference between f and the level there.
     """
 
     count: Any
@@ -174,25 +184,28 @@ class _SearchState:
 
 
 def passes(levels: Levels, value: Real, low: Real, high: Real, gaps: LevelGaps) -> Mask:
-    """Mask of lanes on which all numbers from low to high are on the other side of a level than
-    `value`, or at the level.
+    """Return the mask of lanes on which all numbers from `low` to `high` are at a level, or beyond
+    it as seen from `value`.
 
-    gaps: the differences between `value` and the next levels; they are used for periodic levels.
+    gaps: the differences between `value` and the next levels; used for periodic levels only.
 
     Numbers are compared with the level itself. Beside a pole, a difference of values would lose the
     level by rounding, as 1e28 + 1 does.
     """
     if levels.period is not None:
         return (high - value <= -gaps.below) | (low - value >= gaps.above)
-    passed: Mask = value < value
+    passed: Mask = value < value  # false everywhere
     for level in levels.values:
         passed |= ((value < level) & (low >= level)) | ((value > level) & (high <= level))
     return passed
 
 
 def holds(levels: Levels, value: Real, low: Real, high: Real, gaps: LevelGaps) -> Mask:
-    """Mask of lanes on which a level lies in the range from low to high. value, gaps: f at a point,
-    and the differences between it and the next levels; they are used for periodic levels."""
+    """Return the mask of lanes on which a level lies between `low` and `high`.
+
+    value, gaps: f at a point, and the differences between it and the next levels; used for periodic
+        levels only, which are at value - gaps.below and value + gaps.above and beyond.
+    """
     if levels.period is not None:
         is_held = (low - value <= -gaps.below) & (high - value >= -gaps.below)
         return is_held | ((low - value <= gaps.above) & (high - value >= gaps.above))
@@ -214,14 +227,14 @@ def beyond(
     searches: Mask,
     active: Mask,
 ) -> tuple[Mask, Any]:
-    """Mask of points p for which f is found to take a level at a distance of at most `reach`, and
-    the number of evaluations of f that this took.
+    """Test for which points p the function f takes a level at a distance of at most `reach` from p.
+    Returns the mask of these points and the number of evaluations of f.
 
-    gaps: the differences between f at p and the next levels.
+    gaps: the differences between f at p and the next levels below and above.
     ways: two unit directions (3,), each with the slope of f along it.
     value: f at p.
-    searches: mask of points around which a search is made if the first samples do not decide, since
-        the ray can come no nearer.
+    searches: mask of points around which more samples are made if the first five do not decide,
+        since the ray can come no nearer.
     active: mask of points that are tested.
 
     Proof. Either f at another point q, at most `reach` away, is on the other side of the level, and
@@ -229,11 +242,11 @@ def beyond(
     between them, up to its rounding at q. Or f at q is the level up to rounding, for example
     because it touches the level and turns back.
 
-    Points q. Along the first direction: where the slope says that the level is, twice as far, and
-    at `reach`. Along the second direction: twice as far as its slope says, and at `reach`. If f may
-    be the level at p up to the rounding of p, further points follow: along the first direction by
-    golden sections towards the point where f comes nearest to the level; then back along the second
-    direction, as rounding may have put p behind the level; and half of `reach` along each axis from
+    Points q, in this order. Along the first direction: where its slope says that the level is;
+    twice as far; at `reach`. Along the second direction: twice as far as its slope says; at
+    `reach`. Then, for points in `searches`: along the first direction by golden sections towards
+    the point where f comes nearest to the level; then `reach` back along the second direction, as
+    rounding may have put p beyond the level; then half of `reach` along each axis, both ways, from
     the nearest point.
 
     Ranges of f around p prove nothing, as they may contain numbers that f does not take. The same
@@ -245,7 +258,8 @@ def beyond(
     shortest = 4 * epsilon * reach
 
     def sample_once(now: _SearchState) -> _SearchState:
-        """The state after one more sample q."""
+        """Evaluate f at the next point q, and return the state after it."""
+        # Which of the points q comes next.
         is_first, is_far = now.count < 3, (now.count == 2) | (now.count == 4)
         is_search = now.count >= _TRIAL_COUNT
         is_side = is_search & ((now.high - now.low <= shortest) | (now.count >= _MAX_SAMPLES))
@@ -254,22 +268,29 @@ def beyond(
         slope = dr.abs(dr.select(is_first, ways[0][1], ways[1][1]))
         factor = dr.select(now.count == 0, backend.Float(1), 2)
         distance = dr.select(is_far, reach, fmin(factor * gaps.nearest / slope, reach))
-        behind, ahead = now.inner - now.low, now.high - now.inner
-        section = now.inner + _GOLDEN_SECTION * dr.select(ahead >= behind, ahead, -behind)
-        section = dr.select(is_behind, -reach, dr.select(is_side, now.inner, section))
-        distance = dr.select(is_search, section, distance)
-        side = dr.select((now.side_count & 1) == 0, 0.5 * reach, -0.5 * reach)
+        # The next golden section lies in the longer of the two parts on both sides of the best
+        # length.
+        length_below, length_above = now.inner - now.low, now.high - now.inner
+        search_length = now.inner + _GOLDEN_SECTION * dr.select(
+            length_above >= length_below, length_above, -length_below
+        )
+        search_length = dr.select(is_behind, -reach, dr.select(is_side, now.inner, search_length))
+        distance = dr.select(is_search, search_length, distance)
+        # Of the points after the search, two lie along each axis.
+        axis_step = dr.select((now.side_count & 1) == 0, 0.5 * reach, -0.5 * reach)
         axis = (now.side_count - 1) >> 1  # no axis if the count is 0: 0 - 1 is a large number
-        offset = type(p)(*(dr.select(is_side & (axis == k), side, 0) for k in range(3)))
+        offset = type(p)(*(dr.select(is_side & (axis == k), axis_step, 0) for k in range(3)))
         q = dr.fma(type(p)(distance), direction, p) + offset
         # In coordinates in which q is rounded more coarsely than this, the box is q itself.
         half = type(p)(*(dr.select(shortest > epsilon * dr.abs(x), shortest, 0) for x in q))
+        # Ranges of f at q up to rounding, between p and q, and on a larger box around q.
         at_q = values_between(field, q - half, q + half)
         between = values_between(field, p, q)
         around_q = values_between(
             field, q - _CONTINUITY_FACTOR * half, q + _CONTINUITY_FACTOR * half
         )
         if at_q is None or between is None or around_q is None:
+            # No formula of values: the sample at q decides alone.
             with without_alternatives():
                 low = high = field.evaluate(q).value
             passed = passes(levels, value, low, high, gaps)
@@ -277,7 +298,9 @@ def beyond(
             low, high = at_q.value.lower, at_q.value.upper
             passed = passes(levels, value, low, high, gaps)
             passed &= ~(between.jumps | between.gaps | between.nowhere)
+            # Or a level lies in the range of f at q up to rounding, where f is continuous.
             passed |= holds(levels, value, low, high, gaps) & ~(around_q.jumps | at_q.nowhere)
+        # The difference between f at q and the level that is nearer to f at p.
         nearest = dr.select(
             gaps.below < gaps.above, gaps.below + low - value, gaps.above + value - high
         )
@@ -310,24 +333,36 @@ def beyond(
 
 
 def _narrowed(now: _SearchState, length: Real, gap: Real, is_search: Mask) -> _SearchState:
-    """The state of the search for the point nearest to a level, after a sample at another length
-    along the first direction. gap: the difference between f there and the level. is_search: lanes
-    whose sample belongs to the search; others do not change."""
-    nearer, is_farther = gap <= now.least_gap, length > now.inner
-    end, is_low = dr.select(nearer, now.inner, length), nearer == is_farther
+    """Return the state of the search after a sample at another length along the first direction.
+    The search looks for the point where f comes nearest to a level.
+
+    length, gap: the length of the sample, and the difference between f there and the level.
+    is_search: mask of lanes whose sample belongs to the search; other lanes do not change.
+
+    The better of this sample and the best one so far becomes `inner`; the other becomes an end of
+    the interval, `low` or `high`.
+    """
+    # The worse point is the low end if it is the smaller length of the two: the old best, if the
+    # new one is nearer and farther out, or the new one if it is neither.
+    is_nearer, is_farther = gap <= now.least_gap, length > now.inner
+    end, is_low = dr.select(is_nearer, now.inner, length), is_nearer == is_farther
     return replace(
         now,
         low=dr.select(is_search & is_low, end, now.low),
         high=dr.select(is_search & ~is_low, end, now.high),
-        inner=dr.select(is_search & nearer, length, now.inner),
-        least_gap=dr.select(is_search & nearer, gap, now.least_gap),
+        inner=dr.select(is_search & is_nearer, length, now.inner),
+        least_gap=dr.select(is_search & is_nearer, gap, now.least_gap),
     )
 
 
 def down_or_up(gradient: Vec3, gaps: LevelGaps, otherwise: Vec3) -> Vec3:
-    """The unit vector (3,) along which f goes to the nearer level: against the gradient if that
-    level is below f, else along it; `otherwise` if the gradient is zero or not finite."""
+    """Return the unit vector (3,) along which f goes towards the nearer level: against the gradient
+    if that level is below f, else along the gradient. It is `otherwise` if the gradient is zero or
+    not finite.
+
+    gaps: the differences between f and the next levels below and above.
+    """
     direction = safe_normalize(gradient)
     direction = dr.select(gaps.below < gaps.above, -direction, direction)
-    finite = dr.isfinite(direction.x + direction.y + direction.z)
-    return dr.select(finite, direction, otherwise)
+    is_finite = dr.isfinite(direction.x + direction.y + direction.z)
+    return dr.select(is_finite, direction, otherwise)

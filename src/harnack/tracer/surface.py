@@ -1,4 +1,6 @@
-"""`Surface`: the level sets of a field, or the boundary of a solid, and the volumes that cut it."""
+"""`Surface`: the level sets of a field f (the points at which f takes given values, the levels), or
+the boundary of a solid on which f lies in a range, and the volumes that cut it.
+"""
 
 from __future__ import annotations
 
@@ -29,8 +31,8 @@ SIDES: tuple[Side, ...] = get_args(Side)
 
 
 class SurfaceKeywords(TypedDict, total=False):
-    """The keywords of `Surface`. Every verb (`trace`, `render`, `mesh`, ...) takes them beside a
-    field that is given without a `Surface`."""
+    """The keywords of `Surface`. Every function of the library that takes a surface (`trace`,
+    `render`, `mesh`, ...) takes them beside a field that is given without a `Surface`."""
 
     level: Any
     clip: Volume | None
@@ -43,10 +45,9 @@ class SurfaceKeywords(TypedDict, total=False):
 class Surface:
     """The points at which a field f takes a level, or the boundary of the solid on one side of it.
 
-    Every verb takes a `Surface` in place of a field: `trace`, `crossings`, `render`, `animate`,
-    `view`, `page`, `mesh`, `signed_distance`, `curvature`. Keywords of these verbs that are named
-    as the parameters here are shorthand: `trace(field, ..., level=2.0)` traces `Surface(field,
-    2.0)`.
+    These functions take a `Surface` in place of a field: `trace`, `crossings`, `render`, `animate`,
+    `view`, `page`, `mesh`, `signed_distance`, `curvature`. Their keywords that are named as the
+    parameters here are shorthand: `trace(field, ..., level=2.0)` traces `Surface(field, 2.0)`.
 
     field: the function f.
     level: a number or several, which may be Dr.Jit numbers; None for the field's default. For an
@@ -87,6 +88,7 @@ class Surface:
         side: Side | None = None,
         largest: bool | int = False,
     ) -> None:
+        # All arguments are checked, so that no later call meets a wrong one.
         check_is_field(field)
         levels = _as_levels(field.default_level if level is None else level)
         for number in levels:
@@ -110,7 +112,7 @@ class Surface:
             )
 
     def replace(self, **changes: Any) -> Surface:
-        """This surface with some arguments changed, which are named as in the constructor."""
+        """Return this surface with some arguments changed, by their names in the constructor."""
         arguments: dict[str, Any] = {"field": self.field, "level": self.levels, **self.keywords}
         arguments |= changes
         return Surface(**arguments)
@@ -140,9 +142,11 @@ class Surface:
 
 
 def side_range(side: Side | None, levels: Sequence[float]) -> tuple[float, float] | None:
-    """The interval (low, high) of the values of f on the closed solid that `side` describes; one
-    end may be infinite. None if `side` means the level set itself. levels: one level, or two for
-    "between"."""
+    """Return the interval (low, high) of the values of f on the closed solid that `side` describes;
+    one end may be infinite. It is None if `side` means the level set itself.
+
+    levels: one level, or two for "between".
+    """
     if side is None or side == "surface":
         return None
     low = -math.inf if side == "below" else levels[0]
@@ -150,8 +154,8 @@ def side_range(side: Side | None, levels: Sequence[float]) -> tuple[float, float
 
 
 def intersection_of(volumes: Sequence[Volume | None]) -> Volume | None:
-    """The intersection of volumes. Entries that are None stand for all of space, and so does the
-    result None."""
+    """Return the intersection of volumes. Entries that are None stand for all of space, and so does
+    the result None. A volume that occurs twice counts once."""
     distinct = list(dict.fromkeys(volume for volume in volumes if volume is not None))
     if not distinct:
         return None
@@ -159,26 +163,27 @@ def intersection_of(volumes: Sequence[Volume | None]) -> Volume | None:
 
 
 def level_number(level: Any) -> float:
-    """A level, which may be a Dr.Jit number, as a Python float. Raises TypeError for a level that
-    is no number."""
+    """Return a level, which may be a Dr.Jit number, as a Python float. Raises TypeError for a level
+    that is no number."""
     if dr.is_array_v(type(level)):
         return float(dr.detach(level)[0])
     return as_number(level, "level must be a number, or several, such as 0.5 or 2 * math.pi")
 
 
 def as_number(number: Any, message: str) -> float:
-    """A number as a Python float. Raises TypeError, with a text that begins with `message`, for
-    anything else."""
+    """Return a number as a Python float. Raises TypeError, with a text that begins with `message`,
+    for anything else; also for texts, truth values, and numbers with derivatives enabled."""
     check_no_derivatives("a level or setting that is no Dr.Jit number", number)
     try:
+        # float() would accept texts and truth values; "nothing" makes it raise ValueError.
         return float("nothing" if isinstance(number, str | bool | np.bool_) else number)
     except (TypeError, ValueError):
         raise TypeError(f"{message}, not {number!r}") from None
 
 
 def _check_side(side: Any, levels: Sequence[Any]) -> Side | None:
-    """The option `side`, checked. Raises ValueError if it is unknown, or if the number of levels
-    does not suit it."""
+    """Return the option `side`. Raises ValueError if it is unknown, or if the number of levels does
+    not suit it."""
     if side is not None and not is_one_of(side, SIDES):
         names = ", ".join(f'"{name}"' for name in SIDES)
         raise ValueError(f"side must be one of {names}, not {side!r}{did_you_mean(side, SIDES)}")
@@ -197,7 +202,7 @@ def _check_side(side: Any, levels: Sequence[Any]) -> Side | None:
 
 
 def _in_order(levels: tuple[Any, ...], side: Side | None) -> tuple[Any, ...]:
-    """The levels unchanged. Raises ValueError if side is "between" and they are not in ascending
+    """Return the levels. Raises ValueError if `side` is "between" and they are not in ascending
     order."""
     if side == "between" and not level_number(levels[0]) < level_number(levels[1]):
         low, high = map(level_number, levels)
@@ -206,14 +211,15 @@ def _in_order(levels: tuple[Any, ...], side: Side | None) -> tuple[Any, ...]:
 
 
 def _as_levels(level: Any) -> tuple[Any, ...]:
-    """The levels as a tuple. level: a number or several, which may be a tensor."""
+    """Return the levels as a tuple of numbers. level: a number or several, which may be Dr.Jit
+    numbers or a tensor."""
     if is_tensor(level):
         numbers = tensor_to_array(level, "level")
         backend = backend_of(numbers)
-        rows = map(backend.UInt32, range(dr.width(numbers)))
-        return tuple(dr.gather(backend.Float, numbers, row) for row in rows)
-    is_row = isinstance(level, np.ndarray) and np.ndim(cast("Any", level)) == 1
-    if is_row or (isinstance(level, Sequence) and not isinstance(level, str)):
+        indices = map(backend.UInt32, range(dr.width(numbers)))
+        return tuple(dr.gather(backend.Float, numbers, index) for index in indices)
+    is_numpy_row = isinstance(level, np.ndarray) and np.ndim(cast("Any", level)) == 1
+    if is_numpy_row or (isinstance(level, Sequence) and not isinstance(level, str)):
         entries: list[Any] = [*level]
         if not entries:
             raise ValueError("level: give at least one")

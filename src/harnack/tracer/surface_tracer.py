@@ -1,7 +1,10 @@
-"""`SurfaceTracer`: a surface prepared on a backend, with methods that trace rays to it.
+"""`SurfaceTracer`: a surface prepared on a backend, with methods that trace rays to it. The surface
+consists of the points at which a function f (a field) takes one of given values, the levels. f may
+jump at facets, flat pieces of surface such as the triangles of a mesh; or the field may be a union
+of patches, many level sets in boxes of their own.
 
-Renderers and `trace` call it for first hits, for occlusion and to clip rays, mostly while a kernel
-is being recorded. `trace_queued` traces many rays with few lanes.
+Renderers and `trace` call it for first hits, for occlusion and to clip rays, mostly while Dr.Jit
+records a kernel. `trace_queued` traces many rays with few lanes.
 """
 
 from __future__ import annotations
@@ -40,25 +43,31 @@ __all__ = ["RayTracer", "SmoothTracer", "TracerFactory", "trace_queued"]
 
 
 class RayTracer(Protocol):
-    """Interface to the ways to trace rays: through smooth fields, fields with jumps, and unions of
-    patches. One call of `advance` makes one trial point, or marches one interval between jumps, or
-    one patch. `walk` is the state of this tracer."""
+    """Interface to the ways to trace rays: through smooth functions, functions with jumps at
+    facets, and unions of patches. Each has a state of its own, `walk`; a `MarchState` is what all
+    have in common. One call of `advance` makes one trial point, or marches one interval between
+    jumps, or one patch."""
 
     def begin(self, state: MarchState) -> Any:
-        """The tracer's own state of rays at their start, from the common one."""
+        """Return this tracer's own state for rays that have not moved yet. state: their
+        `MarchState`."""
         ...
 
     def advance(self, walk: Any, /) -> Any:
-        """The state after one more trial point, interval or patch of each active ray."""
+        """Return the state after one more trial point, interval or patch of each active ray."""
         ...
 
     def finish(self, walk: Any, /) -> tuple[MarchState, Any]:
-        """The end of rays as a `MarchState`, and the index of the facet or patch that each ray
-        hit."""
+        """Return how rays ended: a `MarchState`, and the index of the facet or patch that each ray
+        hit.
+
+        walk: this tracer's own state when no ray is active any more.
+        """
         ...
 
     def run(self, state: MarchState) -> tuple[MarchState, Any]:
-        """The result of `finish` for rays that are advanced from `state` until all have ended."""
+        """Advance rays until all have ended, and return the result of `finish`. state: the
+        `MarchState` of rays that have not moved yet."""
         ...
 
 
@@ -68,9 +77,11 @@ TracerFactory: TypeAlias = "Callable[[Ray, Real, Real], RayTracer]"
 
 @dataclass(frozen=True)
 class SmoothTracer:
-    """Traces rays to a level set of a continuous function.
+    """Traces rays to a level set of a continuous function. Its own state is the common `MarchState`
+    itself.
 
     march: the parameters of the march.
+    field: the function.
     path, end: the rays, and the ray parameter at which each ends.
     """
 
@@ -80,27 +91,27 @@ class SmoothTracer:
     end: Real
 
     def begin(self, state: MarchState) -> MarchState:
-        """The state of rays at their start, unchanged."""
+        """Return the state of rays that have not moved yet, unchanged."""
         return state
 
     def advance(self, walk: MarchState) -> MarchState:
-        """The state after one more trial point of each ray."""
+        """Return the state after one more trial point of each ray."""
         return self.march.next_trial(self.field, self.path, self.end, walk)
 
     def finish(self, walk: MarchState) -> tuple[MarchState, Any]:
-        """The end state of rays, and NO_FACET, as a smooth field has no facets to hit."""
+        """Return the end state of rays, and NO_FACET, as a smooth function has no facets to hit."""
         return walk, self.march.backend.UInt32(NO_FACET)
 
     def run(self, state: MarchState) -> tuple[MarchState, Any]:
-        """The end state of rays that march from `state` to a hit or to their end, and NO_FACET.
+        """March rays from `state` to a hit or to their end. Returns their end state, and NO_FACET.
         `March.advance` has the proof that no hit is missed."""
         return self.finish(self.march.advance(self.field, self.path, self.end, state))
 
 
 @dataclass(frozen=True)
 class _QueuedRay:
-    """A ray from `start` to `end` with the state `walk` of its tracer: all that a lane needs when
-    it takes the ray from the queue."""
+    """A ray o + t d as it waits in the queue: its parameters from `start` to `end`, and the state
+    `walk` of its tracer. This is all that a lane needs when it takes the ray from the queue."""
 
     origin: Vec3
     direction: Vec3
@@ -110,6 +121,7 @@ class _QueuedRay:
 
     @property
     def active(self) -> Mask:
+        """Whether the ray goes on."""
         return self.walk.active
 
 
@@ -123,13 +135,13 @@ def trace_queued(
     """Trace many rays with few lanes: a lane that has finished a ray takes the next one from a
     queue.
 
-    Returns `collect(state, index)` for each ray, evaluated: state and index are what
-    `RayTracer.run` returns.
+    Returns `collect(state, index)` for each ray, evaluated. Here state and index are what
+    `RayTracer.run` returns: the end of the ray, and the index of the facet or patch that it hit.
 
-    tracer_of: makes the tracer of rays from the rays, their start and their end.
+    tracer_of: makes a tracer from rays, their start and their end.
     path, start, end: the rays, and the ray parameters between which each is traced.
-    state: the state of rays at their start.
-    collect: makes a record of arrays from the end state and the index. Each array of the record is
+    state: the `MarchState` of rays that have not moved yet.
+    collect: makes a dataclass of arrays from the end state and the index. Each of its arrays is
         written to memory separately, which takes a good part of the time of a step; so it should
         hold only what is needed.
 
@@ -140,11 +152,11 @@ def trace_queued(
     proofs: EnclosureKinds = path.proofs
 
     def tracer(ray: _QueuedRay) -> RayTracer:
-        """The tracer of the rays that are in the lanes now."""
+        """Return the tracer of the rays that are in the lanes now."""
         return tracer_of(Ray(ray.origin, ray.direction, proofs), ray.start, ray.end)
 
     def advance(ray: _QueuedRay) -> _QueuedRay:
-        """The rays in the lanes after one more step."""
+        """Return the rays in the lanes after one more step."""
         return dataclasses.replace(ray, walk=tracer(ray).advance(ray.walk))
 
     begin = tracer_of(path, start, end).begin(state)
@@ -165,9 +177,11 @@ _AT_JUMP_ROUNDINGS = 8.0
 
 @dataclass(frozen=True)
 class MarchResult:
-    """How rays ended, as Dr.Jit arrays with one entry for each ray.
+    """How rays ended, as Dr.Jit arrays with one entry for each ray. f is the function whose level
+    is the surface.
 
-    t: the ray parameter up to which no level lies on the ray: the hit, or inf for a miss.
+    t: the ray parameter of the hit; inf for a miss. For a ray that ran out of steps, the parameter
+        up to which no level lies on it.
     value, gradient: f and its gradient (3,) at t. At a hit on a facet, f just before the facet, and
         the facet's unit normal, which points to the side of larger f.
     tolerance_excess: by how much |f - level| at t may exceed what the tolerance allows, because of
@@ -178,7 +192,7 @@ class MarchResult:
         for other rays.
     side: if hits require a crossing, 1 if f rises through the level along the ray and -1 if it
         falls; otherwise None. If hits require a crossing, t and gradient are those of the root, and
-        `value` is f a little behind it.
+        `value` is f a little beyond it.
     patch: for a union of patches, the index of the patch that was hit, NO_PATCH for rays without a
         hit; None for other fields.
     """
@@ -202,7 +216,8 @@ class MarchResult:
 @dataclass(frozen=True)
 class _EndState:
     """What `SurfaceTracer.first_hit` needs of the end of rays: some attributes of a `MarchState`,
-    and as `sheet` the index of the facet or patch that was hit."""
+    and as `sheet` the index of the facet or patch that was hit. A queue writes each of them to
+    memory, so there are no others."""
 
     proved_to: Real
     value: Real
@@ -215,7 +230,8 @@ class _EndState:
 
     @classmethod
     def of(cls, end: MarchState, sheet: Any) -> _EndState:
-        """These attributes of an end state. sheet: the index of the facet or patch that was hit."""
+        """Take these attributes from the end state of rays. sheet: the index of the facet or patch
+        hit."""
         names = (field.name for field in dataclasses.fields(cls) if field.name != "sheet")
         return cls(**{name: getattr(end, name) for name in names}, sheet=sheet)
 
@@ -228,36 +244,39 @@ class _EndStatus:
 
     @classmethod
     def of(cls, end: MarchState, sheet: Any) -> _EndStatus:
-        """The status of an end state; the index of the facet or patch is not used."""
+        """Take the status from the end state of rays; the index of the facet or patch hit is not
+        used."""
         del sheet
         return cls(end.status)
 
 
 @dataclass(frozen=True)
 class SurfaceTracer:
-    """A surface prepared on a backend. Its methods can be called while a kernel is being recorded,
-    except with `uses_ray_queue`.
+    """A surface prepared on a backend, with methods that trace rays o + t d to it. The surface
+    consists of the points of `volume` at which f, the function `field`, takes one of the `levels`.
+    The methods can be called while Dr.Jit records a kernel, except with `uses_ray_queue`.
 
-    levels: the values of the field that belong to the surface.
+    levels: the values of f that belong to the surface.
     volume: a volume that contains the surface; None for all of space.
-    proofs: the classes of enclosures (intervals that provably contain the change of f along a ray)
-        by which steps are proved.
-    max_steps: the number of evaluations of the field after which a ray is out of steps.
+    proofs: the classes of enclosures by which steps are proved. An enclosure is an interval that is
+        proved to contain the change of f along a ray.
+    tolerance: how near to the surface a hit must be.
+    max_steps: the number of evaluations of f after which a ray is out of steps.
     over_relaxation: trial steps are at most this many times as long as proved steps.
     require_crossing: whether a ray hits only where f passes to the other side of a level.
-    region: the volume in which the field may be evaluated, for rays that look for crossings; it
-        contains `volume`. None for all of space.
+    region: the volume in which f may be evaluated, for rays that look for crossings; it contains
+        `volume`. None for all of space.
     occupied: a grid of cells, in which those that may contain a level are marked; None if there is
         none.
     only_component: whether only levels in the marked cells of `occupied` belong to the surface.
         Otherwise there are no levels outside of these cells.
     section: the volume that cuts the surface open, one of the volumes whose intersection is
         `volume`; None if nothing cuts it open.
-    uses_ray_queue: whether rays are traced at once when a method is called, if samples are not
-        cheap: by few lanes that share a queue of rays. Then no kernel may be being recorded.
-    known_branch_volume: for a field whose samples give f only modulo 1, a volume outside of which
-        no level and no number that differs from a level by an integer lies between f and 0. This
-        determines f from its value modulo 1. None for other fields.
+    uses_ray_queue: whether rays are traced at once when a method is called, by few lanes that share
+        a queue of rays (unless samples are cheap). Then no kernel may be being recorded.
+    known_branch_volume: for a function whose samples may lack an unknown integer (give f only
+        modulo 1), a volume outside of which the integer is known. There no level, and no number
+        that differs from a level by an integer, lies between f and 0. None for other functions.
     """
 
     backend: Backend
@@ -277,58 +296,71 @@ class SurfaceTracer:
     known_branch_volume: Volume | None = None
 
     def sample(self, p: Vec3) -> Sample:
-        """The sample of the field (value, gradient, error bounds) at points p (3,)."""
+        """Return the sample of f (value, gradient, error bounds) at points p (3,)."""
         return self.field.evaluate(p)
 
     def sample_with_branch(self, p: Vec3, value: Real) -> Sample:
-        """The sample at p, for a field that may give f only modulo 1. The integer is chosen for
-        which f is nearest to `value`, so f must differ from `value` by less than a half."""
+        """Return the sample of f at p, with the integer added that is unknown if samples give f
+        only modulo 1.
+
+        value: an approximation of f at p with an error below a half. The integer is chosen for
+            which f is nearest to it.
+        """
         if self.known_branch_volume is None:
             return self.sample(p)
         sample = self.field.evaluate_modulo_one(p)
         return sample.shifted(dr.round(value - sample.value))
 
     def hit_surface(self, hit: MarchResult) -> SurfaceTracer:
-        """The surface that each ray hit: the patch that was hit if the field is a union of patches,
-        else this surface."""
+        """Return the surface that each ray hit: the patch that was hit if the field is a union of
+        patches, else this surface. Rays without a hit get the first patch."""
         if hit.patch is None:
             return self
         patch = dr.select(hit.patch == NO_PATCH, self.backend.UInt32(0), hit.patch)
         return replace(self, field=self.field.patch(patch))
 
     def level_counts(self, p: Vec3) -> Mask:
-        """Mask of the points p at which a level belongs to the surface. If only the largest
+        """Return the mask of points p at which a level belongs to the surface. If only the largest
         component is traced, these are the points in its cells; else all points."""
         if self.occupied is None or not self.only_component:
             return self.backend.Bool(True)
         return self.occupied.cell(p).empty_distance == 0
 
     def is_resolved(self, o: Vec3, end: Real) -> Mask:
-        """Mask of rays on which rounding leaves no doubt in which cell a point lies, from the
-        origin o to the parameter `end`. Only tracing the largest component alone needs that; else
-        all rays are in the mask."""
+        """Return the mask of rays on which rounding leaves no doubt in which cell of the grid a
+        point lies. Only tracing the largest component alone needs that; else all rays are in the
+        mask.
+
+        o: (3,) origins. end: the ray parameters up to which this is asked.
+        """
         if self.occupied is None or not self.only_component:
             return self.backend.Bool(True)
         return self.occupied.is_resolved(o, end)
 
     def clip(self, o: Vec3, d: Vec3, t_min: Real, t_max: Real) -> tuple[Real, Real]:
-        """The interval (start, end) of parameters, within [t_min, t_max], on which rays o + t d can
-        meet the surface. It is empty unless start < end."""
+        """Return the interval (start, end) of ray parameters, within [t_min, t_max], on which rays
+        o + t d can meet the surface: the part in `volume`. It is empty unless start < end."""
         if self.volume is None:
             return t_min, t_max
         return self.volume.clip(o, d, t_min, t_max)
 
     def occluded(self, o: Vec3, d: Vec3, t_min: Real, t_max: Real, active: Mask = True) -> Mask:
-        """Mask of the rays o + t d that meet the surface for t between t_min and t_max. A ray that
-        is out of steps counts as meeting it, as light must not pass where nothing is proved."""
+        """Return the mask of rays o + t d that meet the surface for t between t_min and t_max. A
+        ray that is out of steps counts as meeting it, as light must not pass where nothing is
+        proved.
+
+        active: mask of rays that are traced; others count as not meeting it.
+        """
         end = self._march(o, d, t_min, t_max, active, _EndStatus.of, any_hit=True)
         return end.status != int(RayStatus.MISS)
 
     def first_hit(
         self, o: Vec3, d: Vec3, t_min: Real, t_max: Real, active: Mask = True
     ) -> MarchResult:
-        """The first hits of rays o + t d, |d| = 1, t_min <= t <= t_max, as a `MarchResult`.
-        Inactive rays miss."""
+        """Return the first hits of rays o + t d, |d| = 1, t_min <= t <= t_max, as a `MarchResult`.
+
+        active: mask of rays that are traced; others miss.
+        """
         end = self._march(o, d, t_min, t_max, active, _EndState.of)
         facet, t, gradient, excess, side = (
             end.sheet,
@@ -338,12 +370,15 @@ class SurfaceTracer:
             None,
         )
         contact, evaluations = end.contact, end.evaluations
+        # Hits require a crossing: t is its root.
         if contact is not None:
             is_hit = end.status == int(RayStatus.HIT)
-            root, at_root, samples = self.refined_crossings(o, d, contact, is_hit)
+            root, gradient_at_root, extra_evaluations = self.refined_crossings(
+                o, d, contact, is_hit
+            )
             t = dr.select(is_hit, root, t)
-            gradient = dr.select(is_hit, at_root, gradient)
-            evaluations = evaluations + samples
+            gradient = dr.select(is_hit, gradient_at_root, gradient)
+            evaluations = evaluations + extra_evaluations
             excess, side = dr.select(is_hit, contact.tolerance_excess, 0), contact.side
         t = dr.select(end.status == int(RayStatus.MISS), dr.inf, t)
         patch = None
@@ -356,12 +391,12 @@ class SurfaceTracer:
     def refined_crossings(
         self, o: Vec3, d: Vec3, contact: Contact, active: Mask
     ) -> tuple[Real, Vec3, Any]:
-        """The roots (ray parameters) at which rays cross the level, the gradients of f there, and
-        the number of evaluations of f that this took.
+        """Return the roots (ray parameters) at which rays cross the level, the gradients of f
+        there, and the number of evaluations of f that this took.
 
         contact: the crossings, each with a first approximation of the root. This is returned
-            unchanged if f has jumps or no creases.
-        active: mask of the rays with a crossing.
+            unchanged if f has jumps, or if it has no creases, as then it is good enough.
+        active: mask of rays with a crossing.
         """
         if self.field.has_jumps or not self.field.has_creases:
             return (
@@ -375,10 +410,18 @@ class SurfaceTracer:
     def begin_march(
         self, o: Vec3, d: Vec3, t_min: Real, t_max: Real, active: Mask, *, crosses: bool
     ) -> tuple[March, Ray, Real, Real, MarchState]:
-        """The march, the rays with unit directions, the ray parameters of their start and end after
-        clipping, and their state at the start.
+        """Prepare the march of rays o + t d: clip them to the surface's volume, and skip cells
+        without a level at their start.
 
-        crosses: whether rays end where they have crossed a level, and not where they reach it.
+        Returns the march, the rays, the ray parameters of their start and end, and their state
+        before the first sample.
+
+        active: mask of rays that are traced.
+        crosses: whether rays end only where f has passed to the other side of a level, and not
+            where they reach the level.
+
+        If only the largest component is traced, a ray on which rounding leaves it uncertain in
+        which cell a point lies ends at once, as out of steps.
         """
         backend, real = self.backend, self.backend.Float
         path = Ray(backend.Array3f(o), backend.Array3f(d), self.proofs)
@@ -407,8 +450,8 @@ class SurfaceTracer:
         if occupied is not None and self.only_component:
             # If rounding leaves it uncertain in which cell a point lies, nothing can be proved.
             in_uncertain_cell = state.active & ~self.is_resolved(path.origin, end)
-            out = backend.UInt32(int(RayStatus.OUT_OF_STEPS))
-            status = dr.select(in_uncertain_cell, out, state.status)
+            out_of_steps = backend.UInt32(int(RayStatus.OUT_OF_STEPS))
+            status = dr.select(in_uncertain_cell, out_of_steps, state.status)
             state = replace(state, active=state.active & ~in_uncertain_cell, status=status)
         tracker = None
         if self.known_branch_volume is not None and not crosses:
@@ -416,11 +459,12 @@ class SurfaceTracer:
             # its start: if that is not cheap, its first sample is made with the branch.
             tracker = BranchTracker(self.levels)
             entry, _ = self.known_branch_volume.clip(path.origin, path.direction, t_min, t_max)
-            outside = (entry > t_min) & (start <= entry)
-            begins = state.active & ~outside
+            starts_outside = (entry > t_min) & (start <= entry)
+            starts_inside = state.active & ~starts_outside
             rounding = backend.machine_epsilon * (max_norm(path.origin) + start)
-            value = self.field.value_if_cheap(path.point(start), rounding, begins)
-            has_branch = outside | dr.isfinite(value)
+            value = self.field.value_if_cheap(path.point(start), rounding, starts_inside)
+            has_branch = starts_outside | dr.isfinite(value)
+            # Accuracy scale 0 is the coarsest, which may lack the branch.
             accuracy = dr.select(has_branch, 0, real(self.field.coarsest_accuracy))
             value = dr.select(dr.isfinite(value), value, 0)
             state = replace(state, accuracy_scale=accuracy, value=real(value))
@@ -441,37 +485,38 @@ class SurfaceTracer:
     def _crossing_interval(
         self, path: Ray, t_min: Real, t_max: Real, start: Real, end: Real
     ) -> tuple[Real, Real, Hysteresis]:
-        """The interval (start, end) of ray parameters on which rays look for crossings, and the
-        `Hysteresis` (the rule by which a crossing is counted).
+        """Return the interval (start, end) of ray parameters on which rays look for crossings, and
+        the `Hysteresis` (the rule by which a crossing is counted).
 
         t_min, t_max: the ends of the ray.
         start, end: the ends of the part of the ray in the proved extent of the surface.
 
         The surface may touch the ends of this part, and then f does not change sign within it.
         Outside the part the ray meets no surface. So the part is made a little longer at both ends,
-        but not longer than the ray; and longer still for a ray that leaves a flat solid at a small
-        angle.
+        but not longer than the ray in `region`; and longer still for a ray that leaves a flat solid
+        at a small angle. Without a proved extent, the interval stays as it is.
 
         Proof that this suffices if f is convex along the ray. Suppose that f is W below the level
         at some point of the extent, and reaches the level at the end of the extent. Let e be the
-        error of f there; W >= 8 e (`Hysteresis.band`). Behind the end, f rises at least as steeply
+        error of f there; W >= 8 e (`Hysteresis.band`). Beyond the end, f rises at least as steeply
         as on average before it, and the way from that point to the end is at most end - start. So
-        (end - start)/7 behind the end, f is at least W/7 >= 8/7 e above the level, which a sample
+        (end - start)/7 beyond the end, f is at least W/7 >= 8/7 e above the level, which a sample
         there shows.
         """
         never, size = self.backend.Bool(False), max_norm(path.origin)
         rounding = _AT_JUMP_ROUNDINGS * self.backend.machine_epsilon * (size + t_min)
         if self.volume is None:
             return start, end, Hysteresis.of(self.levels, (never, never), start, rounding)
-        first, last = t_min, t_max
+        lowest_start, highest_end = t_min, t_max
         if self.region is not None:
-            first, last = self.region.clip(path.origin, path.direction, t_min, t_max)
+            lowest_start, highest_end = self.region.clip(path.origin, path.direction, t_min, t_max)
         is_nonempty = start < end
         length = dr.select(dr.isfinite(start) & dr.isfinite(end), end - start, 0)
         margin = _MARGIN_OF_LENGTH * length
-        before = fmax(start - fmax(_MARGIN_OF_SIZE * (size + dr.abs(start)), margin), first)
-        after = fmin(end + fmax(_MARGIN_OF_SIZE * (size + dr.abs(end)), margin), last)
-        free_before, free_after = before > first, after < last
+        before = fmax(start - fmax(_MARGIN_OF_SIZE * (size + dr.abs(start)), margin), lowest_start)
+        after = fmin(end + fmax(_MARGIN_OF_SIZE * (size + dr.abs(end)), margin), highest_end)
+        # An end that was moved only up to the end of the ray leaves unknown what lies beyond it.
+        free_before, free_after = before > lowest_start, after < highest_end
         start, end = dr.select(is_nonempty, before, start), dr.select(is_nonempty, after, end)
         free = is_nonempty & free_before, is_nonempty & free_after
         return start, end, Hysteresis.of(self.levels, free, start, rounding)
@@ -487,18 +532,23 @@ class SurfaceTracer:
         *,
         any_hit: bool = False,
     ) -> Ends:
-        """Trace rays, and return `collect(end state, index)`, where the index is that of the facet
-        or patch that each ray hit.
+        """Trace rays o + t d, t_min <= t <= t_max, and return `collect(end state, index)`. The end
+        state is a `MarchState`, and the index is that of the facet or patch that each ray hit.
 
+        active: mask of rays that are traced.
+        collect: makes a dataclass of arrays from the end state and the index.
         any_hit: whether a ray may end at any hit, if that takes less work than finding the first
             hit.
+
+        With a queue of rays, rays are traced at once; but not if they look for crossings or if
+        evaluations of the field are cheap.
         """
         march, path, start, end, state = self.begin_march(
             o, d, t_min, t_max, active, crosses=self.require_crossing
         )
 
         def tracer(path: Ray, start: Real, end: Real) -> RayTracer:
-            """The tracer for this kind of field."""
+            """Return the tracer for this kind of field."""
             to_end = replace(march, ray_end=end)
             if self.field.has_jumps:
                 return JumpTracer(to_end, self.field, path, start, end)

@@ -1,9 +1,10 @@
-"""`TraceOptions`, how a surface is traced; and the rule by which verbs (`trace`, `render`, `mesh`,
-...) take keywords in place of `Surface` and `TraceOptions`.
+"""`TraceOptions`, how a surface is traced; and the rule by which the functions of the library
+(`trace`, `render`, `mesh`, ...) take keywords in place of `Surface` and `TraceOptions`. In this
+module a verb is such a function.
 
 Beside a bare field, a verb takes the keywords of `Surface`; without `options`, it takes those of
 `TraceOptions`. Keywords beside an object that holds them raise an error, since either could be
-meant. An option that a verb cannot honor raises an error that names it.
+meant. An option that a verb does not have raises an error that names it.
 """
 
 from __future__ import annotations
@@ -26,8 +27,8 @@ _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 
 class TraceKeywords(SurfaceKeywords, total=False):
-    """The keywords of `Surface` and of `TraceOptions`, which verbs (`trace`, `render`, ...) take in
-    place of these objects."""
+    """The keywords of `Surface` and of `TraceOptions`, which the functions of the library (`trace`,
+    `render`, ...) take in place of these objects."""
 
     tolerance: float | HitTolerance | None
     enclosures: EnclosureChoice
@@ -40,20 +41,21 @@ class TraceKeywords(SurfaceKeywords, total=False):
 
 @dataclass(frozen=True, kw_only=True)
 class TraceOptions:
-    """How a surface is traced, drawn, meshed or measured: the `options` of every verb.
+    """How a surface is traced, drawn, meshed or measured: the `options` of every function that
+    takes a surface (`trace`, `render`, `mesh`, ...). f is the field whose level is the surface.
 
     tolerance: the largest distance of hits, of points of a picture or of triangles from the
         surface, a length in the field's coordinates; or a `HitTolerance`. None follows the size of
         the surface: 1e-4 of the longest side of its box (domain, proved extent, clip and section),
         1e-3 of it for meshes, and 1e-4 where the surface has no bounds. In single precision it is
         not below about 1e-6 of the size of coordinates. Closest points are exact up to rounding.
-    enclosures: the proofs by which steps are made: None for all that pay; a name, "classic" for
-        the published rule, "slope", "caps", "curvature", "lipschitz" and others; or classes of
+    enclosures: the proofs by which steps are made: None for all that save time; a name, "classic"
+        for the published rule, "slope", "caps", "curvature", "lipschitz" and others; or classes of
         enclosures (`harnack.enclosures.choose_enclosures`).
-    max_steps: the number of evaluations of the field after which a ray is out of steps.
+    max_steps: the number of evaluations of f after which a ray is out of steps: it ends undecided.
     over_relaxation: a factor in [1, 2). Trial steps are this many times as long as the proved
-        steps, and are kept if an enclosure behind the trial point covers the rest (Keinert et al.
-        2014). 1 turns it off; None is the field's own choice.
+        steps, and are kept if an enclosure that reaches back from the trial point proves the rest
+        (Keinert et al. 2014). 1 turns it off; None is the field's own choice.
     precision: "single" or "double". None follows the input: double precision for float64 arrays,
         single for all others; Dr.Jit arrays have a precision of their own.
     backend: "webgpu" traces on any GPU of the system by the package `wgpu`; None on what Dr.Jit
@@ -75,6 +77,8 @@ class TraceOptions:
     require_crossing: bool = False
 
     def __post_init__(self) -> None:
+        """Check all values; `max_steps` and `over_relaxation` become Python numbers."""
+        # These properties raise an error for wrong values.
         _ = self.hit_tolerance, self.enclosure_kinds
         count = as_integer_in_range(self.max_steps, "max_steps", 1, 2**31 - 1)
         object.__setattr__(self, "max_steps", count)
@@ -103,12 +107,12 @@ class TraceOptions:
 
     @property
     def enclosure_kinds(self) -> EnclosureKinds:
-        """The classes of enclosures that are chosen. An enclosure is an interval that provably
-        contains the change of f along a ray; steps are proved by it."""
+        """The classes of enclosures by which steps are proved. An enclosure is an interval that is
+        proved to contain the change of f along a ray."""
         return choose_enclosures(self.enclosures)
 
     def replace(self, **changes: Any) -> TraceOptions:
-        """These options with some values changed, by name."""
+        """Return these options with some values changed, by name."""
         return replace(self, **changes)
 
 
@@ -125,35 +129,38 @@ def surface_and_options(
     keywords: Mapping[str, Any],
     honored: Sequence[str],
 ) -> tuple[Surface, TraceOptions]:
-    """The surface and the options of a call of a verb (`trace`, `render`, ...). Some options may be
-    given as keywords.
+    """Return the `Surface` and the `TraceOptions` of a call of a function of the library (`trace`,
+    `render`, ...). Some options may be given as keywords.
 
+    verb: the name of the called function, for messages.
     surface: a field or a `Surface`.
     keywords: the keywords of the call that are options of `Surface` or `TraceOptions`.
-    honored: the names of the options that the verb honors; all other options must have their
-        defaults.
+    honored: the names of the options that the called function has; all other options must have
+        their defaults.
 
     Raises:
-        TypeError: a keyword that does not exist, or that the verb does not honor, also within
-            `surface` and `options`; a keyword of `Surface` beside a `Surface`, or of `TraceOptions`
-            beside `options`; `surface` is neither a field nor a `Surface`.
+        TypeError: a keyword that does not exist, or that the called function does not have, also
+            within `surface` and `options`; a keyword of `Surface` beside a `Surface`, or of
+            `TraceOptions` beside `options`; `surface` is neither a field nor a `Surface`.
         ValueError: a value that `Surface` or `TraceOptions` refuses.
     """
+    # First, keywords that the called function does not have.
     for name in keywords:
         if name in (*SURFACE_OPTIONS, *TRACE_OPTIONS) and name not in honored:
             raise TypeError(_refusal(verb, name, honored))
         if name not in honored:
             raise TypeError(f"{verb} has no argument {name!r}{did_you_mean(name, honored)}")
-    of_surface = {name: value for name, value in keywords.items() if name in SURFACE_OPTIONS}
-    choices = trace_options(verb, options, keywords, honored)
+    surface_keywords = {name: value for name, value in keywords.items() if name in SURFACE_OPTIONS}
+    chosen_options = trace_options(verb, options, keywords, honored)
     if isinstance(surface, Surface):
-        if of_surface:
+        if surface_keywords:
             raise TypeError(
-                f"{', '.join(of_surface)}: a Surface holds its own; give {verb} "
-                f"surface.replace({next(iter(of_surface))}=...)"
+                f"{', '.join(surface_keywords)}: a Surface holds its own; give {verb} "
+                f"surface.replace({next(iter(surface_keywords))}=...)"
             )
     else:
-        surface = Surface(surface, **of_surface)
+        surface = Surface(surface, **surface_keywords)
+    # A `Surface` may hold options that the called function does not have.
     if "side" not in honored and surface.solid_range is not None:
         raise TypeError(
             f'{verb} has no side, and this is side="{surface.side}" of a level: faces of a solid '
@@ -161,17 +168,20 @@ def surface_and_options(
         )
     if "largest" not in honored and surface.largest:
         raise TypeError(_refusal(verb, "largest", honored))
-    return surface, choices
+    return surface, chosen_options
 
 
 def trace_options(
     verb: str, options: TraceOptions | None, keywords: Mapping[str, Any], honored: Sequence[str]
 ) -> TraceOptions:
-    """The `TraceOptions` of a call of a verb: `options`, or made from those keywords that are
-    options of traces. honored: the names of the options that the verb honors.
+    """Return the `TraceOptions` of a call of a function of the library: `options`, or made from
+    those keywords that are options of traces.
+
+    verb: the name of the called function, for messages.
+    honored: the names of the options that it has.
 
     Raises:
-        TypeError: both are given; or an option is set that the verb does not honor.
+        TypeError: both are given; or an option is set that the called function does not have.
     """
     choices = trace_options_among(options, keywords)
     for option in fields(TraceOptions):
@@ -181,35 +191,35 @@ def trace_options(
 
 
 def _refusal(verb: str, name: str, honored: Sequence[str]) -> str:
-    """The text of the error for an option that a verb does not have; it lists the options that it
-    has."""
+    """Return the text of the error for an option `name` that the called function `verb` does not
+    have. It lists those that it has, `honored`."""
     return (
         f"{verb} has no {name}; of the options of surfaces and traces it has {', '.join(honored)}"
     )
 
 
 def trace_options_among(options: Any, keywords: Mapping[str, Any]) -> TraceOptions:
-    """The `TraceOptions` of a call: `options`, or made from those keywords that are options of
-    traces.
+    """Return the `TraceOptions` of a call: `options`, or made from those keywords that are options
+    of traces; other keywords are ignored.
 
     Raises:
         TypeError: both are given; `options` is no `TraceOptions`.
     """
-    of_trace = {name: value for name, value in keywords.items() if name in TRACE_OPTIONS}
+    trace_keywords = {name: value for name, value in keywords.items() if name in TRACE_OPTIONS}
     if options is None:
-        return TraceOptions(**of_trace)
+        return TraceOptions(**trace_keywords)
     if not isinstance(options, TraceOptions):
         raise TypeError(f"options must be harnack.TraceOptions(...), not {options!r:.60}")
-    if of_trace:
+    if trace_keywords:
         raise TypeError(
-            f"{', '.join(of_trace)}: there are options already; give all of them in options, such "
-            f"as options.replace({next(iter(of_trace))}=...), or none"
+            f"{', '.join(trace_keywords)}: there are options already; give all of them in options, "
+            f"such as options.replace({next(iter(trace_keywords))}=...), or none"
         )
     return options
 
 
 def shorthand_parameters() -> dict[str, inspect.Parameter]:
-    """The options of `Surface` and `TraceOptions`, by name, as keyword-only parameters for
+    """Return the options of `Surface` and `TraceOptions`, by name, as keyword-only parameters for
     signatures."""
     kinds: tuple[Callable[..., Any], ...] = (Surface, TraceOptions)
     return {
@@ -221,8 +231,9 @@ def shorthand_parameters() -> dict[str, inspect.Parameter]:
 
 
 def shows_keywords(*honored: str) -> Callable[[_Function], _Function]:
-    """Return a decorator of a verb that takes `**keywords: Unpack[TraceKeywords]`. The signature of
-    the decorated verb shows the keywords named in `honored`, with their defaults."""
+    """Return a decorator for a function that takes `**keywords: Unpack[TraceKeywords]`. The
+    signature of the decorated function shows the keywords named in `honored`, with their defaults.
+    """
     shorthand = shorthand_parameters()
     return shows_parameters([shorthand[name] for name in honored])
 
@@ -230,14 +241,14 @@ def shows_keywords(*honored: str) -> Callable[[_Function], _Function]:
 def shows_parameters(
     parameters: Sequence[inspect.Parameter], *, keeps_others: bool = False
 ) -> Callable[[_Function], _Function]:
-    """Return a decorator of a function that takes `**keywords`. The signature of the decorated
-    function shows these parameters by name.
+    """Return a decorator for a function that takes `**keywords`. The signature of the decorated
+    function shows `parameters` by name, in place of `**keywords`.
 
     keeps_others: whether the signature still shows `**keywords`, as there may be other ones.
     """
 
     def decorate(verb: _Function) -> _Function:
-        """The same function with the changed signature."""
+        """Give the function the changed signature, and return it."""
         signature = inspect.signature(verb)
         shown = list(signature.parameters.values())
         variadic = [parameter for parameter in shown if parameter.kind is parameter.VAR_KEYWORD]

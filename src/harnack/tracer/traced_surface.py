@@ -1,5 +1,8 @@
-"""`TracedSurface`: a `Surface` with `TraceOptions`, and the data that one call prepares from
-both."""
+"""`TracedSurface`: a `Surface` with `TraceOptions`, and the data that one call of the library (of
+`trace`, `render`, `mesh` and others) prepares from both. The surface consists of the points at
+which a function f, the field, takes one of given values, the levels; or it is the boundary of a
+solid, on which f lies in a range.
+"""
 
 from __future__ import annotations
 
@@ -50,7 +53,8 @@ _FIRST_HITS_ONLY = (
 
 @dataclass(frozen=True)
 class TracedSurface:
-    """A surface and how rays are traced to it, for one call of the library.
+    """A surface and how rays are traced to it, for one call of the library. The surface consists of
+    the points at which f takes one of the levels, or is the boundary of a solid.
 
     field: the function f.
     levels: the values of f on the surface, which may be Dr.Jit numbers.
@@ -59,9 +63,10 @@ class TracedSurface:
     side: "surface" or None for the level set; "below", "above" or "between" for a solid.
     largest: the number of cells along the longest side of the box by which the largest component is
         told apart; 0 for all components.
-    tolerance: of hits; None for one that follows the size of the surface (`hit_tolerance`).
+    tolerance: how near to the surface a hit must be; None for one that follows the size of the
+        surface (`hit_tolerance`).
     enclosures: the classes of enclosures by which steps are proved. An enclosure is an interval
-        that provably contains the change of f along a ray.
+        that is proved to contain the change of f along a ray.
     max_steps: the number of evaluations of f after which a ray is out of steps.
     over_relaxation: trial steps are at most this many times as long as proved steps.
     require_crossing: whether a ray hits only where f passes to the other side of the level.
@@ -91,12 +96,15 @@ class TracedSurface:
 
     @classmethod
     def of(cls, surface: Surface, options: TraceOptions) -> TracedSurface:
-        """A surface with the options of a call, as a `TracedSurface`.
+        """Combine a surface with the options of a call.
 
         Raises:
             ValueError, NotImplementedError: options that this surface cannot have.
         """
-        factor, default_factor = options.over_relaxation, surface.field.over_relaxation
+        over_relaxation, default_over_relaxation = (
+            options.over_relaxation,
+            surface.field.over_relaxation,
+        )
         return cls(
             surface.field,
             surface.levels,
@@ -104,7 +112,7 @@ class TracedSurface:
             tolerance=options.hit_tolerance,
             enclosures=options.enclosure_kinds,
             max_steps=options.max_steps,
-            over_relaxation=default_factor if factor is None else factor,
+            over_relaxation=default_over_relaxation if over_relaxation is None else over_relaxation,
             require_crossing=options.require_crossing,
         )
 
@@ -126,9 +134,9 @@ class TracedSurface:
         )  # fmt: skip
 
     def validate_crossings(self, option: str) -> None:
-        """Raise an error if crossings of this surface cannot be traced.
+        """Raise an error if this surface is of a kind whose crossings with rays cannot be counted.
 
-        option: the name of the verb or option that needs crossings, for the message.
+        option: the name of the function or option that needs crossings, for the message.
 
         Raises:
             ValueError: the field has jumps and there are several levels; a jump may cross more than
@@ -163,9 +171,9 @@ class TracedSurface:
         return side_range(self.side, self.level_values)
 
     def with_call_cache(self, *, begins: bool = False) -> TracedSurface:
-        """This surface with a cache for a single call of the library, so that its field, extent and
-        cells are prepared only once. Copies made by `dataclasses.replace` share the cache. A
-        surface that has a cache is returned unchanged.
+        """Return this surface with a cache for a single call of the library, so that its field,
+        extent and cells are prepared only once. Copies made by `dataclasses.replace` share the
+        cache. A surface that has a cache is returned unchanged.
 
         begins: whether to start with an empty cache in any case, as users may have changed the
             field in place since the last call.
@@ -175,8 +183,8 @@ class TracedSurface:
         )
 
     def memoize(self, key: Any, compute: Callable[[], _T]) -> _T:
-        """The result of `compute()`. Within a call of the library it is cached for this field,
-        these levels and the key; otherwise `compute` is called each time."""
+        """Return `compute()`. Within a call of the library the result is cached for this field,
+        these levels and `key`; otherwise `compute` is called each time."""
         if self._call_cache is None:
             return compute()
         full_key = key, id(self.field), self.level_values
@@ -187,43 +195,44 @@ class TracedSurface:
 
     @property
     def extent(self) -> Volume | None:
-        """The volume that is proved to contain the level sets; None if none is known."""
+        """The volume in which the level sets are proved to lie; None if none is known."""
         return self.memoize("extent", lambda: self.field.extent(self.level_values))
 
     @property
     def volume(self) -> Volume | None:
-        """The volume to which rays are clipped: the intersection of domain, proved extent, clip and
-        section; None for all of space."""
+        """The volume to which rays are clipped: the intersection of the field's domain, the proved
+        extent, clip and section; None for all of space."""
         return intersection_of([self.field.domain, self.extent, self.clip, self.section])
 
     @property
     def hit_tolerance(self) -> HitTolerance:
-        """The tolerance of hits: the one that was set, or else 1e-4 of the longest side of the box
-        of the volume to which rays are clipped (1e-4 if this box is unbounded)."""
+        """How near to the surface a hit must be: the tolerance that was set, or else 1e-4 of the
+        longest side of the box of `volume` (1e-4 if this box is unbounded)."""
         return default_tolerance(self.volume) if self.tolerance is None else self.tolerance
 
     def for_rays(self, count: int) -> TracedSurface:
-        """The same surface with the field prepared for this many rays (`Field.for_ray_count`)."""
+        """Return this surface with the field prepared for `count` rays (`Field.for_ray_count`)."""
         return replace(self, field=self.field.for_ray_count(count))
 
     def evaluator(self, backend: Backend) -> Field:
-        """The field, prepared for its levels and for a backend. It is cached; a field with
+        """Return the field, prepared for its levels and for a backend. It is cached; a field with
         derivatives enabled and one without have separate entries."""
-        is_followed = any(dr.grad_enabled(parameter) for parameter in self.field.parameters())
-        key = "field", backend, is_followed
+        has_derivatives = any(dr.grad_enabled(parameter) for parameter in self.field.parameters())
+        key = "field", backend, has_derivatives
         return self.memoize(key, lambda: self.field.with_levels(self.level_values).prepare(backend))
 
     def target_levels(self, backend: Backend) -> Levels:
-        """The levels as kernel parameters of a backend, with the period of the field."""
+        """Return the levels as Dr.Jit numbers that kernels take as parameters, with the period of
+        the field."""
         levels = tuple(
             as_kernel_parameters(to_float(backend, level, "level")) for level in self.levels
         )
         return Levels(levels, self.field.period)
 
     def _occupied(self) -> OccupancyGrid | None:
-        """The grid of cells in which those are marked that may contain a level of the surface; None
-        if no cells are known. If only the largest component is traced, the marked cells are those
-        of this component."""
+        """Return the grid of cells with a mark on those that may contain a level of the surface;
+        None if no cells are known. If only the largest component is traced, only its cells are
+        marked."""
         if not self.largest:
             return self.memoize("cells", lambda: self.field.occupied_cells(self.level_values))
         volume = intersection_of([self.field.domain, self.extent, self.clip])
@@ -241,11 +250,16 @@ class TracedSurface:
     def prepare(
         self, backend: Backend, *, crosses: bool = False, many_rays: bool = True
     ) -> SurfaceTracer:
-        """The tracer of this surface, with all data on a backend, for use in a recorded kernel.
+        """Return the tracer of this surface, with all data on a backend, for use in a recorded
+        kernel.
 
         crosses: whether rays will look for crossings, and not for first hits.
-        many_rays: whether there will be so many rays that it pays to compute first which cells
-            contain no level.
+        many_rays: whether there will be so many rays that it saves time to compute first which
+            cells contain no level.
+
+        The tracer of a field whose samples may lack an unknown integer (a winding number modulo 1)
+        gets a volume outside of which the integer is known; but not if a level is nearly an
+        integer.
         """
         if self.largest and crosses:
             raise ValueError(_FIRST_HITS_ONLY)
@@ -258,6 +272,8 @@ class TracedSurface:
         if field.has_unknown_branch and all(
             abs(math.remainder(level, 1)) > _INTEGER_MARGIN for level in self.level_values
         ):
+            # Outside the extent of the levels and of their remainders modulo 1, f is nearer to 0
+            # than all of these.
             extent = self.field.extent(_with_reduced_levels(self.level_values))
             known_volume = None if extent is None else extent.prepare(backend)
         return SurfaceTracer(
@@ -285,13 +301,12 @@ def traced_surface(
     verb: str = "a trace",
     **keywords: Any,
 ) -> TracedSurface:
-    """A surface with the options of a call of a verb (`trace`, `render`, ...), as a
-    `TracedSurface`.
+    """Make the `TracedSurface` of a call of a function of the library (`trace`, `render`, ...).
 
     surface: a `TracedSurface`, which is returned; a `Surface`; or a field, with keywords of
         `Surface`.
     options: a `TraceOptions`; or keywords in its place.
-    verb: the name of the verb, for messages.
+    verb: the name of the called function, for messages.
 
     Raises:
         TypeError, ValueError: keywords that contradict the objects beside them, or values that
@@ -304,8 +319,8 @@ def traced_surface(
 
 
 def check_has_inside(surface: TracedSurface) -> None:
-    """Raise ValueError if this is the boundary of a solid, and the field is of a kind that has no
-    closed solids: angle-valued, with jumps, or a union of patches."""
+    """Raise ValueError if the surface is meant as the boundary of a solid, and the field is of a
+    kind that has no closed solids: angle-valued, with jumps, or a union of patches."""
     field = surface.field
     if surface.solid_range is None:
         return
@@ -323,15 +338,16 @@ def check_has_inside(surface: TracedSurface) -> None:
 
 
 def default_tolerance(volume: Volume | None) -> HitTolerance:
-    """The default tolerance of hits: 1e-4 of the longest side of the box of a volume; the length
-    1e-4 if the volume is None or unbounded."""
+    """Return the default tolerance of hits: 1e-4 of the longest side of the box of a volume; the
+    length 1e-4 if the volume is None or unbounded."""
     side = math.nan if volume is None else float(np.ptp(np.array(volume.bounds()), axis=0).max())
     is_bounded = math.isfinite(side) and side > 0
     return HitTolerance(_RELATIVE_TOLERANCE * side if is_bounded else _UNBOUNDED_TOLERANCE)
 
 
 def _with_reduced_levels(levels: tuple[float, ...]) -> tuple[float, ...]:
-    """The levels; and for those beyond 1/2 in absolute value also their remainders modulo 1, in
-    [-1/2, 1/2], which |f| reaches closer to 0."""
+    """Return the levels, and after them the remainders modulo 1, in [-1/2, 1/2], of those levels
+    that are beyond 1/2 in absolute value. These are the numbers nearest to 0 that differ from a
+    level by an integer."""
     remainders = dict.fromkeys(math.remainder(level, 1) for level in levels if abs(level) > 0.5)
     return levels + tuple(level for level in remainders if level not in levels)
