@@ -317,6 +317,7 @@ class SexticKernel(BlobKernel):
         """
         root_sum = dr.fma(1.2, half_chord_squared, 0.5)
         root_product = half_chord_squared * dr.fma(0.2, half_chord_squared, 1 / 6)
+        # The smaller root, as the product over the larger one: nothing cancels.
         steepest_x = dr.sqrt(
             2 * root_product / (root_sum + dr.sqrt(fmax(root_sum * root_sum - 4 * root_product, 0)))
         )
