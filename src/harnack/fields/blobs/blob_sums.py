@@ -203,7 +203,7 @@ def sum_along(
         slope_scale = amplitude * inverse_radius
         second_scale = slope_scale * inverse_radius
 
-        # Outside of the chord the derivatives are 0, as at its ends.
+        # Outside of the chord the blob is 0. (`_with_jumps` is for derivatives that jump to 0.)
         piece_begin = clamp(positions[0], -chord.half_length, chord.half_length)
         first_at_begin, second_at_begin = kernel.derivatives(
             height_squared, half_chord_squared, piece_begin
