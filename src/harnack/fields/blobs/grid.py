@@ -63,9 +63,9 @@ class CellLists(GridData):
         lower, upper = (centers - supports[:, None]).min(0), (centers + supports[:, None]).max(0)
         while True:
             size = round_to_short_float(size)
-            # The grid extends beyond all supports, so that its outermost cells are empty.
+            # The grid extends beyond all supports by two margins.
             margin = _MARGIN * size
-            # Rounded down, so that single precision holds the same corner.
+            # Rounded down to single precision, so that every backend has the same corner.
             origin = np.nextafter((lower - 2 * margin).astype(np.float32), np.float32(-np.inf))
             origin = origin.astype(np.float64)
             counts = np.ceil((upper + 2 * margin - origin) / size)
@@ -167,9 +167,12 @@ class BlobGrid(EmptySpaceGrid):
         )
 
     def list_at(self, p: Vec3) -> tuple[Any, Any]:
-        """The list of blobs that may be nonzero at p: the two positions (begin, end) for which it
-        is entries[begin:end]. It is the list of the cell that contains p. For p outside of the grid
-        it is that of the nearest cell. This list is right, too: it is empty, since no blob extends
-        to the grid's outermost cells."""
+        """The list of blobs that may be nonzero at p: the two positions (begin, end) for which it is
+        entries[begin:end].
+
+        It is the list of the cell that contains p. For p outside of the grid it is that of the
+        nearest cell. This list is right, too, since no blob extends beyond the grid, so that all
+        are 0 at p.
+        """
         kind, index = self.backend.UInt32, self.cell(p).index
         return dr.gather(kind, self.starts, index), dr.gather(kind, self.starts, index + 1)

@@ -290,8 +290,8 @@ class GroupMaximumEnclosure(Enclosure):
         groups, (rise_length, fall_length) = self.blobs.each_group(
             add_group, start, "steps of groups"
         )
-        # Groups without a blob in the list have the sum 0 on the whole length. If the level is below
-        # 0, the maximum never falls to it.
+        # A group without a blob in the list has the sum 0 on the whole length. If the level is
+        # below 0, the maximum never falls to it.
         zero_is_above_level = (groups < self.blobs.group_count) & (gaps.below > self.value)
         fall_length = dr.select(zero_is_above_level, self.length, fall_length)
         fall_length = dr.select(gaps.below == dr.inf, self.length, fall_length)
