@@ -74,7 +74,7 @@ class BlobError(ValueError):
 
 class Blobs(Formula):
     """Metaballs: f(x) = sum over i of w_i A k(|x - c_i|^2 / (s R_i)^2). Blob i has the center c_i,
-    the radius R_i and the weight w_i. The kernel k falls from 1 or so at the center to 0 at the
+    the radius R_i and the weight w_i. The kernel k falls from the center to 0 at the
     distance s R_i, the radius of the blob's support. A is chosen so that a single blob of weight 1
     has the value 1 at its radius. The surface is f = 1, and f is larger inside. Where blobs meet,
     they flow together.
@@ -247,7 +247,7 @@ class Blobs(Formula):
             slopes = SlopeRange.around(slope, start.gradient_error)
             enclosures = path.proofs.from_restriction(sums, slopes, length)
         else:
-            # The value is that at p, where the groups' proofs begin with their own sums.
+            # The value at p, not at `piece_start`: over an empty length both are 0.
             start = data.value_at(self.kernel, p)
             slope = dr.dot(start.gradient, d)
             enclosures = (

@@ -167,8 +167,8 @@ class BlobGrid(EmptySpaceGrid):
         )
 
     def list_at(self, p: Vec3) -> tuple[Any, Any]:
-        """The list of blobs that may be nonzero at p: the two positions (begin, end) for which it is
-        entries[begin:end].
+        """The list of blobs that may be nonzero at p, as the two positions (begin, end) for which
+        it is entries[begin:end].
 
         It is the list of the cell that contains p. For p outside of the grid it is that of the
         nearest cell. This list is right, too, since no blob extends beyond the grid, so that all
