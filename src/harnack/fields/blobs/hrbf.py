@@ -471,7 +471,8 @@ def _solve_coefficients(points: FloatArray, normals: FloatArray) -> tuple[FloatA
             "some out or add others"
         )
     solution = solution.reshape(n, 4)
-    # Back to unscaled coordinates: with x = size y, r^3 grows by size^3, and grad f by 1/size.
+    # Back to unscaled coordinates, in which r^3 is size^3 times and grad r^3 size^2 times as large;
+    # f is multiplied by size, so that its gradients are still the normals.
     return solution[:, 0] / size**2, solution[:, 1:] / size
 
 
