@@ -245,24 +245,16 @@ def _spectral_norms(
         xy, xz, yz = second[0, 1], second[0, 2], second[1, 2]
         # The Hessian is mean I + spread B, where B has the eigenvalues 2 cos(angle + 2 pi k/3).
         mean = (xx + yy + zz) / 3
-        xx_shifted, yy_shifted, zz_shifted = xx - mean, yy - mean, zz - mean
+        b_xx, b_yy, b_zz = xx - mean, yy - mean, zz - mean
         spread = np.sqrt(
-            (
-                xx_shifted * xx_shifted
-                + yy_shifted * yy_shifted
-                + zz_shifted * zz_shifted
-                + 2 * (xy * xy + xz * xz + yz * yz)
-            )
-            / 6
+            (b_xx * b_xx + b_yy * b_yy + b_zz * b_zz + 2 * (xy * xy + xz * xz + yz * yz)) / 6
         )
         divisor = np.where(spread > 0, spread, 1.0)
-        xx_shifted, yy_shifted, zz_shifted, xy, xz, yz = (
-            values / divisor for values in (xx_shifted, yy_shifted, zz_shifted, xy, xz, yz)
+        b_xx, b_yy, b_zz, xy, xz, yz = (
+            values / divisor for values in (b_xx, b_yy, b_zz, xy, xz, yz)
         )
         half_determinant = 0.5 * (
-            xx_shifted * (yy_shifted * zz_shifted - yz * yz)
-            - xy * (xy * zz_shifted - yz * xz)
-            + xz * (xy * yz - yy_shifted * xz)
+            b_xx * (b_yy * b_zz - yz * yz) - xy * (xy * b_zz - yz * xz) + xz * (xy * yz - b_yy * xz)
         )
         angle = np.arccos(np.clip(half_determinant, -1, 1)) / 3
         largest_eigenvalue = mean + 2 * spread * np.cos(angle)
