@@ -142,16 +142,14 @@ def power_product(exponents: Mapping[complex, Any]) -> PowerProduct:
             chosen[point] = power
     if not chosen:
         raise ValueError("a product of powers needs at least one exponent other than 0")
-    branch_count = math.lcm(*(power.denominator for power in chosen.values()))
-    if branch_count > _MAX_BRANCHES:
+    sheets = math.lcm(*(power.denominator for power in chosen.values()))
+    if sheets > _MAX_BRANCHES:
         raise ValueError(
-            f"these exponents make {branch_count} sheets, and no more than {_MAX_BRANCHES} are drawn: "
+            f"these exponents make {sheets} sheets, and no more than {_MAX_BRANCHES} are drawn: "
             "take "
             "fractions with a smaller common denominator"
         )
-    return PowerProduct(
-        tuple(chosen), tuple(float(power) for power in chosen.values()), branch_count
-    )
+    return PowerProduct(tuple(chosen), tuple(float(power) for power in chosen.values()), sheets)
 
 
 def _fraction(value: Any) -> Fraction:

@@ -408,7 +408,10 @@ class HarmonicPolynomial(_SolidHarmonics):
         # order. Of axes of the same order z comes first: it needs no rotation.
         weights_by_axis = [
             from_monomials(
-                {_rotate_axes(powers, axis + 1): c for powers, c in scaled_coefficients.items()}
+                {
+                    _rotate_axes(exponents, axis + 1): c
+                    for exponents, c in scaled_coefficients.items()
+                }
             )
             for axis in range(3)
         ]
