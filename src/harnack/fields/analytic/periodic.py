@@ -244,8 +244,8 @@ class EigenfunctionSum(Field):
         self._extension = ExtensionBounds.with_best_radius(self.waves)
         self._rounding = WaveRounding.of(self.terms)
         radius = self._extension.radius
-        # The error E R that needs no addition: 16 u times 4 (f - lower)/R times R, where f - lower
-        # is at least half of this minimum.
+        # The part of the error E R that needs no addition, in units of u: 16 times 4 (f - lower),
+        # halved as a margin, where f - lower is about this minimum or more.
         self._rounding_bound = 32 * min(
             0.5 * self.curvature * radius**2, self.max_gradient * radius
         )
