@@ -352,7 +352,8 @@ def from_monomials(coefficients: Monomials) -> dict[tuple[int, int], float]:
             parity = (l - m) % 2
             factor = legendre_weight(l, m)
             factor *= (l + m) * q(l - 1, m) if parity else q(l, m)
-            # Of cos(m t) and, negated, of sin(m t); for m > 0 the spectrum has half of it.
+            # Its real part belongs to cos(m t), its negated imaginary part to sin(m t). For m > 0
+            # the spectrum has half of each.
             fourier_coefficient = complex(spectra[parity][m]) * (2 if m else 1) / factor
             for order, weight in ((m, fourier_coefficient.real), (-m, -fourier_coefficient.imag)):
                 # Smaller weights are rounding errors.

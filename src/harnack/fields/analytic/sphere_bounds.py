@@ -340,9 +340,9 @@ def range_of_harmonic(l: int, m: int) -> tuple[float, float]:  # noqa: E741
     """A proved range (low, high) of the spherical harmonic Y_lm on the unit sphere, within 1e-5 of
     the true one.
 
-    All absolute values are taken on a circle through the poles, on which |m| times the azimuth is
-    0. For m = 0 so are all values. Otherwise the factor cos(m phi) or sin(m phi) takes both signs
-    alike, so that the range is symmetric.
+    All absolute values are taken on the circle of azimuth 0 through the poles, and for m = 0 all
+    values. Otherwise the factor cos(m phi) or sin(m phi) takes both signs alike, so that the range
+    is symmetric.
     """
     sample_count = 8192
     polar_angle = 2 * np.pi * np.arange(sample_count) / sample_count
