@@ -261,7 +261,8 @@ class HypersphericalHarmonic(Field):
             gradient_sum = gradient_sum + c * type(p)(zero + x1, zero + x2, zero + x3)
             radial = 2 * s * first - term.j * c
             radial_sum = radial_sum + harmonic * radial
-            # Rounding: bounds of |S| and |grad S|, and of the errors of S, grad S, C, C' and 2 s C' - j C.
+            # Rounding: bounds of |S| and |grad S|, then of the errors of S, grad S, C, C' and
+            # 2 s C' - j C.
             max_harmonic, max_gradient = term.value(rho, r), term.gradient(rho, r)
             value_error = term.rounding.value_error(rho, r) + _SCALE_ERROR * term.j * max_harmonic
             slope_error = (

@@ -159,19 +159,19 @@ def from_monomials(coefficients: Monomials) -> tuple[int, dict[tuple[int, int], 
         for (i, j, k, n), entry in coefficients.items()
     )
     weights: dict[tuple[int, int], float] = {}
-    remainder = np.array(values, dtype=np.float64)
+    residual = np.array(values, dtype=np.float64)
     for j in range(l + 1):
         axial = norm(l, j) * gegenbauer(l - j, j + 1, w)
         for m in range(-j, j + 1):
             basis = axial * (evaluate({(j, m): 1.0}, *y)[0] + 0.0 * w)
             # The projection to P_ljm, which is subtracted.
             weights[j, m] = float(quadrature_weights @ (values * basis))
-            remainder -= weights[j, m] * basis
+            residual -= weights[j, m] * basis
     largest_value = float(np.abs(values).max())
-    if float(np.abs(remainder).max()) > 1e-9 * largest_value:
+    if float(np.abs(residual).max()) > 1e-9 * largest_value:
         raise ValueError(
             "the polynomial is not harmonic in R^4: its second derivatives in x, y, z and w do not "
-            f"add up to zero (on the unit sphere {float(np.abs(remainder).max()):.3g} is left of it)"
+            f"add up to zero (on the unit sphere {float(np.abs(residual).max()):.3g} is left of it)"
         )
     largest = max(abs(entry) for entry in weights.values())
     return l, {key: entry for key, entry in weights.items() if abs(entry) > 1e-13 * largest}
@@ -214,8 +214,8 @@ class HypersphereRange:
         P is sampled on the sphere in the middle of each zone, at points that are within the angle
         `covering` of all others. With e = (l covering)^2/2 and H half the length of the range of
         the samples, P exceeds this range by at most H e/(1 - e) on that sphere (`proved_range`).
-        Within the zone it exceeds it by at most l A zone_angle/2 more (Bernstein), with A half the length
-        of the range on S^3 and `zone_angle` the angle from the start of a zone to its end.
+        Within the zone it exceeds it by at most l A zone_angle/2 more (Bernstein), with A half the
+        length of the range on S^3 and `zone_angle` the angle from the start of a zone to its end.
         """
         covering = _RESOLUTION / max(1, l)
         sphere = unit_sphere(covering)
