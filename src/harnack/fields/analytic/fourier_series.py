@@ -143,16 +143,16 @@ class FourierSeries(Field):
                 than samples; a function that is constant; a box without size.
             TypeError: neither a function nor numbers; terms that are no integers.
         """
-        term_counts = _as_triple(terms, "terms")
-        _check_terms(term_counts)
+        counts = _as_triple(terms, "terms")
+        _check_terms(counts)
         checked_box = _finite_box(box)
         lower, upper = checked_box.bounds()
         if callable(function):
-            default_samples = tuple(max(_SAMPLES * n, _MIN_SAMPLES) for n in term_counts)
+            default_samples = tuple(max(_SAMPLES * n, _MIN_SAMPLES) for n in counts)
             shape = _as_triple(default_samples if samples is None else samples, "samples")
             if math.prod(shape) > _MAX_SAMPLES:
                 raise ValueError(f"{shape} samples are too many: at most {_MAX_SAMPLES} in all")
-            _check_samples(term_counts, shape)
+            _check_samples(counts, shape)
             grid = _values(function, midpoints(lower, upper, shape)).reshape(shape)
         else:
             if samples is not None:
@@ -160,20 +160,20 @@ class FourierSeries(Field):
             grid = as_real_array(function, "a grid", type_error=TypeError).astype(np.float64)
             if grid.ndim != 3 or 0 in grid.shape:
                 raise ValueError(f"a grid must have shape (n_x, n_y, n_z), not {grid.shape}")
-            _check_samples(term_counts, cast("tuple[int, int, int]", grid.shape))
+            _check_samples(counts, cast("tuple[int, int, int]", grid.shape))
             if not np.isfinite(grid).all():
                 invalid = np.argwhere(~np.isfinite(grid))
                 raise ValueError(
                     f"the grid has {len(invalid)} values that are NaN or infinite, the first at "
-                    f"{tuple(invalid[0].tolist())}: replace them by term_counts"
+                    f"{tuple(invalid[0].tolist())}: replace them by numbers"
                 )
         if float(np.ptp(grid)) == 0.0:
             raise ValueError("the function is constant: it has no level sets")
-        fitted = fit_cosines(grid, term_counts)
+        fitted = fit_cosines(grid, counts)
         # All coefficients but the constant one are rounding errors.
         if np.abs(fitted).sum() - abs(fitted[0, 0, 0]) < _MIN_COEFFICIENT * np.abs(grid).max():
             raise ValueError(
-                f"the series of {term_counts} terms is constant, though the function is not: take more "
+                f"the series of {counts} terms is constant, though the function is not: take more "
                 "terms"
             )
         series = cls(fitted, checked_box)
