@@ -335,7 +335,7 @@ class ParabolaBounds(FormulaNumber):
         slope_to_min, slope_to_max = (bound.intersect(slopes) for bound in chords)
         is_convex, is_concave = curvature.lower >= 0, curvature.upper <= 0
 
-        # For is_convex phi, x > 0 needs the upper chord and x < 0 the lower one.
+        # For a convex phi, x > 0 needs the upper chord and x < 0 the lower one.
         upper_slopes = (
             dr.select(
                 is_concave, slope.lower, dr.select(is_convex, slope_to_min.lower, slopes.lower)
@@ -583,8 +583,8 @@ class ParabolaBounds(FormulaNumber):
         """Extend lines that bound a function on an interval [start, end] to lines that bound it on
         [0, length].
 
-        This function is known on the interval. The extended function equals it there, and is
-        constant before and after the interval.
+        This function is known on the interval. The extended function equals it there; before the
+        interval it is constant, behind it it is 0.
 
         value: the range of the extended function at s = 0.
         is_cut: whether the interval is not all of [0, length].
