@@ -231,8 +231,8 @@ def _sine_and_cosine(x: Interval) -> tuple[Interval, Interval]:
             """The range of a sine or cosine at a single point, from its computed value: the value
             with its rounding, clipped to [-1, 1]."""
             plain = Interval(value, value).widened(4 * epsilon, 4 * epsilon)
-            first_turn = dr.select(is_valid, fmax(plain.lower, -1), -dr.inf)
-            return Interval(first_turn, dr.select(is_valid, fmin(plain.upper, 1), dr.inf))
+            low = dr.select(is_valid, fmax(plain.lower, -1), -dr.inf)
+            return Interval(low, dr.select(is_valid, fmin(plain.upper, 1), dr.inf))
 
         return at_point(s0), at_point(c0)
     s1, c1 = sincos(x.upper)
@@ -275,7 +275,7 @@ def _tan(x: Interval) -> DerivativeRanges:
     numbers if a pole may lie in it."""
     sine_range, cosine_range = _sine_and_cosine(x)
     t = sine_range * cosine_range.reciprocal()
-    # Monotone where the cosine has no zero: the ranges_at_ends are the range.
+    # tan increases where the cosine has no zero: its values at the ends are then the range.
     ranges_at_ends = [
         sine * cosine.reciprocal()
         for sine, cosine in (
@@ -389,8 +389,8 @@ def integer_power(x: Interval, n: int) -> Interval:
         low, high = x.lower, x.upper
     at_low = _power_by_squaring(low, n)
     at_high = at_low if low is high else _power_by_squaring(high, n)
-    # The relative errors of the products add up to at most n - 1 roundings of half at_low machine
-    # epsilon each; at_low product that underflows has at_low small absolute error instead.
+    # The relative errors of the products add up to at most n - 1 roundings of half a machine
+    # epsilon each; a product that underflows has a small absolute error instead.
     result = Interval(at_low, at_high).widened(
         n * machine_epsilon(x.lower), n * _smallest_normal(x)
     )

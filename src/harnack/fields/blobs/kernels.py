@@ -623,8 +623,7 @@ class GaussianKernel(BlobKernel):
         power = dr.fma(b / 32, nearest, 1)
         for _ in range(5):
             power = power * power
-        # e^(b (S^2 - 1)), with a margin for rounding. It is at most 1 if S^2 is only a Python
-        # number.
+        # e^(b (S^2 - 1)), with a margin for rounding. A Python number stands for S = 1.
         largest = (
             1.01
             if isinstance(half_chord_squared, float)
