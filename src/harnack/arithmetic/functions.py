@@ -240,14 +240,12 @@ def _sine_and_cosine(x: Interval) -> tuple[Interval, Interval]:
     # that are too large, the range is [-1, 1].
     scale = 1 / (2 * math.pi)
     rounding = 8 * epsilon * (fmax(dr.abs(x.lower), dr.abs(x.upper)) + 1) * scale
-    first_turn, last_turn = x.lower * scale - rounding, x.upper * scale + rounding
-    is_unknown = ~(fmax(dr.abs(x.lower), dr.abs(x.upper)) <= max_argument) | ~(
-        last_turn - first_turn < 1
-    )
+    low, high = x.lower * scale - rounding, x.upper * scale + rounding
+    is_unknown = ~(fmax(dr.abs(x.lower), dr.abs(x.upper)) <= max_argument) | ~(high - low < 1)
 
     def passes(phase: float) -> Mask:
         """Whether x/(2 pi), the interval in full turns, contains phase + k for an integer k."""
-        return dr.floor(last_turn - phase) > dr.floor(first_turn - phase)
+        return dr.floor(high - phase) > dr.floor(low - phase)
 
     def range_between(a: Real, b: Real, top: float, bottom: float) -> Interval:
         """The range of a sine or cosine on the interval.
