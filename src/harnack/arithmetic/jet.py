@@ -231,6 +231,9 @@ class Jet(FormulaNumber):
         return self * self._constant(b.value.reciprocal())
 
     def __pow__(self, exponent: Any) -> Jet:
+        """This function to a power: as exp(exponent log(this)) for an exponent that is a function,
+        else by the elementary function `power`. The power 1/2 of a known sum of squares is a
+        norm."""
         if isinstance(exponent, Jet):
             if self.value.is_literal:  # Python numbers: take the type from the exponent
                 base = exponent._constant(self.value_on_backend(exponent.backend_number()))

@@ -327,9 +327,12 @@ class FourierSeries(Field):
         return Box(cast("Any", tuple(corners[0].tolist())), cast("Any", tuple(corners[1].tolist())))
 
     def validate_levels(self, levels: tuple[float, ...]) -> None:
+        """Raise ValueError for a level outside of the range of the series in its box."""
         validate_levels_in_range(levels, self.value_range, "in its box the series")
 
     def describe(self) -> dict[str, Any]:
+        """The size of the series, its proved bounds and the error of the fit, as a dictionary for
+        users."""
         return {
             "terms": self.coefficients.shape,
             "range": self.value_range,

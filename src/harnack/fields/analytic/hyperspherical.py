@@ -467,6 +467,7 @@ class HypersphericalHarmonic(Field):
         return Ball(radius=radius) if 0 < radius < math.inf else None
 
     def validate_levels(self, levels: tuple[float, ...]) -> None:
+        """Raise ValueError for a level outside of the proved range of f, and for a constant f."""
         if self.degree == 0:
             raise ValueError(
                 "a hyperspherical harmonic of degree 0 is constant: it has no level sets"
@@ -474,6 +475,7 @@ class HypersphericalHarmonic(Field):
         validate_levels_in_range(levels, self.value_range)
 
     def describe(self) -> dict[str, Any]:
+        """The degree, the number of terms and the proved range of f, as a dictionary for users."""
         return {
             "degree": self.degree,
             "harmonics": sum(len(term.weights) for term in self._orders),

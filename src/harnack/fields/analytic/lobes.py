@@ -420,6 +420,8 @@ class Lobes(Field):
         return value, gradient, (rows[0], rows[1], rows[2])
 
     def describe(self) -> dict[str, Any]:
+        """The degree, the chosen sign and the length of the longest lobe, as a dictionary for
+        users."""
         return {"degree": self.degree, "lobes": self.part, "longest": self.extent_radius()}
 
 

@@ -304,6 +304,7 @@ class EigenfunctionSum(Field):
         return x, y, z
 
     def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
+        """Bounds of the rounding errors of the gradient and of the Hessian of f at p."""
         del sample
         return self._rounding.derivative_errors(p)
 
@@ -313,6 +314,7 @@ class EigenfunctionSum(Field):
         return 0 * p.x + radius * (self.curvature * (1 + _ROUNDING))
 
     def validate_levels(self, levels: tuple[float, ...]) -> None:
+        """Raise ValueError for a level outside of the proved range of f."""
         validate_levels_in_range(levels, self.value_range)
 
     def wall_levels(self, half_width: float, *, level: float | None = None) -> tuple[float, float]:
@@ -353,6 +355,7 @@ class EigenfunctionSum(Field):
         return self.wall_levels(0.5 * self.max_gradient * float(thickness), level=level)
 
     def describe(self) -> dict[str, Any]:
+        """The number of terms and the proved bounds of the sum, as a dictionary for users."""
         return {
             "terms": len(self.terms),
             "range": self.value_range,
@@ -387,6 +390,7 @@ class _CubicSurface(EigenfunctionSum):
     _steepness: float
 
     def __init__(self, cell: float, terms: tuple[Term, ...], domain: Volume | None) -> None:
+        """Set up the sum of waves, with the wavenumber that belongs to the cell."""
         self.cell = float(cell)
         self._wavenumber = _wavenumber(cell)
         super().__init__(terms, domain=Ball(radius=self.cell) if domain is None else domain)
@@ -418,6 +422,7 @@ class Gyroid(_CubicSurface):
     _steepness = math.sqrt(3.0)
 
     def __init__(self, cell: float = 2 * math.pi, *, domain: Volume | None = None) -> None:
+        """Set up the three products of a sine and a cosine of the class."""
         k = _wavenumber(cell)
         s, c = sine_factor(k), cosine_factor(k)
         terms = (WaveProduct(1.0, x=s, y=c), WaveProduct(1.0, y=s, z=c), WaveProduct(1.0, z=s, x=c))
@@ -438,6 +443,7 @@ class SchwarzP(_CubicSurface):
     _steepness = math.sqrt(3.0)
 
     def __init__(self, cell: float = 2 * math.pi, *, domain: Volume | None = None) -> None:
+        """Set up the three cosines of the class."""
         c = cosine_factor(_wavenumber(cell))
         super().__init__(
             cell, (WaveProduct(1.0, x=c), WaveProduct(1.0, y=c), WaveProduct(1.0, z=c)), domain
@@ -445,27 +451,24 @@ class SchwarzP(_CubicSurface):
 
 
 class SchwarzD(_CubicSurface):
-    """Schwarz's diamond surface, the level 0 of
+    """Schwarz's diamond surface, the level 0 of f = s s s + s c c + c s c + c c s. Here the first,
+    second and third s or c of each term is sin or cos of X, Y and Z, and (X, Y, Z) = 2 pi p/cell.
 
-        f = s s s + s c c + c s c + c c s,
+    cell: the edge length of the cubic cell of periodicity, 2 pi by default.
+    domain: the volume in which f is drawn, by default the ball of radius `cell` about the origin.
 
-    where the first, second and third s or c of each term is sin or cos of X, Y and Z, and
-    (X, Y, Z) = 2 pi p/cell.
-
-    cell, domain: as for `Gyroid`.
-
-    Proof of |f| <= sqrt 2: f = sin X cos(Y-Z) + cos X sin(Y+Z), which is at most
-    sqrt(cos^2(Y-Z) + sin^2(Y+Z)) by Cauchy-Schwarz. Proof of |grad f| <= sqrt 3 (2 pi/cell): let A,
-    B, C be the cosines and P, Q, R the sines of 2X, 2Y, 2Z. For cell 2 pi,
-    |grad f|^2 = 3/2 (1 + ABC) - (PQ + QR + RP)/2. Here -2(PQ + QR + RP) <= P^2 + Q^2 + R^2 = 3 - S
-    with S = A^2 + B^2 + C^2, and |ABC| <= (S/3)^(3/2) <= S/3, so
-    |grad f|^2 <= 3/2 + S/2 + (3 - S)/4 <= 3. Both bounds are attained.
+    Proof of |f| <= sqrt 2: f = sin X cos(Y-Z) + cos X sin(Y+Z), which is at most sqrt(cos^2(Y-Z) +
+    sin^2(Y+Z)) by Cauchy-Schwarz. Proof of |grad f| <= sqrt 3 (2 pi/cell): let A, B, C be the
+    cosines and P, Q, R the sines of 2X, 2Y, 2Z. For cell 2 pi, |grad f|^2 = 3/2 (1 + ABC) - (PQ +
+    QR + RP)/2. Here -2(PQ + QR + RP) <= P^2 + Q^2 + R^2 = 3 - S with S = A^2 + B^2 + C^2, and |ABC|
+    <= (S/3)^(3/2) <= S/3, so |grad f|^2 <= 3/2 + S/2 + (3 - S)/4 <= 3. Both bounds are attained.
     """
 
     _largest_value = math.sqrt(2.0)
     _steepness = math.sqrt(3.0)
 
     def __init__(self, cell: float = 2 * math.pi, *, domain: Volume | None = None) -> None:
+        """Set up the four products of sines (s) and cosines (c) of the class."""
         k = _wavenumber(cell)
         s, c = sine_factor(k), cosine_factor(k)
         terms = (

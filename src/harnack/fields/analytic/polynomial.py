@@ -332,9 +332,11 @@ class _SolidHarmonics(Field):
         return x, y, z
 
     def validate_levels(self, levels: tuple[float, ...]) -> None:
+        """Raise ValueError for a level outside of the proved range of f in its domain."""
         validate_levels_in_range(levels, self.value_range, "in its domain the function")
 
     def describe(self) -> dict[str, Any]:
+        """The degree, the number of terms and the proved range of f, as a dictionary for users."""
         return {
             "degree": self.degree,
             "solid harmonics": len(self._weights),

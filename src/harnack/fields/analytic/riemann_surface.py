@@ -356,6 +356,7 @@ class RiemannSurface(Field):
         return vector(xx, xy, zero), vector(xy, -xx, zero), vector(zero, zero, zero)
 
     def describe(self) -> dict[str, Any]:
+        """The number of branches, the period and the singular points, as a dictionary for users."""
         return {
             "branches": self.branches.count,
             "period": self._shift,

@@ -49,6 +49,7 @@ class WaveFactor:
     is_cosine: bool
 
     def __post_init__(self) -> None:
+        """Check the numbers, and convert them to Python floats."""
         check_no_derivatives("a factor of a wave", vars(self))
         for name in ("frequency", "phase"):
             object.__setattr__(
@@ -87,6 +88,7 @@ class WaveProduct:
     z: WaveFactor | None = None
 
     def __post_init__(self) -> None:
+        """Check the amplitude and the factors."""
         check_no_derivatives("a Product", vars(self))
         as_finite(self.amplitude, "the amplitude of a product")
         for name in "xyz":
@@ -114,6 +116,7 @@ class PlaneWave:
     phase: float = 0.0
 
     def __post_init__(self) -> None:
+        """Check the numbers, and convert the wave vector to a tuple of three floats."""
         check_no_derivatives("a PlaneWave", vars(self))
         as_finite(self.amplitude, "the amplitude of a plane wave")
         as_finite(self.phase, "the phase of a plane wave")

@@ -110,6 +110,7 @@ class Blobs(Formula):
         kernel: str | BlobKernel = "compact",
         groups: Any = None,
     ) -> None:
+        """Check the arguments. The blobs are sorted by groups."""
         self.centers, self.radii, self.weights, self.groups = _checked(
             centers, radii, weights, groups
         )
@@ -537,6 +538,7 @@ class Molecule(Blobs):
         sharpness: float = 1.0,
         tail: float = 1 / 32,
     ) -> None:
+        """Read the atoms, and set up a blob with a Gaussian kernel for each."""
         self.atoms = source if isinstance(source, Atoms) else read_molecule(source)
         super().__init__(
             self.atoms.positions, self.atoms.radii, kernel=GaussianKernel(sharpness, tail)

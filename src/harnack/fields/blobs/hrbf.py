@@ -79,6 +79,7 @@ class HRBF(Formula):
     default_level: float = 0.0
 
     def __init__(self, points: Any, normals: Any, *, domain: Volume | None = None) -> None:
+        """Check the arguments, and solve for the coefficients of the function."""
         check_volume(domain, "domain")
         self.points, self.normals = _checked(points, normals)
         self.value_coefficients, self.gradient_coefficients = _solve_coefficients(

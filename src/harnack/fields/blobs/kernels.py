@@ -506,6 +506,7 @@ class GaussianKernel(BlobKernel):
     name = "gaussian"
 
     def __post_init__(self) -> None:
+        """Raise ValueError unless sharpness and tail are in the ranges that the kernel allows."""
         if not 0 < as_real(self.sharpness, "sharpness") <= 12:
             raise ValueError(f"sharpness must be in (0, 12], not {self.sharpness!r}")
         if not 1e-6 <= as_real(self.tail, "tail") <= 0.5:
