@@ -297,8 +297,8 @@ class HypersphericalHarmonic(Field):
 
         square: |p|^2.
         """
-        inner = fmax(dr.sqrt(square) - fraction * dr.sqrt(1 + square), 0)
-        return dr.fma(inner, inner, 1) * (1 - _ROUNDING)
+        smallest_norm = fmax(dr.sqrt(square) - fraction * dr.sqrt(1 + square), 0)
+        return dr.fma(smallest_norm, smallest_norm, 1) * (1 - _ROUNDING)
 
     def _radius(self, square: Real, fraction: float) -> Real:
         """The radius fraction * sqrt(1 + |p|^2) of a ball about p.
@@ -317,8 +317,8 @@ class HypersphericalHarmonic(Field):
         promises: list[TaylorRemainder] = []
         for fraction in _BALL_RADII:
             # By the chain rule, with the smallest 1 + |q|^2 of the ball (see the class).
-            lower = self._min_square(square, fraction)
-            second = (4 * (l - 1) / lower + 4 / dr.sqrt(lower)) / lower
+            min_square = self._min_square(square, fraction)
+            second = (4 * (l - 1) / min_square + 4 / dr.sqrt(min_square)) / min_square
             promises.append(
                 TaylorRemainder(fmax(max_gradient * second, 0), self._radius(square, fraction))
             )
@@ -331,6 +331,8 @@ class HypersphericalHarmonic(Field):
 
         square: |p|^2.
         """
+        # By the chain rule, as in the class, with bounds of S(y) C(w) at all points within the
+        # chord.
         axis_order = min(abs(m) for term in self._orders for _, m in term.weights)
         center_order = min(term.j for term in self._orders)
         if center_order < 3:
@@ -371,8 +373,8 @@ class HypersphericalHarmonic(Field):
             return path.enclose(sample)
         slope = dr.dot(sample.gradient, path.direction)
         slopes = SlopeRange.around(slope, sample.gradient_error)
-        # The point of the line closest to the origin, from one end or the other without
-        # cancellation: the origin of the ray may be far away.
+        # The point of the line that is closest to the origin of space, and the position of p along
+        # the line from there.
         start = dr.dot(path.origin, path.direction)
         closest = path.origin - start * path.direction
         square = 1 + dr.squared_norm(closest)
@@ -424,16 +426,16 @@ class HypersphericalHarmonic(Field):
             c, first, second = term.axial(w)
             harmonic, gradient = evaluate(term.weights, y.x, y.y, y.z)
             xx, yy, zz, xy, xz, yz = hessian(term.weights, y.x, y.y, y.z)
-            matrix = ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))
+            s_hessian = ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))
             for i in range(3):
                 for k in range(3):
-                    rows[i][k] = rows[i][k] + c * matrix[i][k]
+                    rows[i][k] = rows[i][k] + c * s_hessian[i][k]
                 rows[i][3] = rows[i][3] + first * gradient[i]
                 slopes[i] = slopes[i] + c * gradient[i]
             rows[3][3] = rows[3][3] + second * harmonic
             slopes[3] = slopes[3] + first * harmonic
         x = (p.x, p.y, p.z)
-        # Columns of the derivative of (y, w), four by three.
+        # The derivatives of (y, w) by the three coordinates of x.
         jacobian = [[2 * s * ((i == k) - 2 * s * x[i] * x[k]) for k in range(3)] for i in range(3)]
         jacobian.append([4 * s * s * x[k] for k in range(3)])
         radial = x[0] * slopes[0] + x[1] * slopes[1] + x[2] * slopes[2]
@@ -441,6 +443,7 @@ class HypersphericalHarmonic(Field):
         for k in range(3):
             row: list[Real] = []
             for m in range(3):
+                # The Hessian of P between two columns of the first derivatives.
                 total = zero
                 for i in range(4):
                     for n in range(4):

@@ -89,6 +89,7 @@ class Lobes(Field):
     over_relaxation = 1.6
 
     def __init__(self, l: int, m: int, *, scale: float = 1.0, sign: LobeSign = "both") -> None:  # noqa: E741
+        """Set up the lobes of a single spherical harmonic."""
         self._initialize({(integer(l, "l"), integer(m, "m")): 1.0}, scale, sign)
 
     @classmethod
@@ -188,15 +189,17 @@ class Lobes(Field):
 
         levels: the levels of f.
 
-        Proof for scale 1 and a level c > 0, with a the length of the longest lobe. For r >= a, r^2
-        - W >= (r - a)^2 for both signs and r - W >= r - a for one sign, and r^2 >= (r - a)^2. Here
-        W is Y^2 for both signs, else Y or -Y. So f > c where r > a + c^(1/4) or, for one sign, r >
-        a + c^(1/3). Levels c <= 0 are within a.
+        Proof for scale 1 and a level c > 0. Let a be the length of the longest lobe, and let W be
+        Y^2 for both signs, else Y or -Y. For r >= a, r^2 - W >= (r - a)^2 for both signs and r - W
+        >= r - a for one sign, and r^2 >= (r - a)^2. So f > c where r > a + c^(1/4) or, for one
+        sign, r > a + c^(1/3). Levels c <= 0 are within a.
         """
         beyond = max(*levels, 0.0) ** (1 / 4 if self.part == "both" else 1 / 3)
         return Ball(radius=(self.extent_radius() + self.scale * beyond) * (1 + 1e-6))
 
     def evaluate(self, p: Vec3) -> Sample:
+        """The sample at p: value, gradient and bounds of second derivatives of f on balls about p.
+        It is that of lobes of scale 1 at p/scale, scaled back."""
         return space_scaled(self._unscaled(p / self._size), self._size)
 
     def _unscaled(self, x: Vec3) -> Sample:

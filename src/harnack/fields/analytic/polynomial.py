@@ -227,11 +227,11 @@ class HarmonicPromises:
 
         rho, r: the distances of the point from the z axis and from the origin.
 
-        If f has a term of degree 1 or 2, the radius changes linearly with r, from `center_radius`
-        to `boundary_radius`, or more. Otherwise it is proportional to r. Near a z axis along which
-        f vanishes to the order m, the range on the ball is about proportional to (rho + R)^m (r +
-        R)^(l-m). The best R is then 2/((m-2)/rho + (l-m)/r) if rho is a small fraction of r, as it
-        is there.
+        If f has a term of degree 1 or 2, the radius goes from `center_radius` at r = 0 to
+        `boundary_radius` at r = 1. Otherwise it is proportional to r, because f vanishes to a high
+        order at the origin. Near a z axis along which f vanishes to the order m > 2, the range on
+        the ball is about proportional to (rho + R)^m (r + R)^(l-m) with the degree l. The best R is
+        then 2/((m-2)/rho + (l-m)/r) if rho is a small fraction of r, as it is there.
         """
         if self.lowest_degree < 3:
             if self.center_radius < self.boundary_radius:
