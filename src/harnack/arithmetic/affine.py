@@ -128,7 +128,7 @@ class AffineForm(FormulaNumber):
             fmax(-curvature.lower * eighth, 0),
             fmin(-curvature.upper * eighth, 0),
         )
-        size = dr.abs(ends[0].midpoint) + dr.abs(ends[1].midpoint)
+        end_values = dr.abs(ends[0].midpoint) + dr.abs(ends[1].midpoint)
         # Each line as (its value in the middle of the range, its slope by f, its error).
         chord = (
             0.5 * (ends[0].midpoint + ends[1].midpoint) + 0.5 * (max_above_chord + min_above_chord),
@@ -136,7 +136,7 @@ class AffineForm(FormulaNumber):
             0.5 * (max_above_chord - min_above_chord)
             + ends[0].radius
             + ends[1].radius
-            + _rounding_bound(size),
+            + _rounding_bound(end_values),
         )
         middle = 0.5 * f_range.lower + 0.5 * f_range.upper
         middle_value = function.ranges(Interval(middle, middle))[0]
@@ -152,14 +152,17 @@ class AffineForm(FormulaNumber):
             value.radius + _rounding_bound(dr.abs(value.midpoint)),
         )
         best = _smaller_error(_smaller_error(chord, mean_slope_line), constant_line)
-        center, rate, error = best
+        center, best_slope, error = best
         # The line as a function of e, by f = self.center + self.slope e + r.
-        shift = rate * (self.center - middle)
+        shift = best_slope * (self.center - middle)
         rounding = _rounding_bound(
-            dr.abs(center) + dr.abs(rate) * (dr.abs(self.center) + dr.abs(self.slope) + self.error)
+            dr.abs(center)
+            + dr.abs(best_slope) * (dr.abs(self.center) + dr.abs(self.slope) + self.error)
         )
         return AffineForm(
-            center + shift, rate * self.slope, error + dr.abs(rate) * self.error + rounding
+            center + shift,
+            best_slope * self.slope,
+            error + dr.abs(best_slope) * self.error + rounding,
         )
 
     def pointwise_maximum(self, other: Any) -> AffineForm:
@@ -170,24 +173,26 @@ class AffineForm(FormulaNumber):
         is_self_larger, is_other_larger = difference_range.lower >= 0, difference_range.upper <= 0
         # max(t, 0) on [x, y], x < 0 < y: its chord has slope y/(y - x) and lies above by at most
         # -x y/(y - x), at 0.
-        rate = difference_range.upper / (difference_range.upper - difference_range.lower)
-        excess = -difference_range.lower * rate
-        center = rate * (difference.center - difference_range.lower) - 0.5 * excess
-        size = dr.abs(rate) * (
+        chord_slope = difference_range.upper / (difference_range.upper - difference_range.lower)
+        excess = -difference_range.lower * chord_slope
+        center = chord_slope * (difference.center - difference_range.lower) - 0.5 * excess
+        size = dr.abs(chord_slope) * (
             dr.abs(difference.center)
             + dr.abs(difference_range.lower)
             + dr.abs(difference_range.upper)
         )
         positive_part = AffineForm(
             center,
-            rate * difference.slope,
-            rate * difference.error + 0.5 * excess + _rounding_bound(size),
+            chord_slope * difference.slope,
+            chord_slope * difference.error + 0.5 * excess + _rounding_bound(size),
         )
-        both = other.sum(positive_part)
+        general_maximum = other.sum(positive_part)
         return AffineForm(
             *(
                 dr.select(is_self_larger, u, dr.select(is_other_larger, v, w))
-                for u, v, w in zip(_entries(self), _entries(other), _entries(both), strict=True)
+                for u, v, w in zip(
+                    _entries(self), _entries(other), _entries(general_maximum), strict=True
+                )
             )
         )
 

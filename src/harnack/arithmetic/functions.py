@@ -163,10 +163,10 @@ def _sqrt(x: Interval) -> DerivativeRanges:
     root = _increasing_range(dr.sqrt, Interval(low, high))
     # A lower end that rounding took below 0 counts as 0. If x has no number >= 0, there is no root.
     is_none = x.upper < 0
-    end = root.lower
+    number = root.lower
     root = Interval(
-        typed_select(is_none, dr.nan, fmax(root.lower, 0), end),
-        typed_select(is_none, dr.nan, root.upper, end),
+        typed_select(is_none, dr.nan, fmax(root.lower, 0), number),
+        typed_select(is_none, dr.nan, root.upper, number),
     )
     # 1/(2 sqrt x) and -1/(4 x sqrt x)
     slope = _half(_positive_reciprocal(root))
@@ -223,7 +223,7 @@ def _sine_and_cosine(x: Interval) -> tuple[Interval, Interval]:
     look like a value.
     """
     epsilon, max_argument = machine_epsilon(x.lower), max_sincos_argument(type(x.lower))
-    s0, c0 = sincos(x.lower)
+    sine_lower, cosine_lower = sincos(x.lower)
     if x.lower is x.upper:
         is_valid = dr.abs(x.lower) <= max_argument
 
@@ -234,13 +234,13 @@ def _sine_and_cosine(x: Interval) -> tuple[Interval, Interval]:
             low = dr.select(is_valid, fmax(plain.lower, -1), -dr.inf)
             return Interval(low, dr.select(is_valid, fmin(plain.upper, 1), dr.inf))
 
-        return at_point(s0), at_point(c0)
-    s1, c1 = sincos(x.upper)
+        return at_point(sine_lower), at_point(cosine_lower)
+    sine_upper, cosine_upper = sincos(x.upper)
     # The ends of the interval in full turns, moved outwards. From a whole turn on, or for arguments
     # that are too large, the range is [-1, 1].
-    scale = 1 / (2 * math.pi)
-    rounding = 8 * epsilon * (fmax(dr.abs(x.lower), dr.abs(x.upper)) + 1) * scale
-    low, high = x.lower * scale - rounding, x.upper * scale + rounding
+    turns_per_radian = 1 / (2 * math.pi)
+    rounding = 8 * epsilon * (fmax(dr.abs(x.lower), dr.abs(x.upper)) + 1) * turns_per_radian
+    low, high = x.lower * turns_per_radian - rounding, x.upper * turns_per_radian + rounding
     is_unknown = ~(fmax(dr.abs(x.lower), dr.abs(x.upper)) <= max_argument) | ~(high - low < 1)
 
     def passes(phase: float) -> Mask:
@@ -257,7 +257,9 @@ def _sine_and_cosine(x: Interval) -> tuple[Interval, Interval]:
         lowest = dr.select(passes(bottom), -1, plain.lower)
         return _clip_to_unit(Interval(lowest, dr.select(passes(top), 1, plain.upper)), is_unknown)
 
-    return range_between(s0, s1, 0.25, 0.75), range_between(c0, c1, 0.0, 0.5)
+    return range_between(sine_lower, sine_upper, 0.25, 0.75), range_between(
+        cosine_lower, cosine_upper, 0.0, 0.5
+    )
 
 
 def _clip_to_unit(x: Interval, wide: Mask) -> Interval:
@@ -272,7 +274,7 @@ def _tan(x: Interval) -> DerivativeRanges:
     """The ranges of tan, of its derivative and of its second derivative on the interval x; all
     numbers if a pole may lie in it."""
     sine_range, cosine_range = _sine_and_cosine(x)
-    t = sine_range * cosine_range.reciprocal()
+    tangent = sine_range * cosine_range.reciprocal()
     # tan increases where the cosine has no zero: its values at the ends are then the range.
     ranges_at_ends = [
         sine * cosine.reciprocal()
@@ -282,13 +284,13 @@ def _tan(x: Interval) -> DerivativeRanges:
         )
     ]
     has_no_pole = cosine_range.min_abs > 0
-    t = Interval(
-        dr.select(has_no_pole, ranges_at_ends[0].lower, t.lower),
-        dr.select(has_no_pole, ranges_at_ends[1].upper, t.upper),
+    tangent = Interval(
+        dr.select(has_no_pole, ranges_at_ends[0].lower, tangent.lower),
+        dr.select(has_no_pole, ranges_at_ends[1].upper, tangent.upper),
     )
     # 1 + tan^2 and 2 tan (1 + tan^2)
-    slope = ONE + t.square()
-    return _unbounded_unless_defined(has_no_pole, (t, slope, _twice(t * slope)))
+    slope = ONE + tangent.square()
+    return _unbounded_unless_defined(has_no_pole, (tangent, slope, _twice(tangent * slope)))
 
 
 def _hyperbolic_tangent(x: Real) -> Real:
@@ -489,6 +491,7 @@ def _real_power(x: Interval, n: float) -> Interval:
     a few more. A y below the smallest normal number may stand for any number from 0 to that.
     """
     lower = fmax(x.lower, 0)
+    # A point interval keeps the same object as both ends.
     upper = (
         fmax(_smallest_normal(x), x.upper)
         if x.upper is not x.lower
@@ -502,6 +505,7 @@ def _real_power(x: Interval, n: float) -> Interval:
         return result + sign * (error * result + _smallest_normal(x))
 
     positive_lower = fmax(lower, _smallest_normal(x))
+    # For n > 0 the power increases with y, else it falls.
     if n > 0:
         return Interval(
             dr.select(lower >= _smallest_normal(x), fmax(end(positive_lower, -1), 0), 0),

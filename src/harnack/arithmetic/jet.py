@@ -250,14 +250,16 @@ class Jet(FormulaNumber):
         Its derivatives are f(g)' = f' g' and f(g)'' = f'' g' g' + f' g''. The square root of a
         known sum of squares is computed as a norm.
         """
+        # The square root of a sum of squares.
         if function is sqrt and self.roots:
             from harnack.arithmetic.norms import norm
 
             return norm(*self.roots)
         x = self.value_on_backend()
+        # The ranges of f, f' and f'' on the range of g.
         value, slope, curvature = function.ranges(x)
-        first = tuple(slope * derivative for derivative in self.first_derivatives)
-        second = tuple(
+        first_derivatives = tuple(slope * derivative for derivative in self.first_derivatives)
+        second_derivatives = tuple(
             curvature
             * (
                 self.first_derivatives[i].square()
@@ -267,7 +269,7 @@ class Jet(FormulaNumber):
             + slope * self.second_derivatives[k]
             for k, (i, j) in enumerate(self.hessian_indices())
         )
-        jet = Jet(value, first, second, piece_length=self.piece_length)
+        jet = Jet(value, first_derivatives, second_derivatives, piece_length=self.piece_length)
         if self.jet_at_start is not None:
             jet = jet.narrowed_from_start(self.jet_at_start.apply(function), self.piece_length)
         is_square = function.name == "power 2"
@@ -378,14 +380,14 @@ class Jet(FormulaNumber):
 
     def select(self, condition: Mask, other: Jet) -> Jet:
         """This jet on lanes where the condition holds, the jet `other` on all other lanes."""
-        kind = self.backend_number()
+        number = self.backend_number()
 
         def chosen(u: Interval, v: Interval) -> Interval:
             """The range u on lanes where the condition holds, v on all other lanes."""
             if u.is_literal and v.is_literal and u == v:
                 return u
-            low = typed_select(condition, u.lower, v.lower, kind)
-            return Interval(low, typed_select(condition, u.upper, v.upper, kind))
+            low = typed_select(condition, u.lower, v.lower, number)
+            return Interval(low, typed_select(condition, u.upper, v.upper, number))
 
         start = None
         if self.jet_at_start is not None and other.jet_at_start is not None:

@@ -123,16 +123,16 @@ def _plain_norm(values: tuple[Any, ...], p: float) -> Any:
         return scale * np.sum((sizes / scale) ** p, axis=0) ** (1 / p) * (largest > 0)
     # Dr.Jit: the root is taken of 1 where the sum is 0, since its derivative at 0 is infinite.
     if p == 2.0:
-        total = functools.reduce(lambda a, b: a + b, [value * value for value in values])
-        positive = total > 0
-        return dr.select(positive, dr.sqrt(dr.select(positive, total, 1)), 0)
+        power_sum = functools.reduce(lambda a, b: a + b, [value * value for value in values])
+        positive = power_sum > 0
+        return dr.select(positive, dr.sqrt(dr.select(positive, power_sum, 1)), 0)
     # Divided by the largest, so that no power overflows.
     largest = functools.reduce(lambda a, b: fmax(a, b), [dr.abs(value) for value in values])
     positive = largest > 0
     scale = dr.select(positive, dr.detach(largest), 1)
-    parts = [dr.abs(value) / scale for value in values]
-    total = functools.reduce(lambda a, b: a + b, [_plain_power(value, p) for value in parts])
-    return dr.select(positive, scale * dr.power(dr.select(positive, total, 1), 1 / p), 0)
+    ratios = [dr.abs(value) / scale for value in values]
+    power_sum = functools.reduce(lambda a, b: a + b, [_plain_power(value, p) for value in ratios])
+    return dr.select(positive, scale * dr.power(dr.select(positive, power_sum, 1), 1 / p), 0)
 
 
 def _plain_power(x: Any, p: float) -> Any:
@@ -154,11 +154,11 @@ def _jet_norm(xs: list[Jet], p: float) -> Jet:
     inverse_norm = _reciprocal_norm(length)
     ratios = [_clip_magnitude(f * inverse_norm, ONE) for f in values]
     pulls = ratios if p == 2.0 else [_signed_power(f, p - 1) for f in ratios]
-    count = range(len(xs))
+    indices = range(len(xs))
     # N' is the sum of pulls times x_i', and at most the norm of the x_i'.
     first = tuple(
         _clip_magnitude(
-            _total([pulls[k] * xs[k].first_derivatives[i] for k in count]),
+            _total([pulls[k] * xs[k].first_derivatives[i] for k in indices]),
             _norm_range([as_backend_interval(f.first_derivatives[i], number) for f in xs], p),
         )
         for i in range(len(xs[0].first_derivatives))
@@ -171,8 +171,8 @@ def _jet_norm(xs: list[Jet], p: float) -> Jet:
         else:
             convex = -(first[i] * first[j])
             for f, u in zip(xs, ratios, strict=True):
-                by = power(p - 2).ranges(Interval(u.min_abs, u.max_abs))[0]
-                convex = convex + by * _product(f.first_derivatives[i], f.first_derivatives[j])
+                weight = power(p - 2).ranges(Interval(u.min_abs, u.max_abs))[0]
+                convex = convex + weight * _product(f.first_derivatives[i], f.first_derivatives[j])
             convex = convex * inverse_norm * Interval.enclosing(p - 1, type(number))
         # Not negative, because N is convex.
         if i == j:
@@ -231,10 +231,10 @@ def _norm_of_magnitudes(sizes: list[Any], p: float) -> Interval:
     # Divided by the largest, so that no power overflows.
     inverse_largest = Interval.point(fmax(tiny, largest)).reciprocal()
     root_ranges, power_ranges = power(1 / p).ranges, power(p).ranges
-    parts = [power_ranges(Interval.point(size) * inverse_largest)[0] for size in sizes]
-    total = root_ranges(_total(parts))[0] * Interval.point(largest)
+    powers = [power_ranges(Interval.point(size) * inverse_largest)[0] for size in sizes]
+    norm = root_ranges(_total(powers))[0] * Interval.point(largest)
     return Interval(
-        dr.select(largest > tiny, total.lower, 0), fmax(total.upper, 0) + len(sizes) * tiny
+        dr.select(largest > tiny, norm.lower, 0), fmax(norm.upper, 0) + len(sizes) * tiny
     )
 
 

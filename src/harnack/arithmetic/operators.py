@@ -239,15 +239,21 @@ class FormulaNumber(abc.ABC):
             if name in _UFUNCS:
                 return self.apply(_UFUNCS[name])
             if name in _OPERATORS:
-                a, b = inputs
+                left_operand, right_operand = inputs
                 # The method of the left operand if that is a number of an arithmetic, else the
                 # method of the right operand.
-                left, right = _OPERATORS[name]
-                is_left = isinstance(a, FormulaNumber)
-                result = getattr(a, left)(b) if is_left else getattr(b, right)(a)
+                left_method, right_method = _OPERATORS[name]
+                is_left = isinstance(left_operand, FormulaNumber)
+                result = (
+                    getattr(left_operand, left_method)(right_operand)
+                    if is_left
+                    else getattr(right_operand, right_method)(left_operand)
+                )
                 if result is NotImplemented:
-                    other = type(b if is_left else a).__name__
-                    raise TypeError(f"expected a number, not an object of type {other}")
+                    wrong_type = type(right_operand if is_left else left_operand).__name__
+                    raise TypeError(
+                        f"expected left_operand number, not an object of type {wrong_type}"
+                    )
                 return result
         raise TypeError(
             f"numpy.{name} has no proved ranges: write formulas with + - * / **, abs, and "

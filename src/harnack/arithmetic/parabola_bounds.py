@@ -170,14 +170,17 @@ class ParabolaBounds(FormulaNumber):
         middle, radius = factor.midpoint, factor.radius
         if factor.is_zero:
             return self._new(value, (0.0, 0.0), (0.0, 0.0), 0)
-        low, high = self.lower, self.upper
-        scaled_bounds = [(middle * bound[0], middle * bound[1]) for bound in (low, high)]
+        lower_bound, upper_bound = self.lower, self.upper
+        # The bounds of m f; the lower one is the product with the upper bound if m < 0.
+        scaled_bounds = [
+            (middle * bound[0], middle * bound[1]) for bound in (lower_bound, upper_bound)
+        ]
         is_negative = middle < 0
         lower = tuple(dr.select(is_negative, v, u) for u, v in zip(*scaled_bounds, strict=True))
         upper = tuple(dr.select(is_negative, u, v) for u, v in zip(*scaled_bounds, strict=True))
-        sizes = [fmax(dr.abs(u), dr.abs(v)) for u, v in zip(low, high, strict=True)]
+        sizes = [fmax(dr.abs(u), dr.abs(v)) for u, v in zip(lower_bound, upper_bound, strict=True)]
         rounding = [
-            0.0 if _is_zero(low[k]) and _is_zero(high[k])
+            0.0 if _is_zero(lower_bound[k]) and _is_zero(upper_bound[k])
             else radius * sizes[k] + _rounding_bound(dr.abs(middle) * sizes[k])
             for k in range(2)
         ]  # fmt: skip
@@ -238,9 +241,9 @@ class ParabolaBounds(FormulaNumber):
         """Parabolas that bound the change of the product f g of this and another function.
         `product` has the proof: the derivative of each of four quartics is put between two lines.
 
-        In the code v and w are the midpoints of f(0) and g(0), rv and rw their radii. (a, b) is a
-        bound of f and (c, d) one of g, with the radii ra, rb, rc, rd of their coefficients.
-        """
+        In the code v and w are the midpoints of f(0) and g(0), rv and rw their radii. (a, b) is
+        a bound of f and (c, d) one of g, with the radii ra, rb, rc, rd of their coefficients. ah =
+        a h, bh = b h^2 and so on are the coefficients for r = s/h, which goes from 0 to 1."""
         h = self.piece_length
         v, rv, w, rw = *_midpoint_and_radius(self.value), *_midpoint_and_radius(other.value)
         lows: list[Real] = []
@@ -694,16 +697,21 @@ def _common_upper_bound(
     last_controls: list[Real] = []
     for k, (a, b) in enumerate(parabolas):
         offset = offsets[k] if offsets else 0.0
-        first, second = a * h, b * h * h
-        rounding = _rounding_bound(dr.abs(offset) + dr.abs(first) + dr.abs(second) + 0 * h)
-        middle_controls.append(offset + 0.5 * first + rounding)
-        last_controls.append(offset + (first + second) + rounding)
-    middle, last = _maximum_or_inf(*middle_controls), _maximum_or_inf(*last_controls)
-    rounding = _rounding_bound(dr.abs(middle) + dr.abs(last))
+        linear_term, quadratic_term = a * h, b * h * h
+        rounding = _rounding_bound(
+            dr.abs(offset) + dr.abs(linear_term) + dr.abs(quadratic_term) + 0 * h
+        )
+        middle_controls.append(offset + 0.5 * linear_term + rounding)
+        last_controls.append(offset + (linear_term + quadratic_term) + rounding)
+    middle_control, last_control = (
+        _maximum_or_inf(*middle_controls),
+        _maximum_or_inf(*last_controls),
+    )
+    rounding = _rounding_bound(dr.abs(middle_control) + dr.abs(last_control))
     nonempty = h > 0
     # The parabola with the control values 0, middle and last.
-    a = dr.select(nonempty, 2 * middle / h, 0)
-    b = dr.select(nonempty, (last - 2 * middle + rounding) / (h * h), 0)
+    a = dr.select(nonempty, 2 * middle_control / h, 0)
+    b = dr.select(nonempty, (last_control - 2 * middle_control + rounding) / (h * h), 0)
     return a + _rounding_bound(dr.abs(a)), b
 
 

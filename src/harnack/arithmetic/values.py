@@ -75,13 +75,13 @@ class Values(FormulaNumber):
     def constant(self, x: float | Real) -> Values:
         """The constant number x as a function on the same box."""
         is_never = self.nowhere & ~self.nowhere
-        kind = cast("Any", type(self.value.lower))
+        number_type = cast("Any", type(self.value.lower))
         if dr.is_array_v(cast("Any", type(x))):
-            return Values(Interval.point(kind(x)), is_never, is_never, is_never)
-        ends = Interval.enclosing(float(cast("Any", x)), kind)
-        low = kind(ends.lower)
+            return Values(Interval.point(number_type(x)), is_never, is_never, is_never)
+        ends = Interval.enclosing(float(cast("Any", x)), number_type)
+        low = number_type(ends.lower)
         return Values(
-            Interval(low, low if ends.lower == ends.upper else kind(ends.upper)),
+            Interval(low, low if ends.lower == ends.upper else number_type(ends.upper)),
             is_never,
             is_never,
             is_never,
@@ -112,12 +112,12 @@ class Values(FormulaNumber):
         function is outside of the elementary function's domain. It may jump if its range is lost,
         or if it may have a pole."""
         x = self.value
-        value, (low, high) = function.ranges(x)[0], function.domain
+        value, (domain_low, domain_high) = function.ranges(x)[0], function.domain
         nowhere, gaps = self.nowhere, self.gaps
-        if low > -math.inf:
-            nowhere, gaps = nowhere | (x.upper < low), gaps | ~(x.lower >= low)
-        if high < math.inf:
-            nowhere, gaps = nowhere | (x.lower > high), gaps | ~(x.upper <= high)
+        if domain_low > -math.inf:
+            nowhere, gaps = nowhere | (x.upper < domain_low), gaps | ~(x.lower >= domain_low)
+        if domain_high < math.inf:
+            nowhere, gaps = nowhere | (x.lower > domain_high), gaps | ~(x.upper <= domain_high)
         # The range of a box with a pole is all numbers.
         may_have_pole = _is_lost(value, 0.0 if function.has_pole else _LARGE_EXPONENT)
         return Values(value, nowhere, self.jumps | _is_lost(x) | may_have_pole, gaps)

@@ -437,9 +437,9 @@ class PowerProduct(Branches):
             inverse = dr.rcp(offset)
             log_derivative = log_derivative + alpha * inverse
             square_sum = square_sum + alpha * (inverse * inverse)
-        size = dr.exp(log_size)
+        abs_g = dr.exp(log_size)
         sine, cosine = sincos(angle)
-        g = type(z)(size * cosine, size * sine)
+        g = type(z)(abs_g * cosine, abs_g * sine)
         second_ratio = log_derivative * log_derivative - square_sum
         branches: list[Branch] = []
         for k in range(self.denominator):
@@ -461,9 +461,10 @@ class PowerProduct(Branches):
             smallest, largest = part.distances(a)
             log_nearest.append(dr.log(smallest))
             log_farthest.append(dr.log(largest))
-        alphas, total = self.exponents, 0 * part.disk()[1]
+        alphas, bound = self.exponents, 0 * part.disk()[1]
         for i, alpha_i in enumerate(alphas):
             for j, alpha_j in enumerate(alphas[: i + 1]):
+                # The coefficient of this term of |g"|/|g|.
                 factor = abs(alpha_i * (alpha_i - 1)) if i == j else 2 * abs(alpha_i * alpha_j)
                 if factor == 0:
                     continue
@@ -474,8 +475,8 @@ class PowerProduct(Branches):
                     for k, power in enumerate(powers)
                     if power != 0
                 ]
-                total = total + factor * dr.exp(sum(logs)) if logs else factor
-        return total * _BOUND_MARGIN
+                bound = bound + factor * dr.exp(sum(logs)) if logs else factor
+        return bound * _BOUND_MARGIN
 
     def max_abs(self, center: complex, radius: float) -> float:
         """An upper bound of |g| on the disk with this center and radius: the product of bounds of

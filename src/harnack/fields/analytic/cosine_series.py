@@ -234,6 +234,7 @@ def _spectral_norms(
         slab_nodes = nodes[0][start : start + slab_size], nodes[1], nodes[2]
         second: dict[tuple[int, int], FloatArray] = {}
         for a, b in itertools.combinations_with_replacement(range(3), 2):
+            # The second derivative by the coordinates a and b.
             orders = [0, 0, 0]
             orders[a] += 1
             orders[b] += 1
@@ -379,17 +380,17 @@ class CosineSums:
             """
             plane_sum, plane_sum_v, plane_sum_w = _sum_plane(row, y_waves, z_waves)
             sine, cosine = sincos(row[0] * angles.x)
-            f, gx, gy, gz = state
+            total, gx, gy, gz = state
             return (
-                dr.fma(plane_sum, cosine, f),
+                dr.fma(plane_sum, cosine, total),
                 dr.fma(plane_sum, -row[0] * sine, gx),
                 dr.fma(plane_sum_v, cosine, gy),
                 dr.fma(plane_sum_w, cosine, gz),
             )
 
         real = self.backend.Float
-        f, gx, gy, gz = self.rows.for_each(add, tuple(real(0) for _ in range(4)), "cosines")
-        return f, self.rate * self.backend.Array3f(gx, gy, gz)
+        total, gx, gy, gz = self.rows.for_each(add, tuple(real(0) for _ in range(4)), "cosines")
+        return total, self.rate * self.backend.Array3f(gx, gy, gz)
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
         """The three rows of the Hessian of the cosine series at points p."""
@@ -402,19 +403,21 @@ class CosineSums:
             row: the record (i, a_i00, a_i01, ...).
             state: the sums xx, yy, zz, xy, xz, yz so far, which are derivatives by the angles.
             """
-            b, by, bz, byy, byz, bzz = _sum_plane(row, y_waves, z_waves, second=True)
+            plane_sum, plane_sum_v, plane_sum_w, plane_sum_vv, plane_sum_vw, plane_sum_ww = (
+                _sum_plane(row, y_waves, z_waves, second=True)
+            )
             sine, cosine = sincos(row[0] * angles.x)
             # Of cos(i u) by u.
             first_derivative, second_derivative = -row[0] * sine, -row[0] * row[0] * cosine
-            parts = (
-                b * second_derivative,
-                byy * cosine,
-                bzz * cosine,
-                by * first_derivative,
-                bz * first_derivative,
-                byz * cosine,
+            terms = (
+                plane_sum * second_derivative,
+                plane_sum_vv * cosine,
+                plane_sum_ww * cosine,
+                plane_sum_v * first_derivative,
+                plane_sum_w * first_derivative,
+                plane_sum_vw * cosine,
             )
-            return tuple(total + part for total, part in zip(state, parts, strict=True))
+            return tuple(total + part for total, part in zip(state, terms, strict=True))
 
         real, vector, rate = self.backend.Float, self.backend.Array3f, self.rate
         start = tuple(real(0) for _ in range(6))

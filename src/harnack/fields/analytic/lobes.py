@@ -129,13 +129,13 @@ class Lobes(Field):
         self._size: Any = self.scale
         (first_harmonic, *other_harmonics) = self.weights
         if other_harmonics:
-            bounds = BallRange.of(self.weights).with_spheres(self.weights, 1.0).on_ball(1.0)
+            value_range = BallRange.of(self.weights).with_spheres(self.weights, 1.0).on_ball(1.0)
         else:
             # A single harmonic has a sharper range. A negative weight exchanges its ends.
             weight = self.weights[first_harmonic]
             low, high = (weight * end for end in range_of_harmonic(*first_harmonic))
-            bounds = min(low, high), max(low, high)
-        self.value_range = bounds
+            value_range = min(low, high), max(low, high)
+        self.value_range = value_range
         self._rounding = HarmonicRounding.of(self.weights, is_divided=False)
         if self.extent_radius() <= 0:
             raise ValueError(f"there is no direction in which the function is {sign}")
@@ -222,13 +222,15 @@ class Lobes(Field):
             )
             value = r * r * (r - y_value)
             gradient = r * ((3 * r - 2 * y_value) * u - tangential)
-        slope = safe_norm(tangential)
-        error, gradient_error = self._errors(r, y_value, slope, dr.sqrt(u.x * u.x + u.y * u.y))
+        tangential_norm = safe_norm(tangential)
+        error, gradient_error = self._errors(
+            r, y_value, tangential_norm, dr.sqrt(u.x * u.x + u.y * u.y)
+        )
         lower, upper = self._second_derivatives(1.5 * r + 0.5)
         # On the ball of this radius, the distance from the origin is at most 1.5 r + 0.5.
         promises = [TaylorRemainder(fmax(-lower, upper), 0.5 * (r + 1))]
         if self.part == "both" and self.degree > 0:
-            promises.append(self._local_remainder(r, y_value, slope))
+            promises.append(self._local_remainder(r, y_value, tangential_norm))
         return Sample(value, gradient, tuple(promises), error, gradient_error)
 
     def _local_remainder(self, r: Real, y: Real, slope: Real) -> TaylorRemainder:
@@ -409,10 +411,11 @@ class Lobes(Field):
         vector = cast("Any", type(u))
         value, gradient = 0 * u.x, 0 * u
         rows = [0 * u, 0 * u, 0 * u]
+        # The solid harmonic part of each degree l.
         for l in {l for l, _ in self.weights}:  # noqa: E741
             harmonics = {key: c for key, c in self.weights.items() if key[0] == l}
-            k, (harmonic, slope) = n - l, evaluate(harmonics, u.x, u.y, u.z)
-            g, (xx, yy, zz, xy, xz, yz) = vector(*slope), hessian(harmonics, u.x, u.y, u.z)
+            k, (harmonic, components) = n - l, evaluate(harmonics, u.x, u.y, u.z)
+            g, (xx, yy, zz, xy, xz, yz) = vector(*components), hessian(harmonics, u.x, u.y, u.z)
             value, gradient = value + harmonic, gradient + g + (k * harmonic) * u
             for i, row in enumerate(((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))):
                 new_row = (

@@ -172,26 +172,28 @@ class ExtensionBounds:
         f: the value at p, without the constant term.
         rise: the number D, for which |f(y) - f(p)| <= D |y-p|/R.
         """
-        alpha, e = self.alpha, self.spread
-        b = alpha * f - e
-        root = dr.sqrt(b * b + 3 * alpha * (1 + alpha) * rise * rise)
+        alpha, spread = self.alpha, self.spread
+        alpha_f_minus_spread = alpha * f - spread
+        root = dr.sqrt(
+            alpha_f_minus_spread * alpha_f_minus_spread + 3 * alpha * (1 + alpha) * rise * rise
+        )
         # The critical point x* of the cubic h, and h there.
-        x = fmin((1 + alpha) * rise / (root - b), 1.0)
+        x = fmin((1 + alpha) * rise / (root - alpha_f_minus_spread), 1.0)
         weight = 1 - x * x
-        at_critical_point = (1 + alpha * weight) * (rise * x - f) + weight * e
+        at_critical_point = (1 + alpha * weight) * (rise * x - f) + weight * spread
         # The case Dx <= f: the bound is D - f or, if D < 2E, E + D^2/(4E) - f.
         near_rise = rise
-        if e > 0:
-            near_rise = dr.select(rise < 2 * e, e + rise * rise / (4 * e), rise)
+        if spread > 0:
+            near_rise = dr.select(rise < 2 * spread, spread + rise * rise / (4 * spread), rise)
         return fmin(fmax(at_critical_point, near_rise - f), self.largest)
 
     def _descent_at_zero(self, slope: float) -> float:
         """The bound `_max_descent` at a point where f = 0 and the gradient has the length `slope`,
         from samples and without rounding: to choose the radius."""
-        r, alpha, e = self.radius, self.alpha, self.spread
+        r, alpha, spread = self.radius, self.alpha, self.spread
         rise = min(self.largest_gradient * r, slope * r + 0.5 * self.curvature * r * r)
         x = np.linspace(0.0, 1.0, 101)
-        descents = (1 + alpha * (1 - x * x)) * rise * x + (1 - x * x) * e
+        descents = (1 + alpha * (1 - x * x)) * rise * x + (1 - x * x) * spread
         return min(float(descents.max()), self.largest)
 
 

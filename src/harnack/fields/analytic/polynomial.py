@@ -300,6 +300,7 @@ class _SolidHarmonics(Field):
         p/size, where `HarmonicPromises` has the bounds, and scaled back to p."""
         local_p, size = self._local(p), self._size
         value, gradient = evaluate(self._weights, local_p.x, local_p.y, local_p.z)
+        # The distances of the scaled point from the z axis and from the origin.
         rho, r = dr.norm(type(local_p)(local_p.x, local_p.y, 0)), dr.norm(local_p)
         ball, lipschitz = self._promises.ball(rho, r), self._promises.lipschitz(rho, r)
         curvatures = self._promises.curvatures(rho, r)
@@ -312,8 +313,10 @@ class _SolidHarmonics(Field):
             alternatives.append(Lipschitz(lipschitz.constant / size, lipschitz.radius * size))
         error = self._promises.error(rho, r, curvatures[0])
         # The gradient with its components in the order of the coordinates of p.
-        slope = type(p)(*_rotate_axes(gradient, -self._axis - 1)) / size
-        return Sample(value, slope, promises, error, alternative_promises=tuple(alternatives))
+        gradient_at_p = type(p)(*_rotate_axes(gradient, -self._axis - 1)) / size
+        return Sample(
+            value, gradient_at_p, promises, error, alternative_promises=tuple(alternatives)
+        )
 
     def _local(self, p: Vec3) -> Vec3:
         """The point p in the coordinates of the solid harmonics: with its axes rotated, and divided

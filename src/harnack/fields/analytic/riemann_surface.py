@@ -269,21 +269,25 @@ class RiemannSurface(Field):
         free_radius, touching_count = radius, 0 * radius
         for branch in at_p.branches:
             excess = fmax(dr.abs(branch.phi) - dr.abs(at_p.nearest.phi), 0)
-            rate = branch.steepness + at_p.nearest.steepness
-            # The positive root r of rate r + second_bound r^2 = excess: up to there the branch is
+            slope_sum = branch.steepness + at_p.nearest.steepness
+            # The positive root r of slope_sum r + second_bound r^2 = excess: up to there the branch is
             # farther away than the nearest one. This form of it does not cancel.
-            change_radius = 2 * excess / (rate + dr.sqrt(rate * rate + 4 * second_bound * excess))
+            change_radius = (
+                2
+                * excess
+                / (slope_sum + dr.sqrt(slope_sum * slope_sum + 4 * second_bound * excess))
+            )
             is_touching = branch.coincides_with(at_p.nearest)
             free_radius = fmin(dr.select(is_touching, radius, change_radius), free_radius)
             touching_count += dr.select(is_touching, 1, 0)
         remainder = TaylorRemainder(second_bound, free_radius)
         max_slope = (steepest + second_bound * radius) * (1 + 1e-5)
-        change = (max_slope * free_radius + 0.5 * second_bound * free_radius * free_radius) * (
+        max_change = (max_slope * free_radius + 0.5 * second_bound * free_radius * free_radius) * (
             1 + 1e-5
         )
         # The nearest branch coincides with itself, so a count of 1 means that it is alone.
         ball_radius = dr.select(touching_count < 2, free_radius, 0)
-        ball = HarmonicBall(ball_radius, sample.value - change, sample.value + change)
+        ball = HarmonicBall(ball_radius, sample.value - max_change, sample.value + max_change)
         return Sample(
             sample.value,
             sample.gradient,
@@ -336,7 +340,7 @@ class RiemannSurface(Field):
         z = self.branches.move_off_singularities(complex_of(p.x, p.y), self._rounding(p))
         branches = self.branches.evaluate(z)
         graphs = self._graphs(p, branches)
-        xx, xy = 0 * p.x, 0 * p.x
+        u_xx, u_xy = 0 * p.x, 0 * p.x
         at_p = self._nearest_branch(z, p.z, graphs, 0.0, 0.0)
         for k, graph in enumerate(graphs):
             # With a period each branch gives two graphs, the second half of the list.
@@ -348,12 +352,15 @@ class RiemannSurface(Field):
                 )
             branch_xx, branch_xy = derivatives(second, self.part)
             is_nearest = graph.coincides_with(at_p.nearest)
-            xx, xy = dr.select(is_nearest, branch_xx, xx), dr.select(is_nearest, branch_xy, xy)
+            u_xx, u_xy = (
+                dr.select(is_nearest, branch_xx, u_xx),
+                dr.select(is_nearest, branch_xy, u_xy),
+            )
         # f is the sign times (h - height u), so u counts with a minus.
         scale = -at_p.sign * self._height
-        xx, xy, zero = scale * xx, scale * xy, 0 * p.x
+        u_xx, u_xy, zero = scale * u_xx, scale * u_xy, 0 * p.x
         vector = cast("Any", type(p))
-        return vector(xx, xy, zero), vector(xy, -xx, zero), vector(zero, zero, zero)
+        return vector(u_xx, u_xy, zero), vector(u_xy, -u_xx, zero), vector(zero, zero, zero)
 
     def describe(self) -> dict[str, Any]:
         """The number of branches, the period and the singular points, as a dictionary for users."""

@@ -99,13 +99,13 @@ class HarmonicRounding:
             # The amplitude stands for two columns: cos(m b) and sin(m b), at right angles.
             term_count = max(sum(order == k for _, order in weights) for k in (m, -m))
             addition_count = (term_count - 1) + (order_count - 1)
-            size = amplitude * legendre_weight(l, m)
+            factor = amplitude * legendre_weight(l, m)
             value_near, value_anywhere = _value_errors(l, m, addition_count, is_divided)
             steep_near, steep_anywhere = (
                 _slope_errors(l, m, addition_count, is_divided) if l else (0.0, 0.0)
             )
             rho_power = max(m - 1, 0)
-            for table, i, degree, constant in (
+            for terms, i, degree, constant in (
                 (tables[0], m, l, value_near),
                 (tables[1], 0, l, value_anywhere),
                 (tables[2], rho_power, l - 1, steep_near),
@@ -113,9 +113,9 @@ class HarmonicRounding:
             ):
                 # rho^i r^(degree - i)
                 if degree >= i:
-                    table[i, degree - i] = table.get((i, degree - i), 0.0) + size * constant
-            underflow += 2.0 + size * _underflow(l, m)
-        a, b, c, d = (AxialBound.of(table) for table in tables)
+                    terms[i, degree - i] = terms.get((i, degree - i), 0.0) + factor * constant
+            underflow += 2.0 + factor * _underflow(l, m)
+        a, b, c, d = (AxialBound.of(terms) for terms in tables)
         return cls((a, b), (c, d), underflow)
 
     def value_error(self, rho: Real, r: Real) -> Real:
@@ -286,13 +286,13 @@ class WaveRounding:
         value, gradient, total_slopes, hessian = ([0.0] * 4 for _ in range(4))
         value_sum, slope_sum, second_sum = 0.0, 0.0, 0.0
         for n, term in enumerate(terms):
-            size, vector = abs(term.amplitude), _wave_vector(term)
+            amplitude, vector = abs(term.amplitude), _wave_vector(term)
             norm = math.sqrt(sum(k * k for k in vector))
-            second_size = size * norm * norm
+            second_size = amplitude * norm * norm
             # Bounds of the sums so far, each of which is rounded.
             value_sum, slope_sum, second_sum = (
-                value_sum + size,
-                slope_sum + size * norm,
+                value_sum + amplitude,
+                slope_sum + amplitude * norm,
                 second_sum + second_size,
             )
             angle_error, axis_errors, other_errors = _term_roundings(term, common_frequencies)
@@ -300,13 +300,13 @@ class WaveRounding:
             partial_sums = (
                 (value_sum, slope_sum, second_sum) if n else (0.0, 0.0, 0.0)
             )  # the first sum is exact
-            value[0] += size * (angle_error + other_errors) + partial_sums[0]
-            gradient[0] += size * norm * (angle_error + other_errors + 2) + partial_sums[1]
+            value[0] += amplitude * (angle_error + other_errors) + partial_sums[0]
+            gradient[0] += amplitude * norm * (angle_error + other_errors + 2) + partial_sums[1]
             hessian[0] += second_size * (angle_error + other_errors + 6) + partial_sums[2]
             for axis in range(3):
-                value[axis + 1] += size * axis_errors[axis]
-                gradient[axis + 1] += size * norm * axis_errors[axis]
-                total_slopes[axis + 1] += size * norm * all_axis_errors[axis]
+                value[axis + 1] += amplitude * axis_errors[axis]
+                gradient[axis + 1] += amplitude * norm * axis_errors[axis]
+                total_slopes[axis + 1] += amplitude * norm * all_axis_errors[axis]
                 hessian[axis + 1] += second_size * all_axis_errors[axis]
         total_slopes[0] = gradient[0]
         moves = [0.0 if k is None else _product_rounding(k) for k in common_frequencies]

@@ -118,7 +118,7 @@ def evaluate(weights: Weights, x: Any, y: Any, z: Any) -> tuple[Any, tuple[Any, 
         d/dx = -x Q_(l-1)^(m+1) S_m + m Q S_(m-1),   d/dz = (l+m) Q_(l-1)^m S_m,
         d/dy = -y Q_(l-1)^(m+1) S_m + m Q C_(m-1).
     """
-    q = Legendre(z, x * x + y * y + z * z)
+    legendre = Legendre(z, x * x + y * y + z * z)
     zero = 0.0 * z
     value, slope_x, slope_y, slope_z = zero, zero, zero, zero
     c, s, c_lower, s_lower = zero + 1.0, zero, zero, zero
@@ -137,9 +137,9 @@ def evaluate(weights: Weights, x: Any, y: Any, z: Any) -> tuple[Any, tuple[Any, 
                 continue
             # The sums over the degrees l of c_lm N_lm times Q_l^m, Q_(l-1)^(m+1) and (l+m)
             # Q_(l-1)^m.
-            at_m, at_next, rate = _slope_sums(sorted(degree_weights), m, q)
+            at_m, at_next, z_derivative = _slope_sums(sorted(degree_weights), m, legendre)
             value = value + at_m * basis
-            slope_z = slope_z + rate * basis
+            slope_z = slope_z + z_derivative * basis
             slope_x = slope_x - (x * at_next) * basis
             slope_y = slope_y - (y * at_next) * basis
             if m > 0:
@@ -162,14 +162,15 @@ def hessian(weights: Weights, x: Any, y: Any, z: Any) -> tuple[Any, Any, Any, An
         xz = (l+m) (Q_(l-1)^m B_x - x Q_(l-2)^(m+1) B),
         yz = (l+m) (Q_(l-1)^m B_y - y Q_(l-2)^(m+1) B).
     """
-    q = Legendre(z, x * x + y * y + z * z)
+    legendre = Legendre(z, x * x + y * y + z * z)
     zero = 0.0 * z
-    total = [zero] * 6
+    sums = [zero] * 6
     powers = [(zero, zero), (zero, zero), (zero + 1.0, zero)]  # C and S of m-2, m-1, m
     for m in range(max(abs(m) for _, m in weights) + 1):
         if m > 0:
             c, s = powers[2]
             powers = [*powers[1:], (x * c - y * s, x * s + y * c)]
+        # C and S of the orders m - 2, m - 1 and m.
         (c2, s2), (c1, s1), (c, s) = powers
         falling_product = m * (m - 1)
         # For the orders m and -m: B, B_x, B_y, B_xx and B_xy.
@@ -182,9 +183,11 @@ def hessian(weights: Weights, x: Any, y: Any, z: Any) -> tuple[Any, Any, Any, An
                 (key[0], weight) for key, weight in weights.items() if key[1] == order
             ]
             if degree_weights:
-                terms = _hessian_of_sums(_hessian_sums(sorted(degree_weights), m, q), basis, x, y)
-                total = [entry + term for entry, term in zip(total, terms, strict=True)]
-    return total[0], total[1], total[2], total[3], total[4], total[5]
+                terms = _hessian_of_sums(
+                    _hessian_sums(sorted(degree_weights), m, legendre), basis, x, y
+                )
+                sums = [entry + term for entry, term in zip(sums, terms, strict=True)]
+    return sums[0], sums[1], sums[2], sums[3], sums[4], sums[5]
 
 
 def unit_hessian(l: int, m: int, rho: Any, z: Any, azimuth: float, removed_power: int) -> Any:  # noqa: E741
@@ -227,6 +230,7 @@ def _hessian_of_sums(sums: Sequence[Any], basis: Sequence[Any], x: Any, y: Any) 
     """
     at_m, at_next, at_second, rate, rate_next, rate_twice = sums
     b, bx, by, bxx, bxy = basis
+    # By the formulas for xx, yy, zz, xy, xz and yz.
     return (
         (x * x * at_second - at_next) * b - 2 * x * at_next * bx + at_m * bxx,
         (y * y * at_second - at_next) * b - 2 * y * at_next * by - at_m * bxx,
@@ -334,10 +338,10 @@ def from_monomials(coefficients: Monomials) -> dict[tuple[int, int], float]:
     sample_count = 64
     angles = 2 * np.pi * np.arange(sample_count) / sample_count
     x, y = np.cos(angles), np.sin(angles)
-    q = Legendre(0.0, 1.0)
+    legendre = Legendre(0.0, 1.0)
     weights: dict[tuple[int, int], float] = {}
     for l in range(max(sum(powers) for powers in coefficients) + 1):  # noqa: E741
-        parts = [
+        circle_values = [
             np.zeros(sample_count),
             np.zeros(sample_count),
         ]  # f_l and its z-derivative at z = 0
@@ -346,12 +350,12 @@ def from_monomials(coefficients: Monomials) -> dict[tuple[int, int], float]:
             if i + j + k == l:
                 largest_coefficient = max(largest_coefficient, abs(coefficient))
                 if k < 2:
-                    parts[k] += coefficient * x**i * y**j
-        spectra = [np.fft.rfft(part) / sample_count for part in parts]
+                    circle_values[k] += coefficient * x**i * y**j
+        spectra = [np.fft.rfft(part) / sample_count for part in circle_values]
         for m in range(l + 1):
             parity = (l - m) % 2
             factor = legendre_weight(l, m)
-            factor *= (l + m) * q(l - 1, m) if parity else q(l, m)
+            factor *= (l + m) * legendre(l - 1, m) if parity else legendre(l, m)
             # Its real part belongs to cos(m t), its negated imaginary part to sin(m t). For m > 0
             # the spectrum has half of each.
             fourier_coefficient = complex(spectra[parity][m]) * (2 if m else 1) / factor

@@ -223,6 +223,8 @@ def sum_along(
                 seconds = _with_jumps(
                     seconds, half_chord_squared, margin, positions[k], positions[k + 1]
                 )
+            # Add the range to the sums of the first derivative (index 0) or of the second one
+            # (index 2).
             for index, (lower, upper), scale in (
                 (0, slopes, slope_scale),
                 (2, seconds, second_scale),

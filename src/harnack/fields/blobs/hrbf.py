@@ -210,6 +210,7 @@ class HRBF(Formula):
         def add_point(row: list[Real], state: State) -> State:
             """The sums so far of the second derivatives xx, xy, xz, yy, yz, zz (`state`), with the
             term of one more point added. row: the point's record."""
+            # The vector from the point, its length, and three times the vector of the point.
             v, b, r, inverse_r = _offset_of_point(p, row)
             b_dot_e = dr.dot(b, v) * inverse_r
             e = v * inverse_r
@@ -275,15 +276,25 @@ class HRBF(Formula):
             range of the first derivative and those of the second, and at the end the sums for the
             errors of these two ranges.
             """
-            value, gx, gy, gz, value_size, gradient_size, term_count, *sums = state
+            (
+                value,
+                gradient_x,
+                gradient_y,
+                gradient_z,
+                value_size,
+                gradient_size,
+                term_count,
+                *sums,
+            ) = state
             piece_begin = row[6]
             v, piece_end, r, inverse_r = _offset_of_point(p, row)
+            # The term is a r^3 + r (b . v), and its gradient is (3 a r + (b . v)/r) v + r b.
             along_b = dr.dot(piece_end, v)
             radial = dr.fma(3 * piece_begin, r, along_b * inverse_r)
             value = value + r * dr.fma(piece_begin * r, r, along_b)
             gradient = [
                 component + dr.fma(radial, v[k], r * piece_end[k])
-                for k, component in enumerate((gx, gy, gz))
+                for k, component in enumerate((gradient_x, gradient_y, gradient_z))
             ]
             abs_a, norm_b = dr.abs(piece_begin), dr.norm(piece_end)
             value_size = dr.fma(dr.fma(abs_a, r, norm_b), r * r, value_size)
@@ -314,6 +325,8 @@ class HRBF(Formula):
                 )
                 bowl = bowl_min, fmax(start_shapes.bowl, end_shapes.bowl)
                 bell = fmin(start_shapes.bell, end_shapes.bell), bell_max
+                # Add the range of each function times its factor: to the first derivative (index 0)
+                # or to the second one (index 2).
                 for index, scale, (lower, upper) in (
                     (0, 3 * piece_begin, (start_shapes.lift, end_shapes.lift)),
                     (0, c, (start_shapes.sine, end_shapes.sine)),
@@ -349,12 +362,14 @@ class HRBF(Formula):
             sums[-1] = sums[-1] + dr.fma(abs_a, max_distance, norm_b * fraction)
             return value, *gradient, value_size, gradient_size, term_count, *sums
 
-        size = 7 + (4 * count + 2 if count else 0)
-        state = records.for_each(add_point, tuple(real(0) for _ in range(size)), "points")
-        value, gx, gy, gz, value_size, gradient_size, term_count, *sums = state
+        state_size = 7 + (4 * count + 2 if count else 0)
+        state = records.for_each(add_point, tuple(real(0) for _ in range(state_size)), "points")
+        value, gradient_x, gradient_y, gradient_z, value_size, gradient_size, term_count, *sums = (
+            state
+        )
         start = SumValue(
             value,
-            backend.Array3f(gx, gy, gz),
+            backend.Array3f(gradient_x, gradient_y, gradient_z),
             roundoff * (24 + term_count) * value_size,
             roundoff * (64 + 3 * term_count) * gradient_size,
         )
@@ -483,22 +498,28 @@ def _checked(points: Any, normals: Any) -> tuple[FloatArray, FloatArray]:
     Raises:
         ValueError: wrong shapes or numbers, or a repeated point.
     """
-    x = as_real_array(points, "points").astype(np.float64)
-    check_vectors(x, "points")
-    if not 2 <= len(x) <= _MAX_POINTS:
-        raise ValueError(f"points: {len(x):,} given, but 2 to {_MAX_POINTS:,} can be used")
-    check_finite(x, "point {}", ValueError)
-    check_coordinate_size(x, ValueError)
-    n = as_real_array(normals, "normals").astype(np.float64)
-    check_vectors(n, "normals")
-    if len(n) != len(x):
-        raise ValueError(f"{len(x)} points and {len(n)} normals: there must be one for each point")
-    check_finite(n, "normal {}", ValueError, "normals must be finite")
-    length = np.linalg.norm(n, axis=1)
+    checked_points = as_real_array(points, "points").astype(np.float64)
+    check_vectors(checked_points, "points")
+    if not 2 <= len(checked_points) <= _MAX_POINTS:
+        raise ValueError(
+            f"points: {len(checked_points):,} given, but 2 to {_MAX_POINTS:,} can be used"
+        )
+    check_finite(checked_points, "point {}", ValueError)
+    check_coordinate_size(checked_points, ValueError)
+    unit_normals = as_real_array(normals, "normals").astype(np.float64)
+    check_vectors(unit_normals, "normals")
+    if len(unit_normals) != len(checked_points):
+        raise ValueError(
+            f"{len(checked_points)} points and {len(unit_normals)} normals: there must be one for each point"
+        )
+    check_finite(unit_normals, "normal {}", ValueError, "normals must be finite")
+    length = np.linalg.norm(unit_normals, axis=1)
     if not (length > 0).all():
         raise ValueError(f"normal {int(np.argmin(length))} is zero: it has no direction")
-    _, first, counts = np.unique(x, axis=0, return_index=True, return_counts=True)
+    _, first_index, counts = np.unique(
+        checked_points, axis=0, return_index=True, return_counts=True
+    )
     if (counts > 1).any():
-        index = int(first[np.argmax(counts > 1)])
+        index = int(first_index[np.argmax(counts > 1)])
         raise ValueError(f"point {index} is given more than once: leave out the others")
-    return x, n / length[:, None]
+    return checked_points, unit_normals / length[:, None]
