@@ -128,7 +128,7 @@ class AffineForm(FormulaNumber):
             fmax(-curvature.lower * eighth, 0),
             fmin(-curvature.upper * eighth, 0),
         )
-        end_values = dr.abs(ends[0].midpoint) + dr.abs(ends[1].midpoint)
+        end_size = dr.abs(ends[0].midpoint) + dr.abs(ends[1].midpoint)
         # Each line as (its value in the middle of the range, its slope by f, its error).
         chord = (
             0.5 * (ends[0].midpoint + ends[1].midpoint) + 0.5 * (max_above_chord + min_above_chord),
@@ -136,7 +136,7 @@ class AffineForm(FormulaNumber):
             0.5 * (max_above_chord - min_above_chord)
             + ends[0].radius
             + ends[1].radius
-            + _rounding_bound(end_values),
+            + _rounding_bound(end_size),
         )
         middle = 0.5 * f_range.lower + 0.5 * f_range.upper
         middle_value = function.ranges(Interval(middle, middle))[0]

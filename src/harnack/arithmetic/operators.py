@@ -251,9 +251,7 @@ class FormulaNumber(abc.ABC):
                 )
                 if result is NotImplemented:
                     wrong_type = type(right_operand if is_left else left_operand).__name__
-                    raise TypeError(
-                        f"expected left_operand number, not an object of type {wrong_type}"
-                    )
+                    raise TypeError(f"expected a number, not an object of type {wrong_type}")
                 return result
         raise TypeError(
             f"numpy.{name} has no proved ranges: write formulas with + - * / **, abs, and "

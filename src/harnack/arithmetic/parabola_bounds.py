@@ -243,7 +243,8 @@ class ParabolaBounds(FormulaNumber):
 
         In the code v and w are the midpoints of f(0) and g(0), rv and rw their radii. (a, b) is
         a bound of f and (c, d) one of g, with the radii ra, rb, rc, rd of their coefficients. ah =
-        a h, bh = b h^2 and so on are the coefficients for r = s/h, which goes from 0 to 1."""
+        a h, bh = b h^2 and so on are the coefficients for r = s/h, which goes from 0 to 1.
+        """
         h = self.piece_length
         v, rv, w, rw = *_midpoint_and_radius(self.value), *_midpoint_and_radius(other.value)
         lows: list[Real] = []

@@ -270,8 +270,8 @@ class RiemannSurface(Field):
         for branch in at_p.branches:
             excess = fmax(dr.abs(branch.phi) - dr.abs(at_p.nearest.phi), 0)
             slope_sum = branch.steepness + at_p.nearest.steepness
-            # The positive root r of slope_sum r + second_bound r^2 = excess: up to there the branch is
-            # farther away than the nearest one. This form of it does not cancel.
+            # The positive root r of slope_sum r + second_bound r^2 = excess: up to there the branch
+            # is farther away than the nearest one. This form of it does not cancel.
             change_radius = (
                 2
                 * excess

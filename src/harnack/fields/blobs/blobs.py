@@ -462,42 +462,37 @@ def _checked(
     centers: Any, radii: Any, weights: Any, groups: Any
 ) -> tuple[FloatArray, FloatArray, FloatArray, IntArray | None]:
     """The arguments of `Blobs` as arrays, sorted by groups: centers (n, 3), radii (n,), weights
-    (n,) and groups (n,). Groups are numbered from 0 without gaps; None if none are given.
+    (n,) and groups (n,). Groups are numbered from 0 without gaps; None if none are given. In the
+    code these four arrays are c, r, w and g.
 
     Raises:
         BlobError: wrong shapes, or numbers that are not valid for a blob.
     """
-    checked_centers = as_real_array(centers, "centers", BlobError).astype(np.float64)
-    check_vectors(checked_centers, "centers", BlobError)
-    if not len(checked_centers):
+    c = as_real_array(centers, "centers", BlobError).astype(np.float64)
+    check_vectors(c, "centers", BlobError)
+    if not len(c):
         raise BlobError("centers: there are none; give at least one blob")
-    check_finite(checked_centers, "center {}", BlobError)
-    check_coordinate_size(checked_centers, BlobError)
-    checked_radii = _numbers(radii, "radii", len(checked_centers))
-    bad = np.flatnonzero(~(checked_radii > 0))
+    check_finite(c, "center {}", BlobError)
+    check_coordinate_size(c, BlobError)
+    r = _numbers(radii, "radii", len(c))
+    bad = np.flatnonzero(~(r > 0))
     if bad.size:
-        raise BlobError(
-            f"radius {bad[0]} is {checked_radii[bad[0]]:checked_groups}: radii must be positive"
-        )
-    check_coordinate_size(checked_radii, BlobError)
-    checked_weights = (
-        np.ones(len(checked_centers))
-        if weights is None
-        else _numbers(weights, "weights", len(checked_centers))
-    )
+        raise BlobError(f"radius {bad[0]} is {r[bad[0]]:g}: radii must be positive")
+    check_coordinate_size(r, BlobError)
+    w = np.ones(len(c)) if weights is None else _numbers(weights, "weights", len(c))
     if groups is None:
-        return checked_centers, checked_radii, checked_weights, None
-    checked_groups = as_real_array(groups, "groups", BlobError)
-    if checked_groups.shape != (len(checked_centers),) or checked_groups.dtype.kind not in "iu":
+        return c, r, w, None
+    g = as_real_array(groups, "groups", BlobError)
+    if g.shape != (len(c),) or g.dtype.kind not in "iu":
         raise BlobError(
-            f"groups must be {len(checked_centers)} integers, one for each blob, not {checked_groups.dtype} of shape {checked_groups.shape}"
+            f"groups must be {len(c)} integers, one for each blob, not {g.dtype} of shape {g.shape}"
         )
-    order = np.argsort(checked_groups, kind="stable")
+    order = np.argsort(g, kind="stable")
     return (
-        checked_centers[order],
-        checked_radii[order],
-        checked_weights[order],
-        np.unique(checked_groups[order], return_inverse=True)[1],
+        c[order],
+        r[order],
+        w[order],
+        np.unique(g[order], return_inverse=True)[1],
     )
 
 

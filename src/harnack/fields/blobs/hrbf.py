@@ -493,33 +493,28 @@ def _solve_coefficients(points: FloatArray, normals: FloatArray) -> tuple[FloatA
 
 
 def _checked(points: Any, normals: Any) -> tuple[FloatArray, FloatArray]:
-    """The points (n, 3), and the normals (n, 3) as unit vectors, after checks.
+    """The points (n, 3) and the normals (n, 3) after checks, x and n in the code; the normals are
+    made unit vectors.
 
     Raises:
         ValueError: wrong shapes or numbers, or a repeated point.
     """
-    checked_points = as_real_array(points, "points").astype(np.float64)
-    check_vectors(checked_points, "points")
-    if not 2 <= len(checked_points) <= _MAX_POINTS:
-        raise ValueError(
-            f"points: {len(checked_points):,} given, but 2 to {_MAX_POINTS:,} can be used"
-        )
-    check_finite(checked_points, "point {}", ValueError)
-    check_coordinate_size(checked_points, ValueError)
-    unit_normals = as_real_array(normals, "normals").astype(np.float64)
-    check_vectors(unit_normals, "normals")
-    if len(unit_normals) != len(checked_points):
-        raise ValueError(
-            f"{len(checked_points)} points and {len(unit_normals)} normals: there must be one for each point"
-        )
-    check_finite(unit_normals, "normal {}", ValueError, "normals must be finite")
-    length = np.linalg.norm(unit_normals, axis=1)
+    x = as_real_array(points, "points").astype(np.float64)
+    check_vectors(x, "points")
+    if not 2 <= len(x) <= _MAX_POINTS:
+        raise ValueError(f"points: {len(x):,} given, but 2 to {_MAX_POINTS:,} can be used")
+    check_finite(x, "point {}", ValueError)
+    check_coordinate_size(x, ValueError)
+    n = as_real_array(normals, "normals").astype(np.float64)
+    check_vectors(n, "normals")
+    if len(n) != len(x):
+        raise ValueError(f"{len(x)} points and {len(n)} normals: there must be one for each point")
+    check_finite(n, "normal {}", ValueError, "normals must be finite")
+    length = np.linalg.norm(n, axis=1)
     if not (length > 0).all():
         raise ValueError(f"normal {int(np.argmin(length))} is zero: it has no direction")
-    _, first_index, counts = np.unique(
-        checked_points, axis=0, return_index=True, return_counts=True
-    )
+    _, first_index, counts = np.unique(x, axis=0, return_index=True, return_counts=True)
     if (counts > 1).any():
         index = int(first_index[np.argmax(counts > 1)])
         raise ValueError(f"point {index} is given more than once: leave out the others")
-    return checked_points, unit_normals / length[:, None]
+    return x, n / length[:, None]
