@@ -65,9 +65,10 @@ def angle_range(y: Interval, x: Interval) -> tuple[Interval, Mask]:
     Proof. Along an edge of the box the angle is monotone, because its derivative there has one
     sign: it is (y'x - x'y)/(x^2 + y^2). It has no extremum inside. So the ends of the range are at
     corners. The angle falls with x where y > 0 and rises with y where x > 0, which tells the
-    corner. At an infinite end the angle is the limit. No corner is infinite in both coordinates: a
-    box that does not meet the cut has x > 0 where y may have either sign, and at most one
-    coordinate of its corner is an end of the kind that may be infinite.
+    corner. If a coordinate of the corner is infinite, the angle is the limit. Both cannot be: if
+    the corner of the largest angle has x = -infinity, y > 0 on the box (else it would meet the
+    cut), and the corner has the lower y; if it has x = infinity, y <= 0 on the box, and the corner
+    has the upper y.
     """
     meets_cut = meets_branch_cut(y, x)
     is_point = x.lower is x.upper and y.lower is y.upper

@@ -57,8 +57,9 @@ class Interval:
 
     @classmethod
     def enclosing(cls, x: float, like: Any) -> Interval:
-        """The narrowest interval around the Python number x whose ends are numbers of the type
-        `like`. They are still Python floats."""
+        """The narrowest interval around the Python number x whose ends are exact in the precision
+        of the number type `like`: in single precision they are rounded outwards. The ends are
+        Python floats."""
         if dr.is_array_v(like) and dr.type_v(like) == dr.VarType.Float32:
             return cls(*_outward_single(float(x), float(x)), is_single=True)
         return cls(float(x), float(x))
@@ -257,12 +258,12 @@ def typed_select(condition: Mask, a: Real, b: Real, like: Real) -> Real:
 
 
 def _round_down(x: Real, units: float = 1.0) -> Real:
-    """A number below x by at least `units` units in the last place of x."""
+    """x moved down by `units` units in the last place of x, or a little more."""
     return dr.fma(dr.abs(x), -units * machine_epsilon(x), x)
 
 
 def _round_up(x: Real, units: float = 1.0) -> Real:
-    """A number above x by at least `units` units in the last place of x."""
+    """x moved up by `units` units in the last place of x, or a little more."""
     return dr.fma(dr.abs(x), units * machine_epsilon(x), x)
 
 

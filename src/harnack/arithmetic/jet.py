@@ -61,8 +61,8 @@ class Jet(FormulaNumber):
 
     @classmethod
     def at_point(cls, p: Vec3, *, order: int = 1) -> tuple[Jet, Jet, Jet]:
-        """The three coordinates x, y and z as functions of themselves, at points p. A formula of
-        them gives its gradient and Hessian.
+        """The jets of the coordinates x, y and z at points p, as functions of the three variables
+        x, y and z. A formula of them gives its gradient and Hessian.
 
         order: the highest order of derivatives, 1 or 2.
         """
@@ -74,8 +74,8 @@ class Jet(FormulaNumber):
 
     @classmethod
     def over_ball(cls, p: Vec3, radius: Real) -> tuple[Jet, Jet, Jet]:
-        """The three coordinates x, y and z as functions of themselves, on boxes around the balls
-        B(p, radius)."""
+        """The jets of the coordinates x, y and z, as functions of the three variables x, y and z,
+        on boxes around the balls B(p, radius)."""
         x, y, z = cls.at_point(p)
         ends = Interval(-radius, radius)
         x, y, z = (dataclasses.replace(jet, value=jet.value + ends) for jet in (x, y, z))
@@ -515,7 +515,8 @@ class Dual(FormulaNumber):
 
     @classmethod
     def at_point(cls, p: Vec3) -> tuple[Dual, Dual, Dual]:
-        """The three coordinates x, y and z as functions of themselves, at points p."""
+        """The coordinates x, y and z at points p, as functions of the three variables x, y and
+        z."""
         return cls(p.x, (1.0, 0.0, 0.0)), cls(p.y, (0.0, 1.0, 0.0)), cls(p.z, (0.0, 0.0, 1.0))
 
     def constant(self, x: float | Real) -> Dual:

@@ -811,7 +811,7 @@ def _on_backend(x: Interval, like: Real) -> Interval:
 
 
 def _is_zero(x: Real) -> bool:
-    """Whether x is the Python number 0.0, which is known while a kernel is being recorded."""
+    """Whether x is the Python number 0.0, which is known while Dr.Jit records code."""
     return isinstance(x, float) and x == 0.0
 
 

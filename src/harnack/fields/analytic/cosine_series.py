@@ -149,9 +149,10 @@ class CosineBounds:
         size: (3,) the lengths of the box's sides.
 
         In the code n is the degree along an axis and m, in `densities`, the number of nodes per
-        half wave. `grid_factor` is the product of all 1/cos(pi n/N), by which f or a derivative may
-        exceed its maximum over the grid; `relative_error` is the sum of all pi^2/(8 m^2), the error
-        between nodes as a fraction of the bound. The class has the proof.
+        half wave, so that a full turn has N = 2 n m nodes. `grid_factor` is the product of all
+        1/cos(pi n/N), by which f or a derivative may exceed its maximum over the grid;
+        `relative_error` is the sum of all pi^2/(8 m^2), the error between nodes as a fraction of
+        the bound. The class has the proof.
         """
         degrees: list[int] = [n - 1 for n in coefficients.shape]
         densities = [min(max(_MIN_NODES, _AXIS_NODES // max(n, 1)), _MAX_NODES) for n in degrees]

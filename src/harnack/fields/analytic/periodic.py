@@ -104,9 +104,9 @@ class ExtensionBounds:
         """The bounds for the radius R that gives the longest steps near level 0 at a point where
         the gradient has its mean length.
 
-        There a step is shortened by the second-order term of the bound of F, which is proportional
-        to (f - lower)/R^2, so the radius minimizes this. (For the gyroid with the cell 2 pi it is
-        1.1.)
+        There a step is shortened by the second-order term of Harnack's bound, which is proportional
+        to (f - lower)/R^2 with the lower bound of F on the ball, so the radius minimizes this. (For
+        the gyroid with the cell 2 pi it is 1.1.)
 
         waves: bounds of the sum of waves f.
         """
@@ -220,7 +220,7 @@ class EigenfunctionSum(Field):
 
     Rounding. The rounding error of the value is bounded at the point (`WaveRounding`). The effect
     of the rounding error E of the gradient is included in `Sample.value_error`. For the
-    `TaylorRemainder`, the constant (1 + h) H with h = `_SLOPE_SHARE` is promised. For all t
+    `TaylorRemainder`, the constant (1 + h) H with h = `_SLOPE_SHARE` is promised. For all lengths t
 
         E t <= E^2/(2 h H) + h H t^2/2   (since 2 a b <= a^2 + b^2),
 

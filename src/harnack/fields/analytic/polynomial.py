@@ -205,7 +205,7 @@ class HarmonicPromises:
         curvature: the bound of the Hessian on the smallest ball about the point.
 
         Let E bound the rounding error of the gradient, and let H bound the Hessian. The constant in
-        `curvature` is (1 + h) H with h = `_SLOPE_SHARE`. For all t
+        `curvature` is (1 + h) H with h = `_SLOPE_SHARE`. For all lengths t
 
             E t <= E^2/(2 h H) + h H t^2/2   (since 2 a b <= a^2 + b^2),
 

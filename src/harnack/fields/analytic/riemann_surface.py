@@ -384,16 +384,17 @@ class RiemannSurface(Field):
 
     def _graphs(self, p: Vec3, branches: tuple[Branch, ...]) -> list[_BranchValue]:
         """For each branch the height phi of p above the branch's surface, with its gradient and its
-        factor of the field's sign.
+        factor of the field's sign. The surface over z has the height u.
 
         branches: the branches of g at the projection of p.
 
-        With a period and several branches, as for asin, each branch g gives the graphs of g plus
-        all whole periods. For each branch the list then has the graph nearest to p (the first half
-        of the list) and the next graph on the other side of p (the second half). In that case the
-        sign factors are not those of the phi in the list, but those of sin(pi phi/period) with phi
-        before the shift by whole periods: for asin their product has the sign of sin u - sin h. The
-        graphs in the second half have factor 1.
+        If the heights repeat with a period and there are several branches, as for asin, each branch
+        stands for all surfaces at the heights u plus whole multiples of the period. The list has
+        two of them for each branch: in its first half the surface nearest to p, in its second half
+        the next one on the other side of p. The field's sign is then the product of the signs of
+        sin(pi phi/period), one for each branch, with phi before any shift (for asin it is the sign
+        of sin u - sin h). So the factors are those signs in the first half, and 1 in the second
+        half.
         """
         nearest_graphs: list[_BranchValue] = []
         next_graphs: list[_BranchValue] = []
@@ -469,13 +470,13 @@ class RiemannSurface(Field):
         return _PointBranches(z, h, tuple(graphs), nearest, sign, error, rounding)
 
     def _sample(self, local: _PointBranches) -> Sample:
-        """The sample of f at a point, without promises (bounds of f near it).
+        """The sample of f at a point, without bounds of f near it.
 
         local: all branches at the point.
 
         The gradient error is 0 except near a branch point, where all branches meet: there it is so
-        large that the tracer takes the point for no hit if the surface is proved to be farther away
-        than |f|/|grad f|.
+        large that the tracer does not count the point as a hit if the surface is proved to be
+        farther away than |f|/|grad f|.
         """
         nearest, sign = local.nearest, local.sign
         vector = backend_of(nearest.phi).Array3f

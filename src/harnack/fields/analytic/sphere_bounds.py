@@ -126,9 +126,9 @@ def order_on_axis(weights: Weights) -> int:
 
 
 def value_bound(weights: Weights) -> AxialBound:
-    """A bound of |f| in powers of the distances rho from the z axis and r from the origin, for the
-    sum f of solid harmonics with these weights: |r^l Y_lm| <= max(N |Q(cos a)|) rho^m r^(l-m),
-    where the maximum is over all polar angles a.
+    """A bound of |f|, as a sum of terms c rho^i r^j, for the sum f of solid harmonics with these
+    weights. rho and r are the distances from the z axis and from the origin. For each harmonic |r^l
+    Y_lm| <= max(N |Q(cos a)|) rho^m r^(l-m), where the maximum is over all polar angles a.
 
     weights: a mapping (l, m) -> coefficient.
     """
@@ -136,9 +136,9 @@ def value_bound(weights: Weights) -> AxialBound:
 
 
 def gradient_bound(weights: Weights) -> AxialBound:
-    """A bound of |grad f| in powers of the distances rho from the z axis and r from the origin, for
-    the sum f of solid harmonics with these weights. A term of order m contributes a power rho^(m-1)
-    (for m = 0: rho^0).
+    """A bound of |grad f|, as a sum of terms c rho^i r^j, for the sum f of solid harmonics with
+    these weights. rho and r are the distances from the z axis and from the origin. A harmonic of
+    order m contributes a power rho^(m-1) (for m = 0: rho^0).
 
     weights: a mapping (l, m) -> coefficient.
     """
@@ -146,9 +146,10 @@ def gradient_bound(weights: Weights) -> AxialBound:
 
 
 def hessian_bound(weights: Weights) -> AxialBound:
-    """A bound of the absolute second derivatives along any direction, in powers of the distances
-    rho from the z axis and r from the origin, for the sum of solid harmonics with these weights. A
-    term of order m contributes a power rho^(m-2) (for m < 2: rho^0).
+    """A bound of the absolute second derivatives along any direction, as a sum of terms c rho^i
+    r^j, for the sum of solid harmonics with these weights. rho and r are the distances from the z
+    axis and from the origin. A harmonic of order m contributes a power rho^(m-2) (for m < 2:
+    rho^0).
 
     weights: a mapping (l, m) -> coefficient.
     """

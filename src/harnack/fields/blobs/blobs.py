@@ -74,10 +74,10 @@ class BlobError(ValueError):
 
 class Blobs(Formula):
     """Metaballs: f(x) = sum over i of w_i A k(|x - c_i|^2 / (s R_i)^2). Blob i has the center c_i,
-    the radius R_i and the weight w_i. The kernel k falls from the center to 0 at the
-    distance s R_i, the radius of the blob's support. A is chosen so that a single blob of weight 1
-    has the value 1 at its radius. The surface is f = 1, and f is larger inside. Where blobs meet,
-    they flow together.
+    the radius R_i and the weight w_i. The kernel k falls from the center to 0 at the distance s
+    R_i, the radius of the blob's support. A is chosen so that a single blob of weight 1 has the
+    value 1 at its radius. The surface is f = 1, and f is larger inside. Where blobs meet, they flow
+    together.
 
     s is `BlobKernel.support`, and A is `BlobKernel.amplitude`.
 
