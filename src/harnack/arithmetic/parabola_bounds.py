@@ -595,24 +595,34 @@ class ParabolaBounds(FormulaNumber):
         tail: a bound of the derivative outside of the interval, which rounding may cause.
 
         Proof. Let the change be the function minus its value at s = 0. Before `start` it is 0. So a
-        line from 0 at s = 0 to the bound at `end` lies above it. Behind `end` the function is 0,
-        that is, the change is -value. A line of slope at least -value/s is above -value at s; slope
-        -value/length is enough for all s >= end.
+        line from 0 at s = 0 to the upper bound at `end` lies above it. Behind `end` the function is
+        0, that is, the change is -value. A line of slope at least -value/s is above -value at s;
+        slope -value/length is enough for all s >= end. Likewise slope -value/end is small enough to
+        be below -value for all s >= end.
         """
-        (low, _), (high, _) = self.bounds
+        (low_slope, _), (high_slope, _) = self.bounds
         length_fraction = (end - start) / end * (1 + 8 * machine_epsilon(length))
         slope_behind = -(value.lower / length)
         slope_behind = slope_behind + _rounding_bound(dr.abs(slope_behind))
         has_part_before = start > 0
         # The line from 0 at s = 0 to the bound at `end`, where the change is the slope times end -
         # start.
-        high = dr.select(has_part_before, _maximum_or_inf(high, 0 * high) * length_fraction, high)
-        low = dr.select(has_part_before, _minimum_or_inf(low, 0 * low) * length_fraction, low)
+        high_slope = dr.select(
+            has_part_before,
+            _maximum_or_inf(high_slope, 0 * high_slope) * length_fraction,
+            high_slope,
+        )
+        low_slope = dr.select(
+            has_part_before, _minimum_or_inf(low_slope, 0 * low_slope) * length_fraction, low_slope
+        )
         # If there is a part behind `end`, the line is above -value on it.
-        high = dr.select(end < length, _maximum_or_inf(high, slope_behind), high)
-        low = dr.select(end < length, _minimum_or_inf(low, -(value.upper / end) * (1 + 1e-6)), low)
+        high_slope = dr.select(end < length, _maximum_or_inf(high_slope, slope_behind), high_slope)
+        low_slope = dr.select(
+            end < length, _minimum_or_inf(low_slope, -(value.upper / end) * (1 + 1e-6)), low_slope
+        )
+        # The derivative that rounding may cause outside of the interval.
         margin = dr.select(is_cut, tail, 0)
-        return (low - margin, 0.0), (high + margin, 0.0)
+        return (low_slope - margin, 0.0), (high_slope + margin, 0.0)
 
 
 def _lines_bounding_cubic(c0: Real, c1: Real, c2: Real, c3: Real) -> tuple[Real, Real, Real, Real]:

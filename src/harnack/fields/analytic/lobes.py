@@ -213,6 +213,7 @@ class Lobes(Field):
         y_value, y_gradient = evaluate(self.weights, u.x, u.y, u.z)
         tangential = type(x)(*y_gradient)
         tangential -= dr.dot(tangential, u) * u  # the gradient of Y(x/r), times r
+        # f = r^4 - r^2 Y^2 or r^3 - r^2 Y. The gradient of r is u, that of Y is tangential/r.
         if self.part == "both":
             value = r * r * ((r - y_value) * (r + y_value))
             gradient = r * ((4 * r * r - 2 * y_value * y_value) * u - (2 * y_value) * tangential)
@@ -320,6 +321,7 @@ class Lobes(Field):
         """
         low, high = self.value_range
         if self.part == "both":
+            # The range of W = Y^2 is taken as [0, the largest Y^2].
             upper, degree = max(low * low, high * high), 2 * self.degree
             low, high = 0.0, upper
             power = 12 * farthest * farthest

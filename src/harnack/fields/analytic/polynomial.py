@@ -234,6 +234,7 @@ class HarmonicPromises:
         then 2/((m-2)/rho + (l-m)/r) if rho is a small fraction of r, as it is there.
         """
         if self.lowest_degree < 3:
+            # Never below the smaller of the two radii.
             if self.center_radius < self.boundary_radius:
                 return fmax(self.boundary_radius * r, self.center_radius)
             return fmax(
@@ -242,6 +243,7 @@ class HarmonicPromises:
             )
         radius = self.boundary_radius * r
         if self.axial is not None:
+            # m - 2 and l - m
             excess_order, other_degree = self.order - 2.0, float(self.degree - self.order)
             axis_radius = 2 / (excess_order / rho + other_degree / fmax(r, _MIN_DISTANCE))
             radius = dr.select(rho < self.axis_share * r, fmin(axis_radius, radius), radius)

@@ -214,7 +214,7 @@ class Blobs(Formula):
         recorder = KnotRecorder(piece_count)
         no_slope = SlopeRange(0.0, 0.0)
         path.proofs.from_restriction(recorder, no_slope, ahead)
-        # No proof uses ranges of derivatives: only those from the Lipschitz constant are wanted.
+        # No proof asks for ranges of derivatives: those from the Lipschitz constant are used.
         if recorder.knots is None:
             return path.enclose(self.evaluate(p))
         data = self._prepared(p)
@@ -229,6 +229,7 @@ class Blobs(Formula):
             length = fmin(
                 dr.select(skipped > 0, to_exit, fmin(ahead, to_exit)), data.max_path_length
             )
+        # The knots for the final length.
         path.proofs.from_restriction(recorder, no_slope, length)
         enclosures: tuple[Enclosure, ...]
         if data.groups is None:
@@ -242,6 +243,7 @@ class Blobs(Formula):
                 signed=data.has_negative_weights,
             )
             start = (
+                # The sum is that at `piece_start`; at p, in an empty cell, f is 0.
                 sums.start if empty_length is None else _zero_where(empty_length > 0, sums.start)
             )
             slope = dr.dot(start.gradient, d)
@@ -261,6 +263,7 @@ class Blobs(Formula):
             enclosures = tuple(
                 DelayedEnclosure(empty_length, enclosure) for enclosure in enclosures
             )
+        # The next sample's proofs should reach as many of this step's lengths as there are pieces.
         return RaySample(self._sample(start), enclosures, (), slope, float(piece_count))
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:

@@ -174,7 +174,7 @@ class HRBF(Formula):
         recorder = KnotRecorder()
         length = ahead
         path.proofs.from_restriction(recorder, SlopeRange(0.0, 0.0), length)
-        # No proof uses ranges of derivatives: only those from the Lipschitz constant are wanted.
+        # No proof asks for ranges of derivatives: those from the Lipschitz constant are used.
         if recorder.knots is None:
             return path.enclose(self.evaluate(p))
         sums = self._along(p, d, recorder.knots)
