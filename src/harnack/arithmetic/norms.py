@@ -198,7 +198,7 @@ def _wronskian_term(
 
     xs: the functions x_k.
     values: the ranges of their values.
-    over: the range of 1/N.
+    inverse_norm: the range of 1/N.
     i, j: the two variables of the second derivative.
     """
     parts: list[Interval] = []

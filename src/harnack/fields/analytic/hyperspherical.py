@@ -255,6 +255,7 @@ class HypersphericalHarmonic(Field):
         error, gradient_error = zero, zero
         operations = len(self._orders) + 8.0
         for term in self._orders:
+            # C(w), C'(w) and C''(w)
             c, first, second = term.axial(w)
             harmonic, (x1, x2, x3) = evaluate(term.weights, y.x, y.y, y.z)
             value = value + c * harmonic
@@ -423,6 +424,7 @@ class HypersphericalHarmonic(Field):
         rows = [[zero] * 4 for _ in range(4)]
         slopes = [zero] * 4
         for term in self._orders:
+            # C(w), C'(w) and C''(w)
             c, first, second = term.axial(w)
             harmonic, gradient = evaluate(term.weights, y.x, y.y, y.z)
             xx, yy, zz, xy, xz, yz = hessian(term.weights, y.x, y.y, y.z)

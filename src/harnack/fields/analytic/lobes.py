@@ -347,6 +347,7 @@ class Lobes(Field):
         gradient by 4u L^2 M for each of the two. `HarmonicRounding` bounds the error of the
         evaluation of Y. Each product after that adds a few roundings.
         """
+        # The errors of Y and of its gradient; 8 L M and 8 L^2 M in them come from the unit vector.
         roundoff = float(dr.epsilon(type(r)))
         max_value, degree = max(map(abs, self.value_range)), self.degree
         y_error = roundoff * (self._rounding.value_error(rho, 1.0) + (8 * degree + 4) * max_value)

@@ -174,7 +174,7 @@ def _value_errors(l: int, m: int, addition_count: int, is_divided: bool) -> tupl
     `legendre_weight`. The first one is in units of u rho^m r^(l-m), the second one in units of u
     r^l.
 
-    sums: the number of additions in which the term takes part.
+    addition_count: the number of additions in which the term takes part.
     is_divided: whether the point was divided by a size.
     """
     abs_q, q_error, _ = _recurrence(l, m)
@@ -194,7 +194,7 @@ def _slope_errors(l: int, m: int, addition_count: int, is_divided: bool) -> tupl
     divided by `legendre_weight`. The first one is in units of u rho^(m-1) r^(l-m) (for m = 0: of u
     r^(l-1)), the second one in units of u r^(l-1).
 
-    sums: the number of additions in which the term takes part.
+    addition_count: the number of additions in which the term takes part.
     is_divided: whether the point was divided by a size.
 
     The errors in the order in which `solid_harmonics.evaluate` computes: 4u for weights,

@@ -136,9 +136,9 @@ def value_at(kernel: BlobKernel, backend: Backend, p: Vec3, for_each: ForEach) -
         """The numbers of the sum so far (`_add_value`), with one more blob added. row: the blob's
         record."""
         # One over the radius of the blob's support, and the factor of its kernel.
-        inverse, amplitude = row[6], row[7]
-        offset = _vector_to_center(p, row) * inverse
-        return _add_value(kernel, offset, inverse, amplitude, state)
+        inverse_radius, amplitude = row[6], row[7]
+        offset = _vector_to_center(p, row) * inverse_radius
+        return _add_value(kernel, offset, inverse_radius, amplitude, state)
 
     state = for_each(add_blob, tuple(real(0) for _ in range(_VALUE_STATE_SIZE)))
     return _finished_value(kernel, backend, state)
@@ -303,7 +303,7 @@ _VALUE_STATE_SIZE = 8
 
 
 def _add_value(
-    kernel: BlobKernel, offset: Vec3, inverse: Real, amplitude: Real, state: State
+    kernel: BlobKernel, offset: Vec3, inverse_radius: Real, amplitude: Real, state: State
 ) -> State:
     """The sums at a point p, with another blob added.
 
@@ -313,7 +313,7 @@ def _add_value(
         amplitude, k is the kernel, q the squared length of `offset`, and m is the scale of the
         rounding of k (`BlobKernel.profile`). The same numbers are returned, with the blob included.
     offset: the vector from p to the blob's center, in units of the radius of its support.
-    inverse: one over that radius.
+    inverse_radius: one over that radius.
     amplitude: the factor A of the kernel.
     """
     (
@@ -330,7 +330,7 @@ def _add_value(
     k, dk, rounding_scale = kernel.profile(q)
     slope = amplitude * dk
     # The gradient of A k(q) is A dk/dq grad q, with grad q = -2 offset / radius.
-    gradient_factor = -2 * slope * inverse
+    gradient_factor = -2 * slope * inverse_radius
     # A little more than the support, so that rounding leaves out no blob.
     is_inside = q < 1.001
     abs_amplitude = dr.abs(amplitude)
@@ -342,7 +342,9 @@ def _add_value(
         slope_sum + dr.abs(slope),
         dr.fma(abs_amplitude, rounding_scale, rounding_sum),
         gradient_size
-        + dr.select(is_inside, abs_amplitude * inverse * kernel.lipschitz_fraction(1.0, q), 0),
+        + dr.select(
+            is_inside, abs_amplitude * inverse_radius * kernel.lipschitz_fraction(1.0, q), 0
+        ),
         term_count + dr.select(is_inside, type(q)(1), 0),
     )
 
