@@ -357,8 +357,8 @@ class HypersphericalHarmonic(Field):
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
         """The sample at the position t of a ray, with enclosures (proofs of lengths in front of and
-        behind the point on which f takes no level). They use that the image of the ray on S^3 lies
-        on a circle.
+        behind the point on which f takes none of the levels, the values that rays look for). They
+        use that the image of the ray on S^3 lies on a circle.
 
         path: the ray.
         t: a length along it.

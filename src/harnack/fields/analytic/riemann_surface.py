@@ -299,8 +299,8 @@ class RiemannSurface(Field):
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
         """The sample at the position t of a ray, with enclosures: proofs of lengths in front of and
-        behind the point on which f takes no level. They are proved from all branches, on segments
-        of the plane below the ray.
+        behind the point on which f takes none of the levels (the values that rays look for). They
+        are proved from all branches, on segments of the plane below the ray.
 
         path: the ray.
         t: a length along it.
@@ -519,8 +519,9 @@ class RiemannSurface(Field):
     def _cusp_enclosures(
         self, local: _PointBranches, d: Vec3, projection: Complex
     ) -> list[Enclosure]:
-        """Proofs of lengths of a ray on which f takes no level, one for each branch point where all
-        branches meet: they are near one value there, and the ray is at another height.
+        """Proofs of lengths of a ray on which f takes none of the levels (the values that rays look
+        for), one for each branch point where all branches meet: they are near one value there, and
+        the ray is at another height.
 
         local: all branches at the sample on the ray.
         d: the direction of the ray.
@@ -592,7 +593,7 @@ class RiemannSurface(Field):
         self, local: _PointBranches, d: Vec3, projection: Complex, length: Real
     ) -> Enclosure:
         """A proof about f along a ray, from a sample on it and from bounds of all branches: how far
-        the ray can go before f takes a level.
+        the ray can go before f takes a level, a value that rays look for.
 
         local: all branches at the sample.
         d: the direction of the ray.

@@ -192,8 +192,8 @@ class Blobs(Formula):
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
         """The sample at the position t of a ray, with enclosures: proofs of lengths in front of the
-        point on which f takes no level. It needs one loop over the blobs nearby. There is no
-        enclosure behind the point.
+        point on which f takes none of the levels (the values that rays look for). It needs one loop
+        over the blobs nearby. There is no enclosure behind the point.
 
         path: the ray.
         t: a length along it.
@@ -428,9 +428,9 @@ class DelayedEnclosure(Enclosure):
     then: Enclosure
 
     def free_length(self, gaps: LevelGaps) -> Real:
-        """A length of the path that is proved to contain no level: the first part, where F is 0,
-        plus a proved length behind it. gaps: the differences of F at the start, which is 0, from
-        the next levels below and above."""
+        """A length of the path that is proved to contain no level (a value of F that rays look
+        for): the first part, where F is 0, plus a proved length behind it. gaps: the differences of
+        F at the start, which is 0, from the next levels below and above."""
         return self.run + self.then.free_length(gaps)
 
 

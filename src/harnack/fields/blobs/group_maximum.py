@@ -236,9 +236,9 @@ class GroupMaximumEnclosure(Enclosure):
 
     def free_length(self, gaps: LevelGaps) -> Real:
         """A length of the path from p on which the largest of the groups' sums is proved to take no
-        level. It is the smaller of two lengths: the shortest length of any group before its sum
-        rises to the level above, and the longest length of any group before its sum falls to the
-        level below.
+        level (a value that rays look for). It is the smaller of two lengths: the shortest length of
+        any group before its sum rises to the level above, and the longest length of any group
+        before its sum falls to the level below.
 
         gaps: the differences of the largest sum at p from the next levels below and above; infinite
             if there is no such level.

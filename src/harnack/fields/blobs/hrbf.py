@@ -159,8 +159,8 @@ class HRBF(Formula):
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
         """The sample at the position t of a ray, with enclosures: proofs of lengths in front of the
-        point on which f takes no level. It needs one loop over the points p_i. There is no
-        enclosure behind the point.
+        point on which f takes none of the levels (the values that rays look for). It needs one loop
+        over the points p_i. There is no enclosure behind the point.
 
         path: the ray.
         t: a length along it.
