@@ -1,8 +1,7 @@
-"""Arithmetic of functions along a path: numbers that carry proved ranges.
-
-There are intervals, jets, parabolas and affine forms. A formula is written once and evaluated in
-any of them.
-"""
+"""Arithmetic of functions along a path: numbers that carry proved ranges, intervals that contain
+all values of a function. A path is a piece of a ray. There are intervals, jets (ranges of values
+and derivatives), parabolas and affine forms (lines with an error). A formula is written once and
+evaluated with any of them."""
 
 from __future__ import annotations
 

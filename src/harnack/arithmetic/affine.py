@@ -1,7 +1,10 @@
-"""Revised affine arithmetic along a path: a function is a line plus a bounded error.
+"""Revised affine arithmetic along a path: a function is a line plus a bounded error. A path is a
+piece of a ray; s is the length along it, from 0 at its start to h at its end, and e = 2s/h - 1 goes
+from -1 to 1. A number of this arithmetic (`AffineForm`) stands for a function c + l e + r with
+numbers c and l and an unknown r with |r| <= error. Sums are exact. Products and functions put the
+terms that are not linear in s into the error. A formula that is evaluated with the coordinates of
+the path as such numbers returns such a number.
 
-A function of 0 <= s <= h is written as c + l e + r, with e = 2s/h - 1 between -1 and 1, and |r| <=
-error. Sums are exact. Products and functions put the terms that are not linear in s into the error.
 Unlike `ParabolaBounds`, such a number is not exact at s = 0. If it proves nothing on a length, the
 march tries shorter lengths.
 
@@ -32,9 +35,8 @@ _ROUNDINGS = 16.0
 
 @dataclass(frozen=True, eq=False)
 class AffineForm(FormulaNumber):
-    """A function center + slope e + r for -1 <= e <= 1, with an unknown r, |r| <= error.
-
-    e = 2s/h - 1 for the length s along a path, 0 <= s <= h.
+    """A function center + slope e + r along a path, with an unknown r, |r| <= error. Here e = 2s/h
+    - 1 goes from -1 to 1 for the length s along the path, 0 <= s <= h.
 
     center, slope, error: numbers of the backend.
     """
@@ -47,13 +49,13 @@ class AffineForm(FormulaNumber):
     def along_ray(
         cls, p: Vec3, direction: Vec3, length: Real
     ) -> tuple[AffineForm, AffineForm, AffineForm]:
-        """The three coordinates of p + s d as functions of s, for 0 <= s <= length.
+        """The three coordinates of the points p + s d as functions of s, for 0 <= s <= length.
 
         direction: d.
         """
 
         def coordinate(x: Real, rate: Real) -> AffineForm:
-            """The function x + s rate."""
+            """The function x + s rate. Its error is that of rounding."""
             half = 0.5 * length * rate
             return cls(x + half, half, _rounding_bound(dr.abs(x) + dr.abs(half)))
 
@@ -62,13 +64,15 @@ class AffineForm(FormulaNumber):
 
     @property
     def range(self) -> Interval:
-        """The range of the function on the whole length."""
+        """The range of the function on the whole path: center plus and minus the size of slope and
+        error."""
         half_width = dr.abs(self.slope) + self.error
         rounding = _rounding_bound(dr.abs(self.center) + half_width)
         return Interval(self.center - half_width - rounding, self.center + half_width + rounding)
 
     def constant(self, x: float | Real) -> AffineForm:
-        """A constant number as a function along the same path."""
+        """The constant number x as a function along the same path. Its error is that of rounding;
+        small integers and Dr.Jit numbers are exact."""
         kind = cast("Any", type(self.center))
         value = kind(x)
         exact = not isinstance(x, int | float) or (float(x).is_integer() and abs(x) < 2**20)
@@ -79,7 +83,8 @@ class AffineForm(FormulaNumber):
         return AffineForm(-self.center, -self.slope, self.error)
 
     def sum(self, other: Any) -> AffineForm:
-        """The sum of two functions: exact up to rounding, which goes into the error."""
+        """The sum of this function and another one. It is exact up to rounding, which goes into the
+        error."""
         center, slope = self.center + other.center, self.slope + other.slope
         return AffineForm(
             center,
@@ -88,7 +93,7 @@ class AffineForm(FormulaNumber):
         )
 
     def product(self, other: Any) -> AffineForm:
-        """The product of two functions.
+        """The product of this function and another one.
 
         Proof. In (c + l e + r)(d + m e + q), e^2 lies in [0, 1], so l m e^2 is within |l m|/2 of l
         m/2. The other terms that are not linear in e go into the error.
@@ -111,110 +116,137 @@ class AffineForm(FormulaNumber):
         [D-, D+], phi(t) is within (D+ - D-)/2 |t - m| of phi(m) + (D+ + D-)/2 (t - m). For the
         constant, phi stays within its range.
         """
-        x = self.range
-        value, slopes, curvature = function.ranges(x)
-        width = x.upper - x.lower
+        f_range = self.range
+        value, slopes, curvature = function.ranges(f_range)
+        width = f_range.upper - f_range.lower
         epsilon = machine_epsilon(width)
-        ends = [function.ranges(Interval(end, end))[0] for end in (x.lower, x.upper)]
-        rise = dr.select(width > 0, (ends[1].midpoint - ends[0].midpoint) / width, 0)
-        rise = dr.select(dr.isfinite(rise), rise, 0)
+        ends = [function.ranges(Interval(end, end))[0] for end in (f_range.lower, f_range.upper)]
+        chord_slope = dr.select(width > 0, (ends[1].midpoint - ends[0].midpoint) / width, 0)
+        chord_slope = dr.select(dr.isfinite(chord_slope), chord_slope, 0)
         eighth = 0.125 * width * width
-        over, under = fmax(-curvature.lower * eighth, 0), fmin(-curvature.upper * eighth, 0)
-        size = dr.abs(ends[0].midpoint) + dr.abs(ends[1].midpoint)
-        chord = (
-            0.5 * (ends[0].midpoint + ends[1].midpoint) + 0.5 * (over + under),
-            rise,
-            0.5 * (over - under) + ends[0].radius + ends[1].radius + _rounding_bound(size),
+        max_above_chord, min_above_chord = (
+            fmax(-curvature.lower * eighth, 0),
+            fmin(-curvature.upper * eighth, 0),
         )
-        middle = 0.5 * x.lower + 0.5 * x.upper
+        end_size = dr.abs(ends[0].midpoint) + dr.abs(ends[1].midpoint)
+        # Each line as (its value in the middle of the range, its slope by f, its error).
+        chord = (
+            0.5 * (ends[0].midpoint + ends[1].midpoint) + 0.5 * (max_above_chord + min_above_chord),
+            chord_slope,
+            0.5 * (max_above_chord - min_above_chord)
+            + ends[0].radius
+            + ends[1].radius
+            + _rounding_bound(end_size),
+        )
+        middle = 0.5 * f_range.lower + 0.5 * f_range.upper
         middle_value = function.ranges(Interval(middle, middle))[0]
-        mean = (
+        mean_slope_line = (
             middle_value.midpoint,
             slopes.midpoint,
             (slopes.radius * width * 0.5 + middle_value.radius) * (1 + 8 * epsilon)
             + _rounding_bound(dr.abs(middle_value.midpoint) + dr.abs(slopes.midpoint) * width),
         )
-        flat = (value.midpoint, 0 * width, value.radius + _rounding_bound(dr.abs(value.midpoint)))
-        best = _smaller_error(_smaller_error(chord, mean), flat)
-        center, rate, error = best
-        shift = rate * (self.center - middle)
+        constant_line = (
+            value.midpoint,
+            0 * width,
+            value.radius + _rounding_bound(dr.abs(value.midpoint)),
+        )
+        best = _smaller_error(_smaller_error(chord, mean_slope_line), constant_line)
+        center, best_slope, error = best
+        # The line as a function of e, by f = self.center + self.slope e + r.
+        shift = best_slope * (self.center - middle)
         rounding = _rounding_bound(
-            dr.abs(center) + dr.abs(rate) * (dr.abs(self.center) + dr.abs(self.slope) + self.error)
+            dr.abs(center)
+            + dr.abs(best_slope) * (dr.abs(self.center) + dr.abs(self.slope) + self.error)
         )
         return AffineForm(
-            center + shift, rate * self.slope, error + dr.abs(rate) * self.error + rounding
+            center + shift,
+            best_slope * self.slope,
+            error + dr.abs(best_slope) * self.error + rounding,
         )
 
     def pointwise_maximum(self, other: Any) -> AffineForm:
         """The maximum of this function f and another function g, as g + max(f - g, 0). On lanes on
         which f or g is proved to be the larger one everywhere, it is that function itself."""
         difference = self.sum(-other)
-        x = difference.range
-        self_larger, other_larger = x.lower >= 0, x.upper <= 0
+        difference_range = difference.range
+        is_self_larger, is_other_larger = difference_range.lower >= 0, difference_range.upper <= 0
         # max(t, 0) on [x, y], x < 0 < y: its chord has slope y/(y - x) and lies above by at most
         # -x y/(y - x), at 0.
-        rate = x.upper / (x.upper - x.lower)
-        excess = -x.lower * rate
-        center = rate * (difference.center - x.lower) - 0.5 * excess
-        size = dr.abs(rate) * (dr.abs(difference.center) + dr.abs(x.lower) + dr.abs(x.upper))
-        part = AffineForm(
-            center,
-            rate * difference.slope,
-            rate * difference.error + 0.5 * excess + _rounding_bound(size),
+        chord_slope = difference_range.upper / (difference_range.upper - difference_range.lower)
+        excess = -difference_range.lower * chord_slope
+        center = chord_slope * (difference.center - difference_range.lower) - 0.5 * excess
+        size = dr.abs(chord_slope) * (
+            dr.abs(difference.center)
+            + dr.abs(difference_range.lower)
+            + dr.abs(difference_range.upper)
         )
-        both = other.sum(part)
+        positive_part = AffineForm(
+            center,
+            chord_slope * difference.slope,
+            chord_slope * difference.error + 0.5 * excess + _rounding_bound(size),
+        )
+        general_maximum = other.sum(positive_part)
         return AffineForm(
             *(
-                dr.select(self_larger, u, dr.select(other_larger, v, w))
-                for u, v, w in zip(_entries(self), _entries(other), _entries(both), strict=True)
+                dr.select(is_self_larger, u, dr.select(is_other_larger, v, w))
+                for u, v, w in zip(
+                    _entries(self), _entries(other), _entries(general_maximum), strict=True
+                )
             )
         )
 
     def polar_angle(self, x: Any) -> AffineForm:
-        """The polar angle atan2(y, x) of z = (x, y), where y is this function: the angle of the
-        middle c of z's range, plus the angle of z relative to c.
+        """The polar angle atan2(y, x) of the point z = (x, y), where y is this function: the angle
+        of a direction c near z, plus the angle of z relative to c.
 
         Proof. For any vector c = (a, b), the angle of z = (x, y) is that of c plus that of (x a + y
-        b, y a - x b), up to a multiple of 2 pi. If the box of z does not meet the cut, z and c lie
-        in one of the half-planes x > 0, y > 0 and y < 0, so their angles differ by at most pi.
-        Where x a + y b > 0, the angle of the second vector is an arc tangent, less than pi/2 in
-        size. So the multiple is 0. Elsewhere only [-pi, pi] is known.
+        b, y a - x b), up to a multiple of 2 pi. If the box of z does not meet the cut of the angle,
+        z and c lie in one of the half-planes x > 0, y > 0 and y < 0, so their angles differ by at
+        most pi. Where x a + y b > 0, the angle of the second vector is an arc tangent, less than
+        pi/2 in size. So the multiple is 0. Elsewhere only [-pi, pi] is known.
+
+        In the code c is about the direction of the middle of z's range.
         """
         a, b = approximate_direction(x.center, self.center)
-        ahead, aside = x * a + self * b, self * a - x * b
-        offset = aside.product(ahead.apply(reciprocal)).apply(atan)
-        base, _ = angle_range(Interval.point(b), Interval.point(a))
-        is_valid = ~meets_branch_cut(self.range, x.range) & (ahead.range.lower > 0)
-        center = offset.center + base.midpoint
-        error = offset.error + base.radius + _rounding_bound(dr.abs(center) + dr.abs(base.midpoint))
-        is_valid &= dr.isfinite(center) & dr.isfinite(offset.slope) & dr.isfinite(error)
+        along_c, across_c = x * a + self * b, self * a - x * b
+        relative = across_c.product(along_c.apply(reciprocal)).apply(atan)
+        c_angle, _ = angle_range(Interval.point(b), Interval.point(a))
+        is_valid = ~meets_branch_cut(self.range, x.range) & (along_c.range.lower > 0)
+        center = relative.center + c_angle.midpoint
+        error = (
+            relative.error
+            + c_angle.radius
+            + _rounding_bound(dr.abs(center) + dr.abs(c_angle.midpoint))
+        )
+        is_valid &= dr.isfinite(center) & dr.isfinite(relative.slope) & dr.isfinite(error)
         half_turn = math.pi * (1 + 1e-6)
         return AffineForm(
             dr.select(is_valid, center, 0),
-            dr.select(is_valid, offset.slope, 0),
+            dr.select(is_valid, relative.slope, 0),
             dr.select(is_valid, error, half_turn),
         )
 
 
 def _entries(x: AffineForm) -> tuple[Real, Real, Real]:
-    """Center, slope and error as a tuple."""
+    """Center, slope and error of an affine form as a tuple."""
     return x.center, x.slope, x.error
 
 
 def _smaller_error(
     first: tuple[Real, Real, Real], second: tuple[Real, Real, Real]
 ) -> tuple[Real, Real, Real]:
-    """The one of two tuples (center, slope, error) that has the smaller error. If one tuple is not
-    finite, it is the other tuple."""
-    first_finite = dr.isfinite(first[0]) & dr.isfinite(first[1]) & dr.isfinite(first[2])
-    second_finite = dr.isfinite(second[0]) & dr.isfinite(second[1]) & dr.isfinite(second[2])
-    use_first = first_finite & ((first[2] <= second[2]) | ~second_finite)
+    """Of two lines, each given by (center, slope, error), the one with the smaller error. If one of
+    them is not finite, it is the other."""
+    is_first_finite = dr.isfinite(first[0]) & dr.isfinite(first[1]) & dr.isfinite(first[2])
+    is_second_finite = dr.isfinite(second[0]) & dr.isfinite(second[1]) & dr.isfinite(second[2])
+    use_first = is_first_finite & ((first[2] <= second[2]) | ~is_second_finite)
     x, y, z = (dr.select(use_first, u, v) for u, v in zip(first, second, strict=True))
     return x, y, z
 
 
 def _rounding_bound(size: Real) -> Real:
-    """A bound of the rounding and underflow in a sum.
+    """A bound of the errors by rounding and underflow in a computed sum.
 
     size: the sum of the absolute values of its terms.
     """

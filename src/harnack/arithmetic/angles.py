@@ -1,10 +1,9 @@
-"""The polar angle `atan2` of a point of the plane, from -pi (excluded) to pi.
-
-It has a cut {y = 0, x <= 0} along the negative x axis, where it jumps by 2 pi. At the origin it has
-no value (there it counts as 0). On a box that meets the cut, its range is [-pi, pi], and the ranges
-of its derivatives are all numbers. So no arithmetic takes the angle for a continuous function
-there, and no step leads across the cut.
-"""
+"""The polar angle `atan2` of a point (x, y) of the plane in radians, from -pi (excluded) to pi, and
+its range on boxes. It has a cut {y = 0, x <= 0} along the negative x axis, where it jumps by 2 pi.
+At the origin it has no value (there it counts as 0). On a box that meets the cut, its range is
+[-pi, pi], and the ranges of its derivatives are all numbers. So no arithmetic takes the angle for a
+continuous function there, and no step leads across the cut. A box is the set of all points (x, y)
+with x and y in two intervals."""
 
 from __future__ import annotations
 
@@ -31,7 +30,7 @@ _PI = math.nextafter(math.pi, 4.0)
 def atan2(y: Any, x: Any) -> Any:
     """The polar angle of the point (x, y) in radians, -pi < angle <= pi.
 
-    y, x: numbers of any kind.
+    y, x: numbers of any kind: of an arithmetic, Dr.Jit or NumPy arrays or Python numbers.
 
     The angle jumps along the negative x axis, where nothing is proved: a ray stops there. If you
     need only its cosine or sine, x / norm(x, y) and y / norm(x, y) have no such cut.
@@ -55,60 +54,66 @@ def meets_branch_cut(y: Interval, x: Interval) -> Mask:
 
 
 def angle_range(y: Interval, x: Interval) -> tuple[Interval, Mask]:
-    """The range of the polar angle on the box of all points (x, y); and a mask, whether the box
-    meets the cut {y = 0, x <= 0} of the angle.
+    """The range of the polar angle on the box of all points (x, y); and a mask of the lanes on
+    which the box meets the cut {y = 0, x <= 0} of the angle.
 
     y, x: intervals whose ends are numbers of the backend.
 
-    A box that is a single point of the cut other than the origin has the angle pi, though it meets
-    the cut.
+    On a box that meets the cut the range is [-pi, pi]. But a box that is a single point of the cut
+    other than the origin has the angle pi.
 
     Proof. Along an edge of the box the angle is monotone, because its derivative there has one
     sign: it is (y'x - x'y)/(x^2 + y^2). It has no extremum inside. So the ends of the range are at
     corners. The angle falls with x where y > 0 and rises with y where x > 0, which tells the
-    corner. At an infinite end the angle is the limit. No corner is infinite in both coordinates: a
-    box that does not meet the cut has x > 0 where y may have either sign, and at most one
-    coordinate of its corner is an end of the kind that may be infinite.
+    corner. If a coordinate of the corner is infinite, the angle is the limit. Both cannot be: if
+    the corner of the largest angle has x = -infinity, y > 0 on the box (else it would meet the
+    cut), and the corner has the lower y; if it has x = infinity, y <= 0 on the box, and the corner
+    has the upper y.
     """
-    met = meets_branch_cut(y, x)
+    meets_cut = meets_branch_cut(y, x)
     is_point = x.lower is x.upper and y.lower is y.upper
     pi = Interval.enclosing(_PI, type(x.lower)).upper
+    # A point interval has the same object as both ends.
     if is_point:
         angle = dr.atan2(y.lower, x.lower)
         angle = dr.select((y.lower == 0) & (x.lower < 0), math.pi, angle)
         low, high = _widened(angle, angle)
-        unknown = met & ~((y.lower == 0) & (x.lower < 0))
+        is_unknown = meets_cut & ~((y.lower == 0) & (x.lower < 0))
     else:
         y, x = _nan_to_infinite(y), _nan_to_infinite(x)
+        # The smallest angle is minus the largest one of the box mirrored at the x axis.
         low, high = _widened(-_largest_angle(Interval(-y.upper, -y.lower), x), _largest_angle(y, x))
-        unknown = met
+        is_unknown = meets_cut
+    # An end that is NaN is unknown.
     low, high = (dr.select(end == end, end, sign * dr.inf) for end, sign in ((low, -1), (high, 1)))
     low, high = dr.maximum(low, -pi), dr.minimum(high, pi)
-    return Interval(dr.select(unknown, -pi, low), dr.select(unknown, pi, high)), met
+    return Interval(dr.select(is_unknown, -pi, low), dr.select(is_unknown, pi, high)), meets_cut
 
 
 def _largest_angle(y: Interval, x: Interval) -> Real:
-    """The largest angle on a box of points (x, y) that does not meet the cut."""
+    """The largest polar angle on the box of all points (x, y), which does not meet the cut. It is
+    that at a corner (`angle_range`)."""
     corner_x = dr.select(y.upper > 0, x.lower, x.upper)
     corner_y = dr.select(corner_x > 0, y.upper, y.lower)
-    # The limit at infinity, along one axis.
-    far_x, far_y = dr.isinf(corner_x), dr.isinf(corner_y)
+    # At an infinite corner the angle is that of the axis on which it lies.
+    is_x_infinite, is_y_infinite = dr.isinf(corner_x), dr.isinf(corner_y)
     corner_x, corner_y = (
-        dr.select(far_x, dr.sign(corner_x), dr.select(far_y, 0, corner_x)),
-        dr.select(far_x, 0, dr.select(far_y, dr.sign(corner_y), corner_y)),
+        dr.select(is_x_infinite, dr.sign(corner_x), dr.select(is_y_infinite, 0, corner_x)),
+        dr.select(is_x_infinite, 0, dr.select(is_y_infinite, dr.sign(corner_y), corner_y)),
     )
     return dr.atan2(corner_y, corner_x)
 
 
 def _widened(low: Real, high: Real) -> tuple[Real, Real]:
-    """The interval [low, high] of computed angles, moved outwards by the error of atan2."""
+    """The interval [low, high] of computed angles, with its ends moved outwards by the error of
+    atan2."""
     tiny = float(dr.smallest(cast("Any", type(low))))
     wide = Interval(low, high).widened(_MAX_ULP_ERROR * machine_epsilon(low), tiny)
     return wide.lower, wide.upper
 
 
 def _nan_to_infinite(x: Interval) -> Interval:
-    """The interval with infinite ends in place of those that are NaN."""
+    """The interval x, with infinite ends in place of ends that are NaN."""
     return Interval(
         dr.select(x.lower == x.lower, x.lower, -dr.inf),
         dr.select(x.upper == x.upper, x.upper, dr.inf),
@@ -116,13 +121,12 @@ def _nan_to_infinite(x: Interval) -> Interval:
 
 
 def approximate_direction(x: Real, y: Real) -> tuple[Real, Real]:
-    """A vector in about the direction of (x, y), of a length between 1/2 and 2.
-
-    It is (1, 0) if (x, y) is 0 or not finite.
-    """
+    """A vector in about the direction of (x, y), of a length between 1/2 and 2. It is (1, 0) if (x,
+    y) is 0 or not finite."""
     size = dr.maximum(dr.abs(x), dr.abs(y))
     is_valid = (size > 0) & dr.isfinite(size)
     scale = dr.select(is_valid, 1 / size, 0)
     a, b = x * scale, y * scale
+    # The length is now between 1 and sqrt 2.
     inverse_length = dr.rsqrt(dr.maximum(a * a + b * b, 1))
     return dr.select(is_valid, a * inverse_length, 1), dr.select(is_valid, b * inverse_length, 0)

@@ -1,9 +1,10 @@
-"""Elementary functions: the ranges of their values and of their first two derivatives on intervals.
-
-An `ElementaryFunction` serves every arithmetic. It evaluates the function for plain numbers, and
-bounds the ranges of the function and of its first two derivatives on an interval. The functions
-`sin`, `exp` and so on take numbers of any arithmetic, Dr.Jit and NumPy arrays, and Python numbers.
-"""
+"""Elementary functions, such as sin and exp: the ranges of their values and of their first two
+derivatives on intervals. A range is an interval that is proved to contain all values, rounding
+included. An `ElementaryFunction` serves every arithmetic: it evaluates the function for plain
+numbers, and bounds the ranges of the function and of its derivatives on an interval x of arguments.
+A point interval has the same object as both ends (`x.lower is x.upper`), so that functions of it
+are computed once. The functions `sin`, `exp` and so on take numbers of any arithmetic, Dr.Jit and
+NumPy arrays, and Python numbers."""
 
 from __future__ import annotations
 
@@ -34,7 +35,9 @@ _MAX_ULP_ERROR = 8.0
 
 @dataclass(frozen=True)
 class ElementaryFunction:
-    """A function of a single variable.
+    """A function of a single variable, such as sin, that every arithmetic can apply to its numbers:
+    it can be evaluated for plain numbers, and it can bound its own values and derivatives on an
+    interval.
 
     ranges: a callable that returns the ranges of the function, of its derivative and of its second
         derivative on an interval whose ends are Dr.Jit numbers. If the interval contains a pole, or
@@ -61,7 +64,7 @@ class ElementaryFunction:
         return "absolute" if self.name == "abs" else self.name
 
     def __call__(self, x: Any) -> Any:
-        """The function of x, a number of any arithmetic, a Dr.Jit or NumPy array or a Python
+        """The function of x. x is a number of any arithmetic, a Dr.Jit or NumPy array or a Python
         number."""
         if hasattr(x, "apply"):
             return x.apply(self)
@@ -71,9 +74,10 @@ class ElementaryFunction:
 
 
 def _increasing_range(f: Callable[[Any], Any], x: Interval) -> Interval:
-    """The range on x of an increasing function f, whose computed values have an error of
-    `_MAX_ULP_ERROR`."""
+    """The range, on the interval x, of an increasing function f whose computed values have an error
+    of at most `_MAX_ULP_ERROR` units in the last place."""
     low = f(x.lower)
+    # A point interval has the same object as both ends.
     high = low if x.lower is x.upper else f(x.upper)
     return Interval(low, high).widened(
         _MAX_ULP_ERROR * machine_epsilon(x.lower), _smallest_normal(x)
@@ -81,7 +85,7 @@ def _increasing_range(f: Callable[[Any], Any], x: Interval) -> Interval:
 
 
 def _smallest_normal(x: Interval) -> float:
-    """The smallest normal number in the precision of x."""
+    """The smallest normal number in the precision of the interval's ends."""
     return float(dr.smallest(cast("Any", type(x.lower))))
 
 
@@ -91,8 +95,9 @@ def _twice(x: Interval) -> Interval:
 
 
 def _unbounded_unless_defined(defined: Mask, ranges: DerivativeRanges) -> DerivativeRanges:
-    """The three ranges of a function and of its derivatives; on lanes where `defined` is False, the
-    ranges of the derivatives are replaced by all numbers.
+    """The three ranges of a function and of its derivatives. On lanes where `defined` is False, the
+    ranges of the derivatives are replaced by all numbers, because the function has a pole or no
+    value somewhere in the interval.
 
     ranges: of the function, of its derivative and of its second derivative.
     """
@@ -108,7 +113,8 @@ def _unbounded_unless_defined(defined: Mask, ranges: DerivativeRanges) -> Deriva
 
 
 def _exp(x: Interval) -> DerivativeRanges:
-    """The ranges of exp and of its derivatives."""
+    """The ranges of exp, of its derivative and of its second derivative on the interval x, which
+    are all the same."""
     e = _exponential_range(dr.exp, x)
     e = Interval(fmax(e.lower, 0), e.upper)
     return e, e, e
@@ -124,17 +130,19 @@ def _exponential_range(f: Callable[[Any], Any], x: Interval) -> Interval:
     large = _SAFE_FRACTION * float(dr.largest(type(x.lower)))
 
     def end(v: Real, sign: int) -> Real:
-        """A bound of f(v), above it for sign 1, below it for sign -1."""
+        """A bound of f(v): from above for sign 1, from below for sign -1."""
         result = f(v)
         error = machine_epsilon(v) * (_MAX_ULP_ERROR + dr.abs(v))
         moved = dr.fma(dr.abs(result), sign * error, result) + sign * _smallest_normal(x)
+        # A lower bound must not be +infinity, nor an upper bound -infinity.
         return typed_select(sign * result == -dr.inf, -sign * large, moved, v)
 
     return Interval(end(x.lower, -1), end(x.upper, 1))
 
 
 def _log(x: Interval) -> DerivativeRanges:
-    """The ranges of log and of its derivatives."""
+    """The ranges of log, of its derivative 1/x and of its second derivative -1/x^2 on the interval
+    x. If x reaches 0 or below, the ranges of the derivatives are all numbers."""
     inverse = x.reciprocal()
     # Near 1 the error of a logarithm is four units of 1 on CUDA.
     value = _increasing_range(dr.log, x).widened(0.0, 4 * machine_epsilon(x.lower))
@@ -142,22 +150,25 @@ def _log(x: Interval) -> DerivativeRanges:
 
 
 def _sqrt(x: Interval) -> DerivativeRanges:
-    """The ranges of the square root and of its first two derivatives, for the interval x.
+    """The ranges of the square root, of its derivative and of its second derivative on the interval
+    x.
 
     The range of the square root is that for the numbers >= 0 of x; NaN if there are none. If x
     contains a number below 0, the ranges of the derivatives are all numbers.
     """
+    # The part of x with numbers >= 0.
     low = fmax(x.lower, 0)
-    # A point has one number as both ends: then the root of it is computed once.
+    # A point interval keeps one object as both ends: then its root is computed once.
     high = low if x.lower is x.upper else x.upper
     root = _increasing_range(dr.sqrt, Interval(low, high))
-    # Ends that rounding took below 0 count as 0; where both are below, there is no root.
+    # A lower end that rounding took below 0 counts as 0. If x has no number >= 0, there is no root.
     is_none = x.upper < 0
-    like = root.lower
+    number = root.lower
     root = Interval(
-        typed_select(is_none, dr.nan, fmax(root.lower, 0), like),
-        typed_select(is_none, dr.nan, root.upper, like),
+        typed_select(is_none, dr.nan, fmax(root.lower, 0), number),
+        typed_select(is_none, dr.nan, root.upper, number),
     )
+    # 1/(2 sqrt x) and -1/(4 x sqrt x)
     slope = _half(_positive_reciprocal(root))
     second = -_half(slope * _positive_reciprocal(Interval(low, high)))
     return _unbounded_unless_defined(x.lower >= 0, (root, slope, second))
@@ -169,14 +180,18 @@ def _half(x: Interval) -> Interval:
 
 
 def _positive_reciprocal(x: Interval) -> Interval:
-    """The range of 1/y for the numbers y >= 0 of x; its upper end is infinite if 0 is one of
-    them."""
-    above = Interval(x.upper, x.upper).reciprocal()
-    return Interval(fmax(above.lower, 0), Interval(fmax(x.lower, 0), x.upper).reciprocal().upper)
+    """The range of 1/y for the numbers y >= 0 of the interval x. Its upper end is infinite if 0 is
+    one of them."""
+    # The smallest value is 1/x.upper, the largest that at the lower end.
+    of_upper_end = Interval(x.upper, x.upper).reciprocal()
+    return Interval(
+        fmax(of_upper_end.lower, 0), Interval(fmax(x.lower, 0), x.upper).reciprocal().upper
+    )
 
 
 def _reciprocal(x: Interval) -> DerivativeRanges:
-    """The ranges of 1/x and of its derivatives."""
+    """The ranges of 1/x, of its derivative and of its second derivative on the interval x; all
+    numbers if x contains 0."""
     inverse = x.reciprocal()
     slope = -inverse.square()
     return _unbounded_unless_defined(
@@ -185,15 +200,15 @@ def _reciprocal(x: Interval) -> DerivativeRanges:
 
 
 def _sine(x: Interval) -> DerivativeRanges:
-    """The ranges of sin and of its derivatives."""
-    s, c = _sine_and_cosine(x)
-    return s, c, -s
+    """The ranges of sin, of its derivative and of its second derivative on the interval x."""
+    sine, cosine = _sine_and_cosine(x)
+    return sine, cosine, -sine
 
 
 def _cosine(x: Interval) -> DerivativeRanges:
-    """The ranges of cos and of its derivatives."""
-    s, c = _sine_and_cosine(x)
-    return c, -s, -c
+    """The ranges of cos, of its derivative and of its second derivative on the interval x."""
+    sine, cosine = _sine_and_cosine(x)
+    return cosine, -sine, -cosine
 
 
 def _sine_and_cosine(x: Interval) -> tuple[Interval, Interval]:
@@ -208,25 +223,28 @@ def _sine_and_cosine(x: Interval) -> tuple[Interval, Interval]:
     look like a value.
     """
     epsilon, max_argument = machine_epsilon(x.lower), max_sincos_argument(type(x.lower))
-    s0, c0 = sincos(x.lower)
+    sine_lower, cosine_lower = sincos(x.lower)
     if x.lower is x.upper:
         is_valid = dr.abs(x.lower) <= max_argument
 
         def at_point(value: Real) -> Interval:
-            """The range of a sine or cosine at a single point, from its computed value."""
+            """The range of a sine or cosine at a single point, from its computed value: the value
+            with its rounding, clipped to [-1, 1]."""
             plain = Interval(value, value).widened(4 * epsilon, 4 * epsilon)
             low = dr.select(is_valid, fmax(plain.lower, -1), -dr.inf)
             return Interval(low, dr.select(is_valid, fmin(plain.upper, 1), dr.inf))
 
-        return at_point(s0), at_point(c0)
-    s1, c1 = sincos(x.upper)
-    scale = 1 / (2 * math.pi)
-    rounding = 8 * epsilon * (fmax(dr.abs(x.lower), dr.abs(x.upper)) + 1) * scale
-    low, high = x.lower * scale - rounding, x.upper * scale + rounding
+        return at_point(sine_lower), at_point(cosine_lower)
+    sine_upper, cosine_upper = sincos(x.upper)
+    # The ends of the interval in full turns, moved outwards. From a whole turn on, or for arguments
+    # that are too large, the range is [-1, 1].
+    turns_per_radian = 1 / (2 * math.pi)
+    rounding = 8 * epsilon * (fmax(dr.abs(x.lower), dr.abs(x.upper)) + 1) * turns_per_radian
+    low, high = x.lower * turns_per_radian - rounding, x.upper * turns_per_radian + rounding
     is_unknown = ~(fmax(dr.abs(x.lower), dr.abs(x.upper)) <= max_argument) | ~(high - low < 1)
 
     def passes(phase: float) -> Mask:
-        """Whether x/(2 pi) takes the value phase + k for an integer k."""
+        """Whether x/(2 pi), the interval in full turns, contains phase + k for an integer k."""
         return dr.floor(high - phase) > dr.floor(low - phase)
 
     def range_between(a: Real, b: Real, top: float, bottom: float) -> Interval:
@@ -239,11 +257,13 @@ def _sine_and_cosine(x: Interval) -> tuple[Interval, Interval]:
         lowest = dr.select(passes(bottom), -1, plain.lower)
         return _clip_to_unit(Interval(lowest, dr.select(passes(top), 1, plain.upper)), is_unknown)
 
-    return range_between(s0, s1, 0.25, 0.75), range_between(c0, c1, 0.0, 0.5)
+    return range_between(sine_lower, sine_upper, 0.25, 0.75), range_between(
+        cosine_lower, cosine_upper, 0.0, 0.5
+    )
 
 
 def _clip_to_unit(x: Interval, wide: Mask) -> Interval:
-    """The interval x, clipped to [-1, 1]; [-1, 1] itself where `wide` is set."""
+    """The interval x, clipped to [-1, 1]; [-1, 1] itself on lanes where `wide` is set."""
     return Interval(
         dr.select(wide, -1, fmax(x.lower, -1)),
         dr.select(wide, 1, fmin(x.upper, 1)),
@@ -251,24 +271,26 @@ def _clip_to_unit(x: Interval, wide: Mask) -> Interval:
 
 
 def _tan(x: Interval) -> DerivativeRanges:
-    """The ranges of tan and of its derivatives on the interval x; all numbers if a pole may lie in
-    it."""
-    s, c = _sine_and_cosine(x)
-    t = s * c.reciprocal()
-    # Monotone where the cosine has no zero: the ends are the range.
-    ends = [
+    """The ranges of tan, of its derivative and of its second derivative on the interval x; all
+    numbers if a pole may lie in it."""
+    sine_range, cosine_range = _sine_and_cosine(x)
+    tangent = sine_range * cosine_range.reciprocal()
+    # tan increases where the cosine has no zero: its values at the ends are then the range.
+    ranges_at_ends = [
         sine * cosine.reciprocal()
         for sine, cosine in (
             _sine_and_cosine(Interval(x.lower, x.lower)),
             _sine_and_cosine(Interval(x.upper, x.upper)),
         )
     ]
-    no_pole = c.min_abs > 0
-    t = Interval(
-        dr.select(no_pole, ends[0].lower, t.lower), dr.select(no_pole, ends[1].upper, t.upper)
+    has_no_pole = cosine_range.min_abs > 0
+    tangent = Interval(
+        dr.select(has_no_pole, ranges_at_ends[0].lower, tangent.lower),
+        dr.select(has_no_pole, ranges_at_ends[1].upper, tangent.upper),
     )
-    slope = ONE + t.square()
-    return _unbounded_unless_defined(no_pole, (t, slope, _twice(t * slope)))
+    # 1 + tan^2 and 2 tan (1 + tan^2)
+    slope = ONE + tangent.square()
+    return _unbounded_unless_defined(has_no_pole, (tangent, slope, _twice(tangent * slope)))
 
 
 def _hyperbolic_tangent(x: Real) -> Real:
@@ -281,17 +303,19 @@ def _hyperbolic_tangent(x: Real) -> Real:
 
 
 def _tanh(x: Interval) -> DerivativeRanges:
-    """The ranges of tanh and of its derivatives."""
+    """The ranges of tanh, of its derivative and of its second derivative on the interval x."""
     t = _increasing_range(_hyperbolic_tangent, x).widened(_MAX_ULP_ERROR * machine_epsilon(x.lower))
-    high = dr.select(x.upper == x.upper, fmin(t.upper, 1), 1)  # also if an end is NaN
-    t = Interval(fmax(t.lower, -1), high)
+    upper = dr.select(x.upper == x.upper, fmin(t.upper, 1), 1)  # also if an end is NaN
+    t = Interval(fmax(t.lower, -1), upper)
+    # 1 - tanh^2, which is at least 0, and -2 tanh (1 - tanh^2)
     slope = ONE - t.square()
     slope = Interval(fmax(slope.lower, 0), slope.upper)
     return t, slope, -_twice(t * slope)
 
 
 def _atan(x: Interval) -> DerivativeRanges:
-    """The ranges of the arc tangent and of its derivatives."""
+    """The ranges of the arc tangent, of its derivative 1/(1+x^2) and of its second derivative
+    -2x/(1+x^2)^2 on the interval x."""
     slope = (ONE + x.square()).reciprocal()
     max_second = 3 * math.sqrt(3) / 8 * (1 + 1e-6)  # of |2x/(1+x^2)^2|, at x = 1/sqrt(3)
     second = -_twice(x * slope.square())
@@ -300,8 +324,11 @@ def _atan(x: Interval) -> DerivativeRanges:
 
 
 def _asin(x: Interval) -> DerivativeRanges:
-    """The ranges of the arc sine and of its derivatives."""
+    """The ranges of the arc sine, of its derivative and of its second derivative on the interval x.
+    If x is not within [-1, 1], the range is that on the part inside, and the ranges of the
+    derivatives are all numbers."""
     inside = Interval(fmax(x.lower, -1), fmin(x.upper, 1))
+    # 1/sqrt(1 - x^2) and x/sqrt(1 - x^2)^3
     slope = _positive_reciprocal(_sqrt(ONE - inside.square())[0])
     second = inside * slope * slope.square()
     return _unbounded_unless_defined(
@@ -310,61 +337,69 @@ def _asin(x: Interval) -> DerivativeRanges:
 
 
 def _acos(x: Interval) -> DerivativeRanges:
-    """The ranges of the arc cosine and of its derivatives."""
+    """The ranges of the arc cosine, pi/2 - asin, of its derivative and of its second derivative on
+    the interval x."""
     value, slope, second = _asin(x)
     quarter = Interval.enclosing(math.pi / 2, type(x.lower))
     return quarter - value, -slope, -second
 
 
 def _sinh(x: Interval) -> DerivativeRanges:
-    """The ranges of sinh and of its derivatives."""
-    s, c = _exponential_range(dr.sinh, x), _cosh_range(x)
-    return s, c, s
+    """The ranges of sinh, of its derivative cosh and of its second derivative sinh on the interval
+    x."""
+    sinh_range, cosh_range = _exponential_range(dr.sinh, x), _cosh_range(x)
+    return sinh_range, cosh_range, sinh_range
 
 
 def _cosh(x: Interval) -> DerivativeRanges:
-    """The ranges of cosh and of its derivatives."""
-    s, c = _exponential_range(dr.sinh, x), _cosh_range(x)
-    return c, s, c
+    """The ranges of cosh, of its derivative sinh and of its second derivative cosh on the interval
+    x."""
+    sinh_range, cosh_range = _exponential_range(dr.sinh, x), _cosh_range(x)
+    return cosh_range, sinh_range, cosh_range
 
 
 def _cosh_range(x: Interval) -> Interval:
-    """The range of cosh, which increases with |x|."""
+    """The range of cosh on the interval x. cosh increases with |x|."""
     return _exponential_range(dr.cosh, Interval(x.min_abs, x.max_abs))
 
 
 def _abs(x: Interval) -> DerivativeRanges:
-    """The ranges of |x| and of its derivatives. The second derivative has no upper bound at 0,
-    where the slope jumps from -1 to 1."""
-    positive, negative = x.lower > 0, x.upper < 0
-    slope = Interval(typed_select(positive, 1, -1, x.lower), typed_select(negative, -1, 1, x.lower))
-    kink = typed_select(positive | negative, 0, dr.inf, x.lower)
-    return Interval(x.min_abs, x.max_abs), slope, Interval(type(x.lower)(0), kink)
+    """The ranges of |x|, of its derivative and of its second derivative on the interval x. The
+    second derivative has no upper bound at 0, where the slope jumps from -1 to 1."""
+    is_positive, is_negative = x.lower > 0, x.upper < 0
+    slope = Interval(
+        typed_select(is_positive, 1, -1, x.lower), typed_select(is_negative, -1, 1, x.lower)
+    )
+    max_second = typed_select(is_positive | is_negative, 0, dr.inf, x.lower)
+    return Interval(x.min_abs, x.max_abs), slope, Interval(type(x.lower)(0), max_second)
 
 
 def integer_power(x: Interval, n: int) -> Interval:
-    """The range of y^n for y in the interval x, n >= 0. If both ends of x are the same object, only
-    one power is computed."""
+    """The range of y^n for y in the interval x, for an integer n >= 0."""
     if n == 0:
         return ONE
     if n == 1:
         return x
+    # An even power increases with |y|. For a point interval both ends stay the same object.
     if n % 2 == 0:
         low, high = x.min_abs, x.max_abs
         if x.lower is x.upper:
             low = high
     else:
         low, high = x.lower, x.upper
-    a = _power_by_squaring(low, n)
-    b = a if low is high else _power_by_squaring(high, n)
+    at_low = _power_by_squaring(low, n)
+    at_high = at_low if low is high else _power_by_squaring(high, n)
     # The relative errors of the products add up to at most n - 1 roundings of half a machine
     # epsilon each; a product that underflows has a small absolute error instead.
-    result = Interval(a, b).widened(n * machine_epsilon(x.lower), n * _smallest_normal(x))
+    result = Interval(at_low, at_high).widened(
+        n * machine_epsilon(x.lower), n * _smallest_normal(x)
+    )
+    # An even power is at least 0.
     return Interval(fmax(result.lower, 0), result.upper) if n % 2 == 0 else result
 
 
 def _power_by_squaring(x: Real, n: int) -> Real:
-    """x^n by products, for n >= 1."""
+    """x^n by repeated squaring, for an integer n >= 1."""
     result: Real = None
     while n:
         if n & 1:
@@ -382,13 +417,19 @@ def power(n: float) -> ElementaryFunction:
         if k < 0:
 
             def inverse(x: Interval) -> DerivativeRanges:
-                """The ranges of x^n and of its derivatives on the interval x, for a negative
-                integer n."""
-                inv = x.reciprocal()
-                slope = Interval.enclosing(k, type(x.lower)) * integer_power(inv, 1 - k)
-                second = Interval.enclosing(k * (k - 1), type(x.lower)) * integer_power(inv, 2 - k)
-                defined = (x.lower > 0) | (x.upper < 0)
-                return _unbounded_unless_defined(defined, (integer_power(inv, -k), slope, second))
+                """The ranges of x^n and of its first two derivatives on the interval x, for a
+                negative integer n = k. They are powers of 1/x."""
+                reciprocal_range = x.reciprocal()
+                slope = Interval.enclosing(k, type(x.lower)) * integer_power(
+                    reciprocal_range, 1 - k
+                )
+                second = Interval.enclosing(k * (k - 1), type(x.lower)) * integer_power(
+                    reciprocal_range, 2 - k
+                )
+                is_defined = (x.lower > 0) | (x.upper < 0)
+                return _unbounded_unless_defined(
+                    is_defined, (integer_power(reciprocal_range, -k), slope, second)
+                )
 
             def plain(x: Any) -> Any:
                 return 1 / _power_by_squaring(x, -k)
@@ -398,9 +439,13 @@ def power(n: float) -> ElementaryFunction:
             )
 
         def ranges(x: Interval) -> DerivativeRanges:
-            """The ranges of x^n and of its derivatives on the interval x, for an integer n >= 0."""
-            like = cast("Any", type(x.lower))
-            slope, second = Interval.enclosing(k, like), Interval.enclosing(k * (k - 1), like)
+            """The ranges of x^n and of its first two derivatives on the interval x, for an integer
+            n >= 0."""
+            number_type = cast("Any", type(x.lower))
+            slope, second = (
+                Interval.enclosing(k, number_type),
+                Interval.enclosing(k * (k - 1), number_type),
+            )
             return (
                 integer_power(x, k),
                 slope * integer_power(x, max(k - 1, 0)),
@@ -413,18 +458,18 @@ def power(n: float) -> ElementaryFunction:
         return ElementaryFunction(f"power {k}", ranges, of_numbers, _numpy_power(k))
 
     def real(x: Interval) -> DerivativeRanges:
-        """The ranges of x^n and of its derivatives on the interval x, for an n that is no
-        integer."""
-        like = cast("Any", type(x.lower))
-        slope = Interval.enclosing(n, like) * _real_power(x, n - 1)
-        second = Interval.enclosing(n * (n - 1), like) * _real_power(x, n - 2)
-        defined = x.lower >= 0 if n > 0 else x.lower > 0
+        """The ranges of x^n and of its first two derivatives on the interval x, for an n that is no
+        integer. The range of the function is NaN if x has no number >= 0."""
+        number_type = cast("Any", type(x.lower))
+        slope = Interval.enclosing(n, number_type) * _real_power(x, n - 1)
+        second = Interval.enclosing(n * (n - 1), number_type) * _real_power(x, n - 2)
+        is_defined = x.lower >= 0 if n > 0 else x.lower > 0
         value, is_none = _real_power(x, n), x.upper < 0
         value = Interval(
             typed_select(is_none, dr.nan, value.lower, x.lower),
             typed_select(is_none, dr.nan, value.upper, x.lower),
         )
-        return _unbounded_unless_defined(defined, (value, slope, second))
+        return _unbounded_unless_defined(is_defined, (value, slope, second))
 
     def of_positive(x: Any) -> Any:
         return dr.power(fmax(x, 0), n)
@@ -435,7 +480,7 @@ def power(n: float) -> ElementaryFunction:
 
 
 def _numpy_power(n: float) -> Callable[[Any], Any]:
-    """The function x -> x^n for NumPy arrays and Python numbers."""
+    """Make the function x -> x^n for NumPy arrays and Python numbers."""
     return lambda x: np.power(x, float(n))
 
 
@@ -446,6 +491,7 @@ def _real_power(x: Interval, n: float) -> Interval:
     a few more. A y below the smallest normal number may stand for any number from 0 to that.
     """
     lower = fmax(x.lower, 0)
+    # A point interval keeps the same object as both ends.
     upper = (
         fmax(_smallest_normal(x), x.upper)
         if x.upper is not x.lower
@@ -453,18 +499,20 @@ def _real_power(x: Interval, n: float) -> Interval:
     )
 
     def end(v: Real, sign: int) -> Real:
-        """A bound of v^n, above it for sign 1, below it for sign -1."""
+        """A bound of v^n: from above for sign 1, from below for sign -1."""
         result = dr.power(v, n)
         error = machine_epsilon(v) * (_MAX_ULP_ERROR + abs(n) * (4 + 2 * dr.abs(dr.log2(v))))
         return result + sign * (error * result + _smallest_normal(x))
 
-    at_least = fmax(lower, _smallest_normal(x))
+    positive_lower = fmax(lower, _smallest_normal(x))
+    # For n > 0 the power increases with y, else it falls.
     if n > 0:
         return Interval(
-            dr.select(lower >= _smallest_normal(x), fmax(end(at_least, -1), 0), 0), end(upper, 1)
+            dr.select(lower >= _smallest_normal(x), fmax(end(positive_lower, -1), 0), 0),
+            end(upper, 1),
         )
-    high = dr.select(lower >= _smallest_normal(x), end(at_least, 1), dr.inf)
-    return Interval(fmax(end(upper, -1), 0), high)
+    largest = dr.select(lower >= _smallest_normal(x), end(positive_lower, 1), dr.inf)
+    return Interval(fmax(end(upper, -1), 0), largest)
 
 
 exp = ElementaryFunction("exp", _exp, dr.exp, np.exp)
@@ -489,7 +537,8 @@ absolute = ElementaryFunction("abs", _abs, dr.abs, np.abs)
 
 @dataclass(frozen=True)
 class ClippedPower(ElementaryFunction):
-    """The function x -> max(x, 0)^n for an integer n >= 1, a kernel of blobs with compact support.
+    """The function x -> max(x, 0)^n for an integer n >= 1, which is a common kernel (shape) of
+    blobs.
 
     It is convex and n - 1 times continuously differentiable. Written as maximum(x, 0)**n, no bound
     of its second derivative would be known, since the maximum has none at 0. An arithmetic may use
@@ -500,8 +549,8 @@ class ClippedPower(ElementaryFunction):
 
 
 def clipped_power(n: int) -> ClippedPower:
-    """The function x -> max(x, 0)^n for an integer n >= 1, as a `ClippedPower`, which has a bounded
-    second derivative for n >= 2.
+    """The function x -> max(x, 0)^n for an integer n >= 1. As a single function it has, for n >= 2,
+    a bounded second derivative, unlike the power of a maximum.
 
     Raises:
         ValueError: n is less than 1 or no integer.
@@ -510,14 +559,17 @@ def clipped_power(n: int) -> ClippedPower:
         raise ValueError(f"the exponent of a clipped power must be an integer >= 1, not {n}")
 
     def ranges(x: Interval) -> DerivativeRanges:
-        """The ranges of max(x, 0)^n and of its derivatives.
+        """The ranges of max(x, 0)^n, of its derivative and of its second derivative on the interval
+        x.
 
         At 0 the second derivative has no upper bound for n = 1, and jumps from 0 to 2 for n = 2.
         """
         low = fmax(x.lower, 0)
-        u = Interval(low, low if x.lower is x.upper else fmax(x.upper, 0))
-        value, slope, second = power(n).ranges(u)
+        clipped = Interval(low, low if x.lower is x.upper else fmax(x.upper, 0))
+        value, slope, second = power(n).ranges(clipped)
         low, high = x.lower, x.upper
+        # The derivatives of the power at 0 are those from the right only; for n = 1 and 2 those
+        # from the left differ.
         if n == 1:
             slope = Interval(dr.select(low > 0, 1, 0), dr.select(high >= 0, 1, 0))
             crosses = (low <= 0) & (high >= 0)

@@ -1,7 +1,9 @@
-"""Intervals: ranges of real numbers, rounded outwards.
-
-The result of every operation contains the exact result for all numbers of its operands, in spite of
-the backend's rounding. So the ranges of a function and of its derivatives are proved (Moore 1966).
+"""Intervals: ranges [lower, upper] of real numbers, rounded outwards. The result of every operation
+contains the exact result for all numbers of its operands, in spite of the backend's rounding. So
+the ranges of a function and of its derivatives are proved (Moore 1966). An interval in Python
+floats is a constant that is known while Dr.Jit records code; a point interval has the same object
+as both ends (`lower is upper`), so that operations on it are done once. A unit is a unit in the
+last place.
 
 A single rounding in float32 that violates an enclosure may cause a missed hit; therefore ranges are
 rounded outwards. By measurement, a path is best divided into four pieces for blobs, which then
@@ -27,12 +29,10 @@ Number: TypeAlias = "Interval | float"
 
 @dataclass(frozen=True)
 class Interval:
-    """All numbers from `lower` to `upper`.
-
-    The ends are Dr.Jit numbers of the same type, or Python floats.
-
-    An end that is NaN stands for an infinite end: nothing is known on that side. Python floats are
-    constants known while a kernel is recorded, so that some operations with them can be left out.
+    """All numbers from `lower` to `upper`, which are Dr.Jit numbers of the same type, or Python
+    floats. An end that is NaN stands for an infinite end: nothing is known on that side. Python
+    floats are constants that are known while Dr.Jit records code, so that some operations with them
+    can be left out. Results of operations are rounded outwards.
 
     is_single: whether ends that are Python floats are kept at numbers of single precision. They
         must be if they meet arrays of single precision: there other numbers would be rounded,
@@ -52,27 +52,27 @@ class Interval:
 
     @classmethod
     def point(cls, x: Real) -> Interval:
-        """The interval [x, x]."""
+        """The interval [x, x]. Both ends are the same object."""
         return cls(x, x)
 
     @classmethod
     def enclosing(cls, x: float, like: Any) -> Interval:
-        """The narrowest interval around a Python number x whose ends are numbers of the type
-        `like`."""
+        """The narrowest interval around the Python number x whose ends are exact in the precision
+        of the number type `like`: in single precision they are rounded outwards. The ends are
+        Python floats."""
         if dr.is_array_v(like) and dr.type_v(like) == dr.VarType.Float32:
             return cls(*_outward_single(float(x), float(x)), is_single=True)
         return cls(float(x), float(x))
 
     @property
     def is_literal(self) -> bool:
-        """Whether both ends are Python numbers, which are known while a kernel is being
-        recorded."""
+        """Whether both ends are Python floats, which are known while Dr.Jit records code."""
         return isinstance(self.lower, float) and isinstance(self.upper, float)
 
     @property
     def is_zero(self) -> bool:
-        """Whether the interval is [0, 0] in Python numbers, which is known while a kernel is being
-        recorded."""
+        """Whether the interval is [0, 0] in Python floats, which is known while Dr.Jit records
+        code."""
         return self.is_literal and self.lower == 0.0 == self.upper
 
     @property
@@ -91,29 +91,28 @@ class Interval:
 
     @property
     def max_abs(self) -> Real:
-        """The largest absolute value of a number of the interval; NaN if an end is NaN."""
+        """The largest absolute value of the numbers of the interval; NaN if an end is NaN."""
         return _maximum_or_nan(_absolute(self.lower), _absolute(self.upper))
 
     @property
     def min_abs(self) -> Real:
-        """The smallest absolute value of a number of the interval."""
+        """The smallest absolute value of the numbers of the interval, which is 0 if the interval
+        contains 0."""
         return _maximum(-self.upper, _maximum(self.lower, 0.0))
 
     def contains(self, x: Real) -> Mask:
-        """Whether x lies in the interval."""
+        """A mask of the lanes on which the number x lies in the interval."""
         return ~((x < self.lower) | (x > self.upper))
 
     def hull(self, other: Interval) -> Interval:
-        """The smallest interval that contains this and the other interval."""
+        """The smallest interval that contains this interval and the other one."""
         low = -_maximum_or_nan(-self.lower, -other.lower)
         high = _maximum_or_nan(self.upper, other.upper)
         return Interval(low, high, self.is_single or other.is_single)
 
     def intersect(self, other: Interval) -> Interval:
-        """The intersection with an interval that is known to overlap this one.
-
-        An end that is NaN is unknown; the other interval's end is taken instead.
-        """
+        """The intersection with an interval that is known to overlap this one. If an end is NaN
+        (unknown), the other interval's end is taken instead."""
         return Interval(
             _maximum_ignoring_nan(self.lower, other.lower),
             _minimum_ignoring_nan(self.upper, other.upper),
@@ -121,16 +120,18 @@ class Interval:
         )
 
     def shifted(self, x: Real) -> Interval:
-        """The interval of all sums with the exact number x."""
+        """The interval of all y + x for y in this interval, with the exact number x."""
         return self + Interval(x, x)
 
     def __neg__(self) -> Interval:
+        """The interval of all -x for x in the interval. A point interval stays one."""
         if self.lower is self.upper:
             low = -self.lower
             return Interval(low, low, self.is_single)
         return Interval(-self.upper, -self.lower, self.is_single)
 
     def __add__(self, other: Interval) -> Interval:
+        """The interval of all sums of a number of this interval and one of the other."""
         if other.is_zero:
             return self
         if self.is_zero:
@@ -141,41 +142,44 @@ class Interval:
         return self + -other
 
     def __mul__(self, other: Interval) -> Interval:
-        """The interval of all products with numbers of the other interval. An interval of Python
-        floats is multiplied as a constant, with fewer operations."""
+        """The interval of all products of a number of this interval and one of the other. An
+        interval of Python floats is multiplied as a constant, with fewer operations. On lanes where
+        an end is infinite and the other 0, the product may be all numbers."""
         if self.is_zero or other.is_zero:
             return ZERO
         if self.is_literal:
             return other._times(self)
         if other.is_literal:
             return self._times(other)
-        ends = (
+        end_products = (
             self.lower * other.lower,
             self.lower * other.upper,
             self.upper * other.lower,
             self.upper * other.upper,
         )
+        # A point interval has fewer different products of ends.
         if self.lower is self.upper or other.lower is other.upper:
-            ends = (ends[0], ends[3])
+            end_products = (end_products[0], end_products[3])
         if self.lower is self.upper and other.lower is other.upper:
-            ends = (ends[0],)
-        low = high = ends[0]
-        for product in ends[1:]:
+            end_products = (end_products[0],)
+        low = high = end_products[0]
+        for product in end_products[1:]:
             low, high = _minimum(low, product), _maximum(high, product)
-        # 0 times infinity is NaN: the smallest of the other ends may then be wrong.
-        is_valid = _none_is_nan(ends)
+        # 0 times infinity is NaN: the smallest of the other products may then be wrong.
+        is_valid = _none_is_nan(end_products)
         if is_valid is not None:
             low, high = dr.select(is_valid, low, -dr.inf), dr.select(is_valid, high, dr.inf)
         return Interval(_round_down(_pad_underflow(low, -1)), _round_up(_pad_underflow(high, 1)))
 
     def _times(self, constant: Interval) -> Interval:
-        """The product with an interval of Python floats, whose signs are known while a kernel is
-        recorded."""
+        """The product with an interval of Python floats, whose signs are known while Dr.Jit records
+        code."""
         a, b = cast("tuple[float, float]", (constant.lower, constant.upper))
         if a == b == 1.0:
             return self
         if a == b == -1.0:
             return -self
+        # The constant may have either sign: the range is symmetric.
         if a < 0.0 < b:
             bound = _pad_underflow(self.max_abs * max(-a, b), 1)
             return self._rounded_outward(-bound, bound, constant)
@@ -184,12 +188,14 @@ class Interval:
         if a == b <= 1.0 and np.frexp(a)[0] == 0.5:  # a power of two: exact, but for underflow
             low, high = _pad_underflow(self.lower * a, -1), _pad_underflow(self.upper * a, 1)
             return Interval(low, high, self.is_single or constant.is_single)
+        # The constant is positive: whether a or b gives the lowest product depends on the sign of
+        # `lower`.
         low = self.lower * a if a == b else _minimum(self.lower * a, self.lower * b)
         high = self.upper * b if a == b else _maximum(self.upper * a, self.upper * b)
         return self._rounded_outward(_pad_underflow(low, -1), _pad_underflow(high, 1), constant)
 
     def square(self) -> Interval:
-        """The range of x^2 for x in the interval."""
+        """The range of x^2 for x in the interval. It is at least 0."""
         low, high = self.min_abs, self.max_abs
         if self.lower is self.upper:
             low = high
@@ -199,7 +205,7 @@ class Interval:
         return Interval(_maximum(result.lower, 0.0), result.upper, self.is_single)
 
     def reciprocal(self) -> Interval:
-        """The range of 1/x; all numbers if 0 lies in the interval."""
+        """The range of 1/x for x in the interval; all numbers if 0 lies in it."""
         if self.is_literal:
             if self.lower <= 0.0 <= self.upper:
                 return Interval(-math.inf, math.inf, self.is_single)
@@ -211,7 +217,8 @@ class Interval:
         return Interval(dr.select(has_zero, -dr.inf, low), dr.select(has_zero, dr.inf, high))
 
     def _rounded_outward(self, low: Real, high: Real, other: Interval | None = None) -> Interval:
-        """The interval [low, high], computed by a rounded operation, with its ends moved outwards.
+        """The interval [low, high], whose ends were computed with rounding, with its ends moved
+        outwards by that rounding.
 
         other: the second operand of the operation, if there is one. If it or this interval is of
             single precision, so is the result.
@@ -223,11 +230,8 @@ class Interval:
         return Interval(low, high, single)
 
     def widened(self, relative: float, absolute: float = 0.0) -> Interval:
-        """The interval with each end x moved outwards by relative * |x| + absolute.
-
-        So it contains the results of a function of the backend that has these relative and absolute
-        errors.
-        """
+        """The interval with each end x moved outwards by relative * |x| + absolute. So it contains
+        the results of a function of the backend that has these relative and absolute errors."""
         low, high = self.lower, self.upper
         return Interval(
             _round_down(low - relative * _absolute(low) - absolute),
@@ -245,7 +249,7 @@ def machine_epsilon(x: Real) -> float:
 
 
 def typed_select(condition: Mask, a: Real, b: Real, like: Real) -> Real:
-    """a where the condition holds, else b, with numbers of the type of `like`.
+    """a on lanes where the condition holds, else b, with numbers of the type of `like`.
 
     From two Python numbers Dr.Jit's select would make integers or numbers of single precision.
     """
@@ -254,17 +258,18 @@ def typed_select(condition: Mask, a: Real, b: Real, like: Real) -> Real:
 
 
 def _round_down(x: Real, units: float = 1.0) -> Real:
-    """A number below x by at least `units` units in the last place of x."""
+    """x moved down by `units` units in the last place of x, or a little more."""
     return dr.fma(dr.abs(x), -units * machine_epsilon(x), x)
 
 
 def _round_up(x: Real, units: float = 1.0) -> Real:
-    """A number above x by at least `units` units in the last place of x."""
+    """x moved up by `units` units in the last place of x, or a little more."""
     return dr.fma(dr.abs(x), units * machine_epsilon(x), x)
 
 
 def _pad_underflow(x: Real, sign: int) -> Real:
-    """A product x, moved up (sign 1) or down (-1) by the largest error that underflow causes."""
+    """The computed product x, moved up (sign 1) or down (-1) by the largest error that underflow
+    causes. A Python float stays as it is."""
     kind = cast("Any", type(x))
     return x + sign * float(dr.smallest(kind)) if dr.is_array_v(kind) else x
 
@@ -298,7 +303,7 @@ def _maximum(a: Real, b: Real) -> Real:
 
 
 def _maximum_or_nan(a: Real, b: Real) -> Real:
-    """The larger number; NaN if either is NaN."""
+    """The larger number; NaN if either number is NaN."""
     if isinstance(a, float) and isinstance(b, float):
         return math.nan if a != a or b != b else max(a, b)
     return dr.select((a > b) | dr.isnan(a), a, b)
@@ -320,8 +325,8 @@ def _absolute(x: Real) -> Real:
 
 
 def _none_is_nan(numbers: tuple[Real, ...]) -> Mask | None:
-    """Whether the sum of the numbers is a number: none of them is NaN, and no two of them are
-    opposite infinities."""
+    """A mask of the lanes on which the sum of the numbers is a number. It is NaN if one of them is,
+    or if two of them are opposite infinities."""
     total = numbers[0]
     for number in numbers[1:]:
         total = total + number

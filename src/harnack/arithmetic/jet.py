@@ -1,10 +1,11 @@
-"""A function and its derivatives as a single number: `Jet` holds proved ranges, `Dual` plain
-numbers.
-
-A formula that is evaluated with jets as its coordinates returns the jet of its value. With jets at
-a point it gives value, gradient and Hessian with proved bounds of rounding; with jets on a piece of
-a path it gives the ranges from which steps are proved.
-"""
+"""A function and its derivatives as a single number: `Jet` holds ranges, intervals that are proved
+to contain the values and derivatives, and `Dual` plain numbers. A formula that is evaluated with
+jets as its coordinates returns the jet of its value. The variables are either the coordinates x, y
+and z at a point or on a box, or the length s along a path, which is a piece of a ray. Jets at a
+point give value, gradient and Hessian with proved bounds of rounding; jets on a piece of a path
+give the ranges from which steps are proved. Such a jet also holds the jet at the start of its
+piece, because the ranges on the piece follow more sharply from the values there and from the higher
+derivatives. Indices denote derivatives by variables: x_i, x_ij."""
 
 from __future__ import annotations
 
@@ -29,11 +30,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Jet(FormulaNumber):
-    """Ranges of a function of n variables, and of its derivatives, on a box of the variables.
+    """Ranges (intervals) of a function of n variables, and of its first and second derivatives, on
+    a box of the variables. Mostly n = 1, the length along a path, or n = 3, the coordinates at a
+    point.
 
-    Mostly n = 1, the length along a path, or n = 3, the coordinates at a point. The arithmetic is
-    interval arithmetic of value, first and second derivatives at once (Moore 1966). The Taylor
-    forms of Aydinlilar and Zanni (2023, section 6.1) consist of it.
+    The arithmetic is interval arithmetic of value, first and second derivatives at once (Moore
+    1966). The Taylor forms of Aydinlilar and Zanni (2023, section 6.1) consist of it.
 
     value: the range of the function.
     first_derivatives: (n,) the ranges of the partial derivatives.
@@ -59,8 +61,8 @@ class Jet(FormulaNumber):
 
     @classmethod
     def at_point(cls, p: Vec3, *, order: int = 1) -> tuple[Jet, Jet, Jet]:
-        """The three coordinates x, y and z as functions of (x, y, z), at points p: jets for
-        gradients and Hessians.
+        """The jets of the coordinates x, y and z at points p, as functions of the three variables
+        x, y and z. A formula of them gives its gradient and Hessian.
 
         order: the highest order of derivatives, 1 or 2.
         """
@@ -72,8 +74,8 @@ class Jet(FormulaNumber):
 
     @classmethod
     def over_ball(cls, p: Vec3, radius: Real) -> tuple[Jet, Jet, Jet]:
-        """The three coordinates x, y and z as functions of (x, y, z), on boxes around the balls
-        B(p, radius)."""
+        """The jets of the coordinates x, y and z, as functions of the three variables x, y and z,
+        on boxes around the balls B(p, radius)."""
         x, y, z = cls.at_point(p)
         ends = Interval(-radius, radius)
         x, y, z = (dataclasses.replace(jet, value=jet.value + ends) for jet in (x, y, z))
@@ -90,15 +92,17 @@ class Jet(FormulaNumber):
         anchored: bool = True,
         is_rounded: bool = False,
     ) -> tuple[Jet, Jet, Jet]:
-        """The three coordinates of p + s d as functions of s, for start <= s <= end.
+        """The three coordinates of the points p + s d as functions of s, on the piece start <= s <=
+        end.
 
+        direction: d.
         anchored: whether ranges are narrowed from their values at the start of the piece.
         is_rounded: whether the path passes p only up to the rounding of p's coordinates. Ranges
             then hold for all such paths, each along d.
         """
 
         def coordinate(x: Real, slope: Real) -> Jet:
-            """The jet of x + s slope on the piece, with its jet at the start."""
+            """The function x + s slope on the piece, with its jet at the start of the piece."""
             rate = Interval.point(slope)
             base = Interval.point(x)
             if is_rounded:
@@ -114,13 +118,13 @@ class Jet(FormulaNumber):
     # Operators.
 
     def constant(self, x: float | Real) -> Jet:
-        """A constant number as a function of the same variables."""
+        """The constant number x as a function of the same variables."""
         if dr.is_array_v(cast("Any", type(x))):
             return self._constant(Interval.point(x))
         return self._constant(Interval.enclosing(float(x), type(self.backend_number())))
 
     def _constant(self, value: Interval) -> Jet:
-        """A constant with a known range as a function of the same variables."""
+        """A constant in the range `value` as a function of the same variables."""
         zeros = (ZERO,) * len(self.first_derivatives), (ZERO,) * len(self.second_derivatives)
         start = (
             None
@@ -130,14 +134,16 @@ class Jet(FormulaNumber):
         return Jet(value, *zeros, start, self.piece_length)
 
     def backend_number(self) -> Any:
-        """A number of the backend's type that the ranges use; a Python number if there is none."""
-        for jet in (self.value, *self.first_derivatives):
-            if dr.is_array_v(cast("Any", type(jet.lower))):
-                return jet.lower
+        """Any Dr.Jit number among the ends of the ranges; `piece_length` if all ends are Python
+        numbers."""
+        for interval in (self.value, *self.first_derivatives):
+            if dr.is_array_v(cast("Any", type(interval.lower))):
+                return interval.lower
         return self.piece_length
 
     def sum(self, other: Jet) -> Jet:
-        """The sum of two functions."""
+        """The sum of this function and another one. The sum of two sums of squares is a sum of
+        squares."""
         jet = Jet(
             self.value + other.value,
             tuple(
@@ -151,10 +157,13 @@ class Jet(FormulaNumber):
         )
         if self.jet_at_start is not None:
             jet = jet.narrowed_from_start(self.jet_at_start + other.jet_at_start, self.piece_length)
-        is_square = bool(self.roots and other.roots)
-        return dataclasses.replace(jet, roots=self.roots + other.roots) if is_square else jet
+        is_sum_of_squares = bool(self.roots and other.roots)
+        return (
+            dataclasses.replace(jet, roots=self.roots + other.roots) if is_sum_of_squares else jet
+        )
 
     def __neg__(self) -> Jet:
+        """The function times -1."""
         return dataclasses.replace(
             self,
             value=-self.value,
@@ -165,7 +174,8 @@ class Jet(FormulaNumber):
         )
 
     def product(self, other: Jet) -> Jet:
-        """The product of two functions, by the product rule."""
+        """The product of this function and another one, by the product rule. A sum of squares times
+        a positive constant is a sum of squares again."""
         if other is self:  # a square, whose range is sharper than that of a product
             return self.apply(power(2))
         x, y = self.value, other.value
@@ -189,8 +199,9 @@ class Jet(FormulaNumber):
         return dataclasses.replace(jet, roots=roots) if roots else jet
 
     def _scaled_roots(self, factor: Interval) -> tuple[Jet, ...]:
-        """The roots (functions whose squares add up to a function, see `Jet`) of the product of
-        this function with a constant; none if the constant is not known to be positive.
+        """The functions whose squares add up to the product of this function with a constant; none
+        if they are not known, or if the constant is not known to be positive. Each is a root of
+        this function (see `Jet`) times the square root of the constant.
 
         factor: the range of the constant.
         """
@@ -220,6 +231,9 @@ class Jet(FormulaNumber):
         return self * self._constant(b.value.reciprocal())
 
     def __pow__(self, exponent: Any) -> Jet:
+        """This function to a power: as exp(exponent log(this)) for an exponent that is a function,
+        else by the elementary function `power`. The power 1/2 of a known sum of squares is a
+        norm."""
         if isinstance(exponent, Jet):
             if self.value.is_literal:  # Python numbers: take the type from the exponent
                 base = exponent._constant(self.value_on_backend(exponent.backend_number()))
@@ -233,16 +247,19 @@ class Jet(FormulaNumber):
     def apply(self, function: ElementaryFunction) -> Jet:
         """The composition f(g) of an elementary function f with this function g.
 
-        Its derivatives are f(g)' = f' g' and f(g)'' = f'' g' g' + f' g''.
+        Its derivatives are f(g)' = f' g' and f(g)'' = f'' g' g' + f' g''. The square root of a
+        known sum of squares is computed as a norm.
         """
+        # The square root of a sum of squares.
         if function is sqrt and self.roots:
             from harnack.arithmetic.norms import norm
 
             return norm(*self.roots)
         x = self.value_on_backend()
+        # The ranges of f, f' and f'' on the range of g.
         value, slope, curvature = function.ranges(x)
-        first = tuple(slope * derivative for derivative in self.first_derivatives)
-        second = tuple(
+        first_derivatives = tuple(slope * derivative for derivative in self.first_derivatives)
+        second_derivatives = tuple(
             curvature
             * (
                 self.first_derivatives[i].square()
@@ -252,37 +269,44 @@ class Jet(FormulaNumber):
             + slope * self.second_derivatives[k]
             for k, (i, j) in enumerate(self.hessian_indices())
         )
-        jet = Jet(value, first, second, piece_length=self.piece_length)
+        jet = Jet(value, first_derivatives, second_derivatives, piece_length=self.piece_length)
         if self.jet_at_start is not None:
             jet = jet.narrowed_from_start(self.jet_at_start.apply(function), self.piece_length)
         is_square = function.name == "power 2"
         return dataclasses.replace(jet, roots=(self,)) if is_square else jet
 
     def pointwise_maximum(self, other: Jet) -> Jet:
-        """The larger of two functions at each point.
+        """The larger of this function x and another function y at each point.
 
         Proof. If one function is larger everywhere in the box, it is the maximum. Otherwise each
         derivative of the maximum is that of one of the two, except where they cross. There the
         first derivative jumps up, so that the second derivative has no upper bound.
         """
         x, y = self.value_on_backend(), other.value_on_backend(self.backend_number())
-        is_x, is_y = x.lower > y.upper, y.lower > x.upper
+        is_x_larger, is_y_larger = x.lower > y.upper, y.lower > x.upper
 
         def chosen(u: Interval, v: Interval, *, kink: bool) -> Interval:
-            """The range u or v of the larger function; their hull where neither is known to be
-            larger, without an upper end if the derivative may have a kink there."""
+            """The range u (of x or a derivative) or v (of y or its derivative) of the larger
+            function. Where neither is known to be larger, it is the hull of both, without an upper
+            end if the derivative may have a kink there."""
             if u.is_literal and v.is_literal and u == v and not kink:
                 return u
-            both = u.hull(v)
-            high = dr.inf if kink else both.upper
+            hull = u.hull(v)
+            high = dr.inf if kink else hull.upper
             return Interval(
                 typed_select(
-                    is_x, u.lower, typed_select(is_y, v.lower, both.lower, x.lower), x.lower
+                    is_x_larger,
+                    u.lower,
+                    typed_select(is_y_larger, v.lower, hull.lower, x.lower),
+                    x.lower,
                 ),
-                typed_select(is_x, u.upper, typed_select(is_y, v.upper, high, x.lower), x.lower),
+                typed_select(
+                    is_x_larger, u.upper, typed_select(is_y_larger, v.upper, high, x.lower), x.lower
+                ),
             )
 
         pairs = self.hessian_indices()
+        # The larger of both lower ends, and the larger of both upper ends.
         value = Interval(x.intersect(y).lower, x.hull(y).upper)
         first = tuple(
             chosen(u, v, kink=False)
@@ -311,21 +335,28 @@ class Jet(FormulaNumber):
             theta_i = (x y_i - y x_i)/r^2,   rho_i = (x x_i + y y_i)/r^2,
             theta_ij = (x y_ij - y x_ij)/r^2 - theta_i rho_j - theta_j rho_i.
 
-        Symbols in the code: u and v are the ranges of x and y, `over` that of 1/r, c and s those of
-        x/r and y/r.
+        On a box that meets the cut of the angle (the negative x axis), the ranges of the
+        derivatives are all numbers. In the code u and v are the ranges of x and y, `inverse_r` that
+        of 1/r, and `cosine` and `sine` those of x/r and y/r.
         """
-        like = x.backend_number() if self.value.is_literal else self.backend_number()
-        v, u = self.value_on_backend(like), x.value_on_backend(like)
-        value, on_cut = angle_range(v, u)
-        over = sqrt.ranges(u.square() + v.square())[0]
-        over = Interval(0 * over.lower, dr.inf).intersect(reciprocal.ranges(over)[0])
-        c, s = (bound * over for bound in (u, v))
-        c, s = (Interval(fmax(bound.lower, -1), fmin(bound.upper, 1)) for bound in (c, s))
-        count = range(len(self.first_derivatives))
-        theta = [wronskian_range(x, self, u, v, i) * over * over for i in count]
-        rho = [(c * x.first_derivatives[i] + s * self.first_derivatives[i]) * over for i in count]
+        number = x.backend_number() if self.value.is_literal else self.backend_number()
+        v, u = self.value_on_backend(number), x.value_on_backend(number)
+        value, meets_cut = angle_range(v, u)
+        inverse_r = sqrt.ranges(u.square() + v.square())[0]
+        # 1/r is at least 0, and x/r and y/r are within [-1, 1].
+        inverse_r = Interval(0 * inverse_r.lower, dr.inf).intersect(reciprocal.ranges(inverse_r)[0])
+        cosine, sine = (bound * inverse_r for bound in (u, v))
+        cosine, sine = (
+            Interval(fmax(bound.lower, -1), fmin(bound.upper, 1)) for bound in (cosine, sine)
+        )
+        variables = range(len(self.first_derivatives))
+        theta = [wronskian_range(x, self, u, v, i) * inverse_r * inverse_r for i in variables]
+        rho = [
+            (cosine * x.first_derivatives[i] + sine * self.first_derivatives[i]) * inverse_r
+            for i in variables
+        ]
         second = [
-            (c * self.second_derivatives[k] - s * x.second_derivatives[k]) * over
+            (cosine * self.second_derivatives[k] - sine * x.second_derivatives[k]) * inverse_r
             - (theta[i] * rho[j] + theta[j] * rho[i])
             for k, (i, j) in enumerate(self.hessian_indices())
         ]
@@ -333,8 +364,8 @@ class Jet(FormulaNumber):
         def uncut(bound: Interval) -> Interval:
             """The range of a derivative; all numbers where the box meets the cut of the angle."""
             return Interval(
-                typed_select(on_cut, -dr.inf, bound.lower, like),
-                typed_select(on_cut, dr.inf, bound.upper, like),
+                typed_select(meets_cut, -dr.inf, bound.lower, number),
+                typed_select(meets_cut, dr.inf, bound.upper, number),
             )
 
         first = tuple(uncut(bound) for bound in theta)
@@ -349,14 +380,14 @@ class Jet(FormulaNumber):
 
     def select(self, condition: Mask, other: Jet) -> Jet:
         """This jet on lanes where the condition holds, the jet `other` on all other lanes."""
-        kind = self.backend_number()
+        number = self.backend_number()
 
         def chosen(u: Interval, v: Interval) -> Interval:
-            """The range u on lanes where the condition holds, v on all others."""
+            """The range u on lanes where the condition holds, v on all other lanes."""
             if u.is_literal and v.is_literal and u == v:
                 return u
-            low = typed_select(condition, u.lower, v.lower, kind)
-            return Interval(low, typed_select(condition, u.upper, v.upper, kind))
+            low = typed_select(condition, u.lower, v.lower, number)
+            return Interval(low, typed_select(condition, u.upper, v.upper, number))
 
         start = None
         if self.jet_at_start is not None and other.jet_at_start is not None:
@@ -376,7 +407,8 @@ class Jet(FormulaNumber):
         )
 
     def value_on_backend(self, like: Any = None) -> Interval:
-        """The range of the value with ends that are numbers of the backend.
+        """The range of the value with Dr.Jit numbers as its ends: if they are Python numbers, they
+        are converted.
 
         like: a number of the type to use; by default one of this jet.
         """
@@ -389,15 +421,16 @@ class Jet(FormulaNumber):
         )
 
     def hessian_indices(self) -> list[tuple[int, int]]:
-        """The pairs (i, j) of variables of the second derivatives, in the order in which they are
-        stored."""
+        """The pairs (i, j) of variables by which the second derivatives are taken, in the order in
+        which they are stored."""
         n = len(self.first_derivatives)
         return [(i, j) for i in range(n) for j in range(i, n)][: len(self.second_derivatives)]
 
     def narrowed_from_start(self, start: Jet | None, width: Real) -> Jet:
-        """The same jet, narrowed by the ranges at the start of the piece.
+        """This jet on a piece of a path, with its ranges narrowed by the values at the start of the
+        piece.
 
-        start: the jet at the start; None leaves the jet unchanged.
+        start: the jet at the start; None leaves this jet unchanged.
         width: the length w of the piece.
 
         Proof. f(s) = f(0) + s f'(r) for some r between 0 and s, so f stays within f(0) + [0, w] f'.
@@ -409,25 +442,26 @@ class Jet(FormulaNumber):
         rise = range_times_length(self.first_derivatives[0], width)
         first = self.first_derivatives[0]
         if self.second_derivatives:
-            turned = start.first_derivatives[0] + range_times_length(
+            slope_from_start = start.first_derivatives[0] + range_times_length(
                 self.second_derivatives[0], width
             )
-            first = first.intersect(turned)
+            first = first.intersect(slope_from_start)
         value = self.value.intersect(start.value + rise)
         return Jet(value, (first,), self.second_derivatives, start, width)
 
 
 def wronskian_range(x: Jet, y: Jet, u: Interval, v: Interval, i: int) -> Interval:
-    """The range of w = x y_i - y x_i, where y_i and x_i are derivatives by the variable i.
+    """The range of w = x y_i - y x_i on a box or on a piece of a path, where y_i and x_i are
+    derivatives by the variable i.
 
     x, y: the two functions, as jets (ranges of value and derivatives).
     u, v: the ranges of the values of x and of y, with Dr.Jit numbers as ends.
     i: the index of the variable.
 
-    If the jets are on a piece of a path, with the variable i as its parameter, w has the derivative
-    w_i = x y_ii - y x_ii. The range of w is then cut to the value of w at the start of the piece
-    plus the range of w_i times the length. On a straight line the coordinates x and y are linear
-    functions of the parameter, so w_i = 0, and w is known as well as at the start.
+    On a piece of a path the variable i is the length s. Then w has the derivative x y_ii - y x_ii,
+    as the terms x_i y_i cancel. So w is also within its value at the start of the piece plus the
+    length times the range of this derivative, and the two ranges are intersected. Coordinates are
+    linear in s; for them the derivative is 0, and w is its value at the start.
     """
     w = u * y.first_derivatives[i] - v * x.first_derivatives[i]
     if x.jet_at_start is None or y.jet_at_start is None:
@@ -436,12 +470,12 @@ def wronskian_range(x: Jet, y: Jet, u: Interval, v: Interval, i: int) -> Interva
         x.jet_at_start.value * y.jet_at_start.first_derivatives[i]
         - y.jet_at_start.value * x.jet_at_start.first_derivatives[i]
     )
-    rate = u * y.second_derivatives[i] - v * x.second_derivatives[i]
-    return w.intersect(at_start + range_times_length(rate, x.piece_length))
+    derivative = u * y.second_derivatives[i] - v * x.second_derivatives[i]
+    return w.intersect(at_start + range_times_length(derivative, x.piece_length))
 
 
 def range_times_length(slope: Interval, width: Real) -> Interval:
-    """The range of s t for 0 <= s <= width and t in the interval `slope`: it contains 0.
+    """The range of s t for 0 <= s <= width and t in the interval `slope`. It contains 0.
 
     width: a length >= 0, a number of the backend.
 
@@ -456,7 +490,8 @@ def range_times_length(slope: Interval, width: Real) -> Interval:
 
 
 def _moved(base: Interval, rate: Interval, s: Real) -> Interval:
-    """The range of base + rate s for a single number s."""
+    """The range of base + rate s for numbers of the intervals `base` and `rate` and a single number
+    s."""
     if isinstance(s, float) and s == 0.0:
         return base
     return base + rate * Interval.point(s)
@@ -467,11 +502,12 @@ _Partials = tuple[Any, Any, Any]
 
 @dataclass(frozen=True, eq=False)
 class Dual(FormulaNumber):
-    """A function at a point: its value and its three partial derivatives, as plain numbers.
+    """A function of x, y and z at a point: its value and its three partial derivatives there, as
+    plain numbers without ranges. So nothing is proved with it.
 
-    There are no ranges, so nothing is proved. At a tie, such as in max(x, 0) at x = 0, the ranges
-    of a `Jet` contain all slopes nearby. A dual number has the slope of one of the two sides there,
-    since each comparison is decided by the values.
+    At a tie, such as in max(x, 0) at x = 0, the ranges of a `Jet` contain all slopes nearby. A dual
+    number has the slope of one of the two sides there, since each comparison is decided by the
+    values.
     """
 
     value: Real
@@ -479,28 +515,32 @@ class Dual(FormulaNumber):
 
     @classmethod
     def at_point(cls, p: Vec3) -> tuple[Dual, Dual, Dual]:
-        """The three coordinates x, y and z as functions of (x, y, z), at points p."""
+        """The coordinates x, y and z at points p, as functions of the three variables x, y and
+        z."""
         return cls(p.x, (1.0, 0.0, 0.0)), cls(p.y, (0.0, 1.0, 0.0)), cls(p.z, (0.0, 0.0, 1.0))
 
     def constant(self, x: float | Real) -> Dual:
         return Dual(cast("Any", type(self.value))(x), (0.0, 0.0, 0.0))
 
     def sum(self, other: Dual) -> Dual:
-        """The sum of two functions."""
+        """The sum of this function and another one."""
         return Dual(
             self.value + other.value,
             _map_partials(operator.add, self.first_derivatives, other.first_derivatives),
         )
 
     def product(self, other: Dual) -> Dual:
-        """The product of two functions, by the product rule."""
-        x, y = self.value, other.value
+        """The product of this function and another one, by the product rule."""
+        own_value, other_value = self.value, other.value
 
         def rule(a: Any, b: Any) -> Any:
             """The partial derivative of the product, from those of the two factors."""
-            return a * y + x * b
+            return a * other_value + own_value * b
 
-        return Dual(x * y, _map_partials(rule, self.first_derivatives, other.first_derivatives))
+        return Dual(
+            own_value * other_value,
+            _map_partials(rule, self.first_derivatives, other.first_derivatives),
+        )
 
     def __neg__(self) -> Dual:
         return Dual(-self.value, _map_partials(operator.neg, self.first_derivatives))
@@ -521,7 +561,8 @@ class Dual(FormulaNumber):
         return Dual(function.on_drjit(self.value), _map_partials(rule, self.first_derivatives))
 
     def polar_angle(self, x: Dual) -> Dual:
-        """The polar angle of the point (x, y), where y is this function."""
+        """The polar angle of the point (x, y), where y is this function. With an index for a
+        derivative, its derivatives are (x y_i - y x_i)/(x^2 + y^2)."""
         u, v = x.value, self.value
 
         def rule(a: Any, b: Any) -> Any:
@@ -545,7 +586,10 @@ class Dual(FormulaNumber):
 
 
 def _map_partials(function: Callable[..., Any], *partials: _Partials) -> _Partials:
-    """The results of `function` for each of the three partial derivatives of one or several
-    functions."""
+    """Apply `function` three times: to the derivatives by x of one or several functions, to those
+    by y and to those by z. Returns the three results.
+
+    partials: for each function its three partial derivatives.
+    """
     x, y, z = (function(*of_axis) for of_axis in zip(*partials, strict=True))
     return x, y, z

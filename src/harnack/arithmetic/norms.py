@@ -1,9 +1,9 @@
-"""Functions of several numbers: maxima, minima, norms and blends (Hart 1996, appendix B).
-
-Their arguments are jets, numbers of the other arithmetics, Dr.Jit and NumPy arrays or Python
-numbers, also of different kinds in one call. Blends combine distances, with a sharp or with a
-rounded edge.
-"""
+"""Functions of several numbers: maxima, minima, norms and blends (Hart 1996, appendix B). The
+numbers are jets (ranges of a function and of its derivatives), numbers of the other arithmetics,
+Dr.Jit and NumPy arrays or Python numbers, also of different kinds in one call. All ranges are
+intervals that are proved to contain the values. Blends combine two signed distances, or functions
+like these, into that of a union or intersection with a rounded edge. Indices denote derivatives:
+x_i' or x_i,j."""
 
 from __future__ import annotations
 
@@ -36,7 +36,9 @@ def minimum(*values: Any) -> Any:
 
 
 def _reduce_extremum(name: str, values: tuple[Any, ...]) -> Any:
-    """The maximum or minimum (`name`) of two or more numbers of any kind.
+    """The maximum or minimum of two or more numbers of any kind.
+
+    name: "maximum" or "minimum".
 
     Raises:
         TypeError: there are fewer than two numbers.
@@ -47,12 +49,12 @@ def _reduce_extremum(name: str, values: tuple[Any, ...]) -> Any:
         # Jets and their like first: their methods accept numbers of the other kinds.
         ordered = sorted(values, key=lambda value: not isinstance(value, FormulaNumber))
         return functools.reduce(lambda a, b: getattr(a, name)(b), ordered)
-    of_arrays, of_others = _EXTREMUM_FUNCTIONS[name]
+    array_function, plain_function = _EXTREMUM_FUNCTIONS[name]
 
     def plain(a: Any, b: Any) -> Any:
         """The maximum or minimum of two arrays or Python numbers."""
         is_array = any(dr.is_array_v(cast("Any", type(value))) for value in (a, b))
-        return of_arrays(a, b) if is_array else of_others(a, b)
+        return array_function(a, b) if is_array else plain_function(a, b)
 
     return functools.reduce(plain, values)
 
@@ -68,9 +70,9 @@ def norm(*values: Any, p: float = 2.0) -> Any:
 
     p: at least 1; 2 for the Euclidean length, `math.inf` for the largest absolute value.
 
-    Proof of the ranges. Let N be the norm of functions x_i, and u_i = |x_i|/N <= 1. Then
-    N' = sum_i sign(x_i) u_i^(p-1) x_i'. By Hoelder's and Minkowski's inequalities |N'| is at most
-    the p-norm of the x_i'. And
+    Proof of the ranges. Let N be the norm of functions x_i, and u_i = |x_i|/N <= 1. Then N' = sum_i
+    sign(x_i) u_i^(p-1) x_i'. By Hoelder's and Minkowski's inequalities |N'| is at most the p-norm
+    of the x_i'. And
 
         N'' = (p-1)/N (sum_i u_i^(p-2) x_i'^2 - N'^2) + sum_i sign(x_i) u_i^(p-1) x_i''.
 
@@ -94,6 +96,7 @@ def norm(*values: Any, p: float = 2.0) -> Any:
     if p == 1.0:
         return functools.reduce(lambda a, b: a + b, [absolute(term) for term in values])
     jets = [term for term in values if isinstance(term, Jet)]
+    # Another arithmetic than jets: the root of the sum of powers.
     if not jets and any(isinstance(term, FormulaNumber) for term in values):
         sizes = [term if p == 2.0 else absolute(term) for term in values]
         powers = [
@@ -113,58 +116,65 @@ def _plain_norm(values: tuple[Any, ...], p: float) -> Any:
     """The p-norm of arrays and Python numbers, in a form whose derivative is finite if all numbers
     are 0."""
     if not any(dr.is_array_v(cast("Any", type(value))) for value in values):
+        # NumPy: divided by the largest, so that no power overflows.
         sizes = np.array(np.broadcast_arrays(*(np.abs(value) for value in values)))
         largest = sizes.max(axis=0)
         scale = np.where(largest > 0, largest, 1.0)
         return scale * np.sum((sizes / scale) ** p, axis=0) ** (1 / p) * (largest > 0)
+    # Dr.Jit: the root is taken of 1 where the sum is 0, since its derivative at 0 is infinite.
     if p == 2.0:
-        total = functools.reduce(lambda a, b: a + b, [value * value for value in values])
-        positive = total > 0
-        return dr.select(positive, dr.sqrt(dr.select(positive, total, 1)), 0)
+        power_sum = functools.reduce(lambda a, b: a + b, [value * value for value in values])
+        positive = power_sum > 0
+        return dr.select(positive, dr.sqrt(dr.select(positive, power_sum, 1)), 0)
+    # Divided by the largest, so that no power overflows.
     largest = functools.reduce(lambda a, b: fmax(a, b), [dr.abs(value) for value in values])
     positive = largest > 0
     scale = dr.select(positive, dr.detach(largest), 1)
-    parts = [dr.abs(value) / scale for value in values]
-    total = functools.reduce(lambda a, b: a + b, [_plain_power(value, p) for value in parts])
-    return dr.select(positive, scale * dr.power(dr.select(positive, total, 1), 1 / p), 0)
+    ratios = [dr.abs(value) / scale for value in values]
+    power_sum = functools.reduce(lambda a, b: a + b, [_plain_power(value, p) for value in ratios])
+    return dr.select(positive, scale * dr.power(dr.select(positive, power_sum, 1), 1 / p), 0)
 
 
 def _plain_power(x: Any, p: float) -> Any:
-    """x^p for Dr.Jit arrays x >= 0; 0 at x = 0, with derivative 0."""
+    """x^p for Dr.Jit arrays x >= 0, with the derivative 0 at x = 0."""
     return dr.select(x > 0, dr.power(dr.select(x > 0, x, 1), p), 0)
 
 
 def _jet_norm(xs: list[Jet], p: float) -> Jet:
-    """The p-norm N of the jets x_i, for 1 < p < infinity; `norm` has the proof of its ranges.
+    """The p-norm N of the jets x_i (ranges of functions and of their derivatives), for 1 < p <
+    infinity. `norm` has the proof of its ranges.
 
-    In the code `over` is the range of 1/N, `ratios` are the ranges of x_i/N, and `pulls` those of
-    sign(x_i) |x_i/N|^(p-1).
+    In the code `inverse_norm` is the range of 1/N, `ratios` are the ranges of x_i/N, and `pulls`
+    those of sign(x_i) |x_i/N|^(p-1).
     """
-    like = next((f.value.lower for f in xs if not f.value.is_literal), None)
-    like = xs[0].backend_number() if like is None else like
-    values = [as_backend_interval(f.value, like) for f in xs]
+    number = next((f.value.lower for f in xs if not f.value.is_literal), None)
+    number = xs[0].backend_number() if number is None else number
+    values = [as_backend_interval(f.value, number) for f in xs]
     length = _norm_range(values, p)
-    over = _reciprocal_norm(length)
-    ratios = [_clip_magnitude(f * over, ONE) for f in values]
+    inverse_norm = _reciprocal_norm(length)
+    ratios = [_clip_magnitude(f * inverse_norm, ONE) for f in values]
     pulls = ratios if p == 2.0 else [_signed_power(f, p - 1) for f in ratios]
-    count = range(len(xs))
+    indices = range(len(xs))
+    # N' is the sum of pulls times x_i', and at most the norm of the x_i'.
     first = tuple(
         _clip_magnitude(
-            _total([pulls[k] * xs[k].first_derivatives[i] for k in count]),
-            _norm_range([as_backend_interval(f.first_derivatives[i], like) for f in xs], p),
+            _total([pulls[k] * xs[k].first_derivatives[i] for k in indices]),
+            _norm_range([as_backend_interval(f.first_derivatives[i], number) for f in xs], p),
         )
         for i in range(len(xs[0].first_derivatives))
     )
     second: list[Interval] = []
     for k, (i, j) in enumerate(xs[0].hessian_indices()):
+        # The first part of N''.
         if p == 2.0:
-            convex = _wronskian_term(xs, values, over, i, j)
+            convex = _wronskian_term(xs, values, inverse_norm, i, j)
         else:
             convex = -(first[i] * first[j])
             for f, u in zip(xs, ratios, strict=True):
-                by = power(p - 2).ranges(Interval(u.min_abs, u.max_abs))[0]
-                convex = convex + by * _product(f.first_derivatives[i], f.first_derivatives[j])
-            convex = convex * over * Interval.enclosing(p - 1, type(like))
+                weight = power(p - 2).ranges(Interval(u.min_abs, u.max_abs))[0]
+                convex = convex + weight * _product(f.first_derivatives[i], f.first_derivatives[j])
+            convex = convex * inverse_norm * Interval.enclosing(p - 1, type(number))
+        # Not negative, because N is convex.
         if i == j:
             convex = Interval(fmax(convex.lower, 0), convex.upper)
         second.append(
@@ -178,36 +188,39 @@ def _jet_norm(xs: list[Jet], p: float) -> Jet:
 
 
 def _wronskian_term(
-    xs: list[Jet], values: list[Interval], over: Interval, i: int, j: int
+    xs: list[Jet], values: list[Interval], inverse_norm: Interval, i: int, j: int
 ) -> Interval:
-    """The range of sum_(k<l) w_kl,i w_kl,j / N^3: for p = 2 this is the part of a second derivative
-    of the norm N of functions x_k that their first derivatives contribute (`norm` has the proof).
+    """The range of the sum over pairs k < l of w_kl,i w_kl,j / N^3, where N is the Euclidean norm
+    of functions x_k. It is the part of N's second derivative by the variables i and j that the
+    first derivatives of the functions contribute (`norm` has the proof).
 
-    w_kl,i is the function w_kl = x_k x_l' - x_l x_k' with derivatives by the variable i.
+    w_kl,i is the function x_k x_l' - x_l x_k' with derivatives by the variable i.
 
     xs: the functions x_k.
     values: the ranges of their values.
-    over: the range of 1/N.
+    inverse_norm: the range of 1/N.
     i, j: the two variables of the second derivative.
     """
     parts: list[Interval] = []
     for k, m in itertools.combinations(range(len(xs)), 2):
         pair = xs[k], xs[m], values[k], values[m]
-        a = wronskian_range(*pair, i) * over
-        parts.append(a.square() if i == j else a * (wronskian_range(*pair, j) * over))
-    return _total(parts) * over
+        a = wronskian_range(*pair, i) * inverse_norm
+        parts.append(a.square() if i == j else a * (wronskian_range(*pair, j) * inverse_norm))
+    return _total(parts) * inverse_norm
 
 
 def _norm_range(values: list[Interval], p: float) -> Interval:
-    """The range of the p-norm of independent numbers in these intervals."""
+    """The range of the p-norm of independent numbers, one in each of the intervals `values`."""
     smallest, largest = [value.min_abs for value in values], [value.max_abs for value in values]
     low = _norm_of_magnitudes(smallest, p).lower
-    floor = functools.reduce(fmax, smallest)  # rounding and underflow cannot make it shorter
-    return Interval(fmax(low, floor), _norm_of_magnitudes(largest, p).upper)
+    largest_of_smallest = functools.reduce(
+        fmax, smallest
+    )  # rounding and underflow cannot make it shorter
+    return Interval(fmax(low, largest_of_smallest), _norm_of_magnitudes(largest, p).upper)
 
 
 def _norm_of_magnitudes(sizes: list[Any], p: float) -> Interval:
-    """The range of the p-norm of numbers >= 0, with its rounding.
+    """The range of the p-norm of numbers >= 0, which contains its rounding.
 
     sizes: the numbers.
     """
@@ -216,20 +229,21 @@ def _norm_of_magnitudes(sizes: list[Any], p: float) -> Interval:
     largest = functools.reduce(lambda a, b: dr.select((a > b) | dr.isnan(a), a, b), sizes)
     tiny = float(dr.smallest(cast("Any", type(largest))))
     # Divided by the largest, so that no power overflows.
-    over = Interval.point(fmax(tiny, largest)).reciprocal()
-    root, raised = power(1 / p).ranges, power(p).ranges
-    parts = [raised(Interval.point(size) * over)[0] for size in sizes]
-    total = root(_total(parts))[0] * Interval.point(largest)
+    inverse_largest = Interval.point(fmax(tiny, largest)).reciprocal()
+    root_ranges, power_ranges = power(1 / p).ranges, power(p).ranges
+    powers = [power_ranges(Interval.point(size) * inverse_largest)[0] for size in sizes]
+    norm = root_ranges(_total(powers))[0] * Interval.point(largest)
     return Interval(
-        dr.select(largest > tiny, total.lower, 0), fmax(total.upper, 0) + len(sizes) * tiny
+        dr.select(largest > tiny, norm.lower, 0), fmax(norm.upper, 0) + len(sizes) * tiny
     )
 
 
 def _signed_power(x: Interval, q: float) -> Interval:
-    """The range of sign(y) |y|^q for y in the interval x, q > 0. The function increases with y."""
+    """The range of sign(y) |y|^q for y in the interval x, q > 0. The function increases with y, so
+    the range follows from the ends."""
 
     def at(v: Any) -> Interval:
-        """The range at a single number v, with its rounding."""
+        """The range at a single number v, which contains the rounding."""
         size = power(q).ranges(Interval.point(dr.abs(v)))[0]
         return Interval(
             dr.select(v >= 0, size.lower, -size.upper), dr.select(v >= 0, size.upper, -size.lower)
@@ -240,15 +254,17 @@ def _signed_power(x: Interval, q: float) -> Interval:
 
 
 def _reciprocal_norm(length: Interval) -> Interval:
-    """The range of 1/N, where `length` is the range of N >= 0; the upper end is infinite if N may
-    be 0."""
-    over = reciprocal.ranges(length)[0]
+    """The range of 1/N for a norm N >= 0. Its upper end is infinite if N may be 0.
+
+    length: the range of N.
+    """
+    inverse = reciprocal.ranges(length)[0]
     from_upper = Interval.point(length.upper).reciprocal()
-    return Interval(fmax(from_upper.lower, 0), over.upper)
+    return Interval(fmax(from_upper.lower, 0), inverse.upper)
 
 
 def _clip_magnitude(x: Interval, limit: Interval) -> Interval:
-    """The interval x clipped to numbers whose absolute value is at most the upper end of
+    """The interval x, clipped to the numbers whose absolute value is at most the upper end of
     `limit`."""
     bound = limit.upper
     return Interval(fmax(x.lower, -bound), fmin(x.upper, bound))
@@ -256,17 +272,18 @@ def _clip_magnitude(x: Interval, limit: Interval) -> Interval:
 
 def _product(a: Interval, b: Interval) -> Interval:
     """The range of the product of two numbers, each in its interval. If both intervals are the same
-    object, it is the range of the square of one number."""
+    object, they stand for one number, and it is the range of its square."""
     return a.square() if a is b else a * b
 
 
 def _total(parts: list[Interval]) -> Interval:
-    """The sum of the intervals."""
+    """The range of the sum of numbers, one in each of the intervals."""
     return functools.reduce(lambda a, b: a + b, parts)
 
 
 def as_backend_interval(x: Interval, like: Any) -> Interval:
-    """The interval x; if its ends are Python numbers, they are converted to the type of `like`."""
+    """The interval x with Dr.Jit numbers as its ends: if they are Python numbers, they are
+    converted to the type of `like`."""
     if not x.is_literal:
         return x
     kind = cast("Any", type(like))
@@ -275,10 +292,9 @@ def as_backend_interval(x: Interval, like: Any) -> Interval:
 
 
 def blend_union(a: Any, b: Any, radius: Any, power: float = 2.0) -> Any:
-    """The function of a union with a rounded edge.
-
-    It is <= 0 where a <= 0, where b <= 0, and in the inner edge between the two sets, which a
-    superellipse fills.
+    """The function of a union with a rounded edge, from the functions a and b of two sets {a <= 0}
+    and {b <= 0}. It is <= 0 in both sets, and in the inner edge between them, which a superellipse
+    fills.
 
     a, b: numbers of any kind, such as signed distances.
     radius: the blend changes the union where both a and b are less than this.
@@ -286,20 +302,22 @@ def blend_union(a: Any, b: Any, radius: Any, power: float = 2.0) -> Any:
         larger powers make it sharper.
 
     Let r be the radius, p the power, g_a = max(0, 1 - a/r), and g_b the same for b. Where a or b is
-    less than r, the function is r (1 - |(g_a, g_b)|_p); Hart (1996, equation 43) prints the p-th
-    root around the whole expression instead of the sum of powers. Where both are at least r, it is
-    their minimum. It is continuous: where the smaller one is r, both formulas give r.
+    less than r, the function is r (1 - |(g_a, g_b)|_p), with the p-norm (g_a^p + g_b^p)^(1/p). (In
+    Hart 1996, equation 43, the p-th root is printed around the whole expression instead.) Where
+    both are at least r, it is their minimum. It is continuous: where the smaller one is r, both
+    formulas give r.
 
     Proof of its Lipschitz constant, for a and b with constants of at most 1. The gradient is
-    u_a^(p-1) grad a + u_b^(p-1) grad b with u = g/|g|_p. By Hoelder's inequality
-    u_a^(p-1) + u_b^(p-1) is at most 2^(1/p), with equality at a = b. So 2^(1/p) is a Lipschitz
-    constant, which is attained where the gradients are equal. If they are orthogonal and p >= 2, it
-    is 1. With two radii, as in Hart's paper, the function is not continuous at g = 0, and there is
-    no constant at all.
+    u_a^(p-1) grad a + u_b^(p-1) grad b with u = g/|g|_p. By Hoelder's inequality u_a^(p-1) +
+    u_b^(p-1) is at most 2^(1/p), with equality at a = b. So 2^(1/p) is a Lipschitz constant, which
+    is attained where the gradients are equal. If they are orthogonal and p >= 2, it is 1. With two
+    radii, as in Hart's paper, the function is not continuous at g = 0, and there is no constant at
+    all.
     """
     g_a, g_b = (maximum(1.0 - operand / radius, 0.0) for operand in (a, b))
     near = (1.0 - norm(g_a, g_b, p=power)) * radius
     smaller = minimum(a, b)
+    # Where the smaller one is at least r, `near` is r; elsewhere the second term is 0.
     both = near + maximum(smaller - radius, 0.0)
     if not isinstance(smaller, Jet) or not isinstance(both, Jet):
         return both
@@ -310,8 +328,13 @@ def blend_union(a: Any, b: Any, radius: Any, power: float = 2.0) -> Any:
 
 
 def blend_intersection(a: Any, b: Any, radius: Any, power: float = 2.0) -> Any:
-    """The function of the intersection of {a <= 0} and {b <= 0} with a rounded outer edge: the
-    blended union of the complements, negated. The parameters are those of `blend_union`."""
+    """The function of the intersection of the sets {a <= 0} and {b <= 0} with a rounded outer edge:
+    minus the function of the blended union of the complements.
+
+    a, b: numbers of any kind, such as signed distances.
+    radius: the blend changes the intersection where both -a and -b are less than this.
+    power: at least 1; larger powers make the edge sharper (`blend_union`).
+    """
     return -blend_union(-a, -b, radius, power)
 
 
@@ -331,10 +354,13 @@ def orthogonal_intersection(*sides: Any) -> Any:
     both = outside + minimum(largest, 0.0)
     if not isinstance(both, Jet):
         return both
+    # Outside of the set the minimum is 0.
     both = outside.select(largest.value.lower > 0, both)
     # Where no two sides can be positive, as on a face, the distance is the largest of them: the
     # kinks of the norm at 0 and of the minimum do not matter.
     highs = [side.value.upper if isinstance(side, Jet) else side for side in sides]
-    second = functools.reduce(fmax, [fmin(a, b) for a, b in itertools.combinations(highs, 2)])
+    second_largest = functools.reduce(
+        fmax, [fmin(a, b) for a, b in itertools.combinations(highs, 2)]
+    )
     is_finite = dr.isfinite(functools.reduce(lambda a, b: a + b, highs))
-    return largest.select((second < 0) & is_finite, both)
+    return largest.select((second_largest < 0) & is_finite, both)

@@ -1,7 +1,11 @@
 """The operators that the numbers of all arithmetics share, so that each of them evaluates formulas.
+A formula is a Python function of the coordinates x, y and z, written with + - * / ** and functions
+such as `harnack.math.sin`. An arithmetic is a kind of numbers, such as intervals with derivatives
+(`Jet`), for which a formula can be evaluated; all such kinds are subclasses of `FormulaNumber`. A
+number stands for a function of the variables, such as a part of the formula.
 
-`tally_of` estimates, before a kernel is recorded, how large the kernel of a formula will be. It
-also tells whether the formula may jump, have a vertical tangent, or turn within the rounding of
+`tally_of` estimates, before Dr.Jit records code for a formula, how long that code will be. It also
+tells whether the formula may jump, have a vertical tangent, or turn within the rounding of
 coordinates.
 """
 
@@ -62,16 +66,14 @@ _NAMES = (
 
 
 class FormulaNumber(abc.ABC):
-    """Base of the numbers of all arithmetics. It defines their operators.
-
-    These are + - * / **, abs, NumPy's functions, maximum, minimum and atan2. A subclass defines
-    sums, products, functions of a single number, the larger of two numbers, and the polar angle. A
-    formula is written once and evaluated with numbers of any subclass, such as `Jet`.
-    """
+    """Base of the numbers of all arithmetics, with which formulas are evaluated: it defines their
+    operators. These are + - * / **, abs, NumPy's functions, maximum, minimum and atan2. A subclass
+    defines sums, products, functions of a single number, the larger of two numbers, and the polar
+    angle. A formula is written once and evaluated with numbers of any subclass, such as `Jet`."""
 
     @abc.abstractmethod
     def constant(self, x: float | Real) -> Self:
-        """A Python number, or one of the backend, as a constant of this arithmetic."""
+        """The number x, a Python number or one of the backend, as a constant of this arithmetic."""
 
     @abc.abstractmethod
     def sum(self, other: Any) -> Self: ...
@@ -84,7 +86,7 @@ class FormulaNumber(abc.ABC):
 
     @abc.abstractmethod
     def apply(self, function: ElementaryFunction) -> Self:
-        """The elementary function, applied to this number."""
+        """The elementary function, such as sin, of this number."""
 
     @abc.abstractmethod
     def pointwise_maximum(self, other: Any) -> Self: ...
@@ -100,7 +102,8 @@ class FormulaNumber(abc.ABC):
         return self.apply(sqrt if p == 2.0 else power(1 / p))
 
     def _coerce_or_none(self, other: Any) -> Self | None:
-        """Another operand as a number of this arithmetic; None if it is not a number."""
+        """The operand `other` as a number of this arithmetic: itself if it is one already, else a
+        constant; None if it is not a number."""
         if isinstance(other, type(self)):
             return other
         if dr.is_array_v(cast("Any", type(other))):
@@ -111,7 +114,7 @@ class FormulaNumber(abc.ABC):
             return None
 
     def coerce(self, other: Any) -> Self:
-        """A number of any kind as a number of this arithmetic.
+        """The operand `other`, a number of any kind, as a number of this arithmetic.
 
         Raises:
             TypeError: it is no number.
@@ -144,6 +147,11 @@ class FormulaNumber(abc.ABC):
     __rmul__ = __mul__
 
     def __truediv__(self, other: Any) -> Any:
+        """The quotient of this number and another one: this number times the reciprocal.
+
+        Raises:
+            ZeroDivisionError: the divisor is the Python number 0.
+        """
         if isinstance(other, int | float):
             if other == 0:
                 raise ZeroDivisionError("a formula divides by the constant 0")
@@ -165,11 +173,12 @@ class FormulaNumber(abc.ABC):
         return (
             self._power_by_squaring(int(n))
             if n >= 0
+            # A negative power is the reciprocal of the positive one.
             else self._power_by_squaring(int(-n)).apply(reciprocal)
         )
 
     def _power_by_squaring(self, n: int) -> Self:
-        """This number to the power n >= 0, by products."""
+        """This number to the power n >= 0, by repeated squaring."""
         if n == 0:
             return self.constant(1.0)
         if n == 1:
@@ -179,6 +188,11 @@ class FormulaNumber(abc.ABC):
         return square.product(self) if n % 2 else square
 
     def __rpow__(self, base: Any) -> Any:
+        """A constant base to the power of this number.
+
+        Raises:
+            ValueError: the base is not positive.
+        """
         b = self._coerce_or_none(base)
         if b is None:
             return NotImplemented
@@ -197,11 +211,11 @@ class FormulaNumber(abc.ABC):
         return self.apply(absolute)
 
     def maximum(self, other: Any) -> Self:
-        """The larger of this and another number of any kind, at each point."""
+        """The larger of this number and another one of any kind, at each point."""
         return self.pointwise_maximum(self.coerce(other))
 
     def minimum(self, other: Any) -> Self:
-        """The smaller of this and another number of any kind, at each point."""
+        """The smaller of this number and another one of any kind, at each point."""
         return -((-self).pointwise_maximum(-self.coerce(other)))
 
     def atan2(self, x: Any) -> Self:
@@ -215,19 +229,29 @@ class FormulaNumber(abc.ABC):
         return self.coerce(y).polar_angle(self)
 
     def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **settings: Any) -> Any:
-        """NumPy's functions and operators, applied to these numbers."""
+        """Apply one of NumPy's functions or operators to these numbers, as NumPy's protocol asks.
+
+        Raises:
+            TypeError: this function has no proved ranges, or an operand is no number.
+        """
         name = ufunc.__name__
         if method == "__call__" and not settings:
             if name in _UFUNCS:
                 return self.apply(_UFUNCS[name])
             if name in _OPERATORS:
-                a, b = inputs
-                left, right = _OPERATORS[name]
-                is_left = isinstance(a, FormulaNumber)
-                result = getattr(a, left)(b) if is_left else getattr(b, right)(a)
+                left_operand, right_operand = inputs
+                # The method of the left operand if that is a number of an arithmetic, else the
+                # method of the right operand.
+                left_method, right_method = _OPERATORS[name]
+                is_left = isinstance(left_operand, FormulaNumber)
+                result = (
+                    getattr(left_operand, left_method)(right_operand)
+                    if is_left
+                    else getattr(right_operand, right_method)(left_operand)
+                )
                 if result is NotImplemented:
-                    other = type(b if is_left else a).__name__
-                    raise TypeError(f"expected a number, not an object of type {other}")
+                    wrong_type = type(right_operand if is_left else left_operand).__name__
+                    raise TypeError(f"expected a number, not an object of type {wrong_type}")
                 return result
         raise TypeError(
             f"numpy.{name} has no proved ranges: write formulas with + - * / **, abs, and "
@@ -259,7 +283,7 @@ class FormulaNumber(abc.ABC):
 
 
 def exponent_of(n: Any) -> float:
-    """A constant exponent as a Python number.
+    """The constant exponent n as a Python float.
 
     Raises:
         TypeError: it is not a number.
@@ -283,14 +307,16 @@ _MAX_SIZE = 1e100
 
 @dataclass(eq=False)
 class Tally:
-    """A summary of the operations on the numbers of a formula.
+    """A summary of the operations that a formula does on its numbers, from which the length of its
+    compiled code and its smoothness are estimated. A number of the formula is bent by a maximum, an
+    absolute value, or a function that is no power: it may then turn sharply, that is, be flat,
+    steep, and flat again.
 
     operations: about how many operations of Dr.Jit their ranges take.
     may_jump: whether a function was used that is not continuous everywhere.
     is_steep: whether the slope may have no bound in a bounded box, as with roots, powers below 1,
         quotients or logarithms.
-    steepest: the largest slope, for coordinates up to 1, of any number that was bent. A number is
-        bent by a maximum, an absolute value, or a function that is no power.
+    steepest: the largest slope, for coordinates up to 1, of any number that was bent.
     finest: the smallest nonzero constant, at most 1. A bent number may turn within this distance.
     farthest: the largest constant that was added.
     """
@@ -303,8 +329,8 @@ class Tally:
     farthest: float = 0.0
 
     def turns_within(self, finest: float) -> bool:
-        """Whether f may change by far more within the rounding of coordinates than its slopes on
-        both sides say.
+        """Whether the formula may change by far more within the rounding of coordinates than its
+        slopes on both sides say.
 
         max(-1, min(1, 1e9 y)) is an example: flat, steep, and flat again.
 
@@ -319,12 +345,14 @@ class Tally:
 
 @dataclass(frozen=True, eq=False)
 class OperationCounter(FormulaNumber):
-    """A number without a value that counts the operations on it.
+    """A number without a value: a formula that is evaluated with such numbers records its
+    operations in a tally, which all of them share. It knows only estimates of its size and its
+    slope. It is bent if an operation may make it turn sharply (`Tally`).
 
-    tally: the summary of all operations, which all numbers of a formula share.
+    tally: the summary of all operations.
     is_constant: whether the number is the same everywhere, so that functions of it have no slope.
-    is_square: whether it is a sum of squares. The root of such a sum has no vertical tangent:
-        f = sqrt(u^2 + v^2) has |grad f| <= |grad u| + |grad v|.
+    is_square: whether it is a sum of squares. The root of such a sum has no vertical tangent: f =
+        sqrt(u^2 + v^2) has |grad f| <= |grad u| + |grad v|.
     size, rate: estimated bounds of the number and of its slope, for coordinates up to 1
         (`Tally.turns_within`). A function that has a pole or grows faster than a power counts as
         about 1, and as no steeper than its argument. A constant that is an array counts as 1.
@@ -337,7 +365,8 @@ class OperationCounter(FormulaNumber):
     rate: float = 1.0
 
     def constant(self, x: Any) -> OperationCounter:
-        """A constant, whose absolute value is recorded as a size within which numbers may turn."""
+        """The constant x. Its absolute value is recorded in the tally as a size within which
+        numbers may turn."""
         is_number = isinstance(x, int | float)
         size = min(abs(float(x)), _MAX_SIZE) if is_number else 1.0
         if size > 0.0:
@@ -348,7 +377,8 @@ class OperationCounter(FormulaNumber):
         )
 
     def sum(self, other: OperationCounter) -> OperationCounter:
-        """The sum of two numbers; the absolute value of a constant that is added is recorded."""
+        """The sum of this number and another one. The absolute value of a constant that is added is
+        recorded in the tally."""
         for number in (self, other):
             if number.is_constant:
                 self.tally.farthest = max(self.tally.farthest, number.size)
@@ -356,6 +386,8 @@ class OperationCounter(FormulaNumber):
         return self._after(_SUM, other, *total, is_square=self.is_square and other.is_square)
 
     def product(self, other: OperationCounter) -> OperationCounter:
+        """The product of this number and another one. It is a sum of squares if it is a square, or
+        a sum of squares times a positive constant."""
         is_scaled = self.is_constant or other.is_constant
         is_square = other is self or (is_scaled and self.is_square and other.is_square)
         size, rate = self.size * other.size, self.size * other.rate + other.size * self.rate
@@ -365,6 +397,7 @@ class OperationCounter(FormulaNumber):
         return self._after(0, self, self.size, self.rate)
 
     def __pow__(self, exponent: Any) -> OperationCounter:
+        """This number to a power, as an operation in the tally."""
         if isinstance(exponent, OperationCounter):  # exp(exponent log(x))
             self._note(log)
             rate = self.rate + exponent.rate
@@ -374,9 +407,10 @@ class OperationCounter(FormulaNumber):
         return self.apply(sqrt if n == 0.5 else power(n))
 
     def apply(self, function: ElementaryFunction) -> OperationCounter:
-        """A function of this number. A power of at least 1 does not bend it; every other function
-        does."""
+        """An elementary function of this number. A power of at least 1 does not bend it; every
+        other function does."""
         self._note(function)
+        # Powers are named "power n".
         name, _, exponent = function.name.partition(" ")
         if name == "power" and float(exponent) >= 1.0:
             n, size = float(exponent), max(self.size, 1.0)
@@ -390,7 +424,8 @@ class OperationCounter(FormulaNumber):
         return self._bent(_FUNCTION, other, max(self.size, other.size), rate)
 
     def polar_angle(self, x: OperationCounter) -> OperationCounter:
-        """The polar angle, which may jump and be steep unless both numbers are constant."""
+        """The polar angle of the point (x, y), where y is this number. It may jump and be steep
+        unless both numbers are constant."""
         if not (self.is_constant and x.is_constant):
             self.tally.may_jump = self.tally.is_steep = True
         return self._bent(_FUNCTION + _PRODUCT, x, 1.0, self.rate + x.rate)
@@ -400,7 +435,8 @@ class OperationCounter(FormulaNumber):
         return self._bent(_FUNCTION, self, size, self.rate / (p * size ** (p - 1)))
 
     def _note(self, function: ElementaryFunction) -> None:
-        """Record in the tally whether this function of this number may jump or be steep."""
+        """Record in the tally whether this function of this number may jump or be steep. A root of
+        a sum of squares is not steep."""
         if not self.is_constant:
             is_norm = function is sqrt and self.is_square
             self.tally.may_jump |= function.has_pole
@@ -429,10 +465,11 @@ class OperationCounter(FormulaNumber):
         *,
         is_square: bool = False,
     ) -> OperationCounter:
-        """The result of an operation on this and another number.
+        """The result of an operation on this number and another one.
 
         operations: the number of Dr.Jit operations, which is added to the tally.
-        size, rate, is_square: those of the result.
+        size, rate, is_square: the estimates of the result: its size, its slope, and whether it is a
+            sum of squares.
         """
         self.tally.operations += operations
         is_constant = self.is_constant and other.is_constant

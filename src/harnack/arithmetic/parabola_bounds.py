@@ -1,15 +1,15 @@
-"""Bounds of a function along a path by two parabolas, computed operation by operation.
+"""Bounds of a function along a path by two parabolas, computed operation by operation from a
+formula. A path is a piece of a ray; s is the length along it, from 0 at its start to h at its end.
+A number of this arithmetic (`ParabolaBounds`) stands for a function f of s. It holds the value
+f(0), and the coefficients (a, b) of two parabolas a s + b s^2, one below and one above the change
+f(s) - f(0). Sums, products, functions and maxima of such numbers are such numbers again. So a
+formula that is evaluated with the coordinates of the path as such numbers proves parabolas for
+itself. If lines are wanted instead, b = 0 for functions that are no polynomials.
 
 This is the bottom-up linear and quadratic arithmetic of Aydinlilar and Zanni (2023, sections 5.2
-and 6.2, appendices B and C). A number of this arithmetic stands for a function f of the length s
-along a path, 0 <= s <= h. It holds the value at s = 0, and the coefficients of two parabolas with
-
-    a- s + b- s^2  <=  f(s) - f(0)  <=  a+ s + b+ s^2.
-
-Sums, products, functions and maxima of such numbers are such numbers again. So a formula that is
-evaluated with such numbers as its coordinates proves parabolas for itself. Two details improve on
-the published method: functions are bounded by chords from the value at the start, which need no
-validity interval; and the tighter of chords and Taylor's formula is used.
+and 6.2, appendices B and C). Two details improve on the published method: functions are bounded by
+chords from the value at the start, which need no validity interval; and the tighter of chords and
+Taylor's formula is used.
 
 Rounding. Coefficients are computed in rounded arithmetic; each result is moved outwards by
 `_ROUNDINGS` units in the last place of the sum of the absolute values of all terms, which is more
@@ -44,7 +44,9 @@ _COMPARED_AT = 0.6
 
 @dataclass(frozen=True, eq=False)
 class ParabolaBounds(FormulaNumber):
-    """A function f along a path, and two parabolas through its value at the start that bound it.
+    """A function f of the length s along a path, 0 <= s <= h, with two parabolas a s + b s^2 that
+    bound its change f(s) - f(0) from below and from above. A bound is the pair (a, b); it is a line
+    if b = 0.
 
     value: the range of f at s = 0.
     lower, upper: (a, b) for the parabolas a s + b s^2 below and above f(s) - f(0).
@@ -65,14 +67,14 @@ class ParabolaBounds(FormulaNumber):
     def along_ray(
         cls, p: Vec3, direction: Vec3, length: Real, *, degree: int = 2
     ) -> tuple[ParabolaBounds, ParabolaBounds, ParabolaBounds]:
-        """The three coordinates of p + s d as functions of s, for 0 <= s <= length.
+        """The three coordinates of the points p + s d as functions of s, for 0 <= s <= length.
 
         direction: d.
-        degree: the `bound_degree`, 1 for lines or 2 for parabolas.
+        degree: 1 to bound functions by lines, 2 by parabolas.
         """
 
         def coordinate(x: Real, slope: Real) -> ParabolaBounds:
-            """The function x + s slope."""
+            """The function x + s slope. It is a line, and both bounds are this line."""
             line = slope, 0.0
             return cls(Interval.point(x), line, line, length, degree, 1)
 
@@ -81,13 +83,14 @@ class ParabolaBounds(FormulaNumber):
 
     @property
     def bounds(self) -> tuple[Quadratic, Quadratic]:
-        """The parabolas below and above f(s) - f(0); lines, with b = 0, if `bound_degree` is 1."""
+        """The parabolas below and above f(s) - f(0); if `bound_degree` is 1, lines below and above
+        it, with b = 0."""
         if self.bound_degree == 2:
             return self.lower, self.upper
         return _lines_bounding_parabolas(self.lower, self.upper, self.piece_length)
 
     def constant(self, x: float | Real) -> ParabolaBounds:
-        """A constant number as a function along the same path."""
+        """The constant number x as a function along the same path."""
         if isinstance(x, int | float):
             value = Interval.enclosing(float(x), cast("Any", type(self.piece_length)))
         else:
@@ -97,9 +100,8 @@ class ParabolaBounds(FormulaNumber):
     def _new(
         self, value: Interval, lower: Quadratic, upper: Quadratic, polynomial: int | None = None
     ) -> ParabolaBounds:
-        """A function on the same piece of the path, with this value and these bounds. If
-        `bound_degree` is 1, the bounds are replaced by lines that bound them, unless the function
-        is a polynomial.
+        """A function on the same path, with this value at s = 0 and these bounds. If `bound_degree`
+        is 1, the bounds are replaced by lines that bound them, unless the function is a polynomial.
 
         polynomial: the degree of the function if it is a polynomial; else None.
         """
@@ -110,11 +112,12 @@ class ParabolaBounds(FormulaNumber):
         return new
 
     def __neg__(self) -> ParabolaBounds:
+        """-f: the bounds change their signs and their sides."""
         (a, b), (c, d) = self.lower, self.upper
         return dataclasses.replace(self, value=-self.value, lower=(-c, -d), upper=(-a, -b))
 
     def sum(self, other: Any) -> ParabolaBounds:
-        """The sum of two functions: values and bounds are added."""
+        """The sum of this function and another one: values and bounds are added."""
         value = self.value + other.value
         lower = _sum(self.lower, other.lower, -1)
         upper = _sum(self.upper, other.upper, 1)
@@ -125,7 +128,7 @@ class ParabolaBounds(FormulaNumber):
     # Products.
 
     def product(self, other: Any) -> ParabolaBounds:
-        """The product f g.
+        """The product f g of this function and another one.
 
         Proof. Let F = f - f(0) and G = g - g(0). Then f g - f(0) g(0) = f(0) G + g(0) F + F G. Each
         of F and G lies between two parabolas, and this is linear in F and in G. So it lies between
@@ -134,7 +137,11 @@ class ParabolaBounds(FormulaNumber):
         quartic is s (f(0) c + g(0) a + a c s), and the factor of s lies between its values at both
         ends. For parabolas, the derivative of the quartic is a cubic. `_lines_bounding_cubic` puts
         it between two lines, and the integrals of these are parabolas.
+
+        If both are polynomials and f g has the degree 2, it is its own bound. If one is a constant,
+        so is the bound times it.
         """
+        # A constant factor.
         if other.polynomial_degree == 0:
             return self._scaled(other.value)
         if self.polynomial_degree == 0:
@@ -145,6 +152,7 @@ class ParabolaBounds(FormulaNumber):
         degree = None
         if self.polynomial_degree is not None and other.polynomial_degree is not None:
             degree = self.polynomial_degree + other.polynomial_degree
+        # Both are of degree 1: their product is a parabola.
         if degree == 2:
             lower, upper = self._product_of_lines(other)
             return self._new(value, lower, upper, 2)
@@ -153,7 +161,7 @@ class ParabolaBounds(FormulaNumber):
         return self._new(value, *self._curved_product(other))
 
     def _scaled(self, factor: Interval) -> ParabolaBounds:
-        """The product k f with a constant k in the interval `factor`.
+        """The product k f of this function with a constant k in the interval `factor`.
 
         Proof. Let k = m + e with |e| <= r. The bounds of m f are those of f times m, exchanged if m
         < 0; and |e f| <= r max(|lower|, |upper|), for each coefficient.
@@ -162,14 +170,17 @@ class ParabolaBounds(FormulaNumber):
         middle, radius = factor.midpoint, factor.radius
         if factor.is_zero:
             return self._new(value, (0.0, 0.0), (0.0, 0.0), 0)
-        low, high = self.lower, self.upper
-        moved = [(middle * bound[0], middle * bound[1]) for bound in (low, high)]
-        falls = middle < 0
-        lower = tuple(dr.select(falls, v, u) for u, v in zip(*moved, strict=True))
-        upper = tuple(dr.select(falls, u, v) for u, v in zip(*moved, strict=True))
-        sizes = [fmax(dr.abs(u), dr.abs(v)) for u, v in zip(low, high, strict=True)]
+        lower_bound, upper_bound = self.lower, self.upper
+        # The bounds of m f; the lower one is the product with the upper bound if m < 0.
+        scaled_bounds = [
+            (middle * bound[0], middle * bound[1]) for bound in (lower_bound, upper_bound)
+        ]
+        is_negative = middle < 0
+        lower = tuple(dr.select(is_negative, v, u) for u, v in zip(*scaled_bounds, strict=True))
+        upper = tuple(dr.select(is_negative, u, v) for u, v in zip(*scaled_bounds, strict=True))
+        sizes = [fmax(dr.abs(u), dr.abs(v)) for u, v in zip(lower_bound, upper_bound, strict=True)]
         rounding = [
-            0.0 if _is_zero(low[k]) and _is_zero(high[k])
+            0.0 if _is_zero(lower_bound[k]) and _is_zero(upper_bound[k])
             else radius * sizes[k] + _rounding_bound(dr.abs(middle) * sizes[k])
             for k in range(2)
         ]  # fmt: skip
@@ -181,7 +192,8 @@ class ParabolaBounds(FormulaNumber):
         )
 
     def _product_of_lines(self, other: ParabolaBounds) -> tuple[Quadratic, Quadratic]:
-        """Bounds of the product of two polynomials of degree 1: exact up to rounding.
+        """Bounds of the product of this and another function, both polynomials of degree 1: the
+        product itself, up to rounding.
 
         In the code v and w are the midpoints of the two values at s = 0, a and c those of the two
         slopes; rv, rw, ra and rc are the radii of these ranges.
@@ -189,15 +201,25 @@ class ParabolaBounds(FormulaNumber):
         a, ra = _midpoint_and_half_width(self.lower[0], self.upper[0])
         c, rc = _midpoint_and_half_width(other.lower[0], other.upper[0])
         v, rv, w, rw = *_midpoint_and_radius(self.value), *_midpoint_and_radius(other.value)
+        # (v + a s)(w + c s) = v w + (v c + w a) s + a c s^2
         linear = v * c + w * a
-        error_1 = _rounding_bound(dr.abs(v * c) + dr.abs(w * a))
-        error_1 += rv * dr.abs(c) + rw * dr.abs(a) + (dr.abs(v) + rv) * rc + (dr.abs(w) + rw) * ra
+        linear_error = _rounding_bound(dr.abs(v * c) + dr.abs(w * a))
+        linear_error += (
+            rv * dr.abs(c) + rw * dr.abs(a) + (dr.abs(v) + rv) * rc + (dr.abs(w) + rw) * ra
+        )
         quadratic = a * c
-        error_2 = _rounding_bound(dr.abs(quadratic)) + dr.abs(a) * rc + dr.abs(c) * ra + ra * rc
-        return (linear - error_1, quadratic - error_2), (linear + error_1, quadratic + error_2)
+        quadratic_error = (
+            _rounding_bound(dr.abs(quadratic)) + dr.abs(a) * rc + dr.abs(c) * ra + ra * rc
+        )
+        return (linear - linear_error, quadratic - quadratic_error), (
+            linear + linear_error,
+            quadratic + quadratic_error,
+        )
 
     def _straight_product(self, other: ParabolaBounds) -> tuple[Quadratic, Quadratic]:
-        """Bounds of the product f g of this and another function by lines; `product` has the proof.
+        """Lines that bound the change of the product f g of this and another function. `product`
+        has the proof: each of four quartics is s (v c + w a + a c s), whose factor of s lies
+        between its values at both ends of the path.
 
         In the code v and w are the midpoints of f(0) and g(0), rv and rw their radii. a and c are
         the slopes of a bound of f and of one of g.
@@ -216,11 +238,12 @@ class ParabolaBounds(FormulaNumber):
         return (_minimum_or_inf(*lows), 0.0), (_maximum_or_inf(*highs), 0.0)
 
     def _curved_product(self, other: ParabolaBounds) -> tuple[Quadratic, Quadratic]:
-        """Bounds of the product f g of this and another function by parabolas; `product` has the
-        proof.
+        """Parabolas that bound the change of the product f g of this and another function.
+        `product` has the proof: the derivative of each of four quartics is put between two lines.
 
-        In the code v and w are the midpoints of f(0) and g(0), rv and rw their radii. (a, b) is a
-        bound of f and (c, d) one of g, with the radii ra, rb, rc, rd of their coefficients.
+        In the code v and w are the midpoints of f(0) and g(0), rv and rw their radii. (a, b) is
+        a bound of f and (c, d) one of g, with the radii ra, rb, rc, rd of their coefficients. ah =
+        a h, bh = b h^2 and so on are the coefficients for r = s/h, which goes from 0 to 1.
         """
         h = self.piece_length
         v, rv, w, rw = *_midpoint_and_radius(self.value), *_midpoint_and_radius(other.value)
@@ -240,7 +263,7 @@ class ParabolaBounds(FormulaNumber):
                 (4 * bh * dh,),
             )
             c0, c1, c2, c3 = (sum(term[1:], term[0]) for term in terms)
-            size = sum(
+            rounding_size = sum(
                 ((k + 1) * dr.abs(term) for k, group in enumerate(terms) for term in group), 0 * h
             )
             # The uncertainty of the values, and the difference of the bounds of a polynomial.
@@ -250,20 +273,22 @@ class ParabolaBounds(FormulaNumber):
             radius_f, radius_g = ra * h + 2 * rb * h * h, rc * h + 2 * rd * h * h
             uncertainty += radius_f * (dr.abs(w) + rw + size_g + radius_g)
             uncertainty += radius_g * (dr.abs(v) + rv + size_f)
-            rounding = _rounding_bound(size) + uncertainty
-            l0, l1, u0, u1 = _lines_bounding_cubic(c0, c1, c2, c3)
-            lows += [l0 - rounding, l1 - rounding]
-            highs += [u0 + rounding, u1 + rounding]
+            rounding = _rounding_bound(rounding_size) + uncertainty
+            lower_start, lower_end, upper_start, upper_end = _lines_bounding_cubic(c0, c1, c2, c3)
+            lows += [lower_start - rounding, lower_end - rounding]
+            highs += [upper_start + rounding, upper_end + rounding]
+        # The lowest and the highest line, by their values at both ends.
         return (
             _parabola_of_slopes(_minimum_or_inf(*lows[::2]), _minimum_or_inf(*lows[1::2]), h),
             _parabola_of_slopes(_maximum_or_inf(*highs[::2]), _maximum_or_inf(*highs[1::2]), h),
         )
 
     def _bound_coefficients(self) -> list[tuple[Real, Real, Real, Real]]:
-        """The bounds from which products are formed.
+        """The bounds of this function from which products are formed.
 
         In general, two tuples (a, b, 0, 0) for the parabolas below and above. For a polynomial a
-        single tuple (a, b, radius of a, radius of b) for the parabola in the middle.
+        single tuple (a, b, radius of a, radius of b) for the parabola in the middle, from which
+        both differ by rounding alone.
         """
         if self.polynomial_degree is None:
             return [(*self.lower, 0.0, 0.0), (*self.upper, 0.0, 0.0)]
@@ -274,8 +299,9 @@ class ParabolaBounds(FormulaNumber):
     # Functions.
 
     def apply(self, function: ElementaryFunction) -> ParabolaBounds:
-        """The composition phi(f) with an elementary function phi, by the tighter of two proofs on
-        each side.
+        """The composition phi(f) of an elementary function phi with this function f, by the tighter
+        of two proofs on each side. If f is a constant, so is phi(f). If phi is a clipped power
+        max(t, 0)^n and f a polynomial, see `_clipped_power`.
 
         Chords. Let x = f(s) - f(0), which is between x- and x+. Then phi(f(0) + x) - phi(f(0)) = m
         x, where m is the slope of a chord of phi from f(0). m lies in the range of phi' and, for
@@ -296,26 +322,39 @@ class ParabolaBounds(FormulaNumber):
         lower, upper = self.bounds
         h = self.piece_length
         start = _on_backend(self.value, h)
-        fall, rise = -_maximum_on_piece(_negate(lower), h), _maximum_on_piece(upper, h)
+        min_change, max_change = -_maximum_on_piece(_negate(lower), h), _maximum_on_piece(upper, h)
+        # At f(0), and on the range of f.
         value, slope, _ = function.ranges(start)
         _, slopes, curvature = function.ranges(
-            Interval((start + Interval(fall, fall)).lower, (start + Interval(rise, rise)).upper)
+            Interval(
+                (start + Interval(min_change, min_change)).lower,
+                (start + Interval(max_change, max_change)).upper,
+            )
         )
+        # The slopes of the chords of phi from f(0) to the smallest and to the largest value of f.
         chords = [
             ((function.ranges(start.shifted(x))[0] - value) * Interval.point(x).reciprocal())
-            for x in (fall, rise)
+            for x in (min_change, max_change)
         ]
-        to_min, to_max = (bound.intersect(slopes) for bound in chords)
-        convex, concave = curvature.lower >= 0, curvature.upper <= 0
+        slope_to_min, slope_to_max = (bound.intersect(slopes) for bound in chords)
+        is_convex, is_concave = curvature.lower >= 0, curvature.upper <= 0
 
-        # For convex phi, x > 0 needs the upper chord and x < 0 the lower one.
+        # For a convex phi, x > 0 needs the upper chord and x < 0 the lower one.
         upper_slopes = (
-            dr.select(concave, slope.lower, dr.select(convex, to_min.lower, slopes.lower)),
-            dr.select(concave, slope.upper, dr.select(convex, to_max.upper, slopes.upper)),
+            dr.select(
+                is_concave, slope.lower, dr.select(is_convex, slope_to_min.lower, slopes.lower)
+            ),
+            dr.select(
+                is_concave, slope.upper, dr.select(is_convex, slope_to_max.upper, slopes.upper)
+            ),
         )
         lower_slopes = (
-            dr.select(convex, slope.lower, dr.select(concave, to_max.lower, slopes.lower)),
-            dr.select(convex, slope.upper, dr.select(concave, to_min.upper, slopes.upper)),
+            dr.select(
+                is_convex, slope.lower, dr.select(is_concave, slope_to_max.lower, slopes.lower)
+            ),
+            dr.select(
+                is_convex, slope.upper, dr.select(is_concave, slope_to_min.upper, slopes.upper)
+            ),
         )
         above = _common_upper_bound(
             [_scale(m, bound) for m in upper_slopes for bound in (lower, upper)], h
@@ -334,67 +373,81 @@ class ParabolaBounds(FormulaNumber):
         )
 
     def _taylor_bounds(self, slope: Interval, curvature: Interval) -> tuple[Quadratic, Quadratic]:
-        """The bounds of phi(f) by Taylor's formula, for an elementary function phi and this
-        function f; `apply` has the proof.
+        """Bounds of the composition phi(f) of an elementary function phi with this function f, by
+        Taylor's formula; `apply` has the proof.
 
         slope: the range of phi' at f(0).
         curvature: the range of phi'' on the range of f.
         """
-        moved = self._scaled(slope)
-        (low, _), (high, _) = _lines_bounding_parabolas(self.lower, self.upper, self.piece_length)
-        half = Interval(0.5 * curvature.lower, 0.5 * curvature.upper)
-        remainder = half * Interval(low, high).square()
+        linear_part = self._scaled(slope)
+        (min_chord_slope, _), (max_chord_slope, _) = _lines_bounding_parabolas(
+            self.lower, self.upper, self.piece_length
+        )
+        half_curvature = Interval(0.5 * curvature.lower, 0.5 * curvature.upper)
+        remainder = half_curvature * Interval(min_chord_slope, max_chord_slope).square()
         return (
-            _sum(moved.lower, (0.0, remainder.lower), -1),
-            _sum(moved.upper, (0.0, remainder.upper), 1),
+            _sum(linear_part.lower, (0.0, remainder.lower), -1),
+            _sum(linear_part.upper, (0.0, remainder.upper), 1),
         )
 
     def pointwise_maximum(self, other: Any) -> ParabolaBounds:
-        """The maximum of two functions f and g at each point.
+        """The maximum of this function f and another function g at each point.
 
         Proof. Let f(s) <= f(0) + F+(s), the same for g, and V = max(f(0), g(0)). Above: f is below
         V + (f(0) - V) + F+, and g likewise. One parabola bounds both (`_common_upper_bound`),
-        unless one function is larger on the whole length. Below: the maximum is at least the
-        function that is larger at s = 0.
+        unless one function is larger on the whole path. Below: the maximum is at least the function
+        that is larger at s = 0.
         """
         f, g = self.value, other.value
         h = self.piece_length
         (f_low, f_high), (g_low, g_high) = self.bounds, other.bounds
-        f_larger, g_larger = (f - g).lower >= 0, (g - f).lower >= 0  # proved to be larger at 0
+        is_f_larger_at_start, is_g_larger_at_start = (
+            (f - g).lower >= 0,
+            (g - f).lower >= 0,
+        )  # proved to be larger at 0
         below = _common_lower_bound([f_low, g_low], h)
-        below = _select(f_larger, f_low, _select(g_larger, g_low, below))
+        below = _select(is_f_larger_at_start, f_low, _select(is_g_larger_at_start, g_low, below))
         # Proved to be larger on the whole length: f's least is above g's largest.
-        f_fall, f_rise = -_maximum_on_piece(_negate(f_low), h), _maximum_on_piece(f_high, h)
-        g_fall, g_rise = -_maximum_on_piece(_negate(g_low), h), _maximum_on_piece(g_high, h)
-        always_f = (f - g).lower + _shift_by_rounding(
-            f_fall - g_rise, -1, dr.abs(f_fall) + g_rise
+        f_min_change, f_max_change = (
+            -_maximum_on_piece(_negate(f_low), h),
+            _maximum_on_piece(f_high, h),
+        )
+        g_min_change, g_max_change = (
+            -_maximum_on_piece(_negate(g_low), h),
+            _maximum_on_piece(g_high, h),
+        )
+        is_f_always_larger = (f - g).lower + _shift_by_rounding(
+            f_min_change - g_max_change, -1, dr.abs(f_min_change) + g_max_change
         ) >= 0
-        always_g = (g - f).lower + _shift_by_rounding(
-            g_fall - f_rise, -1, dr.abs(g_fall) + f_rise
+        is_g_always_larger = (g - f).lower + _shift_by_rounding(
+            g_min_change - f_max_change, -1, dr.abs(g_min_change) + f_max_change
         ) >= 0
+        # f(0) - V and g(0) - V.
         offsets = fmin((f - g).upper, 0), fmin((g - f).upper, 0)
         above = _common_upper_bound([f_high, g_high], h, offsets)
-        above = _select(always_f, f_high, _select(always_g, g_high, above))
-        below = _select(always_f, f_low, _select(always_g, g_low, below))
+        above = _select(is_f_always_larger, f_high, _select(is_g_always_larger, g_high, above))
+        below = _select(is_f_always_larger, f_low, _select(is_g_always_larger, g_low, below))
         value = Interval(fmax(f.lower, g.lower), fmax(f.upper, g.upper))
         return self._new(value, below, above)
 
     def polar_angle(self, x: Any) -> ParabolaBounds:
-        """The polar angle atan2(y, x) of z = (x, y), where y is this function: its value at the
-        start of the path, and bounds of its change, which is that of the angle relative to a fixed
-        direction c.
+        """The polar angle atan2(y, x) of the point z = (x, y), where y is this function and x
+        another one. Its change along the path is that of the angle relative to a fixed direction c.
 
         Proof. For any vector c = (a, b), the angle of z = (x, y) and the angle of (x a + y b, y a -
-        x b) differ by a constant along a path that does not meet the cut. Where x a + y b > 0 the
-        latter is an arc tangent. Elsewhere nothing is known beyond the start.
+        x b) differ by a constant along a path that does not meet the cut of the angle. Where x a +
+        y b > 0 the latter is an arc tangent. Elsewhere nothing is known beyond the start: the
+        bounds are infinite.
+
+        In the code c is about the direction of z at the start.
         """
         h = self.piece_length
         v, u = (_on_backend(bounds.value, h) for bounds in (self, x))
         value, _ = angle_range(v, u)
         a, b = approximate_direction(u.midpoint, v.midpoint)
-        ahead, aside = x * a + self * b, self * a - x * b
-        relative = aside.product(ahead.apply(reciprocal)).apply(atan)
-        is_valid = ~meets_branch_cut(self._range(), x._range()) & (ahead._range().lower > 0)
+        along_c, across_c = x * a + self * b, self * a - x * b
+        relative = across_c.product(along_c.apply(reciprocal)).apply(atan)
+        is_valid = ~meets_branch_cut(self._range(), x._range()) & (along_c._range().lower > 0)
         zero = 0 * h
         return self._new(
             value,
@@ -403,33 +456,40 @@ class ParabolaBounds(FormulaNumber):
         )
 
     def _range(self) -> Interval:
-        """The range of the function on the whole length."""
+        """The range of the function on the whole path."""
         h, value = self.piece_length, _on_backend(self.value, self.piece_length)
-        fall, rise = _maximum_on_piece(_negate(self.lower), h), _maximum_on_piece(self.upper, h)
+        min_change, max_change = (
+            _maximum_on_piece(_negate(self.lower), h),
+            _maximum_on_piece(self.upper, h),
+        )
         return Interval(
-            (value + Interval(-fall, -fall)).lower, (value + Interval(rise, rise)).upper
+            (value + Interval(-min_change, -min_change)).lower,
+            (value + Interval(max_change, max_change)).upper,
         )
 
     def _clipped_power(self, function: ClippedPower) -> ParabolaBounds:
-        """Bounds of max(f, 0)^n on [0, h] for a polynomial f of degree at most 2.
+        """The function max(f, 0)^n of a polynomial f of degree at most 2, on the path [0, h].
+
+        function: the function t -> max(t, 0)^n.
 
         f = v + a s + b s^2 is known up to rounding: v, a and b below are the middles of narrow
         ranges with the half widths rv, ra and rb. `value_error` bounds |f - (v + a s + b s^2)| on
         [0, h], and also the rounding of this sum.
 
         Proof. If f is concave, f > 0 on at most one interval [s0, s1] of [0, h] (`start`, `end`).
-        There f^n is a product, computed as one on that interval. Elsewhere the derivative is 0.
+        There f^n is a product, computed as one on that interval. Elsewhere f^n counts as 0, and its
+        derivative is 0.
 
         If the bounds are parabolas, the derivative of the product lies between two lines. Raise the
-        upper line, if necessary, to at least 0 at both ends of [0, h]. It is then at least 0 on all
-        of [0, h], and still above the derivative on [s0, s1]. So its integral is an upper bound;
-        the lower bound is found likewise (`_extend_parabolas`). If the bounds are lines,
-        `_extend_lines` has the proof.
+        upper line, if necessary, to at least 0 at both ends of [0, h]. As a line, it is then at
+        least 0 on all of [0, h], and still above the derivative on [s0, s1]. So its integral is an
+        upper bound; the lower bound is found likewise (`_extend_parabolas`). If the bounds are
+        lines, `_extend_lines` has the proof.
 
-        Because of rounding, f may be positive outside of the computed [s0, s1], but is at most
-        r = 2 `value_error` there. The derivative of f^n is then at most `outer_slope`,
-        n r^(n-1) (|a| + 2 |b| h), which is used in place of 0. If there is no interval at all, it
-        is the bound on [0, h]. If f is convex, the general bounds of `apply` are used.
+        Because of rounding, f may be positive outside of the computed [s0, s1], but is at most r =
+        2 `value_error` there. The derivative of f^n is then at most `outer_slope`, n r^(n-1) (|a| +
+        2 |b| h), which is used in place of 0. If there is no interval at all, it is the bound on
+        [0, h]. If f is convex, the general bounds of `apply` are used.
 
         Source: Aydinlilar and Zanni 2023, section 6.2.1, with a corrected extension to [0, h].
         """
@@ -441,17 +501,20 @@ class ParabolaBounds(FormulaNumber):
         size = dr.abs(v) + dr.abs(a) * h + dr.abs(b) * h * h
         value_error = _rounding_bound(size) + rv + ra * h + rb * h * h
         # The roots of v + a s + b s^2, b < 0, without cancellation.
-        square = a * a - 4 * b * v
-        root = dr.sqrt(fmax(square, 0))
-        q = -0.5 * (a + dr.select(a >= 0, root, -root))
+        discriminant = a * a - 4 * b * v
+        discriminant_root = dr.sqrt(fmax(discriminant, 0))
+        q = -0.5 * (a + dr.select(a >= 0, discriminant_root, -discriminant_root))
         root_1, root_2 = q / b, v / q
         root_1 = dr.select(dr.isfinite(root_1), root_1, 0)
         root_2 = dr.select(dr.isfinite(root_2), root_2, 0)
         start, end = clamp(fmin(root_1, root_2), 0, h), clamp(fmax(root_1, root_2), 0, h)
-        is_empty = (square <= 0) | (end <= start)
+        # If there is no interval, all of [0, h] stands for it, so that nothing is divided by 0; the
+        # result is replaced below.
+        is_empty = (discriminant <= 0) | (end <= start)
         start, end = dr.select(is_empty, 0, start), dr.select(is_empty, h, end)
 
         n = function.exponent
+        # f as a polynomial of the length from `start`: its value, slope and b.
         start_value = fmax(v + start * (a + b * start), 0)
         start_slope = a + 2 * b * start
         inner_power = ParabolaBounds(
@@ -468,6 +531,7 @@ class ParabolaBounds(FormulaNumber):
             self.bound_degree,
             2,
         )._power_by_squaring(n)
+        # The value at s = 0, and the bounds on all of [0, h].
         value, _, _ = function.ranges(_on_backend(self.value, h))
         outer_slope = n * (2 * value_error) ** (n - 1) * (dr.abs(a) + ra + 2 * (dr.abs(b) + rb) * h)
         is_cut = (start > 0) | (end < h)
@@ -477,13 +541,14 @@ class ParabolaBounds(FormulaNumber):
             lower, upper = inner_power._extend_parabolas(start, h, is_cut, outer_slope)
         lower = _select(is_empty, (-outer_slope, 0.0), lower)
         upper = _select(is_empty, (outer_slope, 0.0), upper)
+        # Without its polynomial degree f is bounded like any other function.
         general = ParabolaBounds(self.value, self.lower, self.upper, h, self.bound_degree)
         general = ParabolaBounds.apply(general, function)
-        bends_down = b + rb < 0
+        is_concave = b + rb < 0
         return self._new(
             value,
-            _select(bends_down, lower, general.lower),
-            _select(bends_down, upper, general.upper),
+            _select(is_concave, lower, general.lower),
+            _select(is_concave, upper, general.upper),
         )
 
     def _extend_parabolas(
@@ -492,95 +557,119 @@ class ParabolaBounds(FormulaNumber):
         """Extend parabolas that bound a function on an interval to parabolas that bound it on [0,
         length].
 
-        This function is known on an interval that begins at `start`. The extended function equals
-        it there and is constant before and after the interval.
+        This function is known on an interval that begins at `start`, and s counts from there. The
+        extended function equals it on the interval and is constant before and after it.
 
         is_cut: whether the interval is not all of [0, length].
         tail: a bound of the derivative outside of the interval, which rounding may cause.
+
+        The derivative of a bound is a line. It is moved to the safe side of 0 at both ends of [0,
+        length], because the derivative of the extended function is 0 outside of the interval.
         """
         bounds: list[Quadratic] = []
         for sign, (a, b) in ((-1, self.lower), (1, self.upper)):
+            # The derivative of the bound, continued to 0 and to `length`.
             at_start = a - 2 * b * start
             at_end = a + 2 * b * (length - start)
             rounding = _rounding_bound(dr.abs(a) + 2 * dr.abs(b) * length) + tail
-            ends = [end + sign * rounding for end in (at_start, at_end)]
-            extreme = _maximum_or_inf if sign > 0 else _minimum_or_inf
-            ends = [dr.select(is_cut, extreme(end, 0 * end), end) * length for end in ends]
-            bounds.append(_parabola_of_slopes(ends[0], ends[1], length))
+            slopes = [slope + sign * rounding for slope in (at_start, at_end)]
+            safe_extreme = _maximum_or_inf if sign > 0 else _minimum_or_inf
+            slopes = [
+                dr.select(is_cut, safe_extreme(slope, 0 * slope), slope) * length
+                for slope in slopes
+            ]
+            bounds.append(_parabola_of_slopes(slopes[0], slopes[1], length))
         return bounds[0], bounds[1]
 
     def _extend_lines(
         self, start: Real, end: Real, length: Real, value: Interval, is_cut: Any, tail: Real
     ) -> tuple[Quadratic, Quadratic]:
-        """Extend lines that bound a function on an interval to lines that bound it on [0, length].
+        """Extend lines that bound a function on an interval [start, end] to lines that bound it on
+        [0, length].
 
-        This function is known on an interval. The extended function equals it there, and is
-        constant before and after the interval.
+        This function is known on the interval. The extended function equals it there; before the
+        interval it is constant, behind it it is 0.
 
-        start, end: the ends of the interval.
         value: the range of the extended function at s = 0.
         is_cut: whether the interval is not all of [0, length].
         tail: a bound of the derivative outside of the interval, which rounding may cause.
 
         Proof. Let the change be the function minus its value at s = 0. Before `start` it is 0. So a
-        line from 0 at s = 0 to the bound at `end` lies above it. Behind `end` the function is 0,
-        that is, the change is -value. A line of slope at least -value/s is above -value at s; slope
-        -value/length is enough for all s >= end.
+        line from 0 at s = 0 to the upper bound at `end` lies above it. Behind `end` the function is
+        0, that is, the change is -value. A line of slope at least -value/s is above -value at s;
+        slope -value/length is enough for all s >= end. Likewise slope -value/end is small enough to
+        be below -value for all s >= end.
         """
-        (low, _), (high, _) = self.bounds
-        fraction = (end - start) / end * (1 + 8 * machine_epsilon(length))
+        (low_slope, _), (high_slope, _) = self.bounds
+        length_fraction = (end - start) / end * (1 + 8 * machine_epsilon(length))
         slope_behind = -(value.lower / length)
         slope_behind = slope_behind + _rounding_bound(dr.abs(slope_behind))
-        before = start > 0
-        high = dr.select(before, _maximum_or_inf(high, 0 * high) * fraction, high)
-        low = dr.select(before, _minimum_or_inf(low, 0 * low) * fraction, low)
-        high = dr.select(end < length, _maximum_or_inf(high, slope_behind), high)
-        low = dr.select(end < length, _minimum_or_inf(low, -(value.upper / end) * (1 + 1e-6)), low)
+        has_part_before = start > 0
+        # The line from 0 at s = 0 to the bound at `end`, where the change is the slope times end -
+        # start.
+        high_slope = dr.select(
+            has_part_before,
+            _maximum_or_inf(high_slope, 0 * high_slope) * length_fraction,
+            high_slope,
+        )
+        low_slope = dr.select(
+            has_part_before, _minimum_or_inf(low_slope, 0 * low_slope) * length_fraction, low_slope
+        )
+        # If there is a part behind `end`, the line is above -value on it.
+        high_slope = dr.select(end < length, _maximum_or_inf(high_slope, slope_behind), high_slope)
+        low_slope = dr.select(
+            end < length, _minimum_or_inf(low_slope, -(value.upper / end) * (1 + 1e-6)), low_slope
+        )
+        # The derivative that rounding may cause outside of the interval.
         margin = dr.select(is_cut, tail, 0)
-        return (low - margin, 0.0), (high + margin, 0.0)
+        return (low_slope - margin, 0.0), (high_slope + margin, 0.0)
 
 
 def _lines_bounding_cubic(c0: Real, c1: Real, c2: Real, c3: Real) -> tuple[Real, Real, Real, Real]:
-    """Lines below and above the cubic c0 + c1 r + c2 r^2 + c3 r^3 on [0, 1].
+    """Lines below and above the cubic c0 + c1 r + c2 r^2 + c3 r^3 for r on [0, 1].
 
     Returns l0, l1, u0, u1: the values of the lower line at 0 and 1, and of the upper line at 0 and
     1.
 
-    Proof. On either side of its inflection the cubic is convex or concave. So it lies there between
-    a chord and the tangent at the end nearer to 0. The line through the larger values of two lines
-    at 0 and 1 is above both. If rounding mistakes the sign of a second derivative, that derivative
-    is as small as its rounding error.
+    Proof. The inflection t divides [0, 1] into two parts, or into one if t is outside. On each part
+    the cubic is convex or concave. So it lies there between a chord and the tangent at 0 (first
+    part) or at t (second part). The line through the larger values of two lines at 0 and 1 is above
+    both. If rounding mistakes the sign of a second derivative, that derivative is as small as its
+    rounding error.
     """
     t = -c2 / (3 * c3)
     is_divided = (t > 0) & (t < 1)
     t = dr.select(is_divided, t, 1)
 
+    # On [0, t]: the slope of the chord; the tangent at 0 has the slope c1.
     chord = c1 + t * (c2 + t * c3)
-    convex = c2 + 1.5 * c3 * t >= 0
+    is_convex = c2 + 1.5 * c3 * t >= 0
     u0 = l0 = c0
-    u1 = c0 + dr.select(convex, chord, c1)
-    l1 = c0 + dr.select(convex, c1, chord)
+    u1 = c0 + dr.select(is_convex, chord, c1)
+    l1 = c0 + dr.select(is_convex, c1, chord)
 
+    # On [t, 1]: the value and the slope of the tangent at t, and the slope of the chord to 1.
     value = c0 + t * (c1 + t * (c2 + t * c3))
     tangent = c1 + t * (2 * c2 + 3 * c3 * t)
     chord = c1 + c2 * (1 + t) + c3 * (1 + t * (1 + t))
-    convex = c2 + 1.5 * c3 * (1 + t) >= 0
-    steep = dr.select(convex, chord, tangent)
-    flat = dr.select(convex, tangent, chord)
-    u0 = dr.select(is_divided, fmax(u0, value - steep * t), u0)
-    u1 = dr.select(is_divided, fmax(u1, value + steep * (1 - t)), u1)
-    l0 = dr.select(is_divided, fmin(l0, value - flat * t), l0)
-    l1 = dr.select(is_divided, fmin(l1, value + flat * (1 - t)), l1)
+    is_convex = c2 + 1.5 * c3 * (1 + t) >= 0
+    upper_slope = dr.select(is_convex, chord, tangent)
+    lower_slope = dr.select(is_convex, tangent, chord)
+    u0 = dr.select(is_divided, fmax(u0, value - upper_slope * t), u0)
+    u1 = dr.select(is_divided, fmax(u1, value + upper_slope * (1 - t)), u1)
+    l0 = dr.select(is_divided, fmin(l0, value - lower_slope * t), l0)
+    l1 = dr.select(is_divided, fmin(l1, value + lower_slope * (1 - t)), l1)
     return l0, l1, u0, u1
 
 
 def _lines_bounding_parabolas(
     lower: Quadratic, upper: Quadratic, h: Real
 ) -> tuple[Quadratic, Quadratic]:
-    """A line below the parabola `lower` and one above the parabola `upper` on [0, h], as (slope,
-    0).
+    """A line below the parabola `lower` and one above the parabola `upper` for s on [0, h], each as
+    (slope, 0). A parabola is the pair (a, b) for a s + b s^2.
 
-    A parabola through 0 lies between its tangent at 0 and its chord to h.
+    A parabola through 0 lies between its tangent at 0, of the slope a, and its chord to h, of the
+    slope a + b h.
     """
     (a, b), (c, d) = lower, upper
     if _is_zero(b) and _is_zero(d):
@@ -591,8 +680,11 @@ def _lines_bounding_parabolas(
 
 
 def _parabola_of_slopes(at_start: Real, at_end: Real, length: Real) -> Quadratic:
-    """The parabola (a, b) through 0 whose derivative, times `length`, is `at_start` at 0 and
-    `at_end` at `length`."""
+    """The parabola a s + b s^2, as (a, b), whose derivative has given values at both ends of [0,
+    length].
+
+    at_start, at_end: `length` times the derivative at 0 and at `length`.
+    """
     nonempty = length > 0
     a = dr.select(nonempty, at_start / length, 0)
     b = dr.select(nonempty, (at_end - at_start) / (2 * length * length), 0)
@@ -602,9 +694,9 @@ def _parabola_of_slopes(at_start: Real, at_end: Real, length: Real) -> Quadratic
 def _common_upper_bound(
     parabolas: list[Quadratic], length: Real, offsets: tuple[Real, ...] = ()
 ) -> Quadratic:
-    """A parabola through 0 that is above several parabolas on [0, length].
+    """A parabola a s + b s^2, as (a, b), that is above several parabolas for s on [0, length].
 
-    parabolas: the parabolas (a, b).
+    parabolas: the parabolas, as pairs (a, b).
     offsets: a number c <= 0 for each, for the parabola c + a s + b s^2; by default 0.
 
     Proof. On [0, h] the value of c + a s + b s^2 is a weighted mean, with weights >= 0, of the
@@ -612,30 +704,36 @@ def _common_upper_bound(
     a larger parabola.
     """
     h = length
-    middles: list[Real] = []
-    lasts: list[Real] = []
+    middle_controls: list[Real] = []
+    last_controls: list[Real] = []
     for k, (a, b) in enumerate(parabolas):
         offset = offsets[k] if offsets else 0.0
-        first, second = a * h, b * h * h
-        rounding = _rounding_bound(dr.abs(offset) + dr.abs(first) + dr.abs(second) + 0 * h)
-        middles.append(offset + 0.5 * first + rounding)
-        lasts.append(offset + (first + second) + rounding)
-    middle, last = _maximum_or_inf(*middles), _maximum_or_inf(*lasts)
-    rounding = _rounding_bound(dr.abs(middle) + dr.abs(last))
+        linear_term, quadratic_term = a * h, b * h * h
+        rounding = _rounding_bound(
+            dr.abs(offset) + dr.abs(linear_term) + dr.abs(quadratic_term) + 0 * h
+        )
+        middle_controls.append(offset + 0.5 * linear_term + rounding)
+        last_controls.append(offset + (linear_term + quadratic_term) + rounding)
+    middle_control, last_control = (
+        _maximum_or_inf(*middle_controls),
+        _maximum_or_inf(*last_controls),
+    )
+    rounding = _rounding_bound(dr.abs(middle_control) + dr.abs(last_control))
     nonempty = h > 0
-    a = dr.select(nonempty, 2 * middle / h, 0)
-    b = dr.select(nonempty, (last - 2 * middle + rounding) / (h * h), 0)
+    # The parabola with the control values 0, middle and last.
+    a = dr.select(nonempty, 2 * middle_control / h, 0)
+    b = dr.select(nonempty, (last_control - 2 * middle_control + rounding) / (h * h), 0)
     return a + _rounding_bound(dr.abs(a)), b
 
 
 def _common_lower_bound(parabolas: list[Quadratic], length: Real) -> Quadratic:
-    """A parabola through 0 that is below several parabolas on [0, length]."""
+    """A parabola a s + b s^2, as (a, b), that is below several parabolas for s on [0, length]."""
     return _negate(_common_upper_bound([_negate(parabola) for parabola in parabolas], length))
 
 
 def _tighter_bound(first: Quadratic, second: Quadratic, length: Real, sign: int) -> Quadratic:
-    """The tighter of two bounds on one side, compared at one point of the length; if one bound is
-    NaN, the other bound.
+    """The tighter of two bounds on the same side, compared at one point of [0, length]; if one
+    bound is NaN, the other bound. A bound is a parabola (a, b) for a s + b s^2.
 
     sign: 1 for upper bounds, -1 for lower bounds.
     """
@@ -645,26 +743,28 @@ def _tighter_bound(first: Quadratic, second: Quadratic, length: Real, sign: int)
 
 
 def _maximum_on_piece(q: Quadratic, length: Real) -> Real:
-    """An upper bound of a s + b s^2 on [0, length]; infinite if it is NaN.
+    """An upper bound of the parabola a s + b s^2 for s on [0, length], at least 0; infinite if it
+    is NaN.
 
     q: (a, b).
     """
     a, b = q
     if _is_zero(a) and _is_zero(b):
         return 0 * length
-    last = length * (a + b * length)
-    last = last + _rounding_bound(length * (dr.abs(a) + dr.abs(b) * length))
-    inside = (b < 0) & (a > 0) & (a + 2 * b * length < 0)
-    vertex = a * (a / (-4 * b))
-    vertex = dr.select(inside, vertex + _rounding_bound(dr.abs(vertex)), 0)
-    return _maximum_or_inf(0 * length, last, vertex)
+    end_value = length * (a + b * length)
+    end_value = end_value + _rounding_bound(length * (dr.abs(a) + dr.abs(b) * length))
+    has_vertex = (b < 0) & (a > 0) & (a + 2 * b * length < 0)
+    vertex_value = a * (a / (-4 * b))
+    vertex_value = dr.select(has_vertex, vertex_value + _rounding_bound(dr.abs(vertex_value)), 0)
+    return _maximum_or_inf(0 * length, end_value, vertex_value)
 
 
 def _sum(first: Quadratic, second: Quadratic, sign: int) -> Quadratic:
-    """The sum of two bounds, rounded upwards (sign 1) or downwards (sign -1)."""
+    """The sum of two parabolas (a, b), rounded upwards (sign 1) or downwards (sign -1)."""
 
     def plus(x: Real, y: Real) -> Real:
-        """The sum of two coefficients, rounded to the side of `sign`; exact if one is 0."""
+        """The sum of two coefficients, rounded to the side of `sign`; exact if one is the Python
+        number 0."""
         if _is_zero(y):
             return x
         return y if _is_zero(x) else _shift_by_rounding(x + y, sign, 0.0)
@@ -673,17 +773,17 @@ def _sum(first: Quadratic, second: Quadratic, sign: int) -> Quadratic:
 
 
 def _scale(m: Real, q: Quadratic) -> Quadratic:
-    """The parabola q times the number m, without rounding outwards."""
+    """The parabola q = (a, b) times the number m, without rounding outwards."""
     return m * q[0], m * q[1]
 
 
 def _negate(q: Quadratic) -> Quadratic:
-    """The parabola -q."""
+    """The parabola (-a, -b) for q = (a, b)."""
     return -q[0], -q[1]
 
 
 def _select(mask: Any, first: Quadratic, second: Quadratic) -> Quadratic:
-    """The first parabola on lanes where the mask is set, the second one elsewhere."""
+    """The first parabola on lanes where the mask is set, the second one on all others."""
     return dr.select(mask, first[0], second[0]), dr.select(mask, first[1], second[1])
 
 
@@ -711,7 +811,8 @@ def _radius(x: Interval) -> Real:
 
 
 def _on_backend(x: Interval, like: Real) -> Interval:
-    """The interval x; if its ends are Python numbers, they are converted to the type of `like`."""
+    """The interval x with Dr.Jit numbers as its ends: if they are Python numbers, they are
+    converted to the type of `like`."""
     if not x.is_literal:
         return x
     kind = cast("Any", type(like))
@@ -720,7 +821,7 @@ def _on_backend(x: Interval, like: Real) -> Interval:
 
 
 def _is_zero(x: Real) -> bool:
-    """Whether x is the Python number 0.0, which is known while a kernel is being recorded."""
+    """Whether x is the Python number 0.0, which is known while Dr.Jit records code."""
     return isinstance(x, float) and x == 0.0
 
 
@@ -733,9 +834,10 @@ def _shift_by_rounding(x: Real, sign: int, size: Real) -> Real:
 
 
 def _rounding_bound(size: Real) -> Real:
-    """A bound of the rounding and underflow in a sum.
+    """A bound of the errors by rounding and underflow in a computed sum.
 
-    size: the sum of the absolute values of its terms.
+    size: the sum of the absolute values of its terms. The Python number 0.0 stands for a sum that
+        is exact.
     """
     if isinstance(size, float):
         assert size == 0.0

@@ -1,11 +1,13 @@
-"""`Values`: the range of a formula on a box, and whether the formula is continuous there.
+"""`Values`: the range of a formula on a box of its variables, and whether the formula is continuous
+there. A range is an interval that is proved to contain all values. A formula has no value where it
+takes, for example, the root of a negative number; it may jump where it has a pole or the cut of a
+polar angle. A range is lost if an end is infinite or NaN; it may still be known to be large, that
+is, beyond a large number on one side.
 
 Ranges of derivatives prove long steps where a formula is smooth. Near a vertical tangent, such as
 that of sqrt(|x|) at x = 0, they are unbounded, and where the formula has no value they prove
 nothing. The range of values does prove steps there: sqrt(|x|) + 0.5 is at least 0.5, whatever its
 slope.
-
-`tally_of` finds out, before a kernel is recorded, whether a formula may need this.
 """
 
 from __future__ import annotations
@@ -33,7 +35,8 @@ _LARGE_EXPONENT = 0.5
 
 @dataclass(frozen=True, eq=False)
 class Values(FormulaNumber):
-    """The range of a function on a box of its variables.
+    """The range of a function on a box of its variables, and whether it is continuous and has a
+    value everywhere in the box. All are known lane by lane.
 
     value: the range of its values, over the points of the box at which it has one.
     nowhere: whether it has a value at no point of the box.
@@ -54,31 +57,43 @@ class Values(FormulaNumber):
 
         slack: a length by which the box is larger on all sides; None for 0.
         """
-        no = p.x != p.x
-        no = no & ~no
+        is_never = p.x != p.x
+        # False on each lane, in the width of p.
+        is_never = is_never & ~is_never
         padding = ZERO if slack is None else Interval(-slack, slack)
         x, y, z = (
-            cls(Interval.point(p[k]).hull(Interval.point(q[k])) + padding, no, no, no)
+            cls(
+                Interval.point(p[k]).hull(Interval.point(q[k])) + padding,
+                is_never,
+                is_never,
+                is_never,
+            )
             for k in range(3)
         )
         return x, y, z
 
     def constant(self, x: float | Real) -> Values:
-        """A constant number as a function on the same box."""
-        no = self.nowhere & ~self.nowhere
-        kind = cast("Any", type(self.value.lower))
+        """The constant number x as a function on the same box."""
+        is_never = self.nowhere & ~self.nowhere
+        number_type = cast("Any", type(self.value.lower))
         if dr.is_array_v(cast("Any", type(x))):
-            return Values(Interval.point(kind(x)), no, no, no)
-        ends = Interval.enclosing(float(cast("Any", x)), kind)
-        low = kind(ends.lower)
+            return Values(Interval.point(number_type(x)), is_never, is_never, is_never)
+        ends = Interval.enclosing(float(cast("Any", x)), number_type)
+        low = number_type(ends.lower)
         return Values(
-            Interval(low, low if ends.lower == ends.upper else kind(ends.upper)), no, no, no
+            Interval(low, low if ends.lower == ends.upper else number_type(ends.upper)),
+            is_never,
+            is_never,
+            is_never,
         )
 
     def sum(self, other: Values) -> Values:
+        """The sum of this function and another one."""
         return self._with(self.value + other.value, other)
 
     def product(self, other: Values) -> Values:
+        """The product of this function and another one; of a function with itself it is the square,
+        whose range is sharper."""
         if other is self:
             return self.apply(power(2))
         return self._with(self.value * other.value, other)
@@ -87,29 +102,33 @@ class Values(FormulaNumber):
         return Values(-self.value, self.nowhere, self.jumps, self.gaps)
 
     def __pow__(self, exponent: Any) -> Any:
+        """This function to a power."""
         if isinstance(exponent, Values):
             return super().__pow__(exponent)
         return self.apply(power(exponent_of(exponent)))
 
     def apply(self, function: ElementaryFunction) -> Values:
-        """The composition of an elementary function with this function."""
+        """The composition of an elementary function with this function. It has no value where this
+        function is outside of the elementary function's domain. It may jump if its range is lost,
+        or if it may have a pole."""
         x = self.value
-        value, (low, high) = function.ranges(x)[0], function.domain
+        value, (domain_low, domain_high) = function.ranges(x)[0], function.domain
         nowhere, gaps = self.nowhere, self.gaps
-        if low > -math.inf:
-            nowhere, gaps = nowhere | (x.upper < low), gaps | ~(x.lower >= low)
-        if high < math.inf:
-            nowhere, gaps = nowhere | (x.lower > high), gaps | ~(x.upper <= high)
+        if domain_low > -math.inf:
+            nowhere, gaps = nowhere | (x.upper < domain_low), gaps | ~(x.lower >= domain_low)
+        if domain_high < math.inf:
+            nowhere, gaps = nowhere | (x.lower > domain_high), gaps | ~(x.upper <= domain_high)
         # The range of a box with a pole is all numbers.
-        pole = _is_lost(value, 0.0 if function.has_pole else _LARGE_EXPONENT)
-        return Values(value, nowhere, self.jumps | _is_lost(x) | pole, gaps)
+        may_have_pole = _is_lost(value, 0.0 if function.has_pole else _LARGE_EXPONENT)
+        return Values(value, nowhere, self.jumps | _is_lost(x) | may_have_pole, gaps)
 
     def checked(self) -> Values:
-        """The same range, with `jumps` set where numbers overflowed so that no range is known."""
+        """This function, with `jumps` also set where numbers overflowed so that no range is
+        known."""
         return replace(self, jumps=self.jumps | _is_lost(self.value))
 
     def pointwise_maximum(self, other: Values) -> Values:
-        """The larger of this and another function at each point.
+        """The larger of this function and another one at each point.
 
         At a point where only one of the two functions has a value, the result may count as that
         value or as having none. So if there may be such points, the range contains the ranges of
@@ -118,6 +137,7 @@ class Values(FormulaNumber):
         x, y = self.value, other.value
         gaps = self.gaps | other.gaps
         either = _unless(self.nowhere, x, y).hull(_unless(other.nowhere, y, x))
+        # Without such points it is the larger of both lower ends.
         low = dr.select(gaps, either.lower, x.intersect(y).lower)
         return Values(
             Interval(low, either.upper),
@@ -127,14 +147,17 @@ class Values(FormulaNumber):
         )
 
     def polar_angle(self, x: Values) -> Values:
-        value, met = angle_range(self.value, x.value)
+        """The polar angle of the point (x, y), where y is this function. It may jump if the box
+        meets the cut of the angle, the negative x axis."""
+        value, meets_cut = angle_range(self.value, x.value)
         angle = self._with(value, x)
-        jumps = angle.jumps | met | _is_lost(self.value) | _is_lost(x.value)
+        jumps = angle.jumps | meets_cut | _is_lost(self.value) | _is_lost(x.value)
         return Values(value, angle.nowhere, jumps, angle.gaps)
 
     def _with(self, value: Interval, other: Values) -> Values:
-        """A function with the range `value`, computed from this and another function. It has no
-        value at points where one of the two has none, and may jump where one of the two may."""
+        """A function with the range `value` that was computed from this function and another one.
+        It has no value at points where one of the two has none, and may jump where one of the two
+        may."""
         return Values(
             value,
             self.nowhere | other.nowhere,
@@ -159,5 +182,5 @@ def _is_lost(x: Interval, large: float = _LARGE_EXPONENT) -> Mask:
 
 
 def _unless(condition: Mask, x: Interval, y: Interval) -> Interval:
-    """The interval x on lanes where the condition does not hold, y where it does."""
+    """The interval x on lanes where the condition does not hold, y on lanes where it does."""
     return Interval(dr.select(condition, y.lower, x.lower), dr.select(condition, y.upper, x.upper))

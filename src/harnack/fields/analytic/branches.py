@@ -1,4 +1,10 @@
-"""Functions of a complex variable with all their branches, for Riemann surfaces."""
+"""Analytic functions of a complex variable z with all their branches, for Riemann surfaces. A
+branch g is one of the values that such a function takes near a point, continued analytically; the
+square root has the two branches sqrt z and -sqrt z. A singular point is one where some branch is
+not analytic, such as 0 for the square root; at a branch point a turn around it leads from one
+branch to another (in the code all singular points are called branch points). Of each g either the
+real or the imaginary part is drawn as the height of a surface over the plane. If that part may be
+shifted by multiples of a period, such as 2 pi for Im log z, the shifted branches count as one."""
 
 from __future__ import annotations
 
@@ -36,23 +42,23 @@ _BOUND_MARGIN = 1 + 2e-4
 
 
 def complex_type(backend: Backend) -> Any:
-    """The Dr.Jit type of complex numbers (`Complex2f` or `Complex2f64`) of the backend and
+    """The Dr.Jit type of complex numbers (`Complex2f` or `Complex2f64`) of this backend and
     precision."""
     suffix = "64" if backend.precision == "double" else ""
     return getattr(importlib.import_module(f"drjit.{backend.name}.ad"), f"Complex2f{suffix}")
 
 
 def complex_of(x: Real, y: Real) -> Complex:
-    """The complex number x + i y from two Dr.Jit numbers, of the backend and precision of x."""
+    """The complex number x + i y, of the backend and precision of x."""
     return complex_type(backend_of(x))(x, y)
 
 
 def derivatives(number: Complex, part: str) -> tuple[Real, Real]:
-    """The derivatives d/dx and d/dy of the real or imaginary part of an analytic function g(x + i
+    """The derivatives by x and by y of the real or imaginary part of an analytic function g(x + i
     y).
 
-    number: the derivative g'(z).
-    part: "imag" or "real", the part of g that is differentiated.
+    number: the derivative g'(z) of the function as a complex function.
+    part: "imag" or "real": the part of g that is differentiated.
 
     By the Cauchy-Riemann equations they are Im g' and Re g' for the imaginary part, and Re g' and
     -Im g' for the real part.
@@ -64,13 +70,14 @@ def derivatives(number: Complex, part: str) -> tuple[Real, Real]:
 
 @dataclass(frozen=True)
 class BranchPoint:
-    """A point of the plane where branches are not analytic, with a bound of the branches near it.
+    """A point of the complex plane where a branch g of a function is not analytic, with a bound of
+    how far all branches are from a common value near it: |g - value| <= constant |z -
+    location|^power, with power > 0, for all z within `radius` of the point. If the drawn part of g
+    has a period, the bound holds after a shift of g by whole periods.
 
     location: the point.
-    power, constant, radius, value: the numbers of the bound |g - value| <= constant |z -
-        location|^power, with power > 0. All branches g obey it at all z within the radius of the
-        point. If the drawn part of g has a period, they do so after a shift by whole periods. The
-        power is None if no such bound is known, as at poles and logarithms.
+    power, constant, radius, value: the numbers of the bound. The power is None if no such bound is
+        known, as at poles and logarithms.
 
     Raises:
         TypeError, ValueError: a number is not finite (the radius may be infinite), or the power,
@@ -99,9 +106,10 @@ class BranchPoint:
 
 @dataclass(frozen=True)
 class PreparedBranchPoint:
-    """A `BranchPoint` whose numbers are kernel parameters of a backend.
+    """A `BranchPoint` with Dr.Jit numbers: a point of the complex plane where a branch g of a
+    function is not analytic, with a bound of the branches near it.
 
-    at: the point of the plane.
+    at: the point.
     power, constant, radius, value: the bound |g - value| <= constant |z - at|^power of all branches
         g at points z within the radius; the power is None if no such bound is known.
     """
@@ -116,10 +124,10 @@ class PreparedBranchPoint:
     def of(
         cls, point: BranchPoint, make_real: Callable[[float], Real], make_complex: Any
     ) -> PreparedBranchPoint:
-        """Convert a branch point to numbers of a backend.
+        """Convert a branch point to Dr.Jit numbers.
 
-        make_real: makes a real number of the backend from a Python float.
-        make_complex: makes a complex number of the backend from its real and its imaginary part.
+        make_real: makes a real Dr.Jit number from a Python float.
+        make_complex: makes a complex Dr.Jit number from its real and its imaginary part.
         """
         at, value = (
             make_complex(make_real(z.real), make_real(z.imag))
@@ -130,8 +138,8 @@ class PreparedBranchPoint:
 
 @dataclass(frozen=True)
 class Branch:
-    """The value g(z), the derivative g'(z) and, if it is known, g"(z) of one branch g at a
-    point z."""
+    """One branch g of an analytic function at a point z: the value g(z), the derivative g'(z) as
+    `first` and, if it is known, g"(z) as `second`."""
 
     value: Complex
     first: Complex
@@ -139,24 +147,24 @@ class Branch:
 
 
 class PlaneRegion(abc.ABC):
-    """A region of the complex plane, on which `Branches.second_derivative_bound` bounds |g"|.
-
-    The numbers that its methods return are rounded outwards: they hold for the exact region.
-    """
+    """A region of the complex plane, on which second derivatives of analytic functions are bounded
+    (`Branches.second_derivative_bound`). The bounds need only its distances from singular points,
+    and a disk around it. All numbers are rounded to the safe side: they hold for the exact
+    region."""
 
     @abc.abstractmethod
     def distances(self, at: Complex) -> tuple[Real, Real]:
-        """A lower bound of the smallest, and an upper bound of the largest distance from the point
-        `at` to points of the region."""
+        """How near to the point `at` and how far from it the region's points are: a lower bound of
+        the smallest distance and an upper bound of the largest."""
 
     @abc.abstractmethod
     def disk(self) -> tuple[Complex, Real]:
-        """Center and radius of a disk that contains the region."""
+        """The center and the radius of a disk that contains the region."""
 
 
 @dataclass(frozen=True)
 class PlaneSegment(PlaneRegion):
-    """The segment of the complex plane from z to z + length w.
+    """The straight segment of the complex plane from z to z + length w.
 
     z, w: Dr.Jit complex numbers; w need not have length 1.
     length: a multiple of w, >= 0.
@@ -169,16 +177,18 @@ class PlaneSegment(PlaneRegion):
     rounding: Real
 
     def distances(self, at: Complex) -> tuple[Real, Real]:
-        """A lower bound of the smallest, and an upper bound of the largest distance from `at`.
+        """A lower bound of the smallest distance from the point `at` to the segment, and an upper
+        bound of the largest.
 
         The smallest distance is that of the foot of the perpendicular from `at`, or, if the foot is
         not on the segment, of the end nearer to it. The largest distance is that of an end, since
         the distance from a point is a convex function along a line.
         """
         x, y = self.z.real - at.real, self.z.imag - at.imag
-        speed = dr.square(self.w.real) + dr.square(self.w.imag)
-        foot_position = -(x * self.w.real + y * self.w.imag) / speed
-        foot_position = dr.select(speed > 0, fmin(fmax(foot_position, 0), self.length), 0)
+        # The foot is z + foot_position w; |w|^2 is 0 for a segment that is a single point.
+        speed_squared = dr.square(self.w.real) + dr.square(self.w.imag)
+        foot_position = -(x * self.w.real + y * self.w.imag) / speed_squared
+        foot_position = dr.select(speed_squared > 0, fmin(fmax(foot_position, 0), self.length), 0)
         start, foot_distance, end = (
             dr.sqrt(dr.square(x + position * self.w.real) + dr.square(y + position * self.w.imag))
             for position in (0.0, foot_position, self.length)
@@ -213,9 +223,13 @@ class Disk(PlaneRegion):
 
 @dataclass(frozen=True)
 class Branches(abc.ABC):
-    """All branches g of an analytic function of a complex variable, with proved bounds.
+    """An analytic function of a complex variable z with all its branches g (the values that it
+    takes near a point, continued analytically), and proved bounds of them. Either the real or the
+    imaginary part of g is drawn. Branches whose drawn parts differ by whole periods count as one. A
+    singular point, also called a branch point here, is one where a branch is not analytic.
 
-    Branches that differ by whole periods of the drawn part (`period`) count as one.
+    _prepared: the singular points as Dr.Jit numbers of a backend; empty unless `prepare` has made
+        them.
     """
 
     _prepared: tuple[PreparedBranchPoint, ...] = field(
@@ -225,12 +239,12 @@ class Branches(abc.ABC):
     @property
     @abc.abstractmethod
     def branch_points(self) -> tuple[BranchPoint, ...]:
-        """The points where branches are not analytic. Along every curve that avoids them each
-        branch can be continued."""
+        """The points where a branch is not analytic. Along every curve that avoids them each branch
+        can be continued."""
 
     def period(self, imaginary: bool) -> float | None:
-        """A number by which the drawn part of any branch may be shifted to give the drawn part of a
-        branch again; None if there is no such number.
+        """A number by which the drawn part of each branch may be shifted to give the drawn part of
+        a branch again; None if there is no such number.
 
         imaginary: True if the imaginary part is drawn, False if the real part is drawn.
         """
@@ -239,14 +253,15 @@ class Branches(abc.ABC):
 
     @property
     def count(self) -> int:
-        """The number of branches, where those that differ by whole periods count as one."""
+        """The number of branches. Those whose drawn parts differ by whole periods count as one."""
         return 1
 
     def prepare(self, backend: Backend) -> Branches:
-        """A copy of these branches whose numbers are kernel parameters of the backend."""
+        """A copy of these branches whose numbers lie on the backend as data, not as literals:
+        Dr.Jit then need not compile its code again for other numbers."""
 
         def number(value: float) -> Real:
-            """The number as a kernel parameter."""
+            """The number as a Dr.Jit array that is not a literal."""
             return dr.opaque(backend.Float, value)
 
         make_complex = complex_type(backend)
@@ -258,10 +273,10 @@ class Branches(abc.ABC):
         )
 
     def points_on(self, z: Complex) -> tuple[PreparedBranchPoint, ...]:
-        """The branch points as Dr.Jit numbers of the types of z: kernel parameters if these
-        branches were prepared, else literals.
+        """The singular points as Dr.Jit numbers of the types of z: those that `prepare` has made,
+        else literals.
 
-        z: a point of the plane.
+        z: any complex number; it tells the types.
         """
         if self._prepared:
             return self._prepared
@@ -272,23 +287,19 @@ class Branches(abc.ABC):
 
     @abc.abstractmethod
     def evaluate(self, z: Complex) -> tuple[Branch, ...]:
-        """All branches at z, one for each set of branches that differ by whole periods, in any
-        order."""
+        """All branches at the point z, in any order. Of branches that differ by whole periods there
+        is one."""
 
     @abc.abstractmethod
     def second_derivative_bound(self, part: PlaneRegion) -> Real:
-        """A bound of |g"|, for all branches g, on a region of the plane; infinite if no bound is
-        known.
-
-        part: the region.
-        """
+        """A bound of |g"| on a region of the plane that holds for all branches g; infinite if no
+        bound is known."""
 
     def move_off_singularities(self, z: Complex, rounding: Real) -> Complex:
-        """The point z, moved away from singular points, where derivatives are NaN.
+        """The point z, or a point beside it if z is at a singular point, where derivatives are NaN.
 
         rounding: a bound of the rounding error of z, as a distance. If z is nearer to a singular
-            point than this (plus 1e-12), it is replaced by a point at that distance; else it is
-            unchanged.
+            point than this (plus 1e-12), it is replaced by a point at that distance.
         """
         min_distance = rounding + _MIN_DISTANCE
         for point in self.points_on(z):
@@ -297,22 +308,22 @@ class Branches(abc.ABC):
         return z
 
     def clearance(self, z: Complex) -> Real:
-        """The distance from z to the nearest singular point; 2 if there are no singular points, as
-        it limits the size of the disks on which promises are made."""
+        """The distance from z to the nearest singular point. If there are no singular points it is
+        2, because it limits the size of the disks on which the branches are bounded."""
         nearest = 0 * z.real + (dr.inf if self.branch_points else _CLEARANCE_WITHOUT_POINTS)
         for point in self.points_on(z):
             nearest = fmin(abs(z - point.at), nearest)
         return nearest
 
     def max_abs(self, center: complex, radius: float) -> float:
-        """An upper bound of |g|, for all branches g, on the disk about `center` with this radius;
+        """An upper bound of |g|, for all branches g, on the disk with this center and radius;
         infinite if no bound is known."""
         del center, radius
         return math.inf
 
     def value_rounding(self, z: Complex, branches: tuple[Branch, ...]) -> Real:
         """A bound of the rounding error of the values of all branches, as a multiple of the machine
-        epsilon (2^-23 in single precision).
+        epsilon (2^-23 in single precision). By default it is 8 times the largest |value|.
 
         z: the point at which `branches` were evaluated.
         """
@@ -325,10 +336,10 @@ class Branches(abc.ABC):
 
 @dataclass(frozen=True)
 class PowerProduct(Branches):
-    """The product g of (z - a_i)^alpha_i, with rational exponents alpha_i.
-
-    It has q branches, where q is the least common denominator of the exponents: a full turn around
-    a_i multiplies g by exp(2 pi i alpha_i), and these factors generate the q-th roots of unity.
+    """The function g(z) = product of (z - a_i)^alpha_i, with rational exponents alpha_i. It has q
+    branches, where q is the least common denominator of the exponents: a full turn around a_i
+    multiplies g by exp(2 pi i alpha_i), and these factors generate the q-th roots of unity. It is
+    singular at the a_i whose exponent is no positive integer.
 
     centers: the points a_i.
     exponents: the exponents alpha_i, in the same order.
@@ -355,9 +366,12 @@ class PowerProduct(Branches):
 
     @property
     def branch_points(self) -> tuple[BranchPoint, ...]:
-        """The a_i whose exponent is no positive integer, as `BranchPoint`s. For an exponent alpha >
-        0 the bound is |g| <= C |z - a_i|^alpha within half the distance to the nearest other a_j,
-        where C bounds the product of all other factors there."""
+        """The points a_i whose exponent alpha_i is no positive integer, where g = product of (z -
+        a_i)^alpha_i is not analytic.
+
+        For an exponent alpha > 0 all branches are near 0 there: |g| <= C |z - a_i|^alpha within
+        half the distance to the nearest other a_j, where C bounds the product of all other factors.
+        """
         points: list[BranchPoint] = []
         for i, (a, alpha) in enumerate(zip(self.centers, self.exponents, strict=True)):
             if alpha > 0 and alpha.is_integer():
@@ -365,13 +379,17 @@ class PowerProduct(Branches):
             if alpha < 0:
                 points.append(BranchPoint(a))
                 continue
-            factors = [
+            other_factors = [
                 (abs(a - b), beta)
                 for j, (b, beta) in enumerate(zip(self.centers, self.exponents, strict=True))
                 if j != i
             ]
-            radius = 0.5 * min((d for d, _ in factors), default=math.inf)
-            constant = math.prod((d + math.copysign(radius, beta)) ** beta for d, beta in factors)
+            radius = 0.5 * min((d for d, _ in other_factors), default=math.inf)
+            # A power is largest at the largest distance |z - a_j| if its exponent is positive, else
+            # at the smallest one; these are |a_i - a_j| plus and minus the radius.
+            constant = math.prod(
+                (d + math.copysign(radius, beta)) ** beta for d, beta in other_factors
+            )
             points.append(BranchPoint(a, alpha, constant * (1 + 1e-6), radius))
         return tuple(points)
 
@@ -379,12 +397,12 @@ class PowerProduct(Branches):
         return replace(super().prepare(backend), _on=_uploaded(self.centers, backend))
 
     def _centers(self, z: Complex) -> tuple[Complex, ...]:
-        """The points a_i as Dr.Jit numbers of the type of z: kernel parameters if these branches
-        were prepared, else literals."""
+        """The points a_i as Dr.Jit numbers of the type of z: those that `prepare` has made, else
+        literals."""
         return self._on or tuple(type(z)(a.real, a.imag) for a in self.centers)
 
     def move_off_singularities(self, z: Complex, rounding: Real) -> Complex:
-        """The point z, moved away from singular points and from the zeros of g.
+        """The point z, or a point beside it if z is at a singular point or at a zero of g.
 
         rounding: a bound of the rounding error of z, as a distance.
 
@@ -402,11 +420,13 @@ class PowerProduct(Branches):
         return z
 
     def evaluate(self, z: Complex) -> tuple[Branch, ...]:
-        """All q branches at z, computed from the logarithm of the product.
+        """All q branches of g = product of (z - a_i)^alpha_i at z: one value, computed from the
+        logarithm of the product, times each of the q-th roots of unity.
 
         With the logarithmic derivative e = sum alpha_i/(z - a_i), g' = g e and g" = g (e^2 - sum
         alpha_i/(z - a_i)^2).
         """
+        # The real and the imaginary part of log g; e; and the sum of alpha_i/(z - a_i)^2.
         log_size, angle = 0 * z.real, 0 * z.real
         log_derivative = type(z)(log_size, log_size)
         square_sum = log_derivative
@@ -417,9 +437,9 @@ class PowerProduct(Branches):
             inverse = dr.rcp(offset)
             log_derivative = log_derivative + alpha * inverse
             square_sum = square_sum + alpha * (inverse * inverse)
-        size = dr.exp(log_size)
+        abs_g = dr.exp(log_size)
         sine, cosine = sincos(angle)
-        g = type(z)(size * cosine, size * sine)
+        g = type(z)(abs_g * cosine, abs_g * sine)
         second_ratio = log_derivative * log_derivative - square_sum
         branches: list[Branch] = []
         for k in range(self.denominator):
@@ -429,8 +449,9 @@ class PowerProduct(Branches):
         return tuple(branches)
 
     def second_derivative_bound(self, part: PlaneRegion) -> Real:
-        """A bound of |g"| on a region of the plane; the class docstring has the proof. Each term is
-        computed from logarithms of distances.
+        """A bound of |g"| on a region of the plane that holds for all branches g. The class has the
+        proof: a sum of products of powers of the distances d_i from the points a_i. Each product is
+        computed from the logarithms of the distances.
 
         part: the region.
         """
@@ -440,38 +461,42 @@ class PowerProduct(Branches):
             smallest, largest = part.distances(a)
             log_nearest.append(dr.log(smallest))
             log_farthest.append(dr.log(largest))
-        alphas, total = self.exponents, 0 * part.disk()[1]
+        alphas, bound = self.exponents, 0 * part.disk()[1]
         for i, alpha_i in enumerate(alphas):
             for j, alpha_j in enumerate(alphas[: i + 1]):
+                # The coefficient of this term of |g"|/|g|.
                 factor = abs(alpha_i * (alpha_i - 1)) if i == j else 2 * abs(alpha_i * alpha_j)
                 if factor == 0:
                     continue
+                # The exponents of the d_k in |g|/(d_i d_j).
                 powers = [alpha - (k == i) - (k == j) for k, alpha in enumerate(alphas)]
                 logs = [
                     power * (log_nearest if power < 0 else log_farthest)[k]
                     for k, power in enumerate(powers)
                     if power != 0
                 ]
-                total = total + factor * dr.exp(sum(logs)) if logs else factor
-        return total * _BOUND_MARGIN
+                bound = bound + factor * dr.exp(sum(logs)) if logs else factor
+        return bound * _BOUND_MARGIN
 
     def max_abs(self, center: complex, radius: float) -> float:
-        """An upper bound of |g| on the disk about `center` with this radius: the product of bounds
-        of all factors |z - a_i|^alpha_i. It is infinite if the disk contains an a_i with a negative
+        """An upper bound of |g| on the disk with this center and radius: the product of bounds of
+        all factors |z - a_i|^alpha_i. It is infinite if the disk contains an a_i with a negative
         exponent."""
         product = 1.0
         for a, alpha in zip(self.centers, self.exponents, strict=True):
             distance = abs(a - center)
             if alpha < 0 and distance <= radius:
                 return math.inf
+            # The largest distance if alpha is positive, else the smallest one.
             product *= (distance + math.copysign(radius, alpha)) ** alpha
         return product
 
     def value_rounding(self, z: Complex, branches: tuple[Branch, ...]) -> Real:
-        """A bound of the rounding error of the values, as a multiple of the machine epsilon.
+        """A bound of the rounding error of the values of all branches at z, as a multiple of the
+        machine epsilon.
 
         Each value is exp of a sum of logarithms and angles, so its relative error is a few
-        roundings of the terms of these sums.
+        roundings of the terms of these sums. All branches have the same absolute value.
         """
         roundings = 12 + 4 * math.pi * sum(abs(alpha) for alpha in self.exponents)
         for a, alpha in zip(self._centers(z), self.exponents, strict=True):
@@ -481,13 +506,14 @@ class PowerProduct(Branches):
 
 @dataclass(frozen=True)
 class Logarithm(Branches):
-    """g = sum n_i log(z - a_i), the logarithm of a product of integer powers.
+    """The function g(z) = sum n_i log(z - a_i) with integers n_i: the logarithm of a product of
+    integer powers. Its imaginary part is determined up to multiples of 2 pi gcd(n_i); branches that
+    differ by these count as one. It is singular at the points a_i.
 
     centers: the points a_i.
     multiplicities: the integers n_i, in the same order.
 
-    The imaginary part of g is determined up to multiples of 2 pi gcd(n_i); these branches count as
-    one. |g"| = |sum n_i/(z - a_i)^2| <= sum |n_i|/d_i^2 on a region, if d_i is the smallest
+    Bound. |g"| = |sum n_i/(z - a_i)^2| <= sum |n_i|/d_i^2 on a region, if d_i is the smallest
     distance of the region from a_i.
     """
 
@@ -506,12 +532,13 @@ class Logarithm(Branches):
         return replace(super().prepare(backend), _on=_uploaded(self.centers, backend))
 
     def _centers(self, z: Complex) -> tuple[Complex, ...]:
-        """The points a_i as Dr.Jit numbers of the type of z: kernel parameters if these branches
-        were prepared, else literals."""
+        """The points a_i as Dr.Jit numbers of the type of z: those that `prepare` has made, else
+        literals."""
         return self._on or tuple(type(z)(a.real, a.imag) for a in self.centers)
 
     def evaluate(self, z: Complex) -> tuple[Branch, ...]:
-        """The branch at z, as a list of one: the values of log differ by periods only."""
+        """g = sum n_i log(z - a_i) at z, as a tuple with a single branch: all other values differ
+        from it by whole periods."""
         zero = type(z)(0 * z.real, 0 * z.real)
         value, first, second = zero, zero, zero
         for a, n in zip(self._centers(z), self.multiplicities, strict=True):
@@ -529,8 +556,8 @@ class Logarithm(Branches):
         return total * _BOUND_MARGIN
 
     def value_rounding(self, z: Complex, branches: tuple[Branch, ...]) -> Real:
-        """A bound of the rounding error of the value, as a multiple of the machine epsilon: that of
-        the logarithms and of the angles, which are at most pi."""
+        """A bound of the rounding error of g = sum n_i log(z - a_i), as a multiple of the machine
+        epsilon: the sum of those of the logarithms and of the angles, which are at most pi."""
         del branches
         roundings = 0 * z.real
         for a, n in zip(self._centers(z), self.multiplicities, strict=True):
@@ -540,7 +567,8 @@ class Logarithm(Branches):
 
 @dataclass(frozen=True)
 class ArcSine(Branches):
-    """asin: its branches are g and pi - g plus multiples of 2 pi, with g the principal branch.
+    """The function asin with all its branches, which are g and pi - g plus multiples of 2 pi, with
+    g the principal branch. It is singular at 1 and -1.
 
     Bound of |g"|. g' = (1 - z^2)^(-1/2) and g" = z g'^3, so |g"| <= |z|/(d_1 d_2)^(3/2), where d_1
     and d_2 are the distances of z from 1 and -1.
@@ -564,7 +592,8 @@ class ArcSine(Branches):
         return None if imaginary else 2 * math.pi
 
     def evaluate(self, z: Complex) -> tuple[Branch, ...]:
-        """Both branches at z, by Kahan's formulas (1987), in which nothing cancels."""
+        """Both branches g and pi - g of asin at z, by Kahan's formulas (1987), in which nothing
+        cancels."""
         root_minus, root_plus = dr.sqrt(1 - z), dr.sqrt(1 + z)
         product = root_minus * root_plus
         real = dr.atan2(z.real, product.real)
@@ -584,7 +613,7 @@ class ArcSine(Branches):
 
 @dataclass(frozen=True)
 class UserBranches(Branches):
-    """The branches of a user's function of a complex variable.
+    """An analytic function of a complex variable with all its branches that a user has written.
 
     function: a function of z that returns all branches at z, each as (g, g') or (g, g', g").
     singular: the points where a branch is not analytic.
@@ -615,7 +644,8 @@ class UserBranches(Branches):
         return self.shift
 
     def evaluate(self, z: Complex) -> tuple[Branch, ...]:
-        """The branches that the user's function returns, with plain numbers made Dr.Jit numbers."""
+        """The branches at z that the user's function returns; Python numbers among them are
+        converted to Dr.Jit numbers."""
         branches: list[Branch] = []
         for numbers in self.function(z):
             parts = [part if dr.is_array_v(type(part)) else type(z)(part) for part in numbers]
@@ -623,7 +653,14 @@ class UserBranches(Branches):
         return tuple(branches)
 
     def second_derivative_bound(self, part: PlaneRegion) -> Real:
+        """A bound of |g"| on a region that holds for all branches g: the user's bound on a disk
+        that contains the region. It is infinite if a singular point lies in the disk, or if the
+        user's bound is negative or NaN.
+
+        part: the region.
+        """
         center, radius = part.disk()
+        # False if the radius is NaN.
         is_free = radius == radius
         for point in self.points_on(center):
             is_free = is_free & (abs(center - point.at) > radius)
@@ -632,7 +669,7 @@ class UserBranches(Branches):
 
 
 def _uploaded(points: tuple[complex, ...], backend: Backend) -> tuple[Complex, ...]:
-    """The points of the complex plane as kernel parameters of a backend."""
+    """The points of the complex plane as Dr.Jit numbers of a backend that are not literals."""
     make_complex = complex_type(backend)
     real = backend.Float
     return tuple(make_complex(dr.opaque(real, a.real), dr.opaque(real, a.imag)) for a in points)

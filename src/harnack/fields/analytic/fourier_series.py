@@ -1,4 +1,8 @@
-"""Any function on a box, as a cosine series fitted to it (paper, section 4.7.1)."""
+"""Any function on a box, as a cosine series fitted to it (paper, section 4.7.1). The series is the
+sum of a_ijk cos(i u) cos(j v) cos(k w) with coefficients a_ijk, whose angles u, v and w go from 0
+to pi along the sides of the box. The fitted function is a callable of the user or a grid of its
+values at the midpoints of cells of the box. The field is the series; the fitted function serves
+only to measure by how much the series differs from it."""
 
 from __future__ import annotations
 
@@ -46,10 +50,9 @@ Function: TypeAlias = Callable[["FloatArray"], Any]
 
 @dataclass(frozen=True)
 class SurfaceDisplacement:
-    """An estimate of the distance between the surface of a series and that of the function it fits.
-
-    At points of the series' surface the distance is estimated, to first order, by |function -
-    level|/|gradient of the series|.
+    """An estimate of the distance between two surfaces: the level set of a cosine series, and that
+    of the function to which the series was fitted. It is made at points of the series' surface,
+    where the distance is about |function - level|/|gradient of the series|.
 
     mean, largest: the mean and the largest distance, lengths.
     count: the number of points.
@@ -61,13 +64,13 @@ class SurfaceDisplacement:
 
 
 class FourierSeries(Field):
-    """The sum of a_ijk cos(i u) cos(j v) cos(k w) on a box.
+    """A cosine series on a box: f is the sum of a_ijk cos(i u) cos(j v) cos(k w), whose angles u, v
+    and w go from 0 to pi along the sides of the box. `fit` computes the series of any function or
+    grid of values.
 
-    The angles u, v and w go from 0 to pi along the sides of the box.
-
-    `fit` computes the series of any function or grid of values. **All proofs are about the
-    series**, not about the function that it was fitted to: `fit_error` is the difference of their
-    values and `displacement` the distance of their surfaces, both by sampling.
+    **All proofs are about the series**, not about the function that it was fitted to: `fit_error`
+    is the difference of their values and `displacement` the distance of their surfaces, both by
+    sampling.
 
     Beyond the faces of the box the series is a reflection of itself. It converges quickly if the
     function is smooth and has no slope across the faces. Kinks, such as those of distances, cost
@@ -77,11 +80,11 @@ class FourierSeries(Field):
     coefficients: (K_x, K_y, K_z) the a_ijk; each of the three sizes is at most 24.
     box: a finite `Box`.
 
-    Promises: bounds of the second derivatives (`CosineBounds` has the proof), on the whole box and,
-    if local bounds are smaller, on balls around the cells of grids over it. Rounding, in units of
-    the unit roundoff: an angle k u has the error of u (3 roundings, which move the point) and that
-    of the product, at most k pi; a sine or cosine has 2; a coefficient has 1; a term takes part in
-    i + j + k + 3 sums.
+    Promises (proved bounds of f near a point): bounds of the second derivatives (`CosineBounds` has
+    the proof), on the whole box and, if local bounds are smaller, on balls around the cells of
+    grids over it. Rounding, in units of the unit roundoff: an angle k u has the error of u (3
+    roundings, which move the point) and that of the product, at most k pi; a sine or cosine has 2;
+    a coefficient has 1; a term takes part in i + j + k + 3 sums.
 
     Raises:
         ValueError: coefficients of another shape, not finite, or all zero except the first; a box
@@ -95,23 +98,25 @@ class FourierSeries(Field):
     from coefficients."""
 
     def __init__(self, coefficients: Any, box: Box | tuple[Any, Any]) -> None:
-        """Check the arguments, and compute the bounds of the series."""
-        a = as_real_array(coefficients, "coefficients").astype(np.float64)
-        if a.ndim != 3 or 0 in a.shape:
-            raise ValueError(f"coefficients must have shape (K_x, K_y, K_z), not {a.shape}")
-        _check_terms(a.shape)
-        if not np.isfinite(a).all():
+        """Check the arguments, and compute proved bounds of the series."""
+        checked = as_real_array(coefficients, "coefficients").astype(np.float64)
+        if checked.ndim != 3 or 0 in checked.shape:
+            raise ValueError(f"coefficients must have shape (K_x, K_y, K_z), not {checked.shape}")
+        _check_terms(checked.shape)
+        if not np.isfinite(checked).all():
             raise ValueError("coefficients must be finite numbers")
-        if not np.any(a.ravel()[1:]):
+        if not np.any(checked.ravel()[1:]):
             raise ValueError("the series is constant: it has no level sets")
-        self.coefficients = a
+        self.coefficients = checked
         self.domain = self._box = _finite_box(box)
         self._lower, upper = self._box.bounds()
         self._size = upper - self._lower
-        self._bounds = CosineBounds.of(a, self._size)
-        waves = np.indices(a.shape).reshape(3, -1)[:, 1:].T * (math.pi / self._size)
-        self.min_wavelength = mean_wavelength(a.ravel()[1:], np.linalg.norm(waves, axis=1))
-        self._rounding = _rounding(a, self._size)
+        self._bounds = CosineBounds.of(checked, self._size)
+        wave_vectors = np.indices(checked.shape).reshape(3, -1)[:, 1:].T * (math.pi / self._size)
+        self.min_wavelength = mean_wavelength(
+            checked.ravel()[1:], np.linalg.norm(wave_vectors, axis=1)
+        )
+        self._rounding = _rounding(checked, self._size)
         self._source: Function | FloatArray | None = None
         self._device: CosineSums | None = None
 
@@ -124,7 +129,7 @@ class FourierSeries(Field):
         *,
         samples: int | tuple[int, int, int] | None = None,
     ) -> Self:
-        """The cosine series that is closest to a function in mean square.
+        """Compute the cosine series that is closest to a function in mean square.
 
         function: a callable that takes points (n, 3) and gives values (n,); or a grid (n_x, n_y,
             n_z) of values at the midpoints of that many cells of the box.
@@ -138,16 +143,16 @@ class FourierSeries(Field):
                 than samples; a function that is constant; a box without size.
             TypeError: neither a function nor numbers; terms that are no integers.
         """
-        numbers = _as_triple(terms, "terms")
-        _check_terms(numbers)
-        space = _finite_box(box)
-        lower, upper = space.bounds()
+        counts = _as_triple(terms, "terms")
+        _check_terms(counts)
+        checked_box = _finite_box(box)
+        lower, upper = checked_box.bounds()
         if callable(function):
-            chosen = tuple(max(_SAMPLES * n, _MIN_SAMPLES) for n in numbers)
-            shape = _as_triple(chosen if samples is None else samples, "samples")
+            default_samples = tuple(max(_SAMPLES * n, _MIN_SAMPLES) for n in counts)
+            shape = _as_triple(default_samples if samples is None else samples, "samples")
             if math.prod(shape) > _MAX_SAMPLES:
                 raise ValueError(f"{shape} samples are too many: at most {_MAX_SAMPLES} in all")
-            _check_samples(numbers, shape)
+            _check_samples(counts, shape)
             grid = _values(function, midpoints(lower, upper, shape)).reshape(shape)
         else:
             if samples is not None:
@@ -155,7 +160,7 @@ class FourierSeries(Field):
             grid = as_real_array(function, "a grid", type_error=TypeError).astype(np.float64)
             if grid.ndim != 3 or 0 in grid.shape:
                 raise ValueError(f"a grid must have shape (n_x, n_y, n_z), not {grid.shape}")
-            _check_samples(numbers, cast("tuple[int, int, int]", grid.shape))
+            _check_samples(counts, cast("tuple[int, int, int]", grid.shape))
             if not np.isfinite(grid).all():
                 invalid = np.argwhere(~np.isfinite(grid))
                 raise ValueError(
@@ -164,13 +169,14 @@ class FourierSeries(Field):
                 )
         if float(np.ptp(grid)) == 0.0:
             raise ValueError("the function is constant: it has no level sets")
-        fitted = fit_cosines(grid, numbers)
+        fitted = fit_cosines(grid, counts)
+        # All coefficients but the constant one are rounding errors.
         if np.abs(fitted).sum() - abs(fitted[0, 0, 0]) < _MIN_COEFFICIENT * np.abs(grid).max():
             raise ValueError(
-                f"the series of {numbers} terms is constant, though the function is not: take more "
+                f"the series of {counts} terms is constant, though the function is not: take more "
                 "terms"
             )
-        series = cls(fitted, space)
+        series = cls(fitted, checked_box)
         series._source = cast("Any", function) if callable(function) else grid
         series.fit_error = series._largest_difference()
         return series
@@ -183,39 +189,41 @@ class FourierSeries(Field):
 
     @property
     def curvature(self) -> float:
-        """A proved bound of all |directional second derivatives| of the series on its box."""
+        """A proved bound of the absolute second derivatives of the series along any direction, on
+        its box."""
         return self._bounds.curvature
 
     def displacement(self, level: float | None = None, *, rng: int = 0) -> SurfaceDisplacement:
-        """Estimate the distance between the surfaces of the series and of the fitted function, at a
-        level.
+        """Estimate the distance between two level sets: that of the series and that of the fitted
+        function.
 
         level: by default `default_level`.
         rng: the seed of the random points.
 
-        For a function the points are random points of the series' surface; for a grid, those of its
-        points that are next to the surface.
+        If a callable was fitted, the distance is measured at random points of the series' surface;
+        if a grid was fitted, at those of its points that are next to the surface.
 
         Raises:
             ValueError: the series was not computed by `fit`, or no point of the level was found.
         """
         if self._source is None:
             raise ValueError("the series was made from coefficients: there is no function to miss")
-        chosen = self.default_level if level is None else float(level)
-        points, values = self._near(chosen, rng)
+        chosen_level = self.default_level if level is None else float(level)
+        points, differences = self._near(chosen_level, rng)
         if not len(points):
-            raise ValueError(f"no point with level {chosen:g} was found in the box")
+            raise ValueError(f"no point with level {chosen_level:g} was found in the box")
         slope = np.linalg.norm(self.gradient(points, precision="double"), axis=1)
-        distances = np.abs(values) / np.maximum(slope, 1e-300)
+        distances = np.abs(differences) / np.maximum(slope, 1e-300)
         return SurfaceDisplacement(float(distances.mean()), float(distances.max()), len(points))
 
     def _near(self, level: float, rng: int) -> tuple[FloatArray, FloatArray]:
-        """Points (n, 3) of the surface, or next to it, and the differences (n,) between the fitted
-        function and the series there.
+        """Points (n, 3) on or next to the surface of the series at this level, and numbers (n,)
+        that tell the difference between the fitted function and the series there.
 
         level: the level of the surface.
-        rng: the seed of the random points, if a function was fitted. If a grid was fitted, the
-            points are those of the grid.
+        rng: the seed of the random points, if a callable was fitted. They are moved to the surface
+            by Newton's method. If a grid was fitted, the points are those of the grid within about
+            a cell of the surface.
         """
         if not callable(self._source):
             grid = cast("FloatArray", self._source)
@@ -225,33 +233,46 @@ class FourierSeries(Field):
             cell = float((self._size / grid.shape).max())
             is_near = np.abs(value - level) <= slope * cell
             return points[is_near], (grid.ravel() - value)[is_near]
-        x = self._lower + self._size * np.random.default_rng(rng).random((_CHECK_POINTS, 3))
+        points_on_surface = self._lower + self._size * np.random.default_rng(rng).random(
+            (_CHECK_POINTS, 3)
+        )
         for _ in range(_NEWTON_STEPS):
-            gradient = self.gradient(x, precision="double")
+            gradient = self.gradient(points_on_surface, precision="double")
             square = np.maximum((gradient**2).sum(axis=1), 1e-300)
-            difference = (self.value(x, precision="double") - level) / square
+            # A Newton step along the gradient, limited to a tenth of the box.
+            difference = (self.value(points_on_surface, precision="double") - level) / square
             step = difference[:, None] * gradient
             length = np.linalg.norm(step, axis=1, keepdims=True)
-            x = x - step * np.minimum(1, 0.1 * self._size.min() / np.maximum(length, 1e-300))
-            x = np.clip(x, self._lower, self._lower + self._size)
-        slope = np.linalg.norm(self.gradient(x, precision="double"), axis=1)
-        difference = np.abs(self.value(x, precision="double") - level)
-        x = x[difference <= _CONVERGED * float(self._size.max()) * slope]
-        return x, (_values(self._source, x) if len(x) else np.zeros(0)) - level
+            points_on_surface = points_on_surface - step * np.minimum(
+                1, 0.1 * self._size.min() / np.maximum(length, 1e-300)
+            )
+            points_on_surface = np.clip(points_on_surface, self._lower, self._lower + self._size)
+        slope = np.linalg.norm(self.gradient(points_on_surface, precision="double"), axis=1)
+        difference = np.abs(self.value(points_on_surface, precision="double") - level)
+        # Points at which the method has not converged are left out.
+        points_on_surface = points_on_surface[
+            difference <= _CONVERGED * float(self._size.max()) * slope
+        ]
+        return points_on_surface, (
+            _values(self._source, points_on_surface) if len(points_on_surface) else np.zeros(0)
+        ) - level
 
     def _largest_difference(self) -> float:
-        """The largest |series - function| at random points; for a grid, at all of its points."""
+        """The largest |series - fitted function|, at random points of the box if a callable was
+        fitted, at all points of the grid if a grid was."""
         if callable(self._source):
-            x = self._lower + self._size * np.random.default_rng(0).random((_CHECK_POINTS, 3))
-            values = _values(self._source, x)
+            points = self._lower + self._size * np.random.default_rng(0).random((_CHECK_POINTS, 3))
+            values = _values(self._source, points)
         else:
             grid = cast("FloatArray", self._source)
-            x = midpoints(self._lower, self._lower + self._size, grid.shape)
+            points = midpoints(self._lower, self._lower + self._size, grid.shape)
             values = grid.ravel()
-        return float(np.abs(self.value(x, precision="double") - values).max())
+        return float(np.abs(self.value(points, precision="double") - values).max())
 
     @cached_prepare
     def prepare(self, backend: Backend) -> Self:
+        """The same field with its coefficients and bounds uploaded to the backend; the field itself
+        if they are there already."""
         if self._device is not None and self._device.backend is backend:
             return self
         prepared = copy.copy(self)
@@ -259,37 +280,45 @@ class FourierSeries(Field):
         return prepared
 
     def _upload(self, backend: Backend) -> CosineSums:
-        """The series on a backend."""
+        """The coefficients and bounds of the series, uploaded to a backend, in an object that
+        evaluates it."""
         return CosineSums.upload(
             backend, self.coefficients, self._lower, self._size, self._bounds, self._rounding
         )
 
     def _on(self, p: Vec3) -> CosineSums:
-        """The series on the backend of p. If the field is prepared for this backend, nothing is
-        uploaded."""
+        """The uploaded coefficients and bounds of the series, on the backend of p. They are
+        uploaded now unless `prepare` has done so."""
         return self._upload(backend_of(p)) if self._device is None else self._device
 
     def evaluate(self, p: Vec3) -> Sample:
-        """The sample at p: value and gradient of the series, local bounds of second derivatives as
-        promises, and bounds of the rounding of both."""
-        sums = self._on(p)
-        value, gradient = sums.value(p)
-        unit = float(dr.epsilon(type(value))) * _SECOND_ORDER
+        """The sample at p: value and gradient of the series, bounds of their rounding errors, and
+        proved bounds of second derivatives on balls about p."""
+        series = self._on(p)
+        value, gradient = series.value(p)
+        roundoff = float(dr.epsilon(type(value))) * _SECOND_ORDER
         # The rounding of p - lower, times pi/size, moves the point.
-        moves = [dr.fma(3.0, dr.abs(p[k] - sums.lower[k]), dr.abs(sums.lower[k])) for k in range(3)]
+        moves = [
+            dr.fma(3.0, dr.abs(p[k] - series.lower[k]), dr.abs(series.lower[k])) for k in range(3)
+        ]
         error = sum((moves[k] * dr.abs(gradient[k]) for k in range(3)), 0 * p.x)
-        error = unit * (error + sums.rounding[0])
-        length = dr.norm(sums.backend.Array3f(*moves))
-        slope_error = unit * dr.fma(sums.curvature, length, sums.rounding[1])
-        return Sample(value, gradient, sums.curvatures(p), error, slope_error)
+        error = roundoff * (error + series.rounding[0])
+        move_length = dr.norm(series.backend.Array3f(*moves))
+        # A move of the point changes the gradient by at most the bound of second derivatives times
+        # the length.
+        slope_error = roundoff * dr.fma(series.curvature, move_length, series.rounding[1])
+        return Sample(value, gradient, series.curvatures(p), error, slope_error)
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
-        """The three rows of the Hessian of the series."""
+        """The three rows of the Hessian of the series at p."""
         return self._on(p).hessian(p)
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
-        """The part of the box that consists of the cells in which the series may take one of the
-        levels."""
+        """The box around all cells in which the series may take one of the levels; the whole box if
+        there are none.
+
+        levels: the levels.
+        """
         fractions = self._bounds.extent(levels)
         if fractions is None:
             return self.domain
@@ -298,9 +327,12 @@ class FourierSeries(Field):
         return Box(cast("Any", tuple(corners[0].tolist())), cast("Any", tuple(corners[1].tolist())))
 
     def validate_levels(self, levels: tuple[float, ...]) -> None:
+        """Raise ValueError for a level outside of the range of the series in its box."""
         validate_levels_in_range(levels, self.value_range, "in its box the series")
 
     def describe(self) -> dict[str, Any]:
+        """The size of the series, its proved bounds and the error of the fit, as a dictionary for
+        users."""
         return {
             "terms": self.coefficients.shape,
             "range": self.value_range,
@@ -311,7 +343,7 @@ class FourierSeries(Field):
 
 
 def _as_triple(numbers: Any, name: str) -> tuple[int, int, int]:
-    """Three integers, from one integer or from three.
+    """Three integers, from one integer, which is repeated, or from three.
 
     name: what the integers are, for the messages.
 
@@ -334,11 +366,7 @@ def _as_triple(numbers: Any, name: str) -> tuple[int, int, int]:
 
 
 def _check_terms(terms: tuple[int, ...]) -> None:
-    """Check the numbers of terms along the axes.
-
-    Raises:
-        ValueError: one of them is not from 1 to 24.
-    """
+    """Raise ValueError if a number of terms along an axis is not from 1 to 24."""
     if min(terms) < 1 or max(terms) > _MAX_TERMS:
         raise ValueError(
             f"terms must be 1 to {_MAX_TERMS} along each axis, not {tuple(terms)}: an evaluation "
@@ -347,10 +375,10 @@ def _check_terms(terms: tuple[int, ...]) -> None:
 
 
 def _check_samples(terms: tuple[int, int, int], shape: tuple[int, int, int]) -> None:
-    """Check that there are as many samples as terms along each axis.
+    """Raise ValueError if there are fewer samples than terms along an axis.
 
-    Raises:
-        ValueError: there are fewer.
+    terms: the numbers of terms along the axes.
+    shape: the numbers of samples along the axes.
     """
     if any(k > n for k, n in zip(terms, shape, strict=True)):
         raise ValueError(
@@ -360,7 +388,7 @@ def _check_samples(terms: tuple[int, int, int], shape: tuple[int, int, int]) -> 
 
 
 def _finite_box(box: Any) -> Box:
-    """A box with finite sides longer than 0, from a `Box` or from two corners.
+    """A box with finite sides longer than 0, from a `Box` or from its two corners.
 
     Raises:
         TypeError, ValueError: it is no such box.
@@ -376,7 +404,7 @@ def _finite_box(box: Any) -> Box:
 
 
 def _values(function: Function, points: FloatArray) -> FloatArray:
-    """The values (n,) of the user's function at points (n, 3).
+    """The values (n,) of the user's function at points (n, 3), after checks.
 
     Raises:
         TypeError, ValueError: they are not n finite numbers.
@@ -396,18 +424,19 @@ def _values(function: Function, points: FloatArray) -> FloatArray:
     return values.astype(np.float64)
 
 
-def _rounding(a: FloatArray, size: FloatArray) -> tuple[float, float]:
-    """Bounds of the rounding errors of value and gradient, as multiples of the unit roundoff u;
-    `FourierSeries` has the proof. The error that acts like a move of the point is left out.
+def _rounding(coefficients: FloatArray, size: FloatArray) -> tuple[float, float]:
+    """Bounds of the rounding errors of the value and of the gradient of a cosine series, as
+    multiples of the unit roundoff u; `FourierSeries` has the proof. The error that acts like a move
+    of the point is left out.
 
-    a: the coefficients (K_x, K_y, K_z).
+    coefficients: (K_x, K_y, K_z).
     size: (3,) the lengths of the box's sides.
     """
-    i, j, k = np.indices(a.shape)
+    i, j, k = np.indices(coefficients.shape)
     roundings = (i + j + k) * (math.pi + 1) + 10
-    sizes = np.abs(a)
+    abs_coefficients = np.abs(coefficients)
     slopes = [
-        math.pi / size[axis] * float((sizes * n * (roundings + 4)).sum())
+        math.pi / size[axis] * float((abs_coefficients * n * (roundings + 4)).sum())
         for axis, n in enumerate((i, j, k))
     ]
-    return float((sizes * roundings).sum()), math.hypot(*slopes)
+    return float((abs_coefficients * roundings).sum()), math.hypot(*slopes)

@@ -1,4 +1,10 @@
-"""Hyperspherical harmonics, mapped to space by stereographic projection (paper, section 4.7)."""
+"""Hyperspherical harmonics, mapped to space by stereographic projection (paper, section 4.7). A
+point p of space belongs to the point X = (y, w) of S^3, the unit sphere of R^4, with y = 2p/(1 +
+|p|^2) and w = (|p|^2 - 1)/(1 + |p|^2); far away w tends to 1, the pole. f(p) = P(X) for a
+homogeneous harmonic polynomial P of R^4 of degree l. P is a sum over j of parts S(y) C(w): S is a
+sum of solid harmonics of degree j, each times a weight (its coefficient), and C = C_(l-j)^(j+1) is
+a Gegenbauer polynomial of w. Distances of y: r from 0, and rho from the third axis. A square is
+|p|^2, and a chord is a distance in R^4 between points of S^3."""
 
 from __future__ import annotations
 
@@ -60,13 +66,15 @@ _SCALE_ERROR, _W_ERROR = 6.0, 13.0
 
 @dataclass(frozen=True)
 class _OrderTerm:
-    """The part S(y) C_n^k(w) of the function that belongs to one j, with bounds of its factors. S
-    is a sum of solid harmonics of degree j, C_n^k a Gegenbauer polynomial.
+    """The part S(y) C_n^k(w) of a function of points (y, w) of S^3 that belongs to one j, with
+    proved bounds of its factors. S is a sum of solid harmonics of degree j of y, and C_n^k is a
+    Gegenbauer polynomial.
 
     j: the degree of S.
     n, k: l - j and j + 1, the indices of C_n^k.
     weights: (j, m) -> coefficient of the solid harmonic in S.
-    value, gradient, hessian: bounds of |S|, of its gradient and of its second derivatives.
+    value, gradient, hessian: bounds of |S|, of its gradient and of its second derivatives, as
+        functions of the distances rho of y from the third axis and r from 0.
     rounding: bounds of the rounding of S as it is evaluated.
     """
 
@@ -81,7 +89,7 @@ class _OrderTerm:
 
     @classmethod
     def of(cls, l: int, j: int, weights: Weights) -> _OrderTerm:  # noqa: E741
-        """The part of a function of degree l that belongs to this j.
+        """The part S(y) C(w) that belongs to this j of a function of degree l.
 
         weights: (j, m) -> coefficient of the solid harmonic in S, the factor N_lj included.
         """
@@ -101,31 +109,34 @@ class _OrderTerm:
         return slope * c + value * first, curvature * c + slope * first + value * second
 
     def axial(self, w: Real) -> tuple[Real, Real, Real]:
-        """The values at w of C_n^k and of its first two derivatives."""
+        """The values at w of the Gegenbauer polynomial C_n^k and of its first two derivatives,
+        which are Gegenbauer polynomials, too."""
         n, k = self.n, self.k
         first = 2 * k * gegenbauer(n - 1, k + 1, w)
         return gegenbauer(n, k, w), first, 4 * k * (k + 1) * gegenbauer(n - 2, k + 2, w)
 
 
 class HypersphericalHarmonic(Field):
-    """A harmonic function of the sphere S^3 at its point (2p, |p|^2 - 1)/(1 + |p|^2).
+    """A harmonic function of the sphere S^3, the unit sphere of R^4, mapped to space: f(p) = P(y,
+    w) at the point y = 2p/(1 + |p|^2), w = (|p|^2 - 1)/(1 + |p|^2) of S^3. P is a homogeneous
+    harmonic polynomial of degree l of R^4; by default it is P_ljm(X) = N S_jm(y) |X|^(l-j)
+    C_(l-j)^(j+1)(w/|X|) with X = (y, w).
 
-    The function is P_ljm(X) = N S_jm(y) |X|^(l-j) C_(l-j)^(j+1)(w/|X|) with X = (y, w). Here S_jm
-    is the solid harmonic of `SphericalHarmonic`, C is a Gegenbauer polynomial, and N is such that
-    the integral of P^2 over S^3 is 1. The origin of space is the point w = -1 of S^3, the unit
+    S_jm is the solid harmonic of `SphericalHarmonic`, C is a Gegenbauer polynomial, and N is such
+    that the integral of P^2 over S^3 is 1. The origin of space is the point w = -1 of S^3, the unit
     sphere is w = 0, and far away f tends to the value at w = 1, which is 0 for j > 0. No level set
     needs to be clipped: rays that leave are proved to meet nothing.
 
-    l, j, m: degree 0 <= l <= 6, and 0 <= j <= l, -j <= m <= j: (l+1)^2 functions for each l.
-        For more general functions see `from_polynomial`.
+    l, j, m: degree 0 <= l <= 6, and 0 <= j <= l, -j <= m <= j: (l+1)^2 functions for each l. For
+        more general functions see `from_polynomial`.
     domain: the volume in which f is drawn; None for all of space. Surfaces of the level to which f
         tends far away (0 for j > 0) may be unbounded, and so may rays along them: they need a
         domain, or a t_max.
 
-    Proofs. Let P be of degree l. On S^3 let |P| <= M, and let A be half the length of the range of
-    P (`HypersphereRange`). P is harmonic and homogeneous, so |grad P| <= l M on S^3 and
-    |v . H v| <= l (l-1) M for unit vectors v and the Hessian H (`BallRange.curvature` has the
-    proof). Let S = 1 + |p|^2.
+    Proofs. On S^3 let |P| <= M, and let A be half the length of the range of P
+    (`HypersphereRange`). P is harmonic and homogeneous, so |grad P| <= l M on S^3 and |v . H v| <=
+    l (l-1) M for unit vectors v and the Hessian H (`BallRange.curvature` has the proof). Let S = 1
+    + |p|^2.
 
     - `TaylorRemainder` on a ball. The image on S^3 of a line with parameter t moves at speed 2/S,
       and its second derivative by t has the length 4/S^1.5 (for the circle in `SphereArcEnclosure`
@@ -139,9 +150,9 @@ class HypersphericalHarmonic(Field):
       components (a, b) of unit vectors. The ball's image: for R <= 0.3 sqrt(S), 1 + |q|^2 >= 0.49 S
       at all points q of the ball, so on S^3 the image is within the chord 2R/(0.7 S).
     - `SphereArcEnclosure` along a ray. The image of the ray lies on a circle of radius 1/c. The
-      first and the second derivative of its point by the angle have the length 1/c, so
-      |f_aa| <= M l ((l-1)/c^2 + 1/c) for derivatives by the angle. And f is a trigonometric
-      polynomial of degree l of the angle, so |f_aa| <= l^2 A (Bernstein).
+      first and the second derivative of its point by the angle have the length 1/c, so |f_aa| <= M
+      l ((l-1)/c^2 + 1/c) for derivatives by the angle. And f is a trigonometric polynomial of
+      degree l of the angle, so |f_aa| <= l^2 A (Bernstein).
 
     Raises:
         ValueError: l, j or m outside these ranges.
@@ -168,13 +179,13 @@ class HypersphericalHarmonic(Field):
     def from_polynomial(
         cls, coefficients: Monomials, *, domain: Volume | None = None
     ) -> HypersphericalHarmonic:
-        """The function of a homogeneous harmonic polynomial of R^4, from the polynomial's
+        """The field f of a homogeneous harmonic polynomial of R^4, given by the polynomial's
         coefficients.
 
-        coefficients: (a, b, c, d) -> coefficient of x^a y^b z^c w^d. The degree a + b + c + d = l
-            is the same for all, l <= 6. At a point p of space, (x, y, z) is 2p/(1 + |p|^2) and w is
-            (|p|^2 - 1)/(1 + |p|^2).
-        domain: as for the class.
+        coefficients: a mapping (a, b, c, d) -> coefficient of x^a y^b z^c w^d. The degree a + b + c
+            + d = l is the same for all, l <= 6. At a point p of space, (x, y, z) is 2p/(1 + |p|^2)
+            and w is (|p|^2 - 1)/(1 + |p|^2).
+        domain: the volume in which f is drawn; None for all of space.
 
         Raises:
             ValueError: the polynomial is not homogeneous, of a degree above 6, zero, not finite, or
@@ -197,11 +208,12 @@ class HypersphericalHarmonic(Field):
         return field
 
     def _initialize(self, l: int, weights: SphereWeights, domain: Volume | None) -> None:  # noqa: E741
-        """Set up the sum of P_ljm of degree l with these weights, (j, m) -> coefficient."""
+        """Set up the sum of P_ljm of degree l. weights: a mapping (j, m) -> coefficient."""
         self.domain = domain
         self.degree = l
         self._orders = [
-            _OrderTerm.of(l, j, sums) for j, sums in weights_by_order(l, weights).items()
+            _OrderTerm.of(l, j, harmonic_weights)
+            for j, harmonic_weights in weights_by_order(l, weights).items()
         ]
         self._range = HypersphereRange.of(l, weights)
 
@@ -211,10 +223,12 @@ class HypersphericalHarmonic(Field):
         return self._range.low, self._range.high
 
     def evaluate(self, p: Vec3) -> Sample:
-        """The sample at p, with bounds of the Hessian on several balls and a Lipschitz constant."""
+        """The sample at p: value, gradient and bounds of f near p. These are bounds of the Hessian
+        on several balls and a Lipschitz constant; the class has the proofs."""
         square = dr.squared_norm(p)
         value, gradient, error, gradient_error = self._values(p, 1 + square)
         promises = (*self._remainder_near_zero(p, square), *self._curvatures(square))
+        # 2 l A, with A half the length of the range of P.
         slope = self.degree * (self._range.high - self._range.low) * (1 + _ROUNDING)
         lipschitz = Lipschitz(slope / self._min_square(square, _BIG), self._radius(square, _BIG))
         return Sample(
@@ -222,7 +236,7 @@ class HypersphericalHarmonic(Field):
         )
 
     def _values(self, p: Vec3, total: Real) -> tuple[Real, Vec3, Real, Real]:
-        """Value and gradient at p, and bounds of the rounding errors of both.
+        """The value and the gradient of f at p, and bounds of the rounding errors of both.
 
         total: 1 + |p|^2.
 
@@ -234,25 +248,27 @@ class HypersphericalHarmonic(Field):
         their recurrences.
         """
         s = 1 / total
-        y, w, size = 2 * s * p, 1 - 2 * s, dr.norm(p)
+        y, w, norm_p = 2 * s * p, 1 - 2 * s, dr.norm(p)
         r, rho = dr.norm(y), dr.norm(type(y)(y.x, y.y, 0))
         zero = 0 * p.x
-        value, inner, outer = zero, type(p)(0), zero
-        error, slope = zero, zero
-        roundings = len(self._orders) + 8.0
+        value, gradient_sum, radial_sum = zero, type(p)(0), zero
+        error, gradient_error = zero, zero
+        operations = len(self._orders) + 8.0
         for term in self._orders:
+            # C(w), C'(w) and C''(w)
             c, first, second = term.axial(w)
             harmonic, (x1, x2, x3) = evaluate(term.weights, y.x, y.y, y.z)
             value = value + c * harmonic
-            inner = inner + c * type(p)(zero + x1, zero + x2, zero + x3)
+            gradient_sum = gradient_sum + c * type(p)(zero + x1, zero + x2, zero + x3)
             radial = 2 * s * first - term.j * c
-            outer = outer + harmonic * radial
-            # Rounding.
-            upper, slope_max = term.value(rho, r), term.gradient(rho, r)
-            value_error = term.rounding.value_error(rho, r) + _SCALE_ERROR * term.j * upper
+            radial_sum = radial_sum + harmonic * radial
+            # Rounding: bounds of |S| and |grad S|, then of the errors of S, grad S, C, C' and
+            # 2 s C' - j C.
+            max_harmonic, max_gradient = term.value(rho, r), term.gradient(rho, r)
+            value_error = term.rounding.value_error(rho, r) + _SCALE_ERROR * term.j * max_harmonic
             slope_error = (
                 term.rounding.gradient_error(rho, r)
-                + (_SCALE_ERROR * max(term.j - 1, 0) + roundings) * slope_max
+                + (_SCALE_ERROR * max(term.j - 1, 0) + operations) * max_gradient
             )
             c_error = dr.fma(_W_ERROR, dr.abs(first), gegenbauer_rounding(term.n, term.k))
             next_error = 2 * term.k * gegenbauer_rounding(term.n - 1, term.k + 1)
@@ -260,24 +276,30 @@ class HypersphericalHarmonic(Field):
             radial_error = 2 * s * dr.fma(8.0, dr.abs(first), first_error)
             radial_error = radial_error + term.j * (c_error + 3 * dr.abs(c))
             c = dr.abs(c)
-            error = error + c * (value_error + roundings * upper) + upper * c_error
-            slope = slope + c * slope_error + slope_max * c_error
-            slope = slope + size * (
-                dr.abs(radial) * (value_error + roundings * upper) + upper * radial_error
+            error = error + c * (value_error + operations * max_harmonic) + max_harmonic * c_error
+            gradient_error = gradient_error + c * slope_error + max_gradient * c_error
+            gradient_error = gradient_error + norm_p * (
+                dr.abs(radial) * (value_error + operations * max_harmonic)
+                + max_harmonic * radial_error
             )
-        unit = float(dr.epsilon(type(zero))) * _SECOND_ORDER
-        gradient = 2 * s * (inner + p * outer)
+        roundoff = float(dr.epsilon(type(zero))) * _SECOND_ORDER
+        gradient = 2 * s * (gradient_sum + p * radial_sum)
         underflow = 64 * float(dr.smallest(type(zero)))
-        return value, gradient, dr.fma(error, unit, underflow), 2 * s * unit * slope
+        return (
+            value,
+            gradient,
+            dr.fma(error, roundoff, underflow),
+            2 * s * roundoff * gradient_error,
+        )
 
     def _min_square(self, square: Real, fraction: float) -> Real:
-        """A lower bound of 1 + |y|^2 for y in the ball of radius fraction * sqrt(1 + |p|^2) about
-        p.
+        """A lower bound of 1 + |y|^2 for points y of space in the ball of radius fraction * sqrt(1
+        + |p|^2) about p.
 
         square: |p|^2.
         """
-        inner = fmax(dr.sqrt(square) - fraction * dr.sqrt(1 + square), 0)
-        return dr.fma(inner, inner, 1) * (1 - _ROUNDING)
+        smallest_norm = fmax(dr.sqrt(square) - fraction * dr.sqrt(1 + square), 0)
+        return dr.fma(smallest_norm, smallest_norm, 1) * (1 - _ROUNDING)
 
     def _radius(self, square: Real, fraction: float) -> Real:
         """The radius fraction * sqrt(1 + |p|^2) of a ball about p.
@@ -287,46 +309,64 @@ class HypersphericalHarmonic(Field):
         return fraction * dr.sqrt(1 + square)
 
     def _curvatures(self, square: Real) -> list[TaylorRemainder]:
-        """Bounds of the Hessian on two balls about p and on all of space, as promises.
+        """Proved bounds of the Hessian of f on two balls about p and on all of space.
 
         square: |p|^2.
         """
         l = self.degree  # noqa: E741
-        size = l * self._range.largest * (1 + _ROUNDING)
+        max_gradient = l * self._range.largest * (1 + _ROUNDING)
         promises: list[TaylorRemainder] = []
         for fraction in _BALL_RADII:
-            lower = self._min_square(square, fraction)
-            second = (4 * (l - 1) / lower + 4 / dr.sqrt(lower)) / lower
-            promises.append(TaylorRemainder(fmax(size * second, 0), self._radius(square, fraction)))
-        return [*promises, TaylorRemainder(0 * square + max(size * 4.0 * l, 0.0), dr.inf)]
+            # By the chain rule, with the smallest 1 + |q|^2 of the ball (see the class).
+            min_square = self._min_square(square, fraction)
+            second = (4 * (l - 1) / min_square + 4 / dr.sqrt(min_square)) / min_square
+            promises.append(
+                TaylorRemainder(fmax(max_gradient * second, 0), self._radius(square, fraction))
+            )
+        return [*promises, TaylorRemainder(0 * square + max(max_gradient * 4.0 * l, 0.0), dr.inf)]
 
     def _remainder_near_zero(self, p: Vec3, square: Real) -> tuple[TaylorRemainder, ...]:
-        """A bound of the Hessian on a ball near a zero of high order; an empty tuple if there is
-        none.
+        """A proved bound of the Hessian of f on a ball about p that is small near a zero of high
+        order: near y = 0, or near the third axis of y. A tuple with this bound; empty if f has no
+        zero of an order above 2.
 
         square: |p|^2.
         """
+        # By the chain rule, as in the class, with bounds of S(y) C(w) at all points within the
+        # chord.
         axis_order = min(abs(m) for term in self._orders for _, m in term.weights)
         center_order = min(term.j for term in self._orders)
         if center_order < 3:
             return ()
         y = (2 / (1 + square)) * p
         r, rho = dr.norm(y), dr.norm(type(y)(y.x, y.y, 0))
+        # How far on S^3 the image of the ball may extend: a fraction of the distance to the zero.
         chord = _ZERO_CHORD / (center_order - 2) * r
         if axis_order > 2:
             chord = fmin(chord, _ZERO_CHORD / (axis_order - 2) * rho)
-        lower = self._min_square(square, _MAX_RADIUS)
-        root = dr.rcp(dr.sqrt(lower))
+        min_square = self._min_square(square, _MAX_RADIUS)
+        inverse_root = dr.rcp(dr.sqrt(min_square))
         second_max = 0 * square
         for term in self._orders:
             first, second = term.largest(rho + chord, r + chord)
-            second_max = second_max + 4 * root * root * root * dr.fma(root, second, first)
+            second_max = second_max + 4 * inverse_root * inverse_root * inverse_root * dr.fma(
+                inverse_root, second, first
+            )
         radius = fmin(_RADIUS_OF_CHORD * chord * (1 + square), _MAX_RADIUS * dr.sqrt(1 + square))
         return (TaylorRemainder(second_max * (1 + _ROUNDING), radius),)
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
-        """The sample on a ray, with `SphereArcEnclosure` enclosures if the ray uses the sharpest
-        proofs."""
+        """The sample at the position t of a ray, with enclosures (proofs of lengths in front of and
+        behind the point on which f takes none of the levels, the values that rays look for). They
+        use that the image of the ray on S^3 lies on a circle.
+
+        path: the ray.
+        t: a length along it.
+        ahead, back: not used, as the proofs hold on the whole ray.
+
+        If the ray's options exclude the sharpest proofs (`PiecewiseTaylorEnclosure`), the
+        enclosures follow from the sample of `evaluate` alone.
+        """
         del ahead, back
         p = path.point(t)
         sample = self.evaluate(p)
@@ -334,21 +374,25 @@ class HypersphericalHarmonic(Field):
             return path.enclose(sample)
         slope = dr.dot(sample.gradient, path.direction)
         slopes = SlopeRange.around(slope, sample.gradient_error)
-        # The point of the line closest to the origin, from one end or the other without
-        # cancellation: the origin of the ray may be far away.
+        # The point of the line that is closest to the origin of space, and the position of p along
+        # the line from there.
         start = dr.dot(path.origin, path.direction)
         closest = path.origin - start * path.direction
         square = 1 + dr.squared_norm(closest)
         position = dr.dot(p, path.direction)
-        l, c = self.degree, dr.sqrt(square)  # noqa: E741
+        l, sqrt_square = self.degree, dr.sqrt(square)  # noqa: E741
         bounds = self._range
-        limit = l * l * 0.5 * (bounds.high - bounds.low)
-        second = fmin(bounds.largest * l * ((l - 1) / square + 1 / c), limit) * (1 + _ROUNDING)
+        # Two bounds of |f_aa|, the second derivative by the angle on the circle.
+        bernstein_bound = l * l * 0.5 * (bounds.high - bounds.low)
+        second = fmin(
+            bounds.largest * l * ((l - 1) / square + 1 / sqrt_square), bernstein_bound
+        ) * (1 + _ROUNDING)
         forward = SphereArcEnclosure(slopes, second, position, square)
         backward = SphereArcEnclosure(slopes.negated(), second, -position, square)
         curvatures = [
             promise for promise in sample.promises if isinstance(promise, TaylorRemainder)
         ]
+        # Those before the two balls and all of space: at most one, from `_remainder_near_zero`.
         near_zero = curvatures[: -len(_BALL_RADII) - 1]
         ahead_near = [
             ParabolaEnclosure(slopes, -promise.constant, promise.constant, promise.radius)
@@ -361,7 +405,8 @@ class HypersphericalHarmonic(Field):
         return RaySample(sample, (forward, *ahead_near), (backward, *back_near), slope)
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
-        """The three rows of the Hessian. Its trace is not 0: f is harmonic on S^3 and not in space.
+        """The three rows of the Hessian of f at p. Its trace is not 0: f is harmonic on S^3 and not
+        in space.
 
         Let s = 1/(1 + |x|^2) at the point x, and d_ik = 1 for i = k, else 0. The chain rule is
         applied with
@@ -370,8 +415,8 @@ class HypersphericalHarmonic(Field):
         - second derivatives 4 s^2 (4s x_i x_k x_m - x_m d_ik - x_k d_im - x_i d_km) of y_i and 4
           s^2 (d_km - 4s x_k x_m) of w.
 
-        Symbols in the code: `rows` and `slopes` are the Hessian (its upper triangle) and the
-        gradient of the function of (y, w) in R^4.
+        In the code `rows` and `slopes` are the Hessian (its upper triangle) and the gradient of P
+        as a function of (y, w) in R^4.
         """
         vector = cast("Any", type(p))
         s = 1 / (1 + dr.squared_norm(p))
@@ -379,19 +424,20 @@ class HypersphericalHarmonic(Field):
         rows = [[zero] * 4 for _ in range(4)]
         slopes = [zero] * 4
         for term in self._orders:
+            # C(w), C'(w) and C''(w)
             c, first, second = term.axial(w)
             harmonic, gradient = evaluate(term.weights, y.x, y.y, y.z)
             xx, yy, zz, xy, xz, yz = hessian(term.weights, y.x, y.y, y.z)
-            matrix = ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))
+            s_hessian = ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))
             for i in range(3):
                 for k in range(3):
-                    rows[i][k] = rows[i][k] + c * matrix[i][k]
+                    rows[i][k] = rows[i][k] + c * s_hessian[i][k]
                 rows[i][3] = rows[i][3] + first * gradient[i]
                 slopes[i] = slopes[i] + c * gradient[i]
             rows[3][3] = rows[3][3] + second * harmonic
             slopes[3] = slopes[3] + first * harmonic
         x = (p.x, p.y, p.z)
-        # Columns of the derivative of (y, w), four by three.
+        # The derivatives of (y, w) by the three coordinates of x.
         jacobian = [[2 * s * ((i == k) - 2 * s * x[i] * x[k]) for k in range(3)] for i in range(3)]
         jacobian.append([4 * s * s * x[k] for k in range(3)])
         radial = x[0] * slopes[0] + x[1] * slopes[1] + x[2] * slopes[2]
@@ -399,11 +445,13 @@ class HypersphericalHarmonic(Field):
         for k in range(3):
             row: list[Real] = []
             for m in range(3):
+                # The Hessian of P between two columns of the first derivatives.
                 total = zero
                 for i in range(4):
                     for n in range(4):
                         entry = rows[min(i, n)][max(i, n)]
                         total = total + jacobian[i][k] * entry * jacobian[n][m]
+                # The gradient of P times the second derivatives of (y, w), divided by 4 s^2.
                 curved = 4 * s * x[k] * x[m] * (radial - slopes[3])
                 curved = curved - x[m] * slopes[k] - x[k] * slopes[m]
                 if k == m:
@@ -413,14 +461,18 @@ class HypersphericalHarmonic(Field):
         return result[0], result[1], result[2]
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
-        """The domain, or a ball about the origin that contains the level sets; None if they may be
-        unbounded."""
+        """The domain or, if there is none, a ball about the origin that contains the level sets;
+        None if they may be unbounded.
+
+        levels: the levels of f.
+        """
         if self.domain is not None:
             return self.domain
         radius = max((self._range.radius(level) for level in levels), default=0.0)
         return Ball(radius=radius) if 0 < radius < math.inf else None
 
     def validate_levels(self, levels: tuple[float, ...]) -> None:
+        """Raise ValueError for a level outside of the proved range of f, and for a constant f."""
         if self.degree == 0:
             raise ValueError(
                 "a hyperspherical harmonic of degree 0 is constant: it has no level sets"
@@ -428,6 +480,7 @@ class HypersphericalHarmonic(Field):
         validate_levels_in_range(levels, self.value_range)
 
     def describe(self) -> dict[str, Any]:
+        """The degree, the number of terms and the proved range of f, as a dictionary for users."""
         return {
             "degree": self.degree,
             "harmonics": sum(len(term.weights) for term in self._orders),

@@ -1,8 +1,13 @@
-"""Sums of Laplacian eigenfunctions, periodic minimal surfaces among them (paper, section 4.7).
+"""Sums f of waves, periodic minimal surfaces among them (paper, section 4.7). Each term f_i is a
+product of sines and cosines, or a plane wave; it is an eigenfunction of the Laplacian: Laplacian
+f_i = -kappa_i^2 f_i, where kappa_i is called its wavenumber. The term becomes harmonic in four
+dimensions if it is multiplied by cosh(kappa_i w) with a fourth coordinate w; the sum F of these
+products is called the harmonic extension of f, and f = F at w = 0. So bounds for harmonic
+functions, such as Harnack's inequality, hold for F on balls of R^4 and prove steps for f. The paper
+is Gillespie, Yang, Botsch and Crane 2024.
 
 - `EigenfunctionSum`: the field.
-- `ExtensionBounds`: bounds of the harmonic extension of such a sum to four dimensions (paper,
-  section 4.7.1).
+- `ExtensionBounds`: bounds of the harmonic extension (paper, section 4.7.1).
 """
 
 from __future__ import annotations
@@ -57,7 +62,9 @@ _ROUNDING_EXTENSION = 1e-5
 
 @dataclass(frozen=True)
 class ExtensionBounds:
-    """Bounds of the harmonic extension of a sum of waves f on balls B(p, R) of R^4.
+    """Bounds of the harmonic extension F of a sum of waves f = constant + sum f_i, on balls B(p, R)
+    of R^4 about points p of space. Each f_i obeys Laplacian f_i = -kappa_i^2 f_i and |f_i| <= A_i,
+    and F(y, w) = constant + sum cosh(kappa_i w) f_i(y) is harmonic in R^4.
 
     radius: R.
     alpha, spread: the numbers alpha and E of the proof.
@@ -66,10 +73,8 @@ class ExtensionBounds:
         and added in the end.
     largest_gradient, curvature: bounds G of |grad f| and H of the second derivatives of f.
 
-    Proof. Let f = sum f_i with Laplacian f_i = -kappa_i^2 f_i and |f_i| <= A_i. The extension is
-    F(y, w) = sum cosh(kappa_i w) f_i(y): it is harmonic, F(., 0) = f, and it is smaller than the
-    paper's exp(kappa w) f. Take any wavenumber kappa, and let alpha = cosh(kappa R) - 1 and E = sum
-    A_i |cosh(kappa_i R) - cosh(kappa R)|. Then
+    Proof. F(., 0) = f, and F is smaller than the paper's exp(kappa w) f. Take any wavenumber kappa,
+    and let alpha = cosh(kappa R) - 1 and E = sum A_i |cosh(kappa_i R) - cosh(kappa R)|. Then
 
         F = cosh(kappa w) f + (rest),   |rest| <= E w^2/R^2,   cosh(kappa w) <= 1 + alpha w^2/R^2,
 
@@ -96,32 +101,42 @@ class ExtensionBounds:
 
     @classmethod
     def with_best_radius(cls, waves: WaveBounds) -> ExtensionBounds:
-        """The bounds for the radius that gives the longest steps near level 0, for a gradient of
-        mean length.
+        """The bounds for the radius R that gives the longest steps near level 0 at a point where
+        the gradient has its mean length.
 
-        There a step is shortened by the second-order term of the bound, which is proportional to (f
-        - lower)/R^2, so the radius minimizes this. For the gyroid (cell 2 pi) the result is R =
-        1.1, in the middle of the best radii: with the slope bound, radii from 0.8 to 1.4 took 11.5
-        to 11.9 evaluations per ray. The paper's exp with the range +-3/2 took 21.4 at its best
-        radius.
+        There a step is shortened by the second-order term of Harnack's bound, which is proportional
+        to (f - lower)/R^2 with the lower bound of F on the ball, so the radius minimizes this. (For
+        the gyroid with the cell 2 pi it is 1.1.)
+
+        waves: bounds of the sum of waves f.
         """
-        k, a = np.array(waves.wavenumbers), np.array(waves.amplitudes)
-        mean_slope = math.sqrt(0.5 * float(a**2 @ k**2))
-        length_unit = 1 / math.sqrt(float(a**2 @ k**2) / float(a @ a))
+        wavenumbers, amplitudes = np.array(waves.wavenumbers), np.array(waves.amplitudes)
+        # The mean square of |grad f| is half the sum of A_i^2 kappa_i^2.
+        mean_slope = math.sqrt(0.5 * float(amplitudes**2 @ wavenumbers**2))
+        length_unit = 1 / math.sqrt(
+            float(amplitudes**2 @ wavenumbers**2) / float(amplitudes @ amplitudes)
+        )
         steps = (length_unit * 0.02 * 1.02**n for n in range(300))
-        radii = [r for r in steps if r * float(k.max()) < 30.0]  # cosh stays far from overflow
+        radii = [
+            r for r in steps if r * float(wavenumbers.max()) < 30.0
+        ]  # cosh stays far from overflow
         trials = [cls.at(waves, r) for r in radii]
         return min(trials, key=lambda trial: trial._descent_at_zero(mean_slope) / trial.radius**2)
 
     @classmethod
     def at(cls, waves: WaveBounds, radius: float) -> ExtensionBounds:
-        """The bounds for a radius; kappa is the weighted median of the wavenumbers, which makes E
-        smallest."""
+        """The bounds for the radius R. The wavenumber kappa, which the proof may choose, is the
+        weighted median of all, which makes E smallest.
+
+        waves: bounds of the sum of waves f.
+        """
         growth: npt.NDArray[np.float64] = np.cosh(radius * np.array(waves.wavenumbers))
         amplitudes = np.array(waves.amplitudes)
-        order = np.argsort(growth)
-        amplitude_sums: npt.NDArray[np.float64] = np.cumsum(amplitudes[order])
-        median_growth = float(growth[order][np.argmax(amplitude_sums >= 0.5 * amplitude_sums[-1])])
+        by_growth = np.argsort(growth)
+        amplitude_sums: npt.NDArray[np.float64] = np.cumsum(amplitudes[by_growth])
+        median_growth = float(
+            growth[by_growth][np.argmax(amplitude_sums >= 0.5 * amplitude_sums[-1])]
+        )
         spread = float(amplitudes @ np.abs(growth - median_growth)) * (1 + 1e-12)
         largest = median_growth * waves.largest_value + spread
         return cls(
@@ -135,8 +150,8 @@ class ExtensionBounds:
         )
 
     def ball(self, f: Real, slope: Real) -> HarmonicBall:
-        """The promise at a point p: a `HarmonicBall` of R^4 about p, with bounds on it of the
-        harmonic extension F of f to four dimensions.
+        """A ball of R^4 about a point p, with bounds on it of the harmonic extension F of f to four
+        dimensions.
 
         f: the value at p.
         slope: |grad f(p)|.
@@ -151,31 +166,35 @@ class ExtensionBounds:
         return HarmonicBall(real(r), lower, upper, dimension=4)
 
     def _max_descent(self, f: Real, rise: Real) -> Real:
-        """A bound of -F on the ball about p, where F is the harmonic extension of f to four
-        dimensions. With -f instead of f, it is a bound of F.
+        """An upper bound of -F on the ball of R^4 about p, where F is the harmonic extension of f
+        to four dimensions. With -f in place of f, it is a bound of F. The class has the proof.
 
         f: the value at p, without the constant term.
         rise: the number D, for which |f(y) - f(p)| <= D |y-p|/R.
         """
-        alpha, e = self.alpha, self.spread
-        b = alpha * f - e
-        root = dr.sqrt(b * b + 3 * alpha * (1 + alpha) * rise * rise)
-        x = fmin((1 + alpha) * rise / (root - b), 1.0)
+        alpha, spread = self.alpha, self.spread
+        alpha_f_minus_spread = alpha * f - spread
+        root = dr.sqrt(
+            alpha_f_minus_spread * alpha_f_minus_spread + 3 * alpha * (1 + alpha) * rise * rise
+        )
+        # The critical point x* of the cubic h, and h there.
+        x = fmin((1 + alpha) * rise / (root - alpha_f_minus_spread), 1.0)
         weight = 1 - x * x
-        falling = (1 + alpha * weight) * (rise * x - f) + weight * e
-        near = rise
-        if e > 0:
-            near = dr.select(rise < 2 * e, e + rise * rise / (4 * e), rise)
-        return fmin(fmax(falling, near - f), self.largest)
+        at_critical_point = (1 + alpha * weight) * (rise * x - f) + weight * spread
+        # The case Dx <= f: the bound is D - f or, if D < 2E, E + D^2/(4E) - f.
+        near_rise = rise
+        if spread > 0:
+            near_rise = dr.select(rise < 2 * spread, spread + rise * rise / (4 * spread), rise)
+        return fmin(fmax(at_critical_point, near_rise - f), self.largest)
 
     def _descent_at_zero(self, slope: float) -> float:
-        """`_max_descent` for f = 0 and a gradient of length `slope`, in Python floats, to choose
-        the radius."""
-        r, alpha, e = self.radius, self.alpha, self.spread
+        """The bound `_max_descent` at a point where f = 0 and the gradient has the length `slope`,
+        from samples and without rounding: to choose the radius."""
+        r, alpha, spread = self.radius, self.alpha, self.spread
         rise = min(self.largest_gradient * r, slope * r + 0.5 * self.curvature * r * r)
         x = np.linspace(0.0, 1.0, 101)
-        falling = (1 + alpha * (1 - x * x)) * rise * x + (1 - x * x) * e
-        return min(float(falling.max()), self.largest)
+        descents = (1 + alpha * (1 - x * x)) * rise * x + (1 - x * x) * spread
+        return min(float(descents.max()), self.largest)
 
 
 # Constants are increased by this fraction for the roundings of float32.
@@ -185,20 +204,23 @@ _SLOPE_SHARE = 1e-5
 
 
 class EigenfunctionSum(Field):
-    """A sum of products of sines and cosines, and of plane waves: any truncated Fourier series.
+    """A sum f of products of sines and cosines, and of plane waves: any truncated Fourier series.
+    Each term f_i is an eigenfunction of the Laplacian with the eigenvalue -kappa_i^2, so
+    cosh(kappa_i w) f_i is harmonic in four dimensions, where w is the fourth coordinate; the sum of
+    these is the harmonic extension of f.
 
     terms: `WaveProduct` and `PlaneWave` terms; frequencies in radians per unit length.
     domain: the volume in which f is drawn; by default the ball about the origin whose radius is the
         longest wavelength.
 
-    Promises. Each term f_i is an eigenfunction of the Laplacian, so cosh(kappa w) f_i with
-    kappa^2 = -eigenvalue is harmonic in R^4 and equals f_i at w = 0; `ExtensionBounds` has the
-    bounds. Let H be the bound `curvature` of the Hessian. The Lipschitz constant is local,
-    |grad f(p)| + H r / 2 on the ball of radius r (Taylor), and never above `max_gradient`.
+    Promises (proved bounds of f near a point). The harmonic extension equals f at w = 0;
+    `ExtensionBounds` has its bounds. Let H be the bound `curvature` of the Hessian. The Lipschitz
+    constant is local, |grad f(p)| + H r / 2 on the ball of radius r (Taylor), and never above
+    `max_gradient`.
 
     Rounding. The rounding error of the value is bounded at the point (`WaveRounding`). The effect
     of the rounding error E of the gradient is included in `Sample.value_error`. For the
-    `TaylorRemainder`, the constant (1 + h) H with h = `_SLOPE_SHARE` is promised. For all t
+    `TaylorRemainder`, the constant (1 + h) H with h = `_SLOPE_SHARE` is promised. For all lengths t
 
         E t <= E^2/(2 h H) + h H t^2/2   (since 2 a b <= a^2 + b^2),
 
@@ -224,12 +246,15 @@ class EigenfunctionSum(Field):
         self._extension = ExtensionBounds.with_best_radius(self.waves)
         self._rounding = WaveRounding.of(self.terms)
         radius = self._extension.radius
+        # The part of the error E R that needs no addition, in units of u: 16 times 4 (f - lower),
+        # halved as a margin, where f - lower is about this minimum or more.
         self._rounding_bound = 32 * min(
             0.5 * self.curvature * radius**2, self.max_gradient * radius
         )
 
     def _bounds(self) -> WaveBounds:
-        """The bounds of the sum; classes with sharper proved constants override it."""
+        """Proved bounds of the sum and of its derivatives; classes with sharper proved constants
+        override it."""
         return WaveBounds.of(self.terms)
 
     @property
@@ -245,78 +270,94 @@ class EigenfunctionSum(Field):
 
     @property
     def curvature(self) -> float:
-        """A proved bound of the absolute directional second derivatives of f."""
+        """A proved bound of the absolute second derivatives of f along any direction."""
         return self.waves.largest_curvature
 
     def evaluate(self, p: Vec3) -> Sample:
-        """The sample at p. Its promises are a bound of second derivatives, a local Lipschitz
-        constant, and bounds on a harmonic ball of R^4; `EigenfunctionSum` has the proofs."""
+        """The sample at p: value, gradient and bounds of f near p. These are a bound of second
+        derivatives that holds everywhere, a local Lipschitz constant, and a range on a ball of four
+        dimensions in which the harmonic extension of f is harmonic. The class has the proofs."""
         value, components = evaluate_terms(self.terms, p)
         gradient = type(p)(*components)
         epsilon = float(dr.epsilon(type(value)))
-        error, slope_error = self._rounding.errors(p, gradient)
-        slope = dr.norm(gradient) + slope_error
+        error, gradient_error = self._rounding.errors(p, gradient)
+        gradient_norm_bound = dr.norm(gradient) + gradient_error
         radius = 0.9 * self.max_gradient / self.curvature  # the best by experiment, gyroid and P
-        local = (slope + 0.5 * self.curvature * radius) * (1 + _ROUNDING)
-        lipschitz = Lipschitz(fmin(local, self.max_gradient * (1 + _ROUNDING)), radius)
-        change = self.waves.max_third_derivative * (1 + _ROUNDING)
+        local_constant = (gradient_norm_bound + 0.5 * self.curvature * radius) * (1 + _ROUNDING)
+        lipschitz = Lipschitz(fmin(local_constant, self.max_gradient * (1 + _ROUNDING)), radius)
+        third_derivative_bound = self.waves.max_third_derivative * (1 + _ROUNDING)
         promises = (
-            TaylorRemainder(self.curvature * (1 + _ROUNDING + _SLOPE_SHARE), cubic_constant=change),
+            TaylorRemainder(
+                self.curvature * (1 + _ROUNDING + _SLOPE_SHARE),
+                cubic_constant=third_derivative_bound,
+            ),
         )
-        alternatives = (self._extension.ball(value, slope), lipschitz)
-        error += slope_error * (slope_error * (0.5 / (_SLOPE_SHARE * self.curvature)))
-        error += fmax(slope_error * self._extension.radius - self._rounding_bound * epsilon, 0)
+        alternatives = (self._extension.ball(value, gradient_norm_bound), lipschitz)
+        # The effects of the gradient's rounding: E^2/(2 h H) for Taylor's formula, and the rest of
+        # E R for the harmonic ball.
+        error += gradient_error * (gradient_error * (0.5 / (_SLOPE_SHARE * self.curvature)))
+        error += fmax(gradient_error * self._extension.radius - self._rounding_bound * epsilon, 0)
         return Sample(value, gradient, promises, error, alternative_promises=alternatives)
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
-        """The three rows of the Hessian. Its trace is the Laplacian of the sum, which is not
-        zero."""
+        """The three rows of the Hessian of f at p. Its trace is not zero, because f itself is not
+        harmonic."""
         x, y, z = (type(p)(*row) for row in hessian_of_terms(self.terms, p))
         return x, y, z
 
     def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
+        """Bounds of the rounding errors of the gradient and of the Hessian of f at p."""
         del sample
         return self._rounding.derivative_errors(p)
 
     def gradient_change_bound(self, p: Vec3, radius: Real) -> Real:
-        """A bound of |grad f(y) - grad f(p)| for |y - p| <= radius: radius times `curvature`, which
-        bounds the norm of the Hessian."""
+        """A bound of |grad f(y) - grad f(p)| for |y - p| <= radius: the radius times `curvature`,
+        which bounds the norm of the Hessian everywhere."""
         return 0 * p.x + radius * (self.curvature * (1 + _ROUNDING))
 
     def validate_levels(self, levels: tuple[float, ...]) -> None:
+        """Raise ValueError for a level outside of the proved range of f."""
         validate_levels_in_range(levels, self.value_range)
 
     def wall_levels(self, half_width: float, *, level: float | None = None) -> tuple[float, float]:
-        """The two levels that bound the wall |f - level| <= half_width, for the argument `solid=`.
+        """The two levels that bound the wall |f - level| <= half_width: the lower one and the upper
+        one.
 
-        half_width: a difference of values of f, and no length: see `levels_of_thickness`.
-        level: the middle of the wall, by default `default_level`.
+        half_width: a difference of values of f, and no length; see `levels_of_thickness` for
+            lengths.
+        level: the level in the middle of the wall, by default `default_level`.
+
+        Raises:
+            ValueError: the half width is not positive, or one of the levels is outside the range of
+                f.
         """
         middle = self.default_level if level is None else float(level)
         if not 0 < half_width < math.inf:
             raise ValueError(f"the half width of a wall must be positive, not {half_width!r}")
         low, high = middle - half_width, middle + half_width
-        lower, upper = self.value_range
-        if low < lower or high > upper:
+        range_low, range_high = self.value_range
+        if low < range_low or high > range_high:
             raise ValueError(
                 f"a wall from {low:g} to {high:g} has a side without surface: the function stays "
-                f"within [{lower:g}, {upper:g}]; take a smaller half width or thickness"
+                f"within [{range_low:g}, {range_high:g}]; take a smaller half width or thickness"
             )
         return low, high
 
     def levels_of_thickness(
         self, thickness: float, *, level: float | None = None
     ) -> tuple[float, float]:
-        """The two levels that bound a wall about `level` that is proved to be at least this thick.
+        """The two levels that bound a wall about the surface f = level that is proved to be at
+        least this thick.
 
         thickness: a length. The wall contains every point within thickness/2 of the middle surface,
             since there |f - level| <= `max_gradient` * thickness/2. Where f is less steep than at
             its steepest, the wall is thicker.
-        level: the middle of the wall, by default `default_level`.
+        level: the level in the middle of the wall, by default `default_level`.
         """
         return self.wall_levels(0.5 * self.max_gradient * float(thickness), level=level)
 
     def describe(self) -> dict[str, Any]:
+        """The number of terms and the proved bounds of the sum, as a dictionary for users."""
         return {
             "terms": len(self.terms),
             "range": self.value_range,
@@ -326,7 +367,7 @@ class EigenfunctionSum(Field):
 
 
 def _wavenumber(cell: Any) -> float:
-    """The wavenumber 2 pi/cell for a cell with this edge length.
+    """The wavenumber 2 pi/cell of waves that repeat after the length `cell`.
 
     Raises:
         TypeError, ValueError: cell is not a positive finite number.
@@ -340,7 +381,8 @@ def _wavenumber(cell: Any) -> float:
 
 
 class _CubicSurface(EigenfunctionSum):
-    """A sum of waves with the periods `cell` along x, y and z, and with proved constants.
+    """A sum of waves f that repeats after the length `cell` along x, y and z, with sharper proved
+    bounds of |f| and |grad f| than `EigenfunctionSum` computes.
 
     _largest_value: a bound of |f|.
     _steepness: a bound of |grad f| for cell 2 pi.
@@ -350,13 +392,14 @@ class _CubicSurface(EigenfunctionSum):
     _steepness: float
 
     def __init__(self, cell: float, terms: tuple[Term, ...], domain: Volume | None) -> None:
+        """Set up the sum of waves, with the wavenumber that belongs to the cell."""
         self.cell = float(cell)
         self._wavenumber = _wavenumber(cell)
         super().__init__(terms, domain=Ball(radius=self.cell) if domain is None else domain)
 
     def _bounds(self) -> WaveBounds:
-        """The bounds of the sum of waves, with the proved constants of the class in place of two of
-        them."""
+        """Proved bounds of the sum of waves and of its derivatives, with the constants of the class
+        in place of two of them."""
         return replace(
             super()._bounds(),
             largest_value=self._largest_value,
@@ -365,21 +408,23 @@ class _CubicSurface(EigenfunctionSum):
 
 
 class Gyroid(_CubicSurface):
-    """sin X cos Y + sin Y cos Z + sin Z cos X with (X, Y, Z) = 2 pi p/cell (paper, Eq. 18).
+    """The gyroid: f = sin X cos Y + sin Y cos Z + sin Z cos X with (X, Y, Z) = 2 pi p/cell (paper,
+    Eq. 18).
 
     cell: the edge length of the cubic cell of periodicity, 2 pi by default (so X = x).
     domain: the volume in which f is drawn, by default the ball of radius `cell` about the origin.
 
     Proof of |f| <= 3/2: each term obeys 2 sin a cos b <= sin^2 a + cos^2 b, and the three right
-    sides add up to 3. Proof of |grad f| <= sqrt 3 (2 pi/cell): the derivative by X is
-    f_X = cos X cos Y - sin Z sin X. By Cauchy-Schwarz f_X^2 <= cos^2 Y + sin^2 Z, and the three
-    right sides add up to 3. Both bounds are attained.
+    sides add up to 3. Proof of |grad f| <= sqrt 3 (2 pi/cell): the derivative by X is f_X = cos X
+    cos Y - sin Z sin X. By Cauchy-Schwarz f_X^2 <= cos^2 Y + sin^2 Z, and the three right sides add
+    up to 3. Both bounds are attained.
     """
 
     _largest_value = 1.5
     _steepness = math.sqrt(3.0)
 
     def __init__(self, cell: float = 2 * math.pi, *, domain: Volume | None = None) -> None:
+        """Set up the three products of a sine and a cosine of the class."""
         k = _wavenumber(cell)
         s, c = sine_factor(k), cosine_factor(k)
         terms = (WaveProduct(1.0, x=s, y=c), WaveProduct(1.0, y=s, z=c), WaveProduct(1.0, z=s, x=c))
@@ -387,7 +432,7 @@ class Gyroid(_CubicSurface):
 
 
 class SchwarzP(_CubicSurface):
-    """cos X + cos Y + cos Z with (X, Y, Z) = 2 pi p/cell: Schwarz's primitive surface.
+    """Schwarz's primitive surface: f = cos X + cos Y + cos Z with (X, Y, Z) = 2 pi p/cell.
 
     cell: the edge length of the cubic cell of periodicity, 2 pi by default.
     domain: the volume in which f is drawn, by default the ball of radius `cell` about the origin.
@@ -400,6 +445,7 @@ class SchwarzP(_CubicSurface):
     _steepness = math.sqrt(3.0)
 
     def __init__(self, cell: float = 2 * math.pi, *, domain: Volume | None = None) -> None:
+        """Set up the three cosines of the class."""
         c = cosine_factor(_wavenumber(cell))
         super().__init__(
             cell, (WaveProduct(1.0, x=c), WaveProduct(1.0, y=c), WaveProduct(1.0, z=c)), domain
@@ -407,27 +453,24 @@ class SchwarzP(_CubicSurface):
 
 
 class SchwarzD(_CubicSurface):
-    """Schwarz's diamond surface, the level 0 of
+    """Schwarz's diamond surface, the level 0 of f = s s s + s c c + c s c + c c s. Here the first,
+    second and third s or c of each term is sin or cos of X, Y and Z, and (X, Y, Z) = 2 pi p/cell.
 
-        f = s s s + s c c + c s c + c c s,
+    cell: the edge length of the cubic cell of periodicity, 2 pi by default.
+    domain: the volume in which f is drawn, by default the ball of radius `cell` about the origin.
 
-    where the first, second and third s or c of each term is sin or cos of X, Y and Z, and
-    (X, Y, Z) = 2 pi p/cell.
-
-    cell, domain: as for `Gyroid`.
-
-    Proof of |f| <= sqrt 2: f = sin X cos(Y-Z) + cos X sin(Y+Z), which is at most
-    sqrt(cos^2(Y-Z) + sin^2(Y+Z)) by Cauchy-Schwarz. Proof of |grad f| <= sqrt 3 (2 pi/cell): let A,
-    B, C be the cosines and P, Q, R the sines of 2X, 2Y, 2Z. For cell 2 pi,
-    |grad f|^2 = 3/2 (1 + ABC) - (PQ + QR + RP)/2. Here -2(PQ + QR + RP) <= P^2 + Q^2 + R^2 = 3 - S
-    with S = A^2 + B^2 + C^2, and |ABC| <= (S/3)^(3/2) <= S/3, so
-    |grad f|^2 <= 3/2 + S/2 + (3 - S)/4 <= 3. Both bounds are attained.
+    Proof of |f| <= sqrt 2: f = sin X cos(Y-Z) + cos X sin(Y+Z), which is at most sqrt(cos^2(Y-Z) +
+    sin^2(Y+Z)) by Cauchy-Schwarz. Proof of |grad f| <= sqrt 3 (2 pi/cell): let A, B, C be the
+    cosines and P, Q, R the sines of 2X, 2Y, 2Z. For cell 2 pi, |grad f|^2 = 3/2 (1 + ABC) - (PQ +
+    QR + RP)/2. Here -2(PQ + QR + RP) <= P^2 + Q^2 + R^2 = 3 - S with S = A^2 + B^2 + C^2, and |ABC|
+    <= (S/3)^(3/2) <= S/3, so |grad f|^2 <= 3/2 + S/2 + (3 - S)/4 <= 3. Both bounds are attained.
     """
 
     _largest_value = math.sqrt(2.0)
     _steepness = math.sqrt(3.0)
 
     def __init__(self, cell: float = 2 * math.pi, *, domain: Volume | None = None) -> None:
+        """Set up the four products of sines (s) and cosines (c) of the class."""
         k = _wavenumber(cell)
         s, c = sine_factor(k), cosine_factor(k)
         terms = (

@@ -1,4 +1,8 @@
-"""Functions of the plane: analytic functions chosen by name, their level curves, and height fields.
+"""Functions of the plane: analytic functions g(z) of a complex variable z = x + i y that are chosen
+by name, their level curves, and height fields. Such a function may have several values at a point,
+its branches. If the part of g that is drawn, the real or the imaginary one, may be shifted by
+multiples of a period, branches that differ by whole periods count as one. A singular point is one
+where a branch is not analytic.
 
 - `make_branches`: the `Branches` of a function given by name, by a mapping or by the user's code.
 - `LevelCurves`: surfaces over the level curves of harmonic functions of the plane, which is Harnack
@@ -69,7 +73,7 @@ def make_branches(
     second_bound: Callable[[Any, Any], Any] | None = None,
     period: float | None = None,
 ) -> Branches:
-    """Make the `Branches` of an analytic function that may have several values at a point.
+    """Make the `Branches` of an analytic function g(z) that may have several values at a point.
 
     function: "log", "sqrt", "cbrt", "power" or "asin"; or a mapping {a_i: alpha_i}, for the product
         of (z - a_i)^alpha_i; or a callable that returns the branches at a point.
@@ -108,20 +112,22 @@ def make_branches(
     if function == "asin":
         _refuse_settings('"asin"', argument=argument)
         return ArcSine()
-    roots = {complex(a): _integer(n) for a, n in ({0: 1} if argument is None else argument).items()}
+    multiplicities = {
+        complex(a): _integer(n) for a, n in ({0: 1} if argument is None else argument).items()
+    }
     if function == "log":
-        if not roots:
+        if not multiplicities:
             raise ValueError("argument: give at least one zero or pole, such as {1: 1, -1: -1}")
-        return Logarithm(tuple(roots), tuple(roots.values()))
+        return Logarithm(tuple(multiplicities), tuple(multiplicities.values()))
+    # A root or power of a product is the product of the powers of its factors.
     power = {"sqrt": Fraction(1, 2), "cbrt": Fraction(1, 3)}.get(function)
     power = _fraction(exponent) if power is None else power
-    return power_product({a: n * power for a, n in roots.items()})
+    return power_product({a: n * power for a, n in multiplicities.items()})
 
 
 def power_product(exponents: Mapping[complex, Any]) -> PowerProduct:
-    """The product of (z - a)^alpha over the items a: alpha of a mapping.
-
-    Items with exponent 0 are left out.
+    """The product of (z - a)^alpha over the items a: alpha of the mapping. Items with exponent 0
+    are left out.
 
     Raises:
         TypeError, ValueError: a point is not finite, an exponent is not a rational number with a
@@ -136,23 +142,24 @@ def power_product(exponents: Mapping[complex, Any]) -> PowerProduct:
             chosen[point] = power
     if not chosen:
         raise ValueError("a product of powers needs at least one exponent other than 0")
-    count = math.lcm(*(power.denominator for power in chosen.values()))
-    if count > _MAX_BRANCHES:
+    sheets = math.lcm(*(power.denominator for power in chosen.values()))
+    if sheets > _MAX_BRANCHES:
         raise ValueError(
-            f"these exponents make {count} sheets, and no more than {_MAX_BRANCHES} are drawn: "
+            f"these exponents make {sheets} sheets, and no more than {_MAX_BRANCHES} are drawn: "
             "take "
             "fractions with a smaller common denominator"
         )
-    return PowerProduct(tuple(chosen), tuple(float(power) for power in chosen.values()), count)
+    return PowerProduct(tuple(chosen), tuple(float(power) for power in chosen.values()), sheets)
 
 
 def _fraction(value: Any) -> Fraction:
-    """`value` as a fraction with a denominator of at most 24, the largest number of branches.
+    """`value` as a fraction with a denominator of at most 24 (the largest number of branches) and
+    an absolute value of at most 6.
 
     A float is rounded to such a fraction if that is within 1e-12.
 
     Raises:
-        TypeError, ValueError: it is no such fraction, or above 6 in size.
+        TypeError, ValueError: it is no such fraction.
     """
     try:
         exact = Fraction(value)
@@ -187,8 +194,8 @@ def _integer(value: Any) -> int:
 def _user_branches(
     function: Any, singular_points: Any, second_bound: Any, period: Any
 ) -> UserBranches:
-    """The `Branches` of a user's function, after a test evaluation of all functions that the user
-    gave. The parameters are those of `make_branches`.
+    """The `Branches` of a user's function, after all functions that the user gave have been called
+    once as a test. The parameters are those of `make_branches`.
 
     Raises:
         TypeError, ValueError: a parameter is missing or invalid, or a function returns something
@@ -240,6 +247,7 @@ def _user_branches(
         )
     shift = None if period is None else float(period)
     branches_of_user = UserBranches(function, points, second_bound, len(branches), shift)
+    # Raises the errors that the recorded evaluation would raise.
     branches_of_user.evaluate(z)
     return branches_of_user
 
@@ -259,12 +267,9 @@ def _try_bound(second_bound: Callable[[Any, Any], Any], z: Any, radius: Any) -> 
 
 
 def _refuse_settings(context: str, **settings: Any) -> None:
-    """Check that none of the settings was given, that is, that all of them are None.
+    """Raise ValueError if a setting was given, that is, if one is not None.
 
-    context: what they do not belong to, for the message.
-
-    Raises:
-        ValueError: a setting is not None.
+    context: what the settings do not belong to, for the message.
     """
     names = [name for name, value in settings.items() if value is not None]
     if names:
@@ -278,9 +283,9 @@ _MAX_CLEARANCE = 1e6
 
 
 class LevelCurves(Field):
-    """f(x, y, z) = Re g(x + i y), or Im g(x + i y), with an analytic function g.
-
-    f does not depend on z: its level sets stand upright on level curves of the plane.
+    """The function f(x, y, z) = Re g(x + i y), or Im g(x + i y), with an analytic function g of a
+    complex variable. f does not depend on z: its level sets stand upright on level curves of the
+    plane. The singular points are the points of the plane where g is not analytic.
 
     function, exponent, argument, singular_points, second_bound, period: the analytic function g,
         given as for `RiemannSurface`. It must have a single branch, up to a period: for example
@@ -290,10 +295,11 @@ class LevelCurves(Field):
     level: the default level.
     domain: the volume in which f is drawn; by default the box |x|, |y| <= 2, |z| <= 1/4.
 
-    Promises. f is harmonic in the plane, so Harnack's inequality of dimension 2 holds in disks that
-    contain no singular point. There |g"| is bounded (`Branches.second_derivative_bound`), so f
-    changes by at most |g'| r + max|g"| r^2/2 on a disk of radius r. Each disk gives two promises:
-    this range, as a `HarmonicBall` of dimension 2, and the bound of second derivatives.
+    Promises (proved bounds of f near a point). f is harmonic in the plane, so Harnack's inequality
+    of dimension 2 holds in disks that contain no singular point. There |g"| is bounded
+    (`Branches.second_derivative_bound`), so f changes by at most |g'| r + max|g"| r^2/2 on a disk
+    of radius r. Each disk gives two promises: this range, as a `HarmonicBall` of dimension 2, and
+    the bound of second derivatives.
 
     Raises:
         TypeError, ValueError: an invalid function, or a function with several branches.
@@ -337,33 +343,38 @@ class LevelCurves(Field):
         self.period = shift  # pyright: ignore[reportAttributeAccessIssue]
 
     def prepare(self, backend: Backend) -> LevelCurves:
+        """The same field with its numbers on the backend as data, not as literals: Dr.Jit then need
+        not compile its code again for other numbers."""
         field = copy.copy(self)
         field.branches = self.branches.prepare(backend)
         return field
 
     def evaluate(self, p: Vec3) -> Sample:
-        """The sample at p. It has two promises for each of two disks about p: a harmonic ball, and
-        a bound of second derivatives."""
+        """The sample at p: value, gradient and bounds of f on two disks about p that contain no
+        singular point. Each disk gives a range of f in a ball in which f is harmonic, and a bound
+        of second derivatives; the class has their proof."""
         rounding, z, branch = self._at(p)
         slope_x, slope_y = derivatives(branch.first, self.part)
         vector = cast("Any", type(p))
         gradient = vector(slope_x, slope_y, 0 * slope_x)
-        slope, error = dr.norm(gradient), self.branches.value_rounding(z, (branch,))
+        gradient_norm, error_units = dr.norm(gradient), self.branches.value_rounding(z, (branch,))
         clearance = self.branches.clearance(z)
         promises: list[TaylorRemainder | HarmonicBall] = []
         value = branch.value.imag if self.part == "imag" else branch.value.real
         for fraction in _DISK_FRACTIONS:
             radius = fraction * dr.minimum(clearance, _MAX_CLEARANCE)
-            second = self.branches.second_derivative_bound(Disk(z, radius, rounding)) * (1 + 1e-4)
-            change = (slope * radius + 0.5 * second * radius * radius) * (1 + 1e-5)
+            second_bound = self.branches.second_derivative_bound(Disk(z, radius, rounding)) * (
+                1 + 1e-4
+            )
+            change = (gradient_norm * radius + 0.5 * second_bound * radius * radius) * (1 + 1e-5)
             promises += [
-                TaylorRemainder(second, radius),
+                TaylorRemainder(second_bound, radius),
                 HarmonicBall(radius, value - change, value + change, 2),
             ]
-        return Sample(value, gradient, tuple(promises), backend_of(p).machine_epsilon * error)
+        return Sample(value, gradient, tuple(promises), backend_of(p).machine_epsilon * error_units)
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
-        """The three rows of the Hessian; its trace is 0.
+        """The three rows of the Hessian of f at p. f is harmonic in the plane, so its trace is 0.
 
         Raises:
             NotImplementedError: the user's function does not return its second derivative.
@@ -378,10 +389,10 @@ class LevelCurves(Field):
         return vector(xx, xy, zero), vector(xy, -xx, zero), vector(zero, zero, zero)
 
     def _at(self, p: Vec3) -> tuple[Real, Complex, Branch]:
-        """Evaluate g at the points p.
+        """Evaluate g at the projections of the points p to the complex plane.
 
-        Returns a bound of the rounding error of the point of the plane (a distance), the point as a
-        complex number, moved off singular points, and the branch at that point.
+        Returns a bound of the rounding error of the projection (a distance), the projection as a
+        complex number, moved off singular points, and g and its derivatives there.
         """
         rounding = 4 * backend_of(p).machine_epsilon * max_norm(p)
         z = self.branches.move_off_singularities(complex_of(p.x, p.y), rounding)
@@ -399,11 +410,12 @@ def _unit_box() -> Volume:
 
 @dataclass(frozen=True, eq=False)
 class HeightField(Formula):
-    """The surface z = u(x, y): the level 0 of f = z - u, which is negative below the surface.
+    """The surface z = u(x, y) over the plane, which is the level 0 of f = z - u(x, y). f is
+    negative below the surface.
 
     function: u, written with plain operators and functions such as `harnack.math.sin` (see
-        `expression`). It is called while a kernel is being recorded; numbers in it become literals
-        of that kernel.
+        `expression`). It is called while Dr.Jit records code; numbers in it become literals of that
+        code.
     domain: the volume in which the surface is drawn; by default the box of all points with
         coordinates from -1 to 1.
 
@@ -422,7 +434,7 @@ class HeightField(Formula):
     domain: Volume | None = field(default_factory=_unit_box)
 
     def __post_init__(self) -> None:
-        """Check the function and the domain."""
+        """Check the function, by a call as a test, and the domain."""
         if not callable(self.function):
             raise TypeError(f"function must be callable with x, y, not {self.function!r}")
         check_volume(self.domain, "domain")
@@ -443,35 +455,46 @@ class HeightField(Formula):
         return self
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
-        """The part of the domain within the heights that the level sets can have over it."""
+        """The part of the domain between the lowest and the highest height that the level sets can
+        have over it; the whole domain if the heights are not bounded or exceed it.
+
+        levels: the levels of f.
+        """
         assert self.domain is not None
         lower, upper = self.domain.bounds()
-        low, high = self._heights(lower, upper)
+        # At the level c of f = z - u the height is u + c.
+        lowest, highest = self._heights(lower, upper)
         slack = 1e-6 * float(np.abs([lower, upper]).max())
-        low, high = low + min(levels) - slack, high + max(levels) + slack
-        if not (np.isfinite([low, high]).all() and (low > lower[2] or high < upper[2])):
+        lowest, highest = lowest + min(levels) - slack, highest + max(levels) + slack
+        if not (np.isfinite([lowest, highest]).all() and (lowest > lower[2] or highest < upper[2])):
             return self.domain
-        bottom, top = max(low, lower[2] - slack), min(high, upper[2] + slack)
+        bottom, top = max(lowest, lower[2] - slack), min(highest, upper[2] + slack)
+        # No level set meets the domain.
         if bottom >= top:
             return self.domain
-        x, y = (float(coordinate) for coordinate in lower[:2])
-        far_x, far_y = (float(coordinate) for coordinate in upper[:2])
-        slab = Box((x - slack, y - slack, bottom), (far_x + slack, far_y + slack, top))
+        left, front = (float(coordinate) for coordinate in lower[:2])
+        right, back = (float(coordinate) for coordinate in upper[:2])
+        slab = Box((left - slack, front - slack, bottom), (right + slack, back + slack, top))
         return VolumeIntersection((self.domain, slab))
 
     def _heights(self, lower: FloatArray, upper: FloatArray) -> tuple[float, float]:
-        """Proved bounds (lowest, highest) of u over a box.
+        """Proved bounds (lowest, highest) of the height u over a box.
 
         lower, upper: (3,) the corners of the box; their z does not matter.
 
-        The box is divided into 32 x 32 cells, and u is bounded on a ball around each.
+        The box is divided into 32 x 32 cells, and u is bounded, by interval arithmetic, on a square
+        around each.
         """
         backend = choose_backend("double")
         size = (upper - lower)[:2] / _CELLS
-        cells = np.indices((_CELLS, _CELLS)).reshape(2, -1).T + 0.5
-        centers = np.column_stack([cells * size + lower[:2], np.zeros(len(cells))])
+        cell_positions = np.indices((_CELLS, _CELLS)).reshape(2, -1).T + 0.5
+        centers = np.column_stack(
+            [cell_positions * size + lower[:2], np.zeros(len(cell_positions))]
+        )
+        # The longer side, as the boxes of the jets are cubes.
         half_side = backend.Float(0.5 * float(size.max()) * (1 + 1e-9))
         jets = Jet.over_ball(to_vector3(backend, centers, "points"), half_side)
         heights = as_jet(self.function(*jets[:2]), jets[0], "HeightField").value
-        low = to_numpy(0 * half_side + dr.min(heights.lower)).min()
-        return float(low), float(to_numpy(0 * half_side + dr.max(heights.upper)).max())
+        # The added 0 makes an array of a constant.
+        lowest = to_numpy(0 * half_side + dr.min(heights.lower)).min()
+        return float(lowest), float(to_numpy(0 * half_side + dr.max(heights.upper)).max())

@@ -1,4 +1,9 @@
-"""Harmonic polynomials and spherical harmonics, clipped to a ball (paper, section 4.1).
+"""Harmonic polynomials and spherical harmonics, clipped to a ball (paper, section 4.1). Both are
+sums f of solid harmonics r^l Y_lm, homogeneous harmonic polynomials of degree l and order m, each
+times a coefficient. For a point p, r is its distance from the origin and rho its distance from the
+z axis. Proved bounds of f near a point are called promises, as in the rest of the library: a
+`HarmonicBall` is a ball in which f is harmonic, with a range of f; a `TaylorRemainder` bounds
+second derivatives. The paper is Gillespie, Yang, Botsch and Crane 2024.
 
 - `SphericalHarmonic`, `HarmonicPolynomial`: sums of solid harmonics, as fields.
 - `HarmonicPromises`: the promises of such a sum near a point.
@@ -62,9 +67,10 @@ _MIN_DISTANCE = 1e-9
 
 @dataclass(frozen=True)
 class HarmonicPromises:
-    """The promises of a sum f of solid harmonics at points of the unit ball.
-
-    They depend on the distances rho of the point p from the z axis and r from the origin.
+    """Proved bounds (promises) of a sum f of solid harmonics near points p of the unit ball. They
+    depend on two distances of p only: rho from the z axis and r from the origin. f is the sum of
+    parts, one for each degree l; a ball of radius R about p lies in the ball of radius r + R about
+    the origin, where `ball_range` bounds f.
 
     ball_range: ranges of f on balls about the origin.
     degree, lowest_degree: the largest degree of a term, and the smallest degree above 0.
@@ -75,12 +81,10 @@ class HarmonicPromises:
         else None.
     rounding: bounds of the rounding of value and gradient.
 
-    The radius R. A promise at p is for a ball B(p, R). That ball lies in the ball of radius |p| + R
-    about the origin, where `BallRange` bounds f. The paper uses the fixed ball |y| <= 1.25. Near
-    level 0 steps are shortened by the second-order term of the bound, which is proportional to
-    (range on |y| <= |p|+R)/R^2, so R is chosen to minimize that: it is 2|p|/(l-2) for a single
-    degree l > 2. With the slope bound Y_(8,4) took 19 evaluations per ray, and 30 with the fixed
-    ball (27 with the best fixed radius, 1.15); Y_(12,5) took 24, and 61 (50) with a fixed ball.
+    The radius R. The paper uses the fixed ball |y| <= 1.25. Near level 0 steps are shortened by the
+    second-order term of the bound, which is proportional to (range on |y| <= |p|+R)/R^2, so R is
+    chosen to minimize that: it is 2|p|/(l-2) for a single degree l > 2. (By experiment this takes
+    about two thirds of the evaluations that the fixed ball takes.)
 
     Zeros of high order. Where f vanishes to a high order, at the origin or along the z axis, R goes
     to zero with the distance from there, and the range on the ball goes to zero as f does. So every
@@ -102,17 +106,20 @@ class HarmonicPromises:
 
     @classmethod
     def of(cls, weights: Weights, known: BallRange, *, is_divided: bool) -> HarmonicPromises:
-        """The promises of the sum of solid harmonics with these weights.
+        """Compute what the bounds near points need, for the sum f of solid harmonics with these
+        coefficients.
 
-        weights: (l, m) -> coefficient.
-        known: proved ranges of the parts of each degree.
+        weights: a mapping (l, m) -> coefficient of the solid harmonic of degree l and order m.
+        known: proved ranges of the parts of f of each degree.
         is_divided: whether points are divided by a size other than 1 first, which adds rounding.
         """
-        inner, outer = _best_radius(known, 0.0), _best_radius(known, 1.0)
-        order, axial, axis_share = order_on_axis(weights), None, 0.0
+        center_radius, boundary_radius = _best_radius(known, 0.0), _best_radius(known, 1.0)
+        order, axial_bounds, axis_share = order_on_axis(weights), None, 0.0
         if order > 2:
             nonconstant = {key: weight for key, weight in weights.items() if key[0] > 0}
-            axial = (
+            # If f vanishes along the axis to a high order, bounds in powers of rho are sharper near
+            # it.
+            axial_bounds = (
                 value_bound(nonconstant),
                 gradient_bound(nonconstant),
                 hessian_bound(nonconstant),
@@ -120,33 +127,36 @@ class HarmonicPromises:
             lower, upper = known.by_degree(1.0)
             max_value = max(upper - known.constant, known.constant - lower)
             # If rho = axis_share r, both bounds of a single term are the same.
-            axis_share = (max_value / float(axial[0](1.0, 1.0))) ** (1 / order)
+            axis_share = (max_value / float(axial_bounds[0](1.0, 1.0))) ** (1 / order)
         return cls(
-            known.with_spheres(weights, 1.01 * max(inner, 1.0 + outer)),
+            known.with_spheres(weights, 1.01 * max(center_radius, 1.0 + boundary_radius)),
             max(degree for degree, _ in weights),
             min((degree for degree, _ in weights if degree > 0), default=0),
             order,
-            inner,
-            outer,
+            center_radius,
+            boundary_radius,
             axis_share,
-            axial,
+            axial_bounds,
             HarmonicRounding.of(weights, is_divided=is_divided),
         )
 
     def ball(self, rho: Real, r: Real) -> HarmonicBall:
-        """The harmonic ball at distances rho from the z axis and r from the origin."""
+        """A ball about a point in which f is harmonic, with a proved range of f on it.
+
+        rho, r: the distances of the point from the z axis and from the origin.
+        """
         radius = self._radius(rho, r)
         lower, upper = self.ball_range.at(r + radius)
         if self.axial is not None:
-            axial = self.axial[0](rho + radius, r + radius) * (1 + _ROUNDING)
-            lower = fmax(lower, self.ball_range.constant - axial)
-            upper = fmin(upper, self.ball_range.constant + axial)
+            axial_bound = self.axial[0](rho + radius, r + radius) * (1 + _ROUNDING)
+            lower = fmax(lower, self.ball_range.constant - axial_bound)
+            upper = fmin(upper, self.ball_range.constant + axial_bound)
         margin = dr.fma(upper - lower, _ROUNDING, self._underflow(r))
         return HarmonicBall(radius, lower - margin, upper + margin)
 
     def curvatures(self, rho: Real, r: Real) -> list[TaylorRemainder]:
-        """Bounds of the Hessian on balls of different radii about a point, as promises, the
-        smallest ball first.
+        """Proved bounds of the Hessian of f on balls about a point, the smallest ball first. For
+        degrees up to 2 the Hessian is constant, and there is one bound.
 
         rho, r: the distances of the point from the z axis and from the origin.
         """
@@ -154,38 +164,48 @@ class HarmonicPromises:
         if self.degree > 2:
             scale = r / (self.degree - 2)
             radii = [_NEAR * scale, fmax(_WIDE * scale, _FLOOR)]
+            # Near an axis of high order, a smaller ball has a much smaller bound.
             if self.axial is not None:
                 radii.insert(0, fmin(rho * (_BESIDE_AXIS / (self.order - 2)), radii[0]))
         return [TaylorRemainder(self._curvature(rho, r, radius), radius) for radius in radii]
 
     def _curvature(self, rho: Real, r: Real, radius: Real) -> Real:
-        """A bound of the Hessian on the ball of this radius about the point."""
+        """A bound of the Hessian of f, as a norm, on the ball of this radius about a point.
+
+        rho, r: the distances of the point from the z axis and from the origin.
+        """
         if self.degree < 3:
-            constant = self.ball_range.curvature(0.0 * r)
+            bound = self.ball_range.curvature(0.0 * r)
         else:
-            constant = self.ball_range.curvature(r + radius)
+            bound = self.ball_range.curvature(r + radius)
         if self.axial is not None:
-            constant = fmin(constant, self.axial[2](rho + radius, r + radius))
-        return dr.fma(constant, 1 + _ROUNDING + _SLOPE_SHARE, self._underflow(r))
+            bound = fmin(bound, self.axial[2](rho + radius, r + radius))
+        return dr.fma(bound, 1 + _ROUNDING + _SLOPE_SHARE, self._underflow(r))
 
     def lipschitz(self, rho: Real, r: Real) -> Lipschitz | None:
-        """A Lipschitz constant on a ball that has a smallest radius, as a promise; None if the
-        harmonic ball has a smallest radius, too."""
+        """A Lipschitz constant of f on a ball about a point. The ball has a smallest radius, so
+        that rays do not stop at a zero of high order; None if the harmonic ball has a smallest
+        radius, too.
+
+        rho, r: the distances of the point from the z axis and from the origin.
+        """
         if self.lowest_degree < 3:
             return None
         radius = fmax(r * (_WIDE / (self.degree - 2)), _FLOOR)
-        constant = self.ball_range.gradient(r + radius)
+        bound = self.ball_range.gradient(r + radius)
         if self.axial is not None:
-            constant = fmin(constant, self.axial[1](rho + radius, r + radius))
-        return Lipschitz(dr.fma(constant, 1 + _ROUNDING, self._underflow(r)), radius)
+            bound = fmin(bound, self.axial[1](rho + radius, r + radius))
+        return Lipschitz(dr.fma(bound, 1 + _ROUNDING, self._underflow(r)), radius)
 
     def error(self, rho: Real, r: Real, curvature: TaylorRemainder) -> Real:
-        """A bound of the rounding error of the value, plus the effect of that of the gradient.
+        """A bound of the rounding error of the value of f at a point, plus the effect of that of
+        the gradient on bounds by Taylor's formula.
 
-        curvature: the bound of the Hessian for the smallest ball.
+        rho, r: the distances of the point from the z axis and from the origin.
+        curvature: the bound of the Hessian on the smallest ball about the point.
 
-        Let E bound the rounding error of the gradient, and let H bound the Hessian. The promised
-        constant is (1 + h) H with h = `_SLOPE_SHARE`. For all t
+        Let E bound the rounding error of the gradient, and let H bound the Hessian. The constant in
+        `curvature` is (1 + h) H with h = `_SLOPE_SHARE`. For all lengths t
 
             E t <= E^2/(2 h H) + h H t^2/2   (since 2 a b <= a^2 + b^2),
 
@@ -195,21 +215,26 @@ class HarmonicPromises:
         for the rounding of points (8 u |grad f| times their size). For a harmonic ball of radius R,
         E R is a few u times the range; `enclosures.free_radius.condition_rounding` covers 16 u.
         """
-        unit = float(dr.epsilon(type(r)))  # u, half the distance from 1 to the next number
-        error = dr.fma(self.rounding.value_error(rho, r), unit, self._underflow(r))
+        roundoff = float(dr.epsilon(type(r)))  # u, half the distance from 1 to the next number
+        error = dr.fma(self.rounding.value_error(rho, r), roundoff, self._underflow(r))
         if self.degree < 2:
             return error
-        slope = unit * self.rounding.gradient_error(rho, r)
-        return dr.fma(slope * (0.5 / _SLOPE_SHARE), slope / curvature.constant, error)
+        slope_error = roundoff * self.rounding.gradient_error(rho, r)
+        return dr.fma(slope_error * (0.5 / _SLOPE_SHARE), slope_error / curvature.constant, error)
 
     def _radius(self, rho: Real, r: Real) -> Real:
-        """The radius of the harmonic ball at distances rho from the z axis and r from the origin.
+        """The radius of the harmonic ball about a point.
 
-        Near an axis of order m the range on the ball is about proportional to (rho + R)^m (r +
-        R)^(l-m). The best R is then 2/((m-2)/rho + (l-m)/r) if rho is a small fraction of r, as it
-        is there.
+        rho, r: the distances of the point from the z axis and from the origin.
+
+        If f has a term of degree 1 or 2, the radius goes from `center_radius` at r = 0 to
+        `boundary_radius` at r = 1. Otherwise it is proportional to r, because f vanishes to a high
+        order at the origin. Near a z axis along which f vanishes to the order m > 2, the range on
+        the ball is about proportional to (rho + R)^m (r + R)^(l-m) with the degree l. The best R is
+        then 2/((m-2)/rho + (l-m)/r) if rho is a small fraction of r, as it is there.
         """
         if self.lowest_degree < 3:
+            # Never below the smaller of the two radii.
             if self.center_radius < self.boundary_radius:
                 return fmax(self.boundary_radius * r, self.center_radius)
             return fmax(
@@ -218,28 +243,32 @@ class HarmonicPromises:
             )
         radius = self.boundary_radius * r
         if self.axial is not None:
-            order, remaining = self.order - 2.0, float(self.degree - self.order)
-            axis_radius = 2 / (order / rho + remaining / fmax(r, _MIN_DISTANCE))
+            # m - 2 and l - m
+            excess_order, other_degree = self.order - 2.0, float(self.degree - self.order)
+            axis_radius = 2 / (excess_order / rho + other_degree / fmax(r, _MIN_DISTANCE))
             radius = dr.select(rho < self.axis_share * r, fmin(axis_radius, radius), radius)
         return fmax(radius, _MIN_DISTANCE * self.boundary_radius)
 
     def _underflow(self, r: Real) -> float:
-        """A bound of the error of any of these sums by underflow."""
+        """A bound of the error of any of these sums by underflow, in the precision of r."""
         return self.rounding.underflow * max(1, self.degree) ** 2 * float(dr.smallest(type(r)))
 
 
 def _best_radius(known: BallRange, distance: float) -> float:
-    """The radius R that minimizes (range on |y| <= distance + R)/R^2.
+    """The radius R for which the harmonic ball about a point gives the longest steps: it minimizes
+    (range of f on |y| <= distance + R)/R^2.
 
     known: the ranges on balls about the origin.
+    distance: the distance of the point from the origin.
     """
     lower, upper = known.by_degree(distance + _RADII)
     return float(_RADII[np.argmin((upper - lower) / _RADII**2)])
 
 
 class _SolidHarmonics(Field):
-    """A sum of solid harmonics of p/size, for |p| <= size, as a field whose promises are
-    `HarmonicPromises`."""
+    """A field f(p) that is a sum of solid harmonics (homogeneous harmonic polynomials r^l Y_lm,
+    each times a coefficient) of the point p/size, for |p| <= size. Its bounds near points are those
+    of `HarmonicPromises`."""
 
     is_cheap = True
     over_relaxation = 1.6
@@ -249,9 +278,10 @@ class _SolidHarmonics(Field):
     ) -> None:
         """Set up a field.
 
-        weights: (l, m) -> coefficient.
+        weights: a mapping (l, m) -> coefficient of the solid harmonic of degree l and order m.
         known: the ranges of the parts of each degree on the unit sphere.
         size: the radius of a ball about the origin that contains the domain.
+        domain: the volume in which f is drawn.
         axis: the index of the coordinate of p that is the z of the solid harmonics. Their x and y
             are the next two coordinates, cyclically.
         """
@@ -264,15 +294,16 @@ class _SolidHarmonics(Field):
 
     @property
     def degree(self) -> int:
-        """The largest degree of a term."""
+        """The largest degree of a solid harmonic in the sum."""
         return max(degree for degree, _ in self._weights)
 
     def evaluate(self, p: Vec3) -> Sample:
-        """The sample at p. It is computed at p/size and scaled back to p; its promises are those of
-        `HarmonicPromises`."""
-        s, size = self._local(p), self._size
-        value, gradient = evaluate(self._weights, s.x, s.y, s.z)
-        rho, r = dr.norm(type(s)(s.x, s.y, 0)), dr.norm(s)
+        """The sample at p: value, gradient and bounds of f near p. They are computed at the point
+        p/size, where `HarmonicPromises` has the bounds, and scaled back to p."""
+        local_p, size = self._local(p), self._size
+        value, gradient = evaluate(self._weights, local_p.x, local_p.y, local_p.z)
+        # The distances of the scaled point from the z axis and from the origin.
+        rho, r = dr.norm(type(local_p)(local_p.x, local_p.y, 0)), dr.norm(local_p)
         ball, lipschitz = self._promises.ball(rho, r), self._promises.lipschitz(rho, r)
         curvatures = self._promises.curvatures(rho, r)
         promises = tuple(
@@ -283,8 +314,11 @@ class _SolidHarmonics(Field):
         if lipschitz is not None:
             alternatives.append(Lipschitz(lipschitz.constant / size, lipschitz.radius * size))
         error = self._promises.error(rho, r, curvatures[0])
-        slope = type(p)(*_rotate_axes(gradient, -self._axis - 1)) / size
-        return Sample(value, slope, promises, error, alternative_promises=tuple(alternatives))
+        # The gradient with its components in the order of the coordinates of p.
+        gradient_at_p = type(p)(*_rotate_axes(gradient, -self._axis - 1)) / size
+        return Sample(
+            value, gradient_at_p, promises, error, alternative_promises=tuple(alternatives)
+        )
 
     def _local(self, p: Vec3) -> Vec3:
         """The point p in the coordinates of the solid harmonics: with its axes rotated, and divided
@@ -292,17 +326,22 @@ class _SolidHarmonics(Field):
         return type(p)(*_rotate_axes((p.x, p.y, p.z), self._axis + 1)) / self._size
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
-        """The three rows of the Hessian; its trace is 0 up to rounding."""
-        s, scale, turns = self._local(p), 1 / self._size**2, -self._axis - 1
-        xx, yy, zz, xy, xz, yz = (scale * entry for entry in hessian(self._weights, s.x, s.y, s.z))
+        """The three rows of the Hessian of f at p; its trace is 0 up to rounding."""
+        local_p, scale, turns = self._local(p), 1 / self._size**2, -self._axis - 1
+        xx, yy, zz, xy, xz, yz = (
+            scale * entry for entry in hessian(self._weights, local_p.x, local_p.y, local_p.z)
+        )
         rows = ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))
+        # Rows and columns in the order of the coordinates of p.
         x, y, z = _rotate_axes([type(p)(*_rotate_axes(row, turns)) for row in rows], turns)
         return x, y, z
 
     def validate_levels(self, levels: tuple[float, ...]) -> None:
+        """Raise ValueError for a level outside of the proved range of f in its domain."""
         validate_levels_in_range(levels, self.value_range, "in its domain the function")
 
     def describe(self) -> dict[str, Any]:
+        """The degree, the number of terms and the proved range of f, as a dictionary for users."""
         return {
             "degree": self.degree,
             "solid harmonics": len(self._weights),
@@ -311,14 +350,15 @@ class _SolidHarmonics(Field):
 
 
 class SphericalHarmonic(_SolidHarmonics):
-    """The solid harmonic (|p|/radius)^l Y_lm(p/|p|), a homogeneous polynomial, in a ball.
-
-    Y_lm is the real spherical harmonic, orthonormal: the integral of Y_lm^2 over the unit sphere is
-    1. It is without the Condon-Shortley phase: Y_11 is a positive multiple of x, Y_1-1 of y, Y_10
-    of z. Orders m > 0 contain cos(m phi), orders m < 0 contain sin(|m| phi).
+    """The solid harmonic (|p|/radius)^l Y_lm(p/|p|) of degree l and order m, a homogeneous harmonic
+    polynomial, in a ball. Y_lm is a real spherical harmonic: a function on the unit sphere.
 
     l, m: degree 0 <= l <= 12 and order -l <= m <= l.
     radius: the radius of the ball about the origin to which it is clipped.
+
+    Y_lm is orthonormal: the integral of Y_lm^2 over the unit sphere is 1. It is without the
+    Condon-Shortley phase: Y_11 is a positive multiple of x, Y_1-1 of y, Y_10 of z. Orders m > 0
+    contain cos(m phi), orders m < 0 contain sin(|m| phi).
 
     Raises:
         ValueError: l or m outside these ranges, or a radius that is not positive.
@@ -326,7 +366,7 @@ class SphericalHarmonic(_SolidHarmonics):
     """
 
     def __init__(self, l: int, m: int, *, radius: float = 1.0) -> None:  # noqa: E741
-        """Check the arguments, and set up the sum with this single term."""
+        """Check the arguments, and set up the sum of solid harmonics with this single term."""
         l, m = degree_and_order((l, m))  # noqa: E741
         if not 0 <= l <= LARGEST_DEGREE:
             raise ValueError(f"the degree l must be 0 to {LARGEST_DEGREE}, not {l}")
@@ -335,20 +375,22 @@ class SphericalHarmonic(_SolidHarmonics):
         domain = Ball(radius=radius)
         self.l, self.m = l, m
         low, high = range_of_harmonic(l, m)
+        # The range of the constant Y_00 is its value; of all others, the range on the unit sphere.
         known = BallRange(low, ()) if l == 0 else BallRange(0.0, ((l, low, high),))
         super().__init__({(l, m): 1.0}, known, domain.radius, domain)
 
 
 class HarmonicPolynomial(_SolidHarmonics):
-    """A harmonic polynomial from its monomials, up to degree 12.
+    """A harmonic polynomial, given by the coefficients of its monomials x^i y^j z^k, up to degree
+    12. It is evaluated as a sum of solid harmonics.
 
     coefficients: {(i, j, k): c}, for the sum of c x^i y^j z^k; the paper's Eq. 8 is
         HarmonicPolynomial({(2, 1, 0): 1, (0, 1, 2): -1}).
     domain: the bounded volume to which it is clipped; by default the ball of radius 1.
 
-    The Laplacian must vanish, up to 1e-9 of the terms that cancel in it. The polynomial is
-    evaluated as a sum of solid harmonics. The sum has the same values and z-derivatives on the
-    plane z = 0 as the polynomial, and so, both being harmonic, agrees with it everywhere.
+    The Laplacian must vanish, up to 1e-9 of the terms that cancel in it. The sum of solid harmonics
+    has the same values and z-derivatives on the plane z = 0 as the polynomial, and so, both being
+    harmonic, agrees with it everywhere.
 
     Raises:
         ValueError: the polynomial is not harmonic (the message shows its Laplacian), its degree is
@@ -359,32 +401,42 @@ class HarmonicPolynomial(_SolidHarmonics):
     def __init__(
         self, coefficients: Mapping[tuple[int, int, int], float], *, domain: Volume | None = None
     ) -> None:
-        """Check the arguments, and convert the monomials to solid harmonics."""
+        """Check the arguments, and convert the monomials to solid harmonics of p/size, where the
+        ball of radius `size` contains the domain. Of the three coordinate axes, the one along which
+        the polynomial vanishes to the highest order becomes the z axis of the solid harmonics."""
         self.coefficients = _checked(coefficients)
         domain = Ball() if domain is None else domain
         size = _enclosing_radius(domain)
-        scaled = {powers: c * size ** sum(powers) for powers, c in self.coefficients.items()}
+        scaled_coefficients = {
+            powers: c * size ** sum(powers) for powers, c in self.coefficients.items()
+        }
         # The axis along which the polynomial vanishes to the highest order becomes the z axis of
         # the solid harmonics, since `HarmonicPromises` has sharper bounds near a z axis of high
         # order. Of axes of the same order z comes first: it needs no rotation.
-        by_axis = [
-            from_monomials({_rotate_axes(k, axis + 1): c for k, c in scaled.items()})
+        weights_by_axis = [
+            from_monomials(
+                {
+                    _rotate_axes(exponents, axis + 1): c
+                    for exponents, c in scaled_coefficients.items()
+                }
+            )
             for axis in range(3)
         ]
-        axis = max((2, 0, 1), key=lambda axis: order_on_axis(by_axis[axis]))
-        weights = by_axis[axis]
+        axis = max((2, 0, 1), key=lambda axis: order_on_axis(weights_by_axis[axis]))
+        weights = weights_by_axis[axis]
         super().__init__(weights, BallRange.of(weights), size, domain, axis)
 
 
 def _rotate_axes(values: Sequence[Any], n: int) -> tuple[Any, Any, Any]:
-    """Three values rotated by n positions; for n = 1, (x, y, z) becomes (y, z, x)."""
+    """The three values rotated by n positions, cyclically; for n = 1, (x, y, z) becomes (y, z,
+    x)."""
     return values[n % 3], values[(n + 1) % 3], values[(n + 2) % 3]
 
 
 def _checked(coefficients: Any) -> dict[tuple[int, int, int], float]:
-    """The coefficients that are not zero, as Python numbers.
+    """The coefficients that are not zero, as Python numbers, after checks.
 
-    coefficients: the mapping {(i, j, k): c} that a user gave.
+    coefficients: the mapping {(i, j, k): c} that a user gave, for the sum of c x^i y^j z^k.
 
     Raises:
         TypeError, ValueError: it is no mapping of exponents to finite numbers, all are zero, the
@@ -423,7 +475,10 @@ def _checked(coefficients: Any) -> dict[tuple[int, int, int], float]:
 
 
 def _monomial(powers: tuple[int, int, int]) -> str:
-    """The monomial x^i y^j z^k with powers (i, j, k) as text, such as "x^2 y"."""
+    """The monomial x^i y^j z^k as text, such as "x^2 y".
+
+    powers: (i, j, k).
+    """
     factors = zip("xyz", powers, strict=True)
     return " ".join(name if n == 1 else f"{name}^{n}" for name, n in factors if n)
 

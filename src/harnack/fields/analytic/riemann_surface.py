@@ -1,4 +1,11 @@
-"""Riemann surfaces of functions of a complex variable, as graphs over the plane (paper, 4.6)."""
+"""Riemann surfaces of functions of a complex variable, as graphs over the plane (paper, 4.6). The
+function has several branches g_j (its possible values near a point z). The surface over the plane z
+= x + i y has the heights u_j = Im g_j(z), or Re g_j(z), times a factor. At a point p of space over
+z, with the height h, phi_j = h - u_j is the height of p above branch j; the branch with the
+smallest |phi_j| is called the nearest. The field is f = s |phi_j| of the nearest branch, with a
+sign s of 1 or -1. A singular point is a z where a branch is not analytic; near some of them, the
+branch points with a power, all branches are near one value. If the heights repeat with a period,
+each branch stands for all its shifts by whole periods."""
 
 from __future__ import annotations
 
@@ -43,12 +50,12 @@ _BOUND_MARGIN = 1 + 1e-4
 
 @dataclass(frozen=True)
 class _BranchValue:
-    """One branch at a point p of space: phi = h - u, where h is the height of p and u that of the
-    branch.
+    """One branch of a function at a point p of space: phi = h - u, where h is the height of p and u
+    the height of this branch's surface over the same point of the plane.
 
     phi: the value of phi.
     x, y: the derivatives of phi by x and y, which are those of -u. The derivative by z is 1.
-    sign_factor: 1 or -1, the factor of this branch in the sign of the product of all phi.
+    sign_factor: 1 or -1; the field's sign is the product of these factors of all branches.
     """
 
     phi: Real
@@ -62,12 +69,12 @@ class _BranchValue:
         return dr.sqrt(dr.fma(self.x, self.x, dr.fma(self.y, self.y, 1)))
 
     def slope(self, direction: Vec3) -> Real:
-        """The derivative of phi along a direction."""
+        """The derivative of phi (the height of the point above the branch) along a direction."""
         return dr.fma(self.x, direction.x, dr.fma(self.y, direction.y, direction.z))
 
     def coincides_with(self, other: _BranchValue) -> Mask:
-        """Whether phi and its gradient equal phi and the gradient of the branch `other`. For a
-        branch and itself they do.
+        """A mask of the lanes on which this branch touches the branch `other`: phi (the height of
+        the point above the branch) and its gradient are the same. A branch coincides with itself.
 
         On a line of symmetry two branches agree in phi and in its derivative by x but not by y;
         they do not coincide, and f has a crease there.
@@ -77,14 +84,15 @@ class _BranchValue:
 
 @dataclass(frozen=True)
 class _PointBranches:
-    """All branches at a point of space.
+    """All branches of a function at a point p of space. For each branch, phi is the height of p
+    above the branch's surface.
 
-    z: the projection of the point to the complex plane, moved off singular points.
-    h: the height of the point.
+    z: the projection of p to the complex plane, moved off singular points.
+    h: the height of p.
     branches: phi and its gradient for each branch.
     nearest: the branch with the smallest |phi|.
     sign: 1 or -1; f is this sign times phi of the nearest branch.
-    error: a bound of the error of all phi by the arithmetic of their evaluation.
+    error: a bound of the rounding error of each phi.
     rounding: a bound of the rounding error of z, as a distance.
     """
 
@@ -98,20 +106,23 @@ class _PointBranches:
 
     @property
     def value(self) -> Real:
-        """The value of f."""
+        """The value of the field f at the point."""
         return self.sign * self.nearest.phi
 
 
 class RiemannSurface(Field):
-    """The graph h = Im g(x + i y), or Re, of an analytic function with all its branches g_j.
+    """The surface h = Im g(x + i y), or Re, over the plane, of an analytic function with all its
+    branches g_j. At a point p of space with the height h, phi_j = h - Im g_j is the height of p
+    above branch j. With several branches f = s min_j |phi_j|, where s is the sign of the product of
+    all phi_j; with one branch f = phi.
 
     function: "log", "sqrt", "cbrt", "power" (z^exponent), "asin"; a mapping {a_i: alpha_i} for the
         product of (z - a_i)^alpha_i; or a function of a Dr.Jit complex number that returns all its
         branches, each as (g, g') or (g, g', g'') in Dr.Jit complex numbers.
     part: "imag" or "real": the part of g that is the height h.
     exponent: for "power": a rational number such as Fraction(2, 3) or 2 / 3.
-    argument: for "log", "sqrt", "cbrt" and "power": the mapping {a_i: n_i} of the product of
-        (z - a_i)^n_i that is the argument of the function, by default z.
+    argument: for "log", "sqrt", "cbrt" and "power": the mapping {a_i: n_i} of the product of (z -
+        a_i)^n_i that is the argument of the function, by default z.
     singular_points: for a function of your own, the points where a branch is not analytic: complex
         numbers, or `BranchPoint`s, which describe how all branches meet there.
     second_bound: for a function of your own, a bound second_bound(z, r) of |g''|, of all branches,
@@ -122,22 +133,20 @@ class RiemannSurface(Field):
     domain: the volume in which the surface is drawn; by default the ball of radius 1 about the
         origin, of radius 4 for "log" and 2 for "asin".
 
-    With several branches f = s min_j |phi_j|, where phi_j = h - Im g_j at a point of height h, and
-    s is the sign of the product of all phi_j. f is continuous and single-valued, as that product
-    is, and zero only on the surface. With one branch f = phi; for a logarithm it is determined up
-    to the period. level=(-w, w) with side="between" draws a solid: all points that are at most w
-    above or below the surface.
+    f is continuous and single-valued, as that product is, and zero only on the surface. With one
+    branch it is, for a logarithm, determined up to the period. level=(-w, w) with side="between"
+    draws a solid: all points that are at most w above or below the surface.
 
     Proof. Along a ray the set of branches can be continued as long as no singular point is met. So
     branch cuts and the numbering of branches do not matter. For each branch
     `NearestBranchEnclosure` computes the length of the ray within which the surface of this branch
     cannot be met, and takes the minimum over all branches. It uses the slopes of the branches at
     the sample, and a bound of |g''| on the segment of the plane below the ray, which holds for all
-    branches (`Branches.second_derivative_bound`): since h is linear along the ray,
-    |d^2 phi_j/ds^2| <= |g''| |w|^2, where w is the projection of the ray's direction to the plane.
-    The nearest branch may change between two samples, because the proof covers all branches.
-    Near branch points with a power > 0 all branches are near one value; `BranchPointEnclosure`
-    proves the step of a ray that passes such a point at another height.
+    branches (`Branches.second_derivative_bound`): since h is linear along the ray, |d^2 phi_j/ds^2|
+    <= |g''| |w|^2, where w is the projection of the ray's direction to the plane. The nearest
+    branch may change between two samples, because the proof covers all branches. Near branch points
+    with a power > 0 all branches are near one value; `BranchPointEnclosure` proves the step of a
+    ray that passes such a point at another height.
 
     A point is a hit if |f| is at most the tolerance times |grad f| and, near such a branch point,
     the surface is not proved to be farther away than the tolerance: there the slope grows without
@@ -182,6 +191,7 @@ class RiemannSurface(Field):
         radius = {"log": 4.0, "asin": 2.0}.get(function, 1.0) if isinstance(function, str) else 1.0
         self.domain = Ball(radius=radius) if domain is None else domain
         self._height: Any = self.height
+        # The period is scaled like the heights. Only with one branch is f itself periodic.
         shift = self.branches.period(part == "imag")
         self._shift: Any = None if shift is None else abs(self.height) * shift
         self._is_single = self.branches.count == 1
@@ -190,6 +200,8 @@ class RiemannSurface(Field):
             self.period = self._shift  # pyright: ignore[reportAttributeAccessIssue]
 
     def prepare(self, backend: Backend) -> RiemannSurface:
+        """The same field with its numbers on the backend as data, not as literals: Dr.Jit then need
+        not compile its code again for other numbers."""
         field = copy.copy(self)
         field.branches = self.branches.prepare(backend)
         field._height = dr.opaque(backend.Float, self.height)
@@ -198,22 +210,28 @@ class RiemannSurface(Field):
         return field
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
-        """The part of the domain within the heights that the level sets can have over it."""
+        """The part of the domain between the lowest and the highest height that the level sets can
+        have over it; the whole domain if the heights are not bounded or exceed it.
+
+        levels: the levels of f.
+        """
         if self.domain is None or self._shift is not None:
             return self.domain
         max_height = self._max_height()
         if not max_height < math.inf:
             return self.domain
-        limit = max_height * (1 + 1e-5) + max(abs(level) for level in levels)
+        max_level_height = max_height * (1 + 1e-5) + max(abs(level) for level in levels)
         lower, upper = self.domain.bounds()
-        if limit >= min(-lower[2], upper[2]):
+        if max_level_height >= min(-lower[2], upper[2]):
             return self.domain
+        # A box needs finite corners.
         low, high = (np.nan_to_num(corner, posinf=1e9, neginf=-1e9) for corner in (lower, upper))
-        slab = Box((low[0], low[1], -limit), (high[0], high[1], limit))
+        slab = Box((low[0], low[1], -max_level_height), (high[0], high[1], max_level_height))
         return VolumeIntersection((self.domain, slab))
 
     def _max_height(self) -> float:
-        """A bound of the height |h| of the surface over the domain; infinite if none is known."""
+        """An upper bound of the height |h| of the surface over the domain; infinite if none is
+        known. It is a bound on a disk around the domain's projection to the plane."""
         assert self.domain is not None
         lower, upper = self.domain.bounds()
         corners = [complex(x, y) for x in (lower[0], upper[0]) for y in (lower[1], upper[1])]
@@ -224,40 +242,52 @@ class RiemannSurface(Field):
         return abs(self.height) * self.branches.max_abs(middle, reach)
 
     def evaluate(self, p: Vec3) -> Sample:
-        """The sample at p, with promises on disks that contain no singular point.
+        """The sample at p, with bounds of f on disks about p that contain no singular point: a
+        bound of second derivatives, a Lipschitz constant and, as an alternative, a range on a ball
+        in which f is harmonic.
 
         The bound of second derivatives holds within the radius in which no other branch can become
-        the nearest, the Lipschitz constant on the whole disk. If a single branch is nearest, f is
-        harmonic there.
+        the nearest, the Lipschitz constant on the whole disk. If two branches touch at p, f is not
+        harmonic near p, and the ball has the radius 0.
         """
-        local = self._branches_at(p)
-        sample = self._sample(local)
-        clearance = self.branches.clearance(local.z)
+        at_p = self._branches_at(p)
+        sample = self._sample(at_p)
+        clearance = self.branches.clearance(at_p.z)
         radius = _DISK_FRACTION * fmin(clearance, _MAX_LENGTH)
-        second = (
+        second_bound = (
             self._height_factor
-            * self.branches.second_derivative_bound(Disk(local.z, radius, local.rounding))
+            * self.branches.second_derivative_bound(Disk(at_p.z, radius, at_p.rounding))
             * _BOUND_MARGIN
         )
+        # The largest slope of any branch at p.
         steepest: Real = 0.0
-        for branch in local.branches:
+        for branch in at_p.branches:
             steepest = fmax(branch.steepness, steepest)
         # The radius within which no other branch can become the nearest: |phi_j| - |phi_i| > 0.
         # Branches that touch at p have the same value and gradient, and stay within the same
         # parabola; but the nearest of two branches is not harmonic.
-        free_radius, touching = radius, 0 * radius
-        for branch in local.branches:
-            excess = fmax(dr.abs(branch.phi) - dr.abs(local.nearest.phi), 0)
-            rate = branch.steepness + local.nearest.steepness
-            change_radius = 2 * excess / (rate + dr.sqrt(rate * rate + 4 * second * excess))
-            is_touching = branch.coincides_with(local.nearest)
+        free_radius, touching_count = radius, 0 * radius
+        for branch in at_p.branches:
+            excess = fmax(dr.abs(branch.phi) - dr.abs(at_p.nearest.phi), 0)
+            slope_sum = branch.steepness + at_p.nearest.steepness
+            # The positive root r of slope_sum r + second_bound r^2 = excess: up to there the branch
+            # is farther away than the nearest one. This form of it does not cancel.
+            change_radius = (
+                2
+                * excess
+                / (slope_sum + dr.sqrt(slope_sum * slope_sum + 4 * second_bound * excess))
+            )
+            is_touching = branch.coincides_with(at_p.nearest)
             free_radius = fmin(dr.select(is_touching, radius, change_radius), free_radius)
-            touching += dr.select(is_touching, 1, 0)
-        remainder = TaylorRemainder(second, free_radius)
-        max_slope = (steepest + second * radius) * (1 + 1e-5)
-        change = (max_slope * free_radius + 0.5 * second * free_radius * free_radius) * (1 + 1e-5)
-        ball_radius = dr.select(touching < 2, free_radius, 0)
-        ball = HarmonicBall(ball_radius, sample.value - change, sample.value + change)
+            touching_count += dr.select(is_touching, 1, 0)
+        remainder = TaylorRemainder(second_bound, free_radius)
+        max_slope = (steepest + second_bound * radius) * (1 + 1e-5)
+        max_change = (max_slope * free_radius + 0.5 * second_bound * free_radius * free_radius) * (
+            1 + 1e-5
+        )
+        # The nearest branch coincides with itself, so a count of 1 means that it is alone.
+        ball_radius = dr.select(touching_count < 2, free_radius, 0)
+        ball = HarmonicBall(ball_radius, sample.value - max_change, sample.value + max_change)
         return Sample(
             sample.value,
             sample.gradient,
@@ -268,32 +298,41 @@ class RiemannSurface(Field):
         )
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
-        """The sample on a ray, with enclosures that are proved from all branches instead of from
-        promises.
+        """The sample at the position t of a ray, with enclosures: proofs of lengths in front of and
+        behind the point on which f takes none of the levels (the values that rays look for). They
+        are proved from all branches, on segments of the plane below the ray.
 
-        If the ray does not use the sharpest proofs, the enclosures follow from promises.
+        path: the ray.
+        t: a length along it.
+        ahead, back: the lengths in front of and behind the point on which proofs are wanted.
+
+        If the ray's options exclude the sharpest proofs (`PiecewiseTaylorEnclosure`), the
+        enclosures follow from the sample of `evaluate` instead.
         """
         p, d = path.point(t), path.direction
         if PiecewiseTaylorEnclosure not in path.proofs.kinds:
             return path.enclose(self.evaluate(p))
-        local = self._branches_at(p)
-        sample = self._sample(local)
-        slope = local.sign * local.nearest.slope(d)
+        at_point = self._branches_at(p)
+        sample = self._sample(at_point)
+        slope = at_point.sign * at_point.nearest.slope(d)
         projection = complex_of(d.x, d.y)
         speed = abs(projection)
         longest = fmin(ahead, _MAX_LENGTH * (1 + max_norm(p)))
-        clearance = self.branches.clearance(local.z)
+        clearance = self.branches.clearance(at_point.z)
+        # A shorter segment that stays away from singular points has smaller second derivatives, so
+        # its proof may reach farther.
         lengths = [longest, *(fmin(longest, share * clearance / speed) for share in _FRACTIONS)]
-        forwards = [self._enclosure(local, d, projection, length) for length in lengths]
+        forwards = [self._enclosure(at_point, d, projection, length) for length in lengths]
         if not self._is_single:
-            forwards += self._cusp_enclosures(local, d, projection)
+            forwards += self._cusp_enclosures(at_point, d, projection)
         # Slightly longer than the requested length, as steps are rounded down.
         back = fmin(back, _MAX_LENGTH) * (1 + 1e-5)
-        backwards = (self._enclosure(local, -d, -projection, back),)
+        backwards = (self._enclosure(at_point, -d, -projection, back),)
         return RaySample(sample, tuple(forwards), backwards, slope)
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
-        """The three rows of the Hessian; its trace is 0.
+        """The three rows of the Hessian of f at p, which is that of the nearest branch. f is
+        harmonic, so its trace is 0; and it is linear in z, so all derivatives by z are 0.
 
         Raises:
             NotImplementedError: the user's branches come without second derivatives.
@@ -301,9 +340,10 @@ class RiemannSurface(Field):
         z = self.branches.move_off_singularities(complex_of(p.x, p.y), self._rounding(p))
         branches = self.branches.evaluate(z)
         graphs = self._graphs(p, branches)
-        xx, xy = 0 * p.x, 0 * p.x
-        local = self._nearest_branch(z, p.z, graphs, 0.0, 0.0)
+        u_xx, u_xy = 0 * p.x, 0 * p.x
+        at_p = self._nearest_branch(z, p.z, graphs, 0.0, 0.0)
         for k, graph in enumerate(graphs):
+            # With a period each branch gives two graphs, the second half of the list.
             second = branches[k % len(branches)].second
             if second is None:
                 raise NotImplementedError(
@@ -311,14 +351,19 @@ class RiemannSurface(Field):
                     "(g, g', g'') for each"
                 )
             branch_xx, branch_xy = derivatives(second, self.part)
-            is_nearest = graph.coincides_with(local.nearest)
-            xx, xy = dr.select(is_nearest, branch_xx, xx), dr.select(is_nearest, branch_xy, xy)
-        scale = -local.sign * self._height
-        xx, xy, zero = scale * xx, scale * xy, 0 * p.x
+            is_nearest = graph.coincides_with(at_p.nearest)
+            u_xx, u_xy = (
+                dr.select(is_nearest, branch_xx, u_xx),
+                dr.select(is_nearest, branch_xy, u_xy),
+            )
+        # f is the sign times (h - height u), so u counts with a minus.
+        scale = -at_p.sign * self._height
+        u_xx, u_xy, zero = scale * u_xx, scale * u_xy, 0 * p.x
         vector = cast("Any", type(p))
-        return vector(xx, xy, zero), vector(xy, -xx, zero), vector(zero, zero, zero)
+        return vector(u_xx, u_xy, zero), vector(u_xy, -u_xx, zero), vector(zero, zero, zero)
 
     def describe(self) -> dict[str, Any]:
+        """The number of branches, the period and the singular points, as a dictionary for users."""
         return {
             "branches": self.branches.count,
             "period": self._shift,
@@ -329,51 +374,63 @@ class RiemannSurface(Field):
 
     @property
     def _height_factor(self) -> Real:
-        """The absolute value of the factor of g."""
+        """The absolute value of the factor `height`, by which the branches are multiplied."""
         return dr.abs(self._height)
 
     def _rounding(self, p: Vec3) -> Real:
-        """A generous bound of the rounding error of the projection of p to the plane, as a
-        distance."""
+        """A generous bound of the rounding error of the projection of p to the plane, as a distance
+        in the plane."""
         return 4 * backend_of(p).machine_epsilon * max_norm(p)
 
     def _graphs(self, p: Vec3, branches: tuple[Branch, ...]) -> list[_BranchValue]:
-        """phi, its gradient and its sign factor for each branch at p.
+        """For each branch the height phi of p above the branch's surface, with its gradient and its
+        factor of the field's sign. The surface over z has the height u.
 
         branches: the branches of g at the projection of p.
 
-        With a period and several branches, as for asin, each branch g gives the graphs of g plus
-        all whole periods. For each branch the list then has the graph nearest to p (the first half
-        of the list) and the next graph on the other side of p (the second half). In that case the
-        sign factors are not those of the phi in the list, but those of sin(pi phi/period) with phi
-        before the shift by whole periods: for asin their product has the sign of sin u - sin h. The
-        graphs in the second half have factor 1.
+        If the heights repeat with a period and there are several branches, as for asin, each branch
+        stands for all surfaces at the heights u plus whole multiples of the period. The list has
+        two of them for each branch: in its first half the surface nearest to p, in its second half
+        the next one on the other side of p. The field's sign is then the product of the signs of
+        sin(pi phi/period), one for each branch, with phi before any shift (for asin it is the sign
+        of sin u - sin h). So the factors are those signs in the first half, and 1 in the second
+        half.
         """
-        values: list[_BranchValue] = []
-        neighbors: list[_BranchValue] = []
+        nearest_graphs: list[_BranchValue] = []
+        next_graphs: list[_BranchValue] = []
         for branch in branches:
             u = branch.value.imag if self.part == "imag" else branch.value.real
-            x, y = derivatives(branch.first, self.part)
-            phi, x, y = p.z - self._height * u, -self._height * x, -self._height * y
+            slope_x, slope_y = derivatives(branch.first, self.part)
+            phi, slope_x, slope_y = (
+                p.z - self._height * u,
+                -self._height * slope_x,
+                -self._height * slope_y,
+            )
             real = cast("Any", type(phi))
             sign_factor = dr.select(phi < 0, real(-1), 1)
             if self._shift is not None and not self._is_single:
                 periods = dr.floor(phi / self._shift)
+                # The sign of sin(pi phi/period) is 1 if the number of whole periods is even.
                 sign_factor = dr.select(periods == 2 * dr.floor(0.5 * periods), real(1), -1)
                 phi = phi - self._shift * dr.round(phi / self._shift)
-                neighbors.append(
-                    _BranchValue(phi - dr.mulsign(real(self._shift), phi), x, y, real(1))
+                next_graphs.append(
+                    # The graph on the other side of p: one period away, against the sign of phi.
+                    _BranchValue(
+                        phi - dr.mulsign(real(self._shift), phi), slope_x, slope_y, real(1)
+                    )
                 )
-            values.append(_BranchValue(phi, x, y, sign_factor))
-        return values + neighbors
+            nearest_graphs.append(_BranchValue(phi, slope_x, slope_y, sign_factor))
+        return nearest_graphs + next_graphs
 
     def _branches_at(self, p: Vec3) -> _PointBranches:
-        """All branches at the point p, with the bounds of their errors."""
+        """All branches at the point p, with bounds of their rounding errors."""
         rounding = self._rounding(p)
         z = self.branches.move_off_singularities(complex_of(p.x, p.y), rounding)
         branches = self.branches.evaluate(z)
-        units = self._height_factor * self.branches.value_rounding(z, branches) + 4 * dr.abs(p.z)
-        error = backend_of(p).machine_epsilon * units
+        error_units = self._height_factor * self.branches.value_rounding(z, branches) + 4 * dr.abs(
+            p.z
+        )
+        error = backend_of(p).machine_epsilon * error_units
         for point in self.branches.points_on(z):  # slopes do not bound the rounding of values there
             if point.power is not None:
                 is_close = abs(z - point.at) <= 2 * rounding
@@ -389,11 +446,12 @@ class RiemannSurface(Field):
     def _nearest_branch(
         self, z: Complex, h: Real, graphs: list[_BranchValue], error: Real, rounding: Real
     ) -> _PointBranches:
-        """The branches at a point, with the nearest branch and the sign of f.
+        """All branches at a point, with the nearest branch (the smallest |phi|) and the sign of f
+        determined.
 
         z, h: the projection of the point to the plane, and its height.
-        graphs: phi and its gradient for each branch at the point.
-        error, rounding: bounds of the errors of phi and of z, which are stored in the result.
+        graphs: phi (the height of the point above the branch) and its gradient for each branch.
+        error, rounding: bounds of the errors of phi and of z, which are only stored in the result.
         """
         nearest, sign = graphs[0], type(graphs[0].phi)(1)
         if not self._is_single:
@@ -412,16 +470,21 @@ class RiemannSurface(Field):
         return _PointBranches(z, h, tuple(graphs), nearest, sign, error, rounding)
 
     def _sample(self, local: _PointBranches) -> Sample:
-        """The sample of f at a point, without promises.
+        """The sample of f at a point, without bounds of f near it.
 
-        Near a branch point its gradient error is so large that the point is no hit if the surface
-        is proved to be farther away than |f|/|grad f|.
+        local: all branches at the point.
+
+        The gradient error is 0 except near a branch point, where all branches meet: there it is so
+        large that the tracer does not count the point as a hit if the surface is proved to be
+        farther away than |f|/|grad f|.
         """
         nearest, sign = local.nearest, local.sign
         vector = backend_of(nearest.phi).Array3f
         gradient = vector(sign * nearest.x, sign * nearest.y, sign)
         # No hit if the surface is proved to be farther away than f/|grad f|.
         norm, distance = dr.norm(gradient), self._proved_distance(local)
+        # With d the proved distance, |gradient| minus the gradient error is |f|/d, so that the
+        # distance which the tracer takes for the surface's is d.
         slope = dr.abs(nearest.phi) / distance
         gradient_error = dr.select(distance > 0, fmax(norm - slope, 0), 0)
         return Sample(local.value, gradient, (), local.error, gradient_error)
@@ -431,11 +494,14 @@ class RiemannSurface(Field):
     def _bounded_branch_points(
         self, local: _PointBranches
     ) -> list[tuple[PreparedBranchPoint, Complex, Real]]:
-        """The branch points with a bound |g - value| <= constant |z - location|^power; none for one
-        branch.
+        """The branch points with a bound |g - value| <= constant |z - location|^power of all
+        branches; an empty list if the function has only one branch.
 
-        For each of them: the branch point, z minus its location, and the height of the point of
-        space above the value of g at the branch point (by the nearest whole number of periods).
+        local: all branches at a point of space.
+
+        For each branch point: the point itself; z minus its location; and the height of the point
+        of space above the value of g there (if heights repeat, above the nearest of all shifts by
+        whole periods).
         """
         points: list[tuple[PreparedBranchPoint, Complex, Real]] = []
         if self._is_single:
@@ -444,54 +510,71 @@ class RiemannSurface(Field):
             if point.power is None:
                 continue
             value = point.value.imag if self.part == "imag" else point.value.real
-            y = local.h - self._height * value
+            height = local.h - self._height * value
             if self._shift is not None:
-                y -= self._shift * dr.round(y / self._shift)
-            points.append((point, local.z - point.at, y))
+                height -= self._shift * dr.round(height / self._shift)
+            points.append((point, local.z - point.at, height))
         return points
 
     def _cusp_enclosures(
         self, local: _PointBranches, d: Vec3, projection: Complex
     ) -> list[Enclosure]:
-        """Enclosures along a ray from branch points where all branches meet.
+        """Proofs of lengths of a ray on which f takes none of the levels (the values that rays look
+        for), one for each branch point where all branches meet: they are near one value there, and
+        the ray is at another height.
 
         local: all branches at the sample on the ray.
         d: the direction of the ray.
-        projection: its projection to the complex plane.
+        projection: the projection of d to the complex plane.
         """
         enclosures: list[Enclosure] = []
         speed = abs(projection)
-        for point, offset, y in self._bounded_branch_points(local):
-            t_closest = -(offset.real * projection.real + offset.imag * projection.imag) / speed
-            t_closest = dr.select(speed > 0, t_closest, 0)
-            min_offset = (
+        for point, offset, height in self._bounded_branch_points(local):
+            # The position and the distance at which the ray's projection passes the branch point
+            # nearest.
+            closest_position = (
+                -(offset.real * projection.real + offset.imag * projection.imag) / speed
+            )
+            closest_position = dr.select(speed > 0, closest_position, 0)
+            min_distance = (
                 dr.abs(offset.real * projection.imag - offset.imag * projection.real) / speed
             )
-            min_offset = dr.select(speed > 0, min_offset, abs(offset)) + local.rounding
-            fall = dr.abs(d.z)
+            min_distance = dr.select(speed > 0, min_distance, abs(offset)) + local.rounding
+            # How fast the ray's height approaches the common value. With a period there is one
+            # above and one below.
+            approach_rate = dr.abs(d.z)
             if self._shift is None:
-                fall = fmax(-dr.mulsign(d.z, y), 0)
-            gap = fmax(dr.abs(y) - local.error, 0)
-            inner_radius = 0 * y + point.radius * (1 - 1e-6) - local.rounding
-            cone = (point.power, self._height_factor * point.constant * (1 + 1e-5), inner_radius)
+                approach_rate = fmax(-dr.mulsign(d.z, height), 0)
+            gap = fmax(dr.abs(height) - local.error, 0)
+            inner_radius = 0 * height + point.radius * (1 - 1e-6) - local.rounding
+            bound = (point.power, self._height_factor * point.constant * (1 + 1e-5), inner_radius)
             distance = dr.abs(local.nearest.phi)
             enclosures.append(
                 BranchPointEnclosure(
-                    gap, fall, t_closest, min_offset, speed, *cone, distance, local.value >= 0
+                    gap,
+                    approach_rate,
+                    closest_position,
+                    min_distance,
+                    speed,
+                    *bound,
+                    distance,
+                    local.value >= 0,
                 )
             )
         return enclosures
 
     def _proved_distance(self, local: _PointBranches) -> Real:
-        """A proved lower bound of the distance to the surface near a branch point; 0 if there is no
-        such point.
+        """A proved lower bound of the distance from a point p of space to the surface, near a
+        branch point where all branches meet; 0 if there is no such point.
 
-        Let a be the branch point, p the sample above z, y the absolute height of p above the value
-        at a,  C and alpha the constant and the power of the bound at a. A ball of radius r about p
-        contains no point of the surface if C (|z - a| + r)^alpha <= y - r. So for any height m this
-        holds for each r with r <= m and C (|z - a| + r)^alpha <= y - m. The largest such r is
-        computed for two m: for y/2, and for the m at which C (|z - a| + m)^alpha is y, which is
-        nearly sharp where the surface is steep.
+        local: all branches at p.
+
+        Proof. Let a be the branch point, z the projection of p, y the absolute height of p above
+        the common value at a, and C and alpha the constant and the power of the bound at a. A ball
+        of radius r about p contains no point of the surface if C (|z - a| + r)^alpha <= y - r. So
+        for any height m this holds for each r with r <= m and C (|z - a| + r)^alpha <= y - m. The
+        largest such r is computed for two m: for y/2, and for the m at which C (|z - a| + m)^alpha
+        is y, which is nearly sharp where the surface is steep.
         """
         proved = 0 * local.h
         for point, offset, y in self._bounded_branch_points(local):
@@ -509,49 +592,57 @@ class RiemannSurface(Field):
     def _enclosure(
         self, local: _PointBranches, d: Vec3, projection: Complex, length: Real
     ) -> Enclosure:
-        """The enclosure of f from a sample along a ray, from all branches.
+        """A proof about f along a ray, from a sample on it and from bounds of all branches: how far
+        the ray can go before f takes a level, a value that rays look for.
 
         local: all branches at the sample.
         d: the direction of the ray.
-        projection: its projection to the complex plane.
-        length: the length of the ray on which the enclosure holds.
+        projection: the projection of d to the complex plane.
+        length: the length of the ray on which the proof holds.
         """
         segment = PlaneSegment(local.z, projection, length, local.rounding)
-        second = self._height_factor * self.branches.second_derivative_bound(segment)
+        second_bound = self._height_factor * self.branches.second_derivative_bound(segment)
         speed = abs(projection)
         # For the rounding of slopes, and of the position of the point.
         epsilon = backend_of(d).machine_epsilon
-        slope_error = dr.select(speed > 0, second * local.rounding, 0)
-        second = dr.select(speed > 0, second * dr.square(speed) * _BOUND_MARGIN, 0)
+        slope_error = dr.select(speed > 0, second_bound * local.rounding, 0)
+        # By the length along the ray, not along the plane. If the ray is vertical, f is linear on
+        # it.
+        second_bound = dr.select(speed > 0, second_bound * dr.square(speed) * _BOUND_MARGIN, 0)
 
         def slope_range(branch: _BranchValue, sign: Real) -> SlopeRange:
-            """An interval that contains the derivative of sign * phi along the ray, at the point of
-            the sample. phi is the height of the point minus that of the branch; the derivative is
-            computed with rounding."""
+            """An interval that contains the derivative of sign * phi along the ray at the sample,
+            where phi is the height of the point above the branch. It includes the rounding of the
+            derivative."""
             slope = branch.slope(d)
             size = dr.abs(branch.x * d.x) + dr.abs(branch.y * d.y) + dr.abs(d.z)
             return SlopeRange.around(sign * slope, 16 * epsilon * size + slope_error * speed)
 
+        # A single branch: f = phi has this slope, and second derivatives up to the bound.
         if self._is_single:
             return ParabolaEnclosure(
-                slope_range(local.nearest, local.sign), -second, second, length
+                slope_range(local.nearest, local.sign), -second_bound, second_bound, length
             )
         distance = dr.abs(local.nearest.phi)
-        unit = type(distance)(1)
+        one = type(distance)(1)
+        # For each branch: the range of the slope of |phi|, and by how much |phi| is larger than
+        # that of the nearest branch, with rounding subtracted.
         samples = tuple(
             BranchSample(
-                slope_range(branch, dr.mulsign(unit, branch.phi)),
+                slope_range(branch, dr.mulsign(one, branch.phi)),
                 dr.abs(branch.phi) - distance - self._extra_rounding(branch, local),
             )
             for branch in local.branches
         )
         nearest = BranchSample(
-            slope_range(local.nearest, dr.mulsign(unit, local.nearest.phi)), 0 * distance
+            slope_range(local.nearest, dr.mulsign(one, local.nearest.phi)), 0 * distance
         )
-        return NearestBranchEnclosure(samples, nearest, distance, local.value >= 0, second, length)
+        return NearestBranchEnclosure(
+            samples, nearest, distance, local.value >= 0, second_bound, length
+        )
 
     @staticmethod
     def _extra_rounding(branch: _BranchValue, local: _PointBranches) -> Real:
-        """By how much more phi of a branch may change by the rounding of z than phi of the nearest
-        branch; at least 0. phi is the height of the point minus that of the branch."""
+        """By how much more the rounding of z may change phi of this branch than phi of the nearest
+        branch; at least 0. phi is the height of the point above the branch."""
         return fmax(branch.steepness - local.nearest.steepness, 0) * local.rounding

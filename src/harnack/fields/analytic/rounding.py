@@ -1,9 +1,13 @@
-"""Bounds of the rounding of sums of solid harmonics, and of sums of waves.
+"""Bounds of the rounding errors of sums of solid harmonics, and of sums of waves. A solid harmonic
+r^l Y_lm of degree l and order m is a homogeneous harmonic polynomial; with x + iy = rho exp(ib), it
+is the product of a constant N, of a polynomial Q = Q_l^m in z and r^2 (`solid_harmonics`), and of
+rho^m times cos(mb) or sin(mb). A weight is the coefficient of a solid harmonic in a sum. A wave is
+a sine or cosine, or a product of these. All bounds are multiples of u, the unit roundoff (half of
+the machine epsilon of the precision in use).
 
-All bounds here are to first order in u, the unit roundoff (half of the machine epsilon of the
-precision in use). Each operation is exact up to a factor 1 + d with |d| <= u, so the relative
-errors of factors add up. In single precision the terms of second order are below 1e-4 of those of
-first order; `_SECOND_ORDER` covers them.
+The bounds are to first order in u. Each operation is exact up to a factor 1 + d with |d| <= u, so
+the relative errors of factors add up. In single precision the terms of second order are below 1e-4
+of those of first order; `_SECOND_ORDER` covers them.
 
 - `HarmonicRounding`: the rounding of `solid_harmonics.evaluate`.
 - `WaveRounding`: the rounding of `waves.evaluate_terms`.
@@ -44,16 +48,13 @@ _SECOND_ORDER = 1.03
 
 @dataclass(frozen=True)
 class HarmonicRounding:
-    """Bounds of the rounding errors of value and gradient of a sum of solid harmonics, as multiples
-    of the unit roundoff u.
+    """Bounds of the rounding errors of the value and the gradient of a sum of solid harmonics, as
+    multiples of the unit roundoff u. They hold at a point of the unit ball, and depend on its
+    distances rho from the z axis and r from the origin.
 
-    They hold at a point of the unit ball, and depend on its distances rho from the z axis and r
-    from the origin.
-
-    value_bounds, gradient_bounds: two bounds each, of which the smaller one is used. The first is
-        sharp near the z axis: it is a sum of terms c rho^m r^(l-m). The second is a sum of terms c
-        r^l, whose c are computed from the largest error on the unit sphere; away from the axis it
-        is smaller.
+    value_bounds, gradient_bounds: two bounds each; the smaller one is used. The first is sharp near
+        the z axis: it is a sum of terms c rho^m r^(l-m). The second is a sum of terms c r^l, whose
+        c are computed from the largest error on the unit sphere; away from the axis it is smaller.
     underflow: the error of the value by underflow, in smallest normal numbers.
 
     Let z = r c, so that c is the cosine of the polar angle.
@@ -84,106 +85,116 @@ class HarmonicRounding:
 
     @classmethod
     def of(cls, weights: Weights, *, is_divided: bool) -> HarmonicRounding:
-        """The bounds for the sum of solid harmonics with these weights, as
+        """Compute the bounds for the sum of solid harmonics with these weights, as
         `solid_harmonics.evaluate` computes it.
 
-        weights: (l, m) -> coefficient.
+        weights: a mapping (l, m) -> coefficient.
         is_divided: whether points are divided by a size other than 1 before.
         """
+        # The terms of the four bounds, as (power of rho, power of r) -> coefficient.
         tables: list[dict[tuple[int, int], float]] = [{}, {}, {}, {}]
-        orders = len({m for _, m in weights})
+        order_count = len({m for _, m in weights})
         underflow = 1.0
         for (l, m), amplitude in amplitudes(weights).items():  # noqa: E741
             # The amplitude stands for two columns: cos(m b) and sin(m b), at right angles.
-            terms = max(sum(order == k for _, order in weights) for k in (m, -m))
-            sums = (terms - 1) + (orders - 1)
-            size = amplitude * legendre_weight(l, m)
-            value_near, value_anywhere = _value_errors(l, m, sums, is_divided)
-            steep_near, steep_anywhere = _slope_errors(l, m, sums, is_divided) if l else (0.0, 0.0)
-            power = max(m - 1, 0)
-            for table, i, degree, constant in (
+            term_count = max(sum(order == k for _, order in weights) for k in (m, -m))
+            addition_count = (term_count - 1) + (order_count - 1)
+            factor = amplitude * legendre_weight(l, m)
+            value_near, value_anywhere = _value_errors(l, m, addition_count, is_divided)
+            steep_near, steep_anywhere = (
+                _slope_errors(l, m, addition_count, is_divided) if l else (0.0, 0.0)
+            )
+            rho_power = max(m - 1, 0)
+            for terms, i, degree, constant in (
                 (tables[0], m, l, value_near),
                 (tables[1], 0, l, value_anywhere),
-                (tables[2], power, l - 1, steep_near),
+                (tables[2], rho_power, l - 1, steep_near),
                 (tables[3], 0, l - 1, steep_anywhere),
             ):
+                # rho^i r^(degree - i)
                 if degree >= i:
-                    table[i, degree - i] = table.get((i, degree - i), 0.0) + size * constant
-            underflow += 2.0 + size * _underflow(l, m)
-        a, b, c, d = (AxialBound.of(table) for table in tables)
+                    terms[i, degree - i] = terms.get((i, degree - i), 0.0) + factor * constant
+            underflow += 2.0 + factor * _underflow(l, m)
+        a, b, c, d = (AxialBound.of(terms) for terms in tables)
         return cls((a, b), (c, d), underflow)
 
     def value_error(self, rho: Real, r: Real) -> Real:
-        """The bound for the value, in units of u, at distances rho from the z axis and r from the
-        origin."""
+        """The bound of the error of the value, in units of u, at a point with the distances rho
+        from the z axis and r from the origin."""
         near, anywhere = self.value_bounds
         return fmin(near(rho, r), anywhere(rho, r))
 
     def gradient_error(self, rho: Real, r: Real) -> Real:
-        """The bound for the length of the gradient's error, in units of u, at distances rho from
-        the z axis and r from the origin."""
+        """The bound of the error of the gradient, as a length in units of u, at a point with the
+        distances rho from the z axis and r from the origin."""
         near, anywhere = self.gradient_bounds
         return fmin(near(rho, r), anywhere(rho, r))
 
 
 @functools.cache
 def _recurrence(l: int, m: int) -> tuple[FloatArray, FloatArray, float]:  # noqa: E741
-    """|Q|, the rounding error of Q, and the sensitivity of its recurrence, for Q = Q_l^m/(2m-1)!!,
-    r = 1.
+    """Rounding errors of the recurrence by which the polynomials q_l = Q_l^m/(2m-1)!! are computed,
+    at points of the unit sphere with `_SAMPLES` + 1 polar angles. `HarmonicRounding` has the
+    formulas.
 
-    Returns, at `_SAMPLES` + 1 polar angles, the arrays |Q| and a bound of its error in units of u;
-    and the factor for underflow: the sum over the steps k of the recurrence of the largest |G_lk|
-    (see `HarmonicRounding`) times the sum of the step's coefficients plus 2.
+    Returns an array of |q_l|; an array of bounds of its error in units of u; and the factor for
+    underflow: the sum over the steps k of the recurrence of the largest |G_lk| (by which an error
+    of step k has grown at step l) times the sum of the step's coefficients plus 2.
     """
-    c, _ = polar_samples(_SAMPLES)
-    q = Legendre(c, 1.0)
-    zeros, ones = 0.0 * c, 0.0 * c + 1.0
+    cosine, _ = polar_samples(_SAMPLES)
+    q = Legendre(cosine, 1.0)
+    zeros, ones = 0.0 * cosine, 0.0 * cosine + 1.0
     if l < m:
         return zeros, zeros, 0.0
+    # For each step k: the error that it adds, and its growth G_lk up to step l.
     error, underflow_factor = zeros.copy(), 0.0
     for k in range(m + 1, l + 1):
-        a, b = (2 * k - 1) / (k - m), (k + m - 1) / (k - m)
-        step_error = 4 * np.abs(a * c * q(k - 1, m))
+        z_coefficient, square_coefficient = (2 * k - 1) / (k - m), (k + m - 1) / (k - m)
+        step_error = 4 * np.abs(z_coefficient * cosine * q(k - 1, m))
         if k > m + 1:
-            step_error = step_error + 7 * np.abs(b * q(k - 2, m))
+            step_error = step_error + 7 * np.abs(square_coefficient * q(k - 2, m))
         last_growth, growth = zeros, ones
         for j in range(k + 1, l + 1):
-            next_growth = (2 * j - 1) / (j - m) * c * growth - (j + m - 1) / (j - m) * last_growth
+            next_growth = (2 * j - 1) / (j - m) * cosine * growth - (j + m - 1) / (
+                j - m
+            ) * last_growth
             last_growth, growth = growth, next_growth
         error = error + np.abs(growth) * step_error
-        underflow_factor += float(np.abs(growth).max()) * (a + b + 2.0)
+        underflow_factor += float(np.abs(growth).max()) * (z_coefficient + square_coefficient + 2.0)
     return np.abs(q(l, m) + zeros), error, underflow_factor
 
 
 def _complex_power_error(m: int) -> float:
-    """A bound of the relative error of (x + iy)^m, in units of u."""
+    """A bound of the relative error of the computed power (x + iy)^m, in units of u."""
     return 2 * math.sqrt(2) * max(m - 1, 0)
 
 
-def _value_errors(l: int, m: int, sums: int, is_divided: bool) -> tuple[float, float]:  # noqa: E741
-    """Two bounds for the error of the value of r^l Y_lm / `legendre_weight`.
+def _value_errors(l: int, m: int, addition_count: int, is_divided: bool) -> tuple[float, float]:  # noqa: E741
+    """Two bounds of the error of the computed value of a solid harmonic r^l Y_lm, divided by
+    `legendre_weight`. The first one is in units of u rho^m r^(l-m), the second one in units of u
+    r^l.
 
-    The first one is in units of u rho^m r^(l-m), the second one in units of u r^l.
-
-    sums: the number of additions in which the term takes part.
+    addition_count: the number of additions in which the term takes part.
     is_divided: whether the point was divided by a size.
     """
-    q, error, _ = _recurrence(l, m)
-    c, s = polar_samples(_SAMPLES)
-    total = error + (3 + sums + _complex_power_error(m)) * q
+    abs_q, q_error, _ = _recurrence(l, m)
+    cosine, sine = polar_samples(_SAMPLES)
+    total = q_error + (3 + addition_count + _complex_power_error(m)) * abs_q
     if is_divided:
         at_next, at_lower = _recurrence(l - 1, m + 1)[0], _recurrence(l - 1, m)[0]
-        total = total + 3 * (m * q + (2 * m + 1) * s * s * at_next + np.abs(c) * (l + m) * at_lower)
-    return _largest_sample(total), _largest_sample(total * s**m)
+        # 3u (rho |f_rho| + |z f_z|), by the derivatives of Q rho^m.
+        total = total + 3 * (
+            m * abs_q + (2 * m + 1) * sine * sine * at_next + np.abs(cosine) * (l + m) * at_lower
+        )
+    return _largest_sample(total), _largest_sample(total * sine**m)
 
 
-def _slope_errors(l: int, m: int, sums: int, is_divided: bool) -> tuple[float, float]:  # noqa: E741
-    """Two bounds for the error of the gradient of r^l Y_lm / `legendre_weight`, as a length.
+def _slope_errors(l: int, m: int, addition_count: int, is_divided: bool) -> tuple[float, float]:  # noqa: E741
+    """Two bounds of the error of the computed gradient of a solid harmonic r^l Y_lm, as a length,
+    divided by `legendre_weight`. The first one is in units of u rho^(m-1) r^(l-m) (for m = 0: of u
+    r^(l-1)), the second one in units of u r^(l-1).
 
-    The first one is in units of u rho^(m-1) r^(l-m) (for m = 0: of u r^(l-1)), the second one in
-    units of u r^(l-1).
-
-    sums: the number of additions in which the term takes part.
+    addition_count: the number of additions in which the term takes part.
     is_divided: whether the point was divided by a size.
 
     The errors in the order in which `solid_harmonics.evaluate` computes: 4u for weights,
@@ -192,37 +203,39 @@ def _slope_errors(l: int, m: int, sums: int, is_divided: bool) -> tuple[float, f
     H is the Hessian and f_z = (l+m) Q_(l-1)^m B, with B = C_m or S_m, has the degree l-1 and the
     order m; and 3u for the division of the gradient by the size.
     """
-    _, s = polar_samples(_SAMPLES)
-    operations = 4 + 2 + 2 * sums + _complex_power_error(m) + (3 if is_divided else 0)
-    q, q_error, _ = _recurrence(l, m)
+    _, sine = polar_samples(_SAMPLES)
+    operations = 4 + 2 + 2 * addition_count + _complex_power_error(m) + (3 if is_divided else 0)
+    abs_q, q_error, _ = _recurrence(l, m)
     at_next, next_error, _ = _recurrence(l - 1, m + 1)
     at_lower, lower_error, _ = _recurrence(l - 1, m)
-    power = s if m > 0 else 0.0 * s + 1.0
-    radial = s * power * (2 * m + 1) * (next_error + operations * at_next)
-    azimuthal = m * (q_error + operations * q)
+    power = sine if m > 0 else 0.0 * sine + 1.0
+    # The errors of the components of the gradient along rho, azimuth and z, divided by rho^(m-1).
+    radial = sine * power * (2 * m + 1) * (next_error + operations * at_next)
+    azimuthal = m * (q_error + operations * abs_q)
     axial = power * (l + m) * (lower_error + operations * at_lower)
     total = np.hypot(radial + azimuthal, axial)
-    near, anywhere = _largest_sample(total), _largest_sample(total * s ** max(m - 1, 0))
+    near_axis, anywhere = _largest_sample(total), _largest_sample(total * sine ** max(m - 1, 0))
     if is_divided:
         # On the sphere |H| <= l (l-1) M and |grad f_z| <= (l-1) l M: see `BallRange.curvature`.
         division = 3 * largest_hessian(l, m) / legendre_weight(l, m)
         if l > m:
             division += 3 * (l + m) * largest_gradient(l - 1, m) / legendre_weight(l - 1, m)
-        near += division
-        anywhere += min(division, 6 * l * (l - 1) * _largest_sample(q * s**m))
-    return near, anywhere
+        near_axis += division
+        anywhere += min(division, 6 * l * (l - 1) * _largest_sample(abs_q * sine**m))
+    return near_axis, anywhere
 
 
 def _largest_sample(sampled: FloatArray) -> float:
-    """The largest sample, times `_SECOND_ORDER`, which covers values between samples."""
+    """The largest of the samples, times a factor that covers values between samples
+    (`_SECOND_ORDER`)."""
     return float(sampled.max()) * _SECOND_ORDER
 
 
 def _underflow(l: int, m: int) -> float:  # noqa: E741
-    """A bound of the error of r^l Y_lm / `legendre_weight` by underflow, in smallest normal
-    numbers."""
-    q, _, factors = _recurrence(l, m)
-    return factors + (2 * m + 2) * float(q.max()) + 2
+    """A bound of the error of a computed solid harmonic r^l Y_lm by underflow, divided by
+    `legendre_weight`, in smallest normal numbers."""
+    abs_q, _, factors = _recurrence(l, m)
+    return factors + (2 * m + 2) * float(abs_q.max()) + 2
 
 
 # The rounding of a sine or cosine in units of u (`backend.elementary.sincos`).
@@ -235,7 +248,8 @@ _LinearBound: TypeAlias = tuple[float, float, float, float]
 @dataclass(frozen=True)
 class WaveRounding:
     """Bounds of the rounding errors of a sum of waves at a point p, as multiples of the unit
-    roundoff u.
+    roundoff u. A term of the sum is a plane wave or a product of sines and cosines, its factors. A
+    part of the rounding acts as if the point were moved; it is kept apart from the rest.
 
     move: (x, y, z). Rounding that is the same for all terms acts as if p were moved, in each
         coordinate by this number times the absolute value of the coordinate.
@@ -266,73 +280,84 @@ class WaveRounding:
 
     @classmethod
     def of(cls, terms: Sequence[Term]) -> WaveRounding:
-        """The bounds of the rounding errors that `evaluate_terms` makes when it sums these
-        terms."""
+        """Compute the bounds of the rounding errors that `evaluate_terms` makes when it sums these
+        terms of waves."""
         common_frequencies = [_common_frequency(terms, axis) for axis in range(3)]
-        value, gradient, total_slopes, second = ([0.0] * 4 for _ in range(4))
-        sizes, slopes, seconds = 0.0, 0.0, 0.0
+        value, gradient, total_slopes, hessian = ([0.0] * 4 for _ in range(4))
+        value_sum, slope_sum, second_sum = 0.0, 0.0, 0.0
         for n, term in enumerate(terms):
-            size, vector = abs(term.amplitude), _wave_vector(term)
+            amplitude, vector = abs(term.amplitude), _wave_vector(term)
             norm = math.sqrt(sum(k * k for k in vector))
-            second_size = size * norm * norm
-            sizes, slopes, seconds = sizes + size, slopes + size * norm, seconds + second_size
-            angle, per_axis, operations = _term_roundings(term, common_frequencies)
-            _, all_per_axis, _ = _term_roundings(term, (None, None, None))
-            partial = (sizes, slopes, seconds) if n else (0.0, 0.0, 0.0)  # the first sum is exact
-            value[0] += size * (angle + operations) + partial[0]
-            gradient[0] += size * norm * (angle + operations + 2) + partial[1]
-            second[0] += second_size * (angle + operations + 6) + partial[2]
+            second_size = amplitude * norm * norm
+            # Bounds of the sums so far, each of which is rounded.
+            value_sum, slope_sum, second_sum = (
+                value_sum + amplitude,
+                slope_sum + amplitude * norm,
+                second_sum + second_size,
+            )
+            angle_error, axis_errors, other_errors = _term_roundings(term, common_frequencies)
+            _, all_axis_errors, _ = _term_roundings(term, (None, None, None))
+            partial_sums = (
+                (value_sum, slope_sum, second_sum) if n else (0.0, 0.0, 0.0)
+            )  # the first sum is exact
+            value[0] += amplitude * (angle_error + other_errors) + partial_sums[0]
+            gradient[0] += amplitude * norm * (angle_error + other_errors + 2) + partial_sums[1]
+            hessian[0] += second_size * (angle_error + other_errors + 6) + partial_sums[2]
             for axis in range(3):
-                value[axis + 1] += size * per_axis[axis]
-                gradient[axis + 1] += size * norm * per_axis[axis]
-                total_slopes[axis + 1] += size * norm * all_per_axis[axis]
-                second[axis + 1] += second_size * all_per_axis[axis]
+                value[axis + 1] += amplitude * axis_errors[axis]
+                gradient[axis + 1] += amplitude * norm * axis_errors[axis]
+                total_slopes[axis + 1] += amplitude * norm * all_axis_errors[axis]
+                hessian[axis + 1] += second_size * all_axis_errors[axis]
         total_slopes[0] = gradient[0]
         moves = [0.0 if k is None else _product_rounding(k) for k in common_frequencies]
-        a, b, c, d = ((s[0], s[1], s[2], s[3]) for s in (value, gradient, total_slopes, second))
+        a, b, c, d = ((s[0], s[1], s[2], s[3]) for s in (value, gradient, total_slopes, hessian))
         return cls((moves[0], moves[1], moves[2]), a, b, c, d)
 
     def errors(self, p: Vec3, gradient: Vec3) -> tuple[Real, Real]:
-        """Bounds of the errors of value and gradient at p.
+        """Bounds of the errors of the computed value and gradient of the sum at p. That of the
+        gradient is the difference from the exact gradient at the point moved by `move`, as a
+        length.
 
         gradient: the computed gradient at p.
-
-        The bound for the gradient is that of its difference from the exact gradient at the point
-        moved by `move`.
         """
-        size = [dr.abs(p.x), dr.abs(p.y), dr.abs(p.z)]
+        abs_p = [dr.abs(p.x), dr.abs(p.y), dr.abs(p.z)]
         value, slope = self.value[0], self.gradient[0]
         for axis in range(3):
             if self.move[axis] > 0:
-                value = value + self.move[axis] * size[axis] * dr.abs(gradient[axis])
+                value = value + self.move[axis] * abs_p[axis] * dr.abs(gradient[axis])
             if self.value[axis + 1] > 0:
-                value = value + self.value[axis + 1] * size[axis]
-                slope = slope + self.gradient[axis + 1] * size[axis]
-        unit = float(dr.epsilon(type(p.x)))
-        return unit * (value + 0 * p.x), unit * (slope + 0 * p.x)
+                value = value + self.value[axis + 1] * abs_p[axis]
+                slope = slope + self.gradient[axis + 1] * abs_p[axis]
+        roundoff = float(dr.epsilon(type(p.x)))
+        return roundoff * (value + 0 * p.x), roundoff * (slope + 0 * p.x)
 
     def derivative_errors(self, p: Vec3) -> tuple[Real, Real]:
-        """Bounds of the errors of gradient and Hessian, relative to the exact ones at p itself."""
-        unit = float(dr.epsilon(type(p.x)))
+        """Bounds of the errors of the computed gradient and Hessian of the sum, compared with the
+        exact ones at p itself: a length, and a matrix norm."""
+        roundoff = float(dr.epsilon(type(p.x)))
 
         def at(parts: _LinearBound) -> Real:
-            """The bound at p."""
+            """The bound constant + x |p_x| + y |p_y| + z |p_z| at p. parts: (constant, x, y, z)."""
             terms = (rate * dr.abs(x) for rate, x in zip(parts[1:], p, strict=True))
-            return unit * (parts[0] + sum(terms, 0 * p.x))
+            return roundoff * (parts[0] + sum(terms, 0 * p.x))
 
         return at(self.slopes), at(self.hessian)
 
 
 def _wave_vector(term: Term) -> tuple[float, ...]:
-    """The wave vector of a plane wave, or the frequencies of the factors of a product."""
+    """The wave vector of a plane wave; for a product of sines and cosines the frequencies of its
+    factors."""
     if isinstance(term, PlaneWave):
         return term.wave_vector
     return tuple(factor.frequency for _, factor in term.factors)
 
 
 def _common_frequency(terms: Sequence[Term], axis: int) -> float | None:
-    """The absolute frequency of all factors along an axis; None if they differ, if there are none,
-    or if a plane wave has a component along the axis."""
+    """The absolute frequency of all factors (sines and cosines) of one coordinate; None if they
+    differ, if there are none, or if a plane wave has a component along this axis.
+
+    axis: the index of the coordinate.
+    """
     frequencies: set[float] = set()
     for term in terms:
         if isinstance(term, PlaneWave):
@@ -346,19 +371,21 @@ def _common_frequency(terms: Sequence[Term], axis: int) -> float | None:
 
 
 def _product_rounding(frequency: float) -> float:
-    """The error of frequency times coordinate as a multiple of u, the frequency's rounding
-    included: 0 if the frequency is a power of two, else 2."""
+    """The error of the computed product of frequency and coordinate, as a multiple of u times the
+    product. It includes the rounding of the frequency: 0 if the frequency is a power of two, else
+    2."""
     return 0.0 if abs(math.frexp(frequency)[0]) == 0.5 else 2.0
 
 
 def _term_roundings(term: Term, common: Sequence[float | None]) -> tuple[float, list[float], float]:
-    """The rounding errors of a term of amplitude 1, in units of u.
+    """The rounding errors of a term (a plane wave or a product of sines and cosines) of amplitude
+    1, in units of u.
 
     common: for each axis the frequency that all terms share, or None. The error of a product with a
         shared frequency is left out, as it counts as a move of the point.
 
-    Returns the constant part of the errors of its angles, their part for each axis in units of the
-    absolute value of that coordinate, and the error of the other operations.
+    Returns the constant part of the errors of its angles; their part for each axis, in units of the
+    absolute value of that coordinate; and the error of the other operations.
     """
     if isinstance(term, PlaneWave):
         operations = _SINE + 2
@@ -372,7 +399,8 @@ def _term_roundings(term: Term, common: Sequence[float | None]) -> tuple[float, 
 
 
 def _angle_rounding(factor: WaveFactor, is_common: bool) -> float:
-    """The rounding error of a factor's angle, in units of u |k x|.
+    """The rounding error of the angle k x + phase of a sine or cosine, in units of u |k x|, without
+    the part 2u |phase|.
 
     is_common: whether all factors of the axis have this frequency k. The error of the product k x
         is then left out, as it counts as a move of the point.

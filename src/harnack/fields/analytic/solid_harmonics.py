@@ -1,12 +1,9 @@
-"""Real solid harmonics r^l Y_lm in Cartesian coordinates, up to degree 12, and their sums.
-
-For m >= 0, r^l Y_lm = N_lm Q_l^m(z, r^2) C_m(x, y). For m < 0, |m| takes the place of m in Q, and
-S_|m| the place of C_m. Here
-
-- C_m + i S_m = (x + iy)^m;
-- Q_l^m is r^(l-m) times the m-th derivative of the Legendre polynomial P_l at z/r, which is a
-  polynomial in z and r^2;
-- N_lm is the factor for which the integral of Y_lm^2 over the unit sphere is 1.
+"""Real solid harmonics r^l Y_lm in Cartesian coordinates, up to degree 12, and their sums. They are
+homogeneous harmonic polynomials of degree l; m, with -l <= m <= l, is called the order. For m >= 0,
+r^l Y_lm = N_lm Q_l^m(z, r^2) C_m(x, y); for m < 0, |m| takes the place of m in Q, and S_|m| the
+place of C_m. Here C_m + i S_m = (x + iy)^m; Q_l^m is r^(l-m) times the m-th derivative of the
+Legendre polynomial P_l at z/r, which is a polynomial in z and r^2; and N_lm is the factor for which
+the integral of Y_lm^2 over the unit sphere is 1. The weights of a sum are its coefficients c_lm.
 
 C_m, S_m and Q_l^m are computed by recurrences that lose no accuracy (for Q_l^m the upward
 recurrence of associated Legendre functions). A sum of monomials instead would lose three digits to
@@ -30,7 +27,7 @@ Monomials: TypeAlias = Mapping[tuple[int, int, int], float]  #: (i, j, k) -> tha
 
 
 def degree_and_order(key: Any) -> tuple[int, int]:
-    """The degree l and the order m as two ints, from a pair of integers.
+    """The degree l and the order m of a harmonic as two ints, from a pair of integers.
 
     key: the pair (l, m), any value that a user gave.
 
@@ -49,26 +46,29 @@ def degree_and_order(key: Any) -> tuple[int, int]:
 
 
 def normalization(l: int, m: int) -> float:  # noqa: E741
-    """The factor N_lm, for which the integral of Y_lm^2 over the unit sphere is 1."""
+    """The factor N_lm of the solid harmonic r^l Y_lm, for which the integral of Y_lm^2 over the
+    unit sphere is 1."""
     order = abs(m)
     ratio = math.factorial(l - order) / math.factorial(l + order)
     return math.sqrt((2 * l + 1) / (4 * math.pi) * ratio * (2 if order else 1))
 
 
 def odd_factorial(m: int) -> float:
-    """The product of the odd numbers (2m-1)!! = 1 * 3 * ... * (2m-1), which is the value of
-    Q_m^m."""
+    """The product of the odd numbers (2m-1)!! = 1 * 3 * ... * (2m-1), which is the value of the
+    polynomial Q_m^m."""
     return float(math.prod(range(1, 2 * m, 2)))
 
 
 def legendre_weight(l: int, m: int) -> float:  # noqa: E741
-    """The factor N_lm (2m-1)!! of the polynomial Q_l^m/(2m-1)!! in a solid harmonic, for m >= 0."""
+    """The factor N_lm (2m-1)!! that a solid harmonic has beside the polynomial Q_l^m/(2m-1)!!, for
+    m >= 0."""
     return normalization(l, m) * odd_factorial(m)
 
 
 class Legendre:
-    """The polynomials Q_l^m / (2m-1)!! at given z and r^2. Q_l^m is r^(l-m) times the m-th
-    derivative of the Legendre polynomial P_l at z/r. Each is computed once.
+    """The polynomials Q_l^m / (2m-1)!! at given z and r^2, computed when they are asked for, each
+    once. Q_l^m is r^(l-m) times the m-th derivative of the Legendre polynomial P_l at z/r, and
+    (2m-1)!! is the product of the odd numbers up to 2m-1.
 
     Without the division by (2m-1)!!, which is Q_m^m, values would leave the range of float32. The
     factors `legendre_weight` of a sum contain it.
@@ -82,7 +82,11 @@ class Legendre:
         self._known: dict[tuple[int, int], Any] = {}
 
     def __call__(self, l: int, m: int) -> Any:  # noqa: E741
-        """Q_l^m / (2m-1)!! for m >= 0; 0.0 for l < m."""
+        """The polynomial Q_l^m / (2m-1)!! at the given z and r^2, for m >= 0; 0.0 for l < m.
+
+        It follows from those of the degrees l-1 and l-2: (l-m) Q_l = (2l-1) z Q_(l-1) - (l+m-1) r^2
+        Q_(l-2).
+        """
         if l <= m:
             return 1.0 if l == m else 0.0
         if (l, m) not in self._known:
@@ -95,7 +99,7 @@ class Legendre:
 
 
 def evaluate(weights: Weights, x: Any, y: Any, z: Any) -> tuple[Any, tuple[Any, Any, Any]]:
-    """Value and gradient of the sum of c_lm r^l Y_lm at points.
+    """The value and the gradient of the sum of c_lm r^l Y_lm at points.
 
     weights: the coefficients (l, m) -> c_lm.
     x, y, z: the coordinates, numbers or arrays.
@@ -114,27 +118,33 @@ def evaluate(weights: Weights, x: Any, y: Any, z: Any) -> tuple[Any, tuple[Any, 
         d/dx = -x Q_(l-1)^(m+1) S_m + m Q S_(m-1),   d/dz = (l+m) Q_(l-1)^m S_m,
         d/dy = -y Q_(l-1)^(m+1) S_m + m Q C_(m-1).
     """
-    q = Legendre(z, x * x + y * y + z * z)
+    legendre = Legendre(z, x * x + y * y + z * z)
     zero = 0.0 * z
-    f, gx, gy, gz = zero, zero, zero, zero
+    value, slope_x, slope_y, slope_z = zero, zero, zero, zero
     c, s, c_lower, s_lower = zero + 1.0, zero, zero, zero
     for m in range(max(abs(m) for _, m in weights) + 1):
         if m > 0:
+            # C_m and S_m by a complex product with x + iy; `_lower` are those of m - 1.
             c_lower, s_lower, c, s = c, s, x * c - y * s, x * s + y * c
+        # The orders m and -m. dx and dy are the derivatives of C_m or S_m, divided by m.
         for order, basis, dx, dy in ((m, c, c_lower, -s_lower), (-m, s, s_lower, c_lower)):
             if m == 0 and basis is s:
                 continue
-            column = [(key[0], w) for key, w in weights.items() if key[1] == order]
-            if not column:
+            degree_weights = [
+                (key[0], weight) for key, weight in weights.items() if key[1] == order
+            ]
+            if not degree_weights:
                 continue
-            at_m, at_next, rate = _slope_sums(sorted(column), m, q)
-            f = f + at_m * basis
-            gz = gz + rate * basis
-            gx = gx - (x * at_next) * basis
-            gy = gy - (y * at_next) * basis
+            # The sums over the degrees l of c_lm N_lm times Q_l^m, Q_(l-1)^(m+1) and (l+m)
+            # Q_(l-1)^m.
+            at_m, at_next, z_derivative = _slope_sums(sorted(degree_weights), m, legendre)
+            value = value + at_m * basis
+            slope_z = slope_z + z_derivative * basis
+            slope_x = slope_x - (x * at_next) * basis
+            slope_y = slope_y - (y * at_next) * basis
             if m > 0:
-                gx, gy = gx + (m * at_m) * dx, gy + (m * at_m) * dy
-    return f, (gx, gy, gz)
+                slope_x, slope_y = slope_x + (m * at_m) * dx, slope_y + (m * at_m) * dy
+    return value, (slope_x, slope_y, slope_z)
 
 
 def hessian(weights: Weights, x: Any, y: Any, z: Any) -> tuple[Any, Any, Any, Any, Any, Any]:
@@ -152,44 +162,52 @@ def hessian(weights: Weights, x: Any, y: Any, z: Any) -> tuple[Any, Any, Any, An
         xz = (l+m) (Q_(l-1)^m B_x - x Q_(l-2)^(m+1) B),
         yz = (l+m) (Q_(l-1)^m B_y - y Q_(l-2)^(m+1) B).
     """
-    q = Legendre(z, x * x + y * y + z * z)
+    legendre = Legendre(z, x * x + y * y + z * z)
     zero = 0.0 * z
-    total = [zero] * 6
+    sums = [zero] * 6
     powers = [(zero, zero), (zero, zero), (zero + 1.0, zero)]  # C and S of m-2, m-1, m
     for m in range(max(abs(m) for _, m in weights) + 1):
         if m > 0:
             c, s = powers[2]
             powers = [*powers[1:], (x * c - y * s, x * s + y * c)]
+        # C and S of the orders m - 2, m - 1 and m.
         (c2, s2), (c1, s1), (c, s) = powers
-        square = m * (m - 1)
+        falling_product = m * (m - 1)
+        # For the orders m and -m: B, B_x, B_y, B_xx and B_xy.
         bases = (
-            (m, (c, m * c1, -m * s1, square * c2, -square * s2)),
-            (-m, (s, m * s1, m * c1, square * s2, square * c2)),
+            (m, (c, m * c1, -m * s1, falling_product * c2, -falling_product * s2)),
+            (-m, (s, m * s1, m * c1, falling_product * s2, falling_product * c2)),
         )
         for order, basis in bases[: 2 if m else 1]:
-            column = [(key[0], w) for key, w in weights.items() if key[1] == order]
-            if column:
-                terms = _hessian_of_sums(_hessian_sums(sorted(column), m, q), basis, x, y)
-                total = [entry + term for entry, term in zip(total, terms, strict=True)]
-    return total[0], total[1], total[2], total[3], total[4], total[5]
+            degree_weights = [
+                (key[0], weight) for key, weight in weights.items() if key[1] == order
+            ]
+            if degree_weights:
+                terms = _hessian_of_sums(
+                    _hessian_sums(sorted(degree_weights), m, legendre), basis, x, y
+                )
+                sums = [entry + term for entry, term in zip(sums, terms, strict=True)]
+    return sums[0], sums[1], sums[2], sums[3], sums[4], sums[5]
 
 
 def unit_hessian(l: int, m: int, rho: Any, z: Any, azimuth: float, removed_power: int) -> Any:  # noqa: E741
-    """The Hessians (n, 3, 3) of the real solid harmonic r^l Y_lm, divided by rho^removed_power, at
-    n points of the unit sphere on one meridian.
+    """The Hessians (n, 3, 3) of the solid harmonic r^l Y_lm, divided by rho^removed_power, at n
+    points of the unit sphere with the same azimuth.
 
     l, m: degree and order, m >= 0; either removed_power is 0, or m >= 2 + removed_power.
     rho, z: (n,) the distances of the points from the z axis, and their z.
-    azimuth: the azimuth of the meridian, in radians.
+    azimuth: the azimuth of the points, in radians.
     removed_power: how many factors rho are left out. For m >= 2 every entry of the Hessian contains
         rho^(m-2). So the factors are left out of the formula, and the result is finite at rho = 0.
     """
 
     def power(n: int) -> Any:
-        """rho^(n - removed_power). If n < removed_power it is 1: the factor before it is 0 then."""
+        """rho^n / rho^removed_power. If n < removed_power it is 1, since the factor before it is 0
+        then."""
         return rho ** max(n - removed_power, 0)
 
     x, y = rho * math.cos(azimuth), rho * math.sin(azimuth)
+    # C_m = rho^m cos(m azimuth) and its derivatives by x, y, xx and xy.
     basis = (
         power(m) * math.cos(m * azimuth),
         m * power(m - 1) * math.cos((m - 1) * azimuth),
@@ -198,19 +216,21 @@ def unit_hessian(l: int, m: int, rho: Any, z: Any, azimuth: float, removed_power
         -m * (m - 1) * power(m - 2) * math.sin((m - 2) * azimuth),
     )
     sums = _hessian_sums([(l, 1.0)], m, Legendre(z, 1.0))
+    # The added 0 makes arrays of constants.
     xx, yy, zz, xy, xz, yz = (entry + 0.0 * z for entry in _hessian_of_sums(sums, basis, x, y))
     return np.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], axis=-1).reshape(-1, 3, 3)
 
 
 def _hessian_of_sums(sums: Sequence[Any], basis: Sequence[Any], x: Any, y: Any) -> tuple[Any, ...]:
-    """The second derivatives xx, yy, zz, xy, xz, yz of the sum over l of c_l N_lm Q_l^m B, by the
-    formulas of `hessian`.
+    """The second derivatives xx, yy, zz, xy, xz, yz of the sum over l of c_l N_lm Q_l^m B, where B
+    is C_m or S_m, by the formulas of `hessian`.
 
     sums: the six sums over l that `_hessian_sums` returns.
-    basis: B, B_x, B_y, B_xx, B_xy, where B is C_m or S_m and indices are derivatives.
+    basis: B, B_x, B_y, B_xx, B_xy, where indices are derivatives.
     """
     at_m, at_next, at_second, rate, rate_next, rate_twice = sums
     b, bx, by, bxx, bxy = basis
+    # By the formulas for xx, yy, zz, xy, xz and yz.
     return (
         (x * x * at_second - at_next) * b - 2 * x * at_next * bx + at_m * bxx,
         (y * y * at_second - at_next) * b - 2 * y * at_next * by - at_m * bxx,
@@ -224,59 +244,65 @@ def _hessian_of_sums(sums: Sequence[Any], basis: Sequence[Any], x: Any, y: Any) 
 def _hessian_sums(
     degree_weights: Sequence[tuple[int, float]], m: int, q: Legendre
 ) -> tuple[Any, Any, Any, Any, Any, Any]:
-    """The weighted sums over l that second derivatives need, for one order.
+    """For one order m, the six sums over the degrees l that second derivatives of a sum of solid
+    harmonics need.
 
     With c_l the weight of the degree l, these are the sums of c_l N_lm times Q_l^m, Q_(l-1)^(m+1),
     Q_(l-2)^(m+2), (l+m) Q_(l-1)^m, (l+m) Q_(l-2)^(m+1) and (l+m) (l+m-1) Q_(l-2)^m.
 
     degree_weights: (l, c_l) for all degrees l of the order.
     m: the absolute value of the order.
-    q: the polynomials Q_l^m at the points.
+    q: the polynomials Q_l^m/(2m-1)!! at the points.
     """
     at_m, at_next, rate = _slope_sums(degree_weights, m, q)
     at_second, rate_next, rate_twice = 0.0, 0.0, 0.0
     for l, weight in degree_weights:  # noqa: E741
-        a = weight * legendre_weight(l, m)
+        # The factors 2m + 1 and 2m + 3 turn (2m-1)!! into the double factorials of the orders m + 1
+        # and m + 2. Polynomials that are 0 are left out.
+        factor = weight * legendre_weight(l, m)
         if l > m + 1:
-            rate_twice = rate_twice + (a * (l + m) * (l + m - 1)) * q(l - 2, m)
+            rate_twice = rate_twice + (factor * (l + m) * (l + m - 1)) * q(l - 2, m)
         if l > m + 2:
-            rate_next = rate_next + (a * (l + m) * (2 * m + 1)) * q(l - 2, m + 1)
+            rate_next = rate_next + (factor * (l + m) * (2 * m + 1)) * q(l - 2, m + 1)
         if l > m + 3:
-            at_second = at_second + (a * (2 * m + 1) * (2 * m + 3)) * q(l - 2, m + 2)
+            at_second = at_second + (factor * (2 * m + 1) * (2 * m + 3)) * q(l - 2, m + 2)
     return at_m, at_next, at_second, rate, rate_next, rate_twice
 
 
 def _slope_sums(
     degree_weights: Sequence[tuple[int, float]], m: int, q: Legendre
 ) -> tuple[Any, Any, Any]:
-    """The weighted sums over l that values and gradients need, for one order.
+    """For one order m, the three sums over the degrees l that values and gradients of a sum of
+    solid harmonics need.
 
     With c_l the weight of the degree l, these are the sums of c_l N_lm times Q_l^m, Q_(l-1)^(m+1)
     and (l+m) Q_(l-1)^m.
 
     degree_weights: (l, c_l) for all degrees l of the order.
     m: the absolute value of the order.
-    q: the polynomials Q_l^m at the points.
+    q: the polynomials Q_l^m/(2m-1)!! at the points.
     """
     at_m, at_next, rate = 0.0, 0.0, 0.0
     for l, weight in degree_weights:  # noqa: E741
-        a = weight * legendre_weight(l, m)
-        at_m = at_m + a * q(l, m)
+        # The factor 2m + 1 below turns (2m-1)!! into the double factorial of the order m + 1.
+        # Polynomials that are 0 are left out.
+        factor = weight * legendre_weight(l, m)
+        at_m = at_m + factor * q(l, m)
         if l > m:
-            rate = rate + (a * (l + m)) * q(l - 1, m)
+            rate = rate + (factor * (l + m)) * q(l - 1, m)
         if l > m + 1:
-            at_next = at_next + (a * (2 * m + 1)) * q(l - 1, m + 1)
+            at_next = at_next + (factor * (2 * m + 1)) * q(l - 1, m + 1)
     return at_m, at_next, rate
 
 
 def laplacian(coefficients: Monomials) -> tuple[dict[tuple[int, int, int], float], float]:
-    """The Laplacian of a polynomial, and how large it is.
+    """The Laplacian of a polynomial, and a measure of how large it is.
 
-    coefficients: (i, j, k) -> coefficient of x^i y^j z^k.
+    coefficients: a mapping (i, j, k) -> coefficient of x^i y^j z^k.
 
     Returns the coefficients of the Laplacian, without those that are rounding errors; and the
-    largest ratio of the absolute value of a coefficient to the sum of the absolute values of the
-    terms of which it is the sum (0 to 1).
+    measure, from 0 to 1. Each coefficient of the Laplacian is a sum; the measure is the largest
+    ratio of the absolute value of a sum to the sum of the absolute values.
     """
     total: dict[tuple[int, int, int], float] = {}
     abs_sum: dict[tuple[int, int, int], float] = {}
@@ -284,23 +310,24 @@ def laplacian(coefficients: Monomials) -> tuple[dict[tuple[int, int, int], float
         for axis in range(3):
             n = powers[axis]
             if n >= 2:
-                lowered = (
+                lowered_powers = (
                     powers[0] - 2 * (axis == 0),
                     powers[1] - 2 * (axis == 1),
                     powers[2] - 2 * (axis == 2),
                 )
                 term = n * (n - 1) * coefficient
-                total[lowered] = total.get(lowered, 0.0) + term
-                abs_sum[lowered] = abs_sum.get(lowered, 0.0) + abs(term)
+                total[lowered_powers] = total.get(lowered_powers, 0.0) + term
+                abs_sum[lowered_powers] = abs_sum.get(lowered_powers, 0.0) + abs(term)
     largest_ratio = max((abs(total[k]) / abs_sum[k] for k in total if abs_sum[k] > 0), default=0.0)
     return {k: v for k, v in total.items() if abs(v) > 1e-12 * abs_sum[k]}, largest_ratio
 
 
 def from_monomials(coefficients: Monomials) -> dict[tuple[int, int], float]:
-    """The weights (l, m) -> c_lm of a harmonic polynomial, given by its monomials.
+    """The weights (l, m) -> c_lm of a harmonic polynomial as a sum of solid harmonics, from the
+    coefficients of its monomials.
 
-    coefficients: (i, j, k) -> coefficient of x^i y^j z^k; their degree is at most 12, and the
-        polynomial must be harmonic.
+    coefficients: a mapping (i, j, k) -> coefficient of x^i y^j z^k; their degree is at most 12, and
+        the polynomial must be harmonic.
 
     A harmonic function is determined by its values and its z-derivatives on the plane z = 0. For
     the part of degree l, these are Fourier series on the circle r = 1 of that plane, with
@@ -308,26 +335,32 @@ def from_monomials(coefficients: Monomials) -> dict[tuple[int, int], float]:
     1) for odd l - m (the z-derivatives). Their degree is at most 12, so 64 samples determine them
     exactly.
     """
-    n = 64
-    angles = 2 * np.pi * np.arange(n) / n
+    sample_count = 64
+    angles = 2 * np.pi * np.arange(sample_count) / sample_count
     x, y = np.cos(angles), np.sin(angles)
-    q = Legendre(0.0, 1.0)
+    legendre = Legendre(0.0, 1.0)
     weights: dict[tuple[int, int], float] = {}
     for l in range(max(sum(powers) for powers in coefficients) + 1):  # noqa: E741
-        parts = [np.zeros(n), np.zeros(n)]  # f_l and its z-derivative at z = 0
-        scale = 0.0
+        circle_values = [
+            np.zeros(sample_count),
+            np.zeros(sample_count),
+        ]  # f_l and its z-derivative at z = 0
+        largest_coefficient = 0.0
         for (i, j, k), coefficient in coefficients.items():
             if i + j + k == l:
-                scale = max(scale, abs(coefficient))
+                largest_coefficient = max(largest_coefficient, abs(coefficient))
                 if k < 2:
-                    parts[k] += coefficient * x**i * y**j
-        spectra = [np.fft.rfft(part) / n for part in parts]
+                    circle_values[k] += coefficient * x**i * y**j
+        spectra = [np.fft.rfft(part) / sample_count for part in circle_values]
         for m in range(l + 1):
-            odd = (l - m) % 2
-            size = legendre_weight(l, m)
-            size *= (l + m) * q(l - 1, m) if odd else q(l, m)
-            harmonic = complex(spectra[odd][m]) * (2 if m else 1) / size
-            for order, weight in ((m, harmonic.real), (-m, -harmonic.imag)):
-                if abs(weight) > 1e-13 * scale:
+            parity = (l - m) % 2
+            factor = legendre_weight(l, m)
+            factor *= (l + m) * legendre(l - 1, m) if parity else legendre(l, m)
+            # Its real part belongs to cos(m t), its negated imaginary part to sin(m t). For m > 0
+            # the spectrum has half of each.
+            fourier_coefficient = complex(spectra[parity][m]) * (2 if m else 1) / factor
+            for order, weight in ((m, fourier_coefficient.real), (-m, -fourier_coefficient.imag)):
+                # Smaller weights are rounding errors.
+                if abs(weight) > 1e-13 * largest_coefficient:
                     weights[l, order] = weight
     return weights

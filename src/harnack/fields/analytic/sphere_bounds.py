@@ -1,4 +1,12 @@
-"""Proved bounds of sums of solid harmonics, computed from samples by Bernstein's inequality.
+"""Proved bounds of sums f of solid harmonics, computed from samples by Bernstein's inequality. A
+solid harmonic r^l Y_lm of degree l and order m is a homogeneous harmonic polynomial; on the unit
+sphere it is the spherical harmonic Y_lm. Its weight is its coefficient in the sum. f_l is the part
+of f of degree l, the sum of the harmonics of this degree. For a point, r is the distance from the
+origin, rho the distance from the z axis, a the polar angle (from the z axis), and b the azimuth. A
+set of sample points covers the sphere within an angle if each point of the sphere is within this
+angle of a sample. Bernstein's inequality bounds the derivatives of a function along a great circle,
+a trigonometric polynomial, by its degree and its largest absolute value; so it bounds what the
+function does between samples.
 
 - `AxialBound`: bounds that depend on the distances rho from the z axis and r from the origin.
 - `BallRange`: ranges on spheres and balls about the origin.
@@ -47,16 +55,16 @@ _AZIMUTH_SAMPLES = 24
 
 @dataclass(frozen=True)
 class AxialBound:
-    """A bound of the form sum of c rho^i r^j with all c >= 0.
-
-    rho and r are the distances of a point from the z axis and from the origin.
+    """A bound, at a point, of the form sum of c rho^i r^j with all c >= 0, where rho and r are the
+    distances of the point from the z axis and from the origin.
 
     rows: (i, ((j, c), ...)) for each power i, with i and j decreasing.
 
-    r^l Y_lm vanishes to order |m| along the z axis and to order l at the origin. Near these places
-    it, its derivatives and their rounding errors are far smaller than elsewhere on the sphere of
-    radius r, and a useful bound must become small there, too. Since such a sum grows with rho and
-    with r, its value at (rho(p) + R, |p| + R) is a bound on the whole ball B(p, R).
+    A solid harmonic r^l Y_lm vanishes to order |m| along the z axis and to order l at the origin.
+    Near these places it, its derivatives and their rounding errors are far smaller than elsewhere
+    on the sphere of radius r, and a useful bound must become small there, too. Since such a sum
+    grows with rho and with r, its value at (rho(p) + R, |p| + R) is a bound on the whole ball B(p,
+    R).
 
     Every r^l Y_lm is homogeneous, so the constants c need only be computed on the unit sphere. Let
     Q = Q_l^m as in `solid_harmonics`, and x + iy = sin(a) exp(i b), z = cos(a) on that sphere.
@@ -69,7 +77,7 @@ class AxialBound:
 
     @classmethod
     def of(cls, terms: dict[tuple[int, int], float]) -> AxialBound:
-        """The bound with these terms, given as (i, j) -> c."""
+        """The bound sum of c rho^i r^j. terms: a mapping (i, j) -> c."""
         powers = sorted({i for i, _ in terms}, reverse=True)
         return cls(
             tuple(
@@ -84,13 +92,16 @@ class AxialBound:
         )
 
     def __call__(self, rho: Real, r: Real) -> Real:
-        """The value of the bound at distances rho and r, by Horner's rule in both variables."""
+        """The value of the bound at points with the distances rho from the z axis and r from the
+        origin, by Horner's rule in both variables."""
+        # The coefficient of each power of rho, a polynomial in r.
         outer = [(i, _horner([(j, 0.0 * r + c) for j, c in row], r)) for i, row in self.rows]
         return _horner(outer, rho) if outer else 0.0 * r
 
 
 def _horner(terms: list[tuple[int, Real]], x: Real) -> Real:
-    """The sum of c x^i over the terms (i, c); i decreases from term to term."""
+    """The polynomial that is the sum of c x^i over the terms (i, c), at x, by Horner's rule. The
+    powers i decrease from term to term."""
     (i, total), *rest = terms
     for j, c in rest:
         total, i = total * _power(x, i - j) + c, j
@@ -98,7 +109,7 @@ def _horner(terms: list[tuple[int, Real]], x: Real) -> Real:
 
 
 def _power(x: Real, n: int) -> Real:
-    """x^n for n >= 1 by squaring."""
+    """x^n for n >= 1, by repeated squaring."""
     half = None if n < 2 else _power(x, n // 2)
     if half is None:
         return x
@@ -107,34 +118,40 @@ def _power(x: Real, n: int) -> Real:
 
 def order_on_axis(weights: Weights) -> int:
     """The order to which a sum of solid harmonics, minus its constant term, vanishes along the z
-    axis.
+    axis: the smallest |m| of its terms.
 
-    weights: (l, m) -> coefficient. The order is the smallest |m|.
+    weights: a mapping (l, m) -> coefficient.
     """
     return min((abs(m) for l, m in weights if l > 0), default=0)  # noqa: E741
 
 
 def value_bound(weights: Weights) -> AxialBound:
-    """A bound of |f| for the sum f of solid harmonics with these weights: |r^l Y_lm| <= max(N
-    |Q(cos a)|) rho^m r^(l-m), where the maximum is over all polar angles a.
+    """A bound of |f|, as a sum of terms c rho^i r^j, for the sum f of solid harmonics with these
+    weights. rho and r are the distances from the z axis and from the origin. For each harmonic |r^l
+    Y_lm| <= max(N |Q(cos a)|) rho^m r^(l-m), where the maximum is over all polar angles a.
 
-    weights: (l, m) -> coefficient.
+    weights: a mapping (l, m) -> coefficient.
     """
     return _summed(weights, lambda l, m: (m, l, largest_value(l, m)))  # noqa: E741
 
 
 def gradient_bound(weights: Weights) -> AxialBound:
-    """A bound of |grad f| for the sum f with these weights.
+    """A bound of |grad f|, as a sum of terms c rho^i r^j, for the sum f of solid harmonics with
+    these weights. rho and r are the distances from the z axis and from the origin. A harmonic of
+    order m contributes a power rho^(m-1) (for m = 0: rho^0).
 
-    A term of order m contributes a power rho^(m-1) (for m = 0: rho^0).
+    weights: a mapping (l, m) -> coefficient.
     """
     return _summed(weights, lambda l, m: (max(m - 1, 0), l - 1, largest_gradient(l, m)))  # noqa: E741
 
 
 def hessian_bound(weights: Weights) -> AxialBound:
-    """A bound of the absolute directional second derivatives of the sum f with these weights.
+    """A bound of the absolute second derivatives along any direction, as a sum of terms c rho^i
+    r^j, for the sum of solid harmonics with these weights. rho and r are the distances from the z
+    axis and from the origin. A harmonic of order m contributes a power rho^(m-2) (for m < 2:
+    rho^0).
 
-    A term of order m contributes a power rho^(m-2) (for m < 2: rho^0).
+    weights: a mapping (l, m) -> coefficient.
     """
     return _summed(weights, lambda l, m: (max(m - 2, 0), l - 2, largest_hessian(l, m)))  # noqa: E741
 
@@ -142,12 +159,12 @@ def hessian_bound(weights: Weights) -> AxialBound:
 def _summed(weights: Weights, bound_of: Callable[[int, int], tuple[int, int, float]]) -> AxialBound:
     """The sum of the bounds of all terms of a sum of solid harmonics.
 
-    weights: (l, m) -> coefficient.
-    bound_of: a function (l, m >= 0) -> (i, d, c), for the bound c rho^i r^(d-i) of Y_lm; the term
-        is left out if d < i.
+    weights: a mapping (l, m) -> coefficient.
+    bound_of: a function of (l, m) with m >= 0 that returns (i, d, c), for the bound c rho^i r^(d-i)
+        of r^l Y_lm or of a derivative; the term is left out if d < i.
 
-    The orders m and -m are bounded together: their amplitude is the root of the sum of the squares
-    of their weights.
+    The orders m and -m are bounded together, by the root of the sum of the squares of their
+    weights.
     """
     terms: dict[tuple[int, int], float] = {}
     for (l, m), amplitude in amplitudes(weights).items():  # noqa: E741
@@ -159,10 +176,11 @@ def _summed(weights: Weights, bound_of: Callable[[int, int], tuple[int, int, flo
 
 
 def amplitudes(weights: Weights) -> dict[tuple[int, int], float]:
-    """For each (l, m) with m >= 0, the amplitude of the harmonics of degree l and orders m and -m
-    together: the root of the sum of the squares of their weights.
+    """For each (l, m) with m >= 0, the amplitude of the solid harmonics of degree l and orders m
+    and -m together: the root of the sum of the squares of their weights. (Together they are a
+    multiple of the cosine of m times a shifted azimuth.)
 
-    weights: (l, m) -> coefficient.
+    weights: a mapping (l, m) -> coefficient.
     """
     sizes: dict[tuple[int, int], float] = {}
     for (l, m), weight in weights.items():  # noqa: E741
@@ -177,15 +195,16 @@ def polar_samples(count: int = _POLAR_INTERVALS) -> tuple[FloatArray, FloatArray
 
 
 def _proved_maximum(sampled: FloatArray, degree: int) -> float:
-    """A bound of the largest absolute value of a trigonometric polynomial in the polar angle a.
+    """A bound of the largest absolute value of a trigonometric polynomial T in the polar angle a,
+    from samples.
 
-    sampled: its values at the angles of `polar_samples`.
-    degree: its degree, or more.
+    sampled: the values of T at the angles of `polar_samples`.
+    degree: the degree of T, or more.
 
-    Let A be the largest absolute value. Where it is taken, the slope is 0, and by Bernstein's
-    inequality the second derivative is at most degree^2 A everywhere. A sample is within half a
-    spacing of that place, so the samples fall short of A by at most e A, with e = (degree *
-    spacing/2)^2/2.
+    Proof. Let A be the largest absolute value. Where it is taken, the slope is 0, and by
+    Bernstein's inequality the second derivative is at most degree^2 A everywhere. A sample is
+    within half a spacing of that place, so the samples fall short of A by at most e A, with e =
+    (degree * spacing/2)^2/2.
     """
     e = 0.5 * (max(degree, 1) * 0.5 * math.pi / _POLAR_INTERVALS) ** 2
     return float(np.abs(sampled).max()) / (1 - e) * (1 + 1e-12)
@@ -193,8 +212,8 @@ def _proved_maximum(sampled: FloatArray, degree: int) -> float:
 
 @functools.cache
 def largest_value(l: int, m: int) -> float:  # noqa: E741
-    """A bound of N |Q(cos a)| over all polar angles a, where Y_lm = N Q(cos a) sin(a)^m times cos
-    or sin of m times the azimuth."""
+    """A bound of N |Q(cos a)| over all polar angles a, where the spherical harmonic is Y_lm = N
+    Q(cos a) sin(a)^m times cos or sin of m times the azimuth."""
     z, _ = polar_samples()
     return legendre_weight(l, m) * _proved_maximum(
         np.broadcast_to(Legendre(z, 1.0)(l, m), z.shape), l
@@ -203,7 +222,8 @@ def largest_value(l: int, m: int) -> float:  # noqa: E741
 
 @functools.cache
 def largest_gradient(l: int, m: int) -> float:  # noqa: E741
-    """A bound of |grad r^l Y_lm| / sin(a)^(m-1) on the unit sphere, for m >= 0 (m = 0: of |grad|).
+    """A bound of |grad r^l Y_lm| / sin(a)^(m-1) on the unit sphere, for m >= 0 (m = 0: of |grad|),
+    where a is the polar angle.
 
     Let B = rho^m cos(m b). The components of the gradient along rho and z are cos(m b) times the
     derivative of Q rho^m by rho and (l+m) Q_(l-1)^m rho^m; the component along the azimuth b is
@@ -227,22 +247,22 @@ def largest_gradient(l: int, m: int) -> float:  # noqa: E741
 @functools.cache
 def largest_hessian(l: int, m: int) -> float:  # noqa: E741
     """A bound of |v . H v| / sin(a)^(m-2) on the unit sphere for all unit vectors v (m < 2: of |v .
-    H v|).
+    H v|), where H is the Hessian of r^l Y_lm, m >= 0, and a the polar angle.
 
-    H is the Hessian of r^l Y_lm, m >= 0. For fixed components of v in cylindrical coordinates, v .
-    H v is of degree l in the polar angle a, and A cos(m b) + B sin(m b) in the azimuth b. The
-    largest absolute value of the latter is at most the largest sample at a spacing w of m b,
-    divided by cos(w/2).
+    Proof. For fixed components of v in cylindrical coordinates, v . H v is of degree l in the polar
+    angle a, and A cos(m b) + B sin(m b) in the azimuth b. The largest absolute value of the latter
+    is at most the largest sample at a spacing w of m b, divided by cos(w/2).
     """
     if l < 2:
         return 0.0
     z, rho = polar_samples()
     largest = 0.0
-    for angle in np.pi * np.arange(_AZIMUTH_SAMPLES) / _AZIMUTH_SAMPLES:
-        b = angle / max(m, 1)
-        hessians = unit_hessian(l, m, rho, z, float(b), removed_power=max(m - 2, 0))
-        sizes = np.abs(np.linalg.eigvalsh(hessians)).max(axis=1)
-        largest = max(largest, _proved_maximum(sizes, l))
+    for m_azimuth in np.pi * np.arange(_AZIMUTH_SAMPLES) / _AZIMUTH_SAMPLES:
+        azimuth = m_azimuth / max(m, 1)
+        hessians = unit_hessian(l, m, rho, z, float(azimuth), removed_power=max(m - 2, 0))
+        norms = np.abs(np.linalg.eigvalsh(hessians)).max(axis=1)
+        largest = max(largest, _proved_maximum(norms, l))
+        # Nothing depends on the azimuth.
         if m == 0:
             break
     return largest / math.cos(0.5 * math.pi / _AZIMUTH_SAMPLES)
@@ -256,8 +276,8 @@ _FRACTIONS = (0.25, 0.4, 0.55, 0.7, 0.85, 1.0)
 
 
 def unit_sphere(covering: float) -> FloatArray:
-    """Points (3, n) of the unit sphere. Each point of the sphere is within the angle `covering` of
-    one.
+    """Points (3, n) of the unit sphere that cover it: each point of the sphere is within the angle
+    `covering` of one.
 
     The points lie on rings at equal steps h of latitude, on each ring at equal steps w of
     longitude. The nearest one is within h/2 in latitude and w/2 in longitude. For two points with
@@ -268,35 +288,42 @@ def unit_sphere(covering: float) -> FloatArray:
     with sin b <= sin a + h/2.
     """
     chord = 2 * math.sin(0.5 * min(covering, math.pi))
-    rings = math.ceil(math.pi / (1.4 * chord)) + 1
-    h = math.pi / rings
+    ring_count = math.ceil(math.pi / (1.4 * chord)) + 1
+    h = math.pi / ring_count
     points: list[FloatArray] = []
-    for ring in range(rings):
-        a = (ring + 0.5) * h
+    for ring in range(ring_count):
+        polar_angle = (ring + 0.5) * h
         max_east_west = math.sqrt(chord**2 - (h / 2) ** 2)
-        w = 2 * max_east_west / math.sqrt(math.sin(a) * (math.sin(a) + h / 2))
+        # The largest w for which this bound is at most chord^2.
+        w = 2 * max_east_west / math.sqrt(math.sin(polar_angle) * (math.sin(polar_angle) + h / 2))
         longitude = 2 * math.pi * np.arange(n := math.ceil(2 * math.pi / w)) / n
-        sine = math.sin(a)
+        sine = math.sin(polar_angle)
         points.append(
-            np.stack((sine * np.cos(longitude), sine * np.sin(longitude), np.full(n, math.cos(a))))
+            np.stack(
+                (
+                    sine * np.cos(longitude),
+                    sine * np.sin(longitude),
+                    np.full(n, math.cos(polar_angle)),
+                )
+            )
         )
     return np.concatenate(points, axis=1)
 
 
 def proved_range(low: float, high: float, degree: int, covering: float) -> tuple[float, float]:
-    """Bounds of a polynomial on a sphere, from its extremes over a set of points of the sphere.
+    """Bounds (lower, upper) of a polynomial on a sphere, from its smallest and largest value over a
+    set of points of the sphere.
 
     low, high: the smallest and the largest value on the set.
     degree: the degree L of the polynomial.
     covering: an angle. Every point of the sphere is within this angle of the set.
 
-    Returns the lower and the upper bound.
-
     Proof. Let the true range be [c - A, c + A]. Take the great circle through a point with the
     largest value and the point of the set nearest to it. On this circle the polynomial is a
     trigonometric polynomial T of degree L with |T - c| <= A, so |T''| <= L^2 A by Bernstein's
     inequality. At the maximum T' = 0, hence `high` falls short of the maximum by at most e A, e =
-    (L covering)^2/2. The same holds for `low`. So 2A <= high - low + 2 e A.
+    (L covering)^2/2. The same holds for `low`. So 2A <= high - low + 2 e A, that is, A <= (high -
+    low)/2/(1 - e).
 
     Raises:
         ValueError: e >= 1, the points are too far apart.
@@ -304,32 +331,33 @@ def proved_range(low: float, high: float, degree: int, covering: float) -> tuple
     e = 0.5 * (degree * covering) ** 2
     if e >= 1:
         raise ValueError(f"the points are too far apart ({covering:g}) for degree {degree}")
-    half = 0.5 * (high - low) / (1 - e)
+    half_range = 0.5 * (high - low) / (1 - e)
     # The samples carry rounding errors of double precision, far below this.
-    margin = e * half + 1e-11 * (abs(low) + abs(high) + half)
+    margin = e * half_range + 1e-11 * (abs(low) + abs(high) + half_range)
     return low - margin, high + margin
 
 
 def range_of_harmonic(l: int, m: int) -> tuple[float, float]:  # noqa: E741
-    """A proved range (low, high) of Y_lm on the unit sphere, within 1e-5 of the true one.
+    """A proved range (low, high) of the spherical harmonic Y_lm on the unit sphere, within 1e-5 of
+    the true one.
 
-    For m = 0 all values are taken on a circle through the poles. Otherwise the factor cos(m phi) or
-    sin(m phi) takes both signs alike, so that the range is symmetric.
+    All absolute values are taken on the circle of azimuth 0 through the poles, and for m = 0 all
+    values. Otherwise the factor cos(m phi) or sin(m phi) takes both signs alike, so that the range
+    is symmetric.
     """
-    n = 8192
-    t = 2 * np.pi * np.arange(n) / n
-    values = evaluate({(l, abs(m)): 1.0}, np.sin(t), 0.0 * t, np.cos(t))[0]
-    low, high = proved_range(float(values.min()), float(values.max()), l, math.pi / n)
+    sample_count = 8192
+    polar_angle = 2 * np.pi * np.arange(sample_count) / sample_count
+    values = evaluate(
+        {(l, abs(m)): 1.0}, np.sin(polar_angle), 0.0 * polar_angle, np.cos(polar_angle)
+    )[0]
+    low, high = proved_range(float(values.min()), float(values.max()), l, math.pi / sample_count)
     return (low, high) if m == 0 else (-max(high, -low), max(high, -low))
 
 
 @dataclass(frozen=True)
 class BallRange:
-    """Bounds of a harmonic polynomial f = f_0 + f_1 + ... on balls |y| <= s, f_l homogeneous of
-    degree l.
-
-    By the maximum principle a range on a sphere is a range on its ball. The ranges are proved by
-    samples and Bernstein's inequality.
+    """Bounds of a harmonic polynomial f on balls |y| <= s about the origin. f = f_0 + f_1 + ...,
+    where f_l is its part that is homogeneous of degree l.
 
     constant: f_0.
     ends: (l, lower, upper) for l > 0, the range of f_l on the unit sphere. f_l has mean 0 there, so
@@ -337,6 +365,9 @@ class BallRange:
     spheres: (s, lower, upper), the range of f itself on a few spheres of radius s, which also holds
         for |y| <= s. As the f_l seldom have their extremes at the same point, this range is
         tighter.
+
+    By the maximum principle a range on a sphere is a range on its ball. The ranges are proved by
+    samples and Bernstein's inequality.
     """
 
     constant: float
@@ -345,7 +376,11 @@ class BallRange:
 
     @classmethod
     def of(cls, weights: Weights) -> BallRange:
-        """The bounds for the sum of solid harmonics with these weights, without `spheres`."""
+        """Compute the ranges of the parts of each degree, for the sum of solid harmonics with these
+        weights. `spheres` stays empty.
+
+        weights: a mapping (l, m) -> coefficient.
+        """
         constant, ends = 0.0, list[tuple[int, float, float]]()
         points, covering = _points(weights)
         for degree, values in _values(weights, points).items():
@@ -357,10 +392,10 @@ class BallRange:
         return cls(constant, tuple(ends))
 
     def with_spheres(self, weights: Weights, largest: float) -> BallRange:
-        """The same bounds of f, with ranges of f on six spheres up to the radius `largest`.
+        """The same bounds of f, with ranges of f on six spheres added, up to the radius `largest`.
 
-        weights: (l, m) -> coefficient, those of f. A polynomial with a single f_l besides f_0 is
-            returned unchanged.
+        weights: a mapping (l, m) -> coefficient, those of f. A polynomial with a single f_l besides
+            f_0 is returned unchanged, since such ranges would not be tighter.
         """
         if len(self.ends) < 2:
             return self
@@ -372,34 +407,37 @@ class BallRange:
         return BallRange(self.constant, self.ends, tuple(spheres))
 
     def by_degree(self, s: Real) -> tuple[Real, Real]:
-        """Lower and upper bound on |y| <= s, from `ends` only; s is a number or an array."""
+        """A lower and an upper bound of f on the ball |y| <= s, from the ranges of the parts f_l
+        alone. s: a number or an array."""
         lower = upper = 0.0 * s
-        top = max((degree for degree, _, _ in self.ends), default=0)
+        largest_degree = max((degree for degree, _, _ in self.ends), default=0)
         ends = {degree: (low, high) for degree, low, high in self.ends}
-        for degree in range(top, 0, -1):
+        for degree in range(largest_degree, 0, -1):
             low, high = ends.get(degree, (0.0, 0.0))
+            # Horner's rule.
             lower, upper = (lower + low) * s, (upper + high) * s
         return lower + self.constant, upper + self.constant
 
     def curvature(self, s: Real) -> Real:
-        """A bound of the absolute directional second derivatives v . H v on |y| <= s, s a number or
-        array.
+        """A bound of the absolute second derivatives v . H v of f along unit vectors v, on the ball
+        |y| <= s. s: a number or an array.
 
-        Let |f_l| <= M on the unit sphere. Then |grad f_l| <= l M there: along a great circle f_l is
-        a trigonometric polynomial T of degree l, its radial derivative is l T, and T'^2 + l^2 T^2
-        <= l^2 M^2 (Bernstein-Szego). A directional derivative of f_l is again homogeneous and
-        harmonic, of degree l-1, so |v . H v| <= l (l-1) M |y|^(l-2).
+        Proof. Let |f_l| <= M on the unit sphere. Then |grad f_l| <= l M there: along a great circle
+        f_l is a trigonometric polynomial T of degree l, its radial derivative is l T, and T'^2 +
+        l^2 T^2 <= l^2 M^2 (Bernstein-Szego). A directional derivative of f_l is again homogeneous
+        and harmonic, of degree l-1, so |v . H v| <= l (l-1) M |y|^(l-2).
         """
         return self._derivative(s, 2)
 
     def gradient(self, s: Real) -> Real:
-        """A bound of |grad f| on |y| <= s, from |grad f_l| <= l M |y|^(l-1), where M is the largest
-        |f_l| on the unit sphere. `curvature` has the proof."""
+        """A bound of |grad f| on the ball |y| <= s, from |grad f_l| <= l M |y|^(l-1), where M is
+        the largest |f_l| on the unit sphere. `curvature` has the proof. s: a number or an array."""
         return self._derivative(s, 1)
 
     def _derivative(self, s: Real, order: int) -> Real:
-        """The sum over l of l (l-1) .. (l-order+1) M_l s^(l-order), by Horner's rule, M_l = max
-        |f_l| on the unit sphere."""
+        """A bound of the derivatives of f of this order on the ball |y| <= s: the sum over l of l
+        (l-1) .. (l-order+1) M_l s^(l-order), by Horner's rule, where M_l is the largest |f_l| on
+        the unit sphere."""
         total = 0.0 * s
         max_abs = {degree: max(-low, high) for degree, low, high in self.ends}
         for degree in range(max(max_abs, default=0), order - 1, -1):
@@ -407,32 +445,36 @@ class BallRange:
         return total
 
     def at(self, s: Real) -> tuple[Real, Real]:
-        """Lower and upper bound on |y| <= s, from `ends` and `spheres`; s is a Dr.Jit array."""
+        """A lower and an upper bound of f on the ball |y| <= s, the tighter ones of those by degree
+        and those on spheres. s: a Dr.Jit array."""
         lower, upper = self.by_degree(s)
         for radius, low, high in self.spheres:
+            # The range on a sphere holds for all smaller balls.
             inside = s <= radius
             lower = fmax(dr.select(inside, low, -math.inf), lower)
             upper = fmin(dr.select(inside, high, math.inf), upper)
         return lower, upper
 
     def on_ball(self, s: float) -> tuple[float, float]:
-        """Lower and upper bound on |y| <= s, from `ends` and `spheres`; s is a Python number."""
+        """A lower and an upper bound of f on the ball |y| <= s, the tighter ones of those by degree
+        and those on spheres. s: a Python number."""
         bounds = [self.by_degree(s), *((low, high) for r, low, high in self.spheres if s <= r)]
         return max(low for low, _ in bounds), min(high for _, high in bounds)
 
 
 def _points(weights: Weights) -> tuple[FloatArray, float]:
-    """Sample points of the unit sphere for sums with these weights, an array (3, n); and an angle:
-    each point of the sphere is within it of a sample point.
+    """Sample points of the unit sphere that are dense enough for sums of solid harmonics with these
+    weights, an array (3, n); and an angle: each point of the sphere is within it of a sample point.
 
-    weights: (l, m) -> coefficient.
+    weights: a mapping (l, m) -> coefficient.
     """
     covering = _RESOLUTION / max(1, max(degree for degree, _ in weights))
     return unit_sphere(covering), covering
 
 
 def _values(weights: Weights, points: FloatArray) -> dict[int, FloatArray]:
-    """The values (n,) of each f_l at points (3, n) of the unit sphere, by degree l."""
+    """The values (n,) of the part f_l of each degree l at points (3, n) of the unit sphere, as a
+    mapping l -> values. f is the sum of solid harmonics with these weights."""
     degrees = sorted({degree for degree, _ in weights})
     return {
         degree: evaluate({k: w for k, w in weights.items() if k[0] == degree}, *points)[0]
@@ -441,9 +483,10 @@ def _values(weights: Weights, points: FloatArray) -> dict[int, FloatArray]:
 
 
 def sphere_range(values: dict[int, FloatArray], s: float, covering: float) -> tuple[float, float]:
-    """A proved range (low, high) of the sum of all f_l on the sphere of radius s.
+    """A proved range (low, high) of a harmonic polynomial on the sphere of radius s, the sum of its
+    parts f_l of each degree l.
 
-    values: the values of each f_l at points of the unit sphere, by degree l.
+    values: the values of each f_l at sample points of the unit sphere, by degree l.
     covering: an angle. Every point of the unit sphere is within this angle of one of these points.
     """
     total: FloatArray = np.sum([s**degree * v for degree, v in values.items()], axis=0)

@@ -1,10 +1,9 @@
-"""Sums of sine waves: their terms, values and gradients, and proved bounds of the sum.
-
-Every Laplacian eigenfunction that separates in Cartesian coordinates is a product of sines and
-cosines, and every such product is a sum of plane waves. Terms are evaluated as the user wrote them,
-because a product needs only one sine and one cosine for each coordinate. They are bounded as sums
-of plane waves.
-"""
+"""Sums of sine waves: their terms, values and gradients, and proved bounds of the sum. A term is
+either a plane wave A cos(k . p + phase) with a wave vector k, or a product of sines and cosines of
+single coordinates, called its factors. A factor is the sine or cosine of frequency * coordinate +
+phase. Every product is also a sum of plane waves. Terms are evaluated as the user wrote them,
+because a product needs only one sine and one cosine for each coordinate; they are bounded as sums
+of plane waves."""
 
 from __future__ import annotations
 
@@ -35,7 +34,8 @@ __all__ = [
 
 @dataclass(frozen=True)
 class WaveFactor:
-    """The factor sin(frequency * coordinate + phase), or cos, if `is_cosine`.
+    """The function sin(frequency * t + phase), or cos if `is_cosine`, of a single coordinate t, as
+    a factor of a product of waves.
 
     frequency: in radians per unit length, not 0.
     phase: in radians.
@@ -49,6 +49,7 @@ class WaveFactor:
     is_cosine: bool
 
     def __post_init__(self) -> None:
+        """Check the numbers, and convert them to Python floats."""
         check_no_derivatives("a factor of a wave", vars(self))
         for name in ("frequency", "phase"):
             object.__setattr__(
@@ -60,19 +61,22 @@ class WaveFactor:
 
 @no_derivatives
 def sine_factor(frequency: float = 1.0, phase: float = 0.0) -> WaveFactor:
-    """sin(frequency * coordinate + phase); frequency in radians per unit length."""
+    """The factor sin(frequency * coordinate + phase) of a product of waves. frequency is in radians
+    per unit length, phase in radians."""
     return WaveFactor(frequency, phase, False)
 
 
 @no_derivatives
 def cosine_factor(frequency: float = 1.0, phase: float = 0.0) -> WaveFactor:
-    """cos(frequency * coordinate + phase); frequency in radians per unit length."""
+    """The factor cos(frequency * coordinate + phase) of a product of waves. frequency is in radians
+    per unit length, phase in radians."""
     return WaveFactor(frequency, phase, True)
 
 
 @dataclass(frozen=True)
 class WaveProduct:
-    """The product of the amplitude and of the factors for x, y and z. None stands for no factor.
+    """A product of waves: the amplitude times the factors of x, y and z, each a sine or cosine of
+    that coordinate. None stands for no factor.
 
     WaveProduct(2.0, x=sine_factor(3.0), y=cosine_factor(4.0)) is 2 sin(3x) cos(4y), an
     eigenfunction of the Laplacian with eigenvalue -(9 + 16).
@@ -84,6 +88,7 @@ class WaveProduct:
     z: WaveFactor | None = None
 
     def __post_init__(self) -> None:
+        """Check the amplitude and the factors."""
         check_no_derivatives("a Product", vars(self))
         as_finite(self.amplitude, "the amplitude of a product")
         for name in "xyz":
@@ -95,20 +100,23 @@ class WaveProduct:
 
     @property
     def factors(self) -> tuple[tuple[int, WaveFactor], ...]:
-        """The pairs (axis, factor) for the coordinates that have a factor; axis is 0, 1 or 2."""
+        """The pairs (axis, factor) for the coordinates that have a factor; the axis is 0, 1 or 2
+        for x, y or z."""
         named = enumerate((self.x, self.y, self.z))
         return tuple((axis, factor) for axis, factor in named if factor is not None)
 
 
 @dataclass(frozen=True)
 class PlaneWave:
-    """amplitude * cos(wave_vector . p + phase): its Laplacian is -|wave_vector|^2 times itself."""
+    """The plane wave amplitude * cos(wave_vector . p + phase). Its Laplacian is -|wave_vector|^2
+    times itself."""
 
     amplitude: float
     wave_vector: tuple[float, float, float]
     phase: float = 0.0
 
     def __post_init__(self) -> None:
+        """Check the numbers, and convert the wave vector to a tuple of three floats."""
         check_no_derivatives("a PlaneWave", vars(self))
         as_finite(self.amplitude, "the amplitude of a plane wave")
         as_finite(self.phase, "the phase of a plane wave")
@@ -120,7 +128,7 @@ Term = WaveProduct | PlaneWave
 
 
 def checked_terms(terms: Iterable[Term]) -> tuple[Term, ...]:
-    """The terms as a tuple, with Python numbers as amplitudes and phases.
+    """The terms as a tuple, checked, and with Python floats as amplitudes and phases.
 
     Raises:
         ValueError, TypeError: there is no term, or a term is invalid; the message names the first
@@ -141,24 +149,32 @@ def checked_terms(terms: Iterable[Term]) -> tuple[Term, ...]:
 
 
 class _FactorEvaluator:
-    """The values of factors and of their derivatives at a point p. Each sine and cosine is computed
-    once."""
+    """A function that evaluates factors of products (sines and cosines of one coordinate) and their
+    derivatives at a point p. Each sine and cosine is computed once, even if several factors have
+    the same angle."""
 
     def __init__(self, p: Vec3) -> None:
         self._p = p
         self._sincos: dict[Any, tuple[Real, Real]] = {}
 
     def __call__(self, axis: int, factor: WaveFactor) -> tuple[Real, Real]:
-        """The values of the factor and of its derivative along the axis, at p."""
+        """The values at p of the factor and of its derivative by its coordinate.
+
+        axis: the index of the coordinate.
+        """
         key = (axis, factor.frequency, factor.phase)
         if key not in self._sincos:
             self._sincos[key] = sincos(_angle(factor.frequency * self._p[axis], factor.phase))
-        s, c = self._sincos[key]
-        return (c, -factor.frequency * s) if factor.is_cosine else (s, factor.frequency * c)
+        sine, cosine = self._sincos[key]
+        return (
+            (cosine, -factor.frequency * sine)
+            if factor.is_cosine
+            else (sine, factor.frequency * cosine)
+        )
 
 
 def evaluate_terms(terms: Sequence[Term], p: Vec3) -> tuple[Real, list[Real]]:
-    """Value and the three components of the gradient of the sum of the terms at p, a Dr.Jit
+    """The value and the three components of the gradient of the sum of the terms at p, a Dr.Jit
     vector."""
     evaluate_factor = _FactorEvaluator(p)
     value, gradient = p[0] * 0.0, [p[0] * 0.0 for _ in range(3)]
@@ -166,15 +182,17 @@ def evaluate_terms(terms: Sequence[Term], p: Vec3) -> tuple[Real, list[Real]]:
         if isinstance(term, PlaneWave):
             k = term.wave_vector
             angle = _angle(k[0] * p[0] + k[1] * p[1] + k[2] * p[2], term.phase)
-            s, c = sincos(angle)
-            value += term.amplitude * c
+            sine, cosine = sincos(angle)
+            value += term.amplitude * cosine
             for axis in range(3):
                 if k[axis] != 0:
-                    gradient[axis] -= term.amplitude * k[axis] * s
+                    gradient[axis] -= term.amplitude * k[axis] * sine
             continue
+        # (axis, value, derivative) of each factor of a product.
         values = [(axis, *evaluate_factor(axis, factor)) for axis, factor in term.factors]
         value += _product([f for _, f, _ in values], term.amplitude)
         for axis, _, derivative in values:
+            # The derivative along an axis: all other factors stay as they are.
             factors = [f for factor_axis, f, _ in values if factor_axis != axis]
             gradient[axis] += _product([*factors, derivative], term.amplitude)
     return value, gradient
@@ -199,23 +217,31 @@ def hessian_of_terms(terms: Sequence[Term], p: Vec3) -> list[list[Real]]:
                     upper[i, j] -= k[i] * k[j] * wave
             continue
         frequency = {axis: factor.frequency for axis, factor in term.factors}
-        value = {axis: evaluate_factor(axis, factor) for axis, factor in term.factors}
+        value_and_derivative = {
+            axis: evaluate_factor(axis, factor) for axis, factor in term.factors
+        }
         for i, j in upper:
-            if i in value and j in value:
-                order = {axis: (axis == i) + (axis == j) for axis in value}
-                factors = [value[axis][1 if n == 1 else 0] for axis, n in order.items()]
+            if i in value_and_derivative and j in value_and_derivative:
+                # How often each axis is differentiated: once takes the derivative, twice the value
+                # again.
+                order = {axis: (axis == i) + (axis == j) for axis in value_and_derivative}
+                factors = [
+                    value_and_derivative[axis][1 if n == 1 else 0] for axis, n in order.items()
+                ]
                 product = _product(factors, term.amplitude)
                 upper[i, j] += -(frequency[i] ** 2) * product if i == j else product
     return [[upper[min(i, j), max(i, j)] for j in range(3)] for i in range(3)]
 
 
 def _angle(angle: Real, phase: float) -> Real:
-    """angle + phase, without the addition if the phase is 0."""
+    """angle + phase; without the addition if the phase is 0, which saves an operation and its
+    rounding."""
     return angle + phase if phase else angle
 
 
 def _product(factors: Sequence[Real], amplitude: float) -> Real:
-    """The product of the amplitude and all factors, without a multiplication by 1."""
+    """The product of the amplitude and all factors. A multiplication by 1 is left out, which saves
+    an operation and its rounding."""
     product: Real = None
     for factor in factors:
         product = factor if product is None else product * factor
@@ -226,10 +252,12 @@ def _product(factors: Sequence[Real], amplitude: float) -> Real:
 
 @dataclass(frozen=True)
 class WaveBounds:
-    """Proved bounds of a sum f = constant + sum_i A_i cos(k_i . p + phase_i), A_i > 0.
+    """Proved bounds of a sum of plane waves f = constant + sum_i A_i cos(k_i . p + phase_i), A_i >
+    0, with wave vectors k_i, and of its derivatives.
 
     wavenumbers: the |k_i|.
     amplitudes: the A_i, in the same order.
+    constant: the constant term of f.
     largest_value: bounds |f - constant|; it is sum A_i.
     largest_gradient: bounds |grad f|. For a unit vector v, |v . grad f| <= sum A_i |k_i . v|, which
         is at most sum A_i |k_i| and, by Cauchy-Schwarz, at most sqrt(sum A_i) sqrt(sum A_i (k_i .
@@ -253,7 +281,8 @@ class WaveBounds:
 
     @classmethod
     def of(cls, terms: Iterable[Term]) -> WaveBounds:
-        """The bounds of the sum of the terms. Waves with equal wave vectors are added first.
+        """Compute the bounds of the sum of the terms. The terms are written as plane waves, and
+        waves with equal wave vectors are added first.
 
         Raises:
             ValueError: the sum is constant.
@@ -266,18 +295,20 @@ class WaveBounds:
         waves = {k: amplitude for k, amplitude in waves.items() if amplitude != 0}
         if not waves:
             raise ValueError("the sum is constant: it has no level sets")
-        vectors = np.array(list(waves))
-        sizes = np.abs(np.array(list(waves.values())))
+        wave_vectors = np.array(list(waves))
+        absolute_amplitudes = np.abs(np.array(list(waves.values())))
         # All sums below have positive terms: a few roundings, covered by this factor.
         margin = 1.0 + 1e-12
-        matrix: npt.NDArray[np.float64] = np.einsum("n,ni,nj->ij", sizes, vectors, vectors)
+        matrix: npt.NDArray[np.float64] = np.einsum(
+            "n,ni,nj->ij", absolute_amplitudes, wave_vectors, wave_vectors
+        )
         curvature = float(np.linalg.eigvalsh(matrix)[-1]) * margin
-        lengths = np.linalg.norm(vectors, axis=1)
-        value = float(sizes.sum()) * margin
-        gradient = min(float(sizes @ lengths) * margin, math.sqrt(value * curvature))
+        lengths = np.linalg.norm(wave_vectors, axis=1)
+        value = float(absolute_amplitudes.sum()) * margin
+        gradient = min(float(absolute_amplitudes @ lengths) * margin, math.sqrt(value * curvature))
         return cls(
             tuple(float(v) for v in lengths),
-            tuple(float(v) for v in sizes),
+            tuple(float(v) for v in absolute_amplitudes),
             constant,
             value,
             gradient,
@@ -287,27 +318,30 @@ class WaveBounds:
 
 
 def mean_wavelength(amplitudes: npt.ArrayLike, wavenumbers: npt.ArrayLike) -> float:
-    """2 pi over the root mean square of the wavenumbers, weighted by the absolute amplitudes. For a
-    single wave it is its wavelength. For a sum it is the length of the waves that dominate its
-    shape, and not that of the shortest wave.
+    """A typical wavelength of a sum of waves: 2 pi over the root mean square of the wavenumbers,
+    weighted by the absolute amplitudes. For a single wave it is its wavelength. For a sum it is the
+    length of the waves that dominate its shape, and not that of the shortest wave.
 
     amplitudes, wavenumbers: arrays (n,).
     """
-    sizes, numbers = np.abs(amplitudes), np.asarray(wavenumbers, np.float64)
+    weights, numbers = np.abs(amplitudes), np.asarray(wavenumbers, np.float64)
+    # Divided by the largest, so that no square overflows.
     largest = float(numbers.max())
-    mean = float((sizes * (numbers / largest) ** 2).sum() / sizes.sum())
-    return 2 * math.pi / (largest * math.sqrt(mean))
+    mean_square = float((weights * (numbers / largest) ** 2).sum() / weights.sum())
+    return 2 * math.pi / (largest * math.sqrt(mean_square))
 
 
 def _plane_waves(term: Term) -> list[tuple[tuple[float, ...], complex]]:
-    """The plane waves of a term, as pairs (k, A) with term = sum of Re(A exp(i k . p)) and complex
-    A. The first nonzero component of each k is positive (`_canonical`).
+    """The plane waves whose sum is the term, as pairs (k, A) with term = sum of Re(A exp(i k . p))
+    and complex A. The first nonzero component of each wave vector k is positive (`_canonical`).
 
     A product cos a cos b cos c is the mean of cos(a +- b +- c) over the signs.
     """
     if isinstance(term, PlaneWave):
         phasor = term.amplitude * complex(math.cos(term.phase), math.sin(term.phase))
         return [_canonical(term.wave_vector, phasor)]
+    # Multiply by one factor after another: each wave becomes two, with the sum and the difference
+    # of the angles. The first factor makes one wave of the constant.
     waves: list[tuple[tuple[float, ...], complex]] = [((0.0, 0.0, 0.0), complex(term.amplitude))]
     for index, (axis, factor) in enumerate(term.factors):
         phasor = complex(math.cos(factor.phase), math.sin(factor.phase))
@@ -325,13 +359,14 @@ def _plane_waves(term: Term) -> list[tuple[tuple[float, ...], complex]]:
 
 
 def _canonical(k: Sequence[float], amplitude: complex) -> tuple[tuple[float, ...], complex]:
-    """The wave vector and the complex amplitude of the same plane wave Re(amplitude exp(i k . p)),
-    with a wave vector whose first nonzero component is positive.
+    """The same plane wave Re(amplitude exp(i k . p)), written with a wave vector whose first
+    nonzero component is positive: its wave vector and its complex amplitude.
 
     If k has to be negated for this, the amplitude is conjugated: cos(k.p + t) = cos(-k.p - t). So k
     and -k give the same result.
     """
     leading = next((v for v in k if v != 0), 0.0)
     if leading < 0:
+        # The sum with 0.0 turns -0.0 into 0.0, as the vector is a key.
         return tuple(-v + 0.0 for v in k), amplitude.conjugate()
     return tuple(v + 0.0 for v in k), amplitude

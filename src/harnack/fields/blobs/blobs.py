@@ -1,4 +1,8 @@
-"""Blobs: metaballs, soft objects and densities of molecules, as level sets of sums of kernels.
+"""Blobs: metaballs, soft objects and densities of molecules, as level sets of sums of bumps. A blob
+is a bump around a center that is 0 outside of a ball, its support; its shape is called the kernel.
+f is the sum of all blobs or, if the blobs are divided into groups, the largest of the groups' sums.
+For many blobs there is a uniform grid, which lists the blobs near each of its cells. Jets are
+intervals that contain the values and the derivatives of a function.
 
 `Blobs` is the field of any blobs. `Molecule` is the field of a molecule's atoms, with their van der
 Waals radii.
@@ -69,12 +73,13 @@ class BlobError(ValueError):
 
 
 class Blobs(Formula):
-    """f(x) = sum over i of w_i A k(|x - c_i|^2 / (s R_i)^2): metaballs. Their surface is f = 1, and
-    f is larger inside.
+    """Metaballs: f(x) = sum over i of w_i A k(|x - c_i|^2 / (s R_i)^2). Blob i has the center c_i,
+    the radius R_i and the weight w_i. The kernel k falls from the center to 0 at the distance s
+    R_i, the radius of the blob's support. A is chosen so that a single blob of weight 1 has the
+    value 1 at its radius. The surface is f = 1, and f is larger inside. Where blobs meet, they flow
+    together.
 
-    Blob i has the center c_i, the radius R_i and the weight w_i. The kernel k falls from the center
-    to 0 at s R_i, where s is `BlobKernel.support`; A makes a single blob of weight 1 the ball of
-    its radius. Where blobs meet, they flow together.
+    s is `BlobKernel.support`, and A is `BlobKernel.amplitude`.
 
     centers: (n, 3).
     radii: (n,) or one number, > 0.
@@ -105,6 +110,7 @@ class Blobs(Formula):
         kernel: str | BlobKernel = "compact",
         groups: Any = None,
     ) -> None:
+        """Check the arguments. The blobs are sorted by groups."""
         self.centers, self.radii, self.weights, self.groups = _checked(
             centers, radii, weights, groups
         )
@@ -116,20 +122,21 @@ class Blobs(Formula):
 
     @property
     def _supports(self) -> FloatArray:
-        """The radii (n,) of the supports: of the balls outside of which the blobs are 0."""
+        """The radii (n,) of the balls outside of which the blobs are 0."""
         return self.radii * self.kernel.support
 
     @functools.cached_property
     def cell_lists(self) -> CellLists | None:
-        """The grid with a list of the blobs near each cell; None for a small number of blobs."""
+        """The uniform grid with a list of the blobs near each cell; None for fewer than 64 blobs,
+        for which a sum over all is faster."""
         return (
             CellLists.of(self.centers, self._supports) if len(self) >= _MIN_BLOBS_FOR_GRID else None
         )
 
     @cached_prepare
     def prepare(self, backend: Backend) -> Blobs:
-        """The same field with its blobs as records of the backend. Kernels compiled for it serve
-        other blobs as well."""
+        """The same field with its blobs uploaded to the backend. Code that Dr.Jit compiles for it
+        serves other blobs as well, because all numbers are data and none are literals."""
         prepared = copy.copy(self)
         prepared._on = _BlobDeviceData.upload(backend, self)
         prepared.kernel = self.kernel.prepare(backend)
@@ -137,16 +144,21 @@ class Blobs(Formula):
         return prepared
 
     def largest_gradient(self) -> float:
-        """A bound of |grad f| everywhere. With a grid, the bounds of the gradients of the blobs in
-        a cell's list are added up, and the largest of these sums is returned. Without a grid it is
-        the sum over all blobs."""
-        gradients = np.abs(self.weights) * (self.kernel.amplitude * self.kernel.steepness.slope)
-        gradients /= self._supports
+        """A bound of |grad f| everywhere. It is a sum of bounds of the single blobs' gradients:
+        without a grid the sum over all blobs, with a grid the largest of the sums over the cells'
+        lists of blobs nearby."""
+        gradient_bounds = np.abs(self.weights) * (
+            self.kernel.amplitude * self.kernel.steepness.slope
+        )
+        gradient_bounds /= self._supports
         lists = self.cell_lists
         if lists is None:
-            return float(gradients.sum())
-        sums = np.concatenate([[0.0], np.cumsum(gradients[lists.entries])])
-        return float((sums[lists.starts[1:]] - sums[lists.starts[:-1]]).max()) * (1 + 1e-6)
+            return float(gradient_bounds.sum())
+        # A cell's sum is a difference of two running sums over the entries of all lists.
+        running_sums = np.concatenate([[0.0], np.cumsum(gradient_bounds[lists.entries])])
+        return float((running_sums[lists.starts[1:]] - running_sums[lists.starts[:-1]]).max()) * (
+            1 + 1e-6
+        )
 
     def extent(self, levels: tuple[float, ...]) -> Volume:
         """The box around all supports, for any levels: outside of it f is 0."""
@@ -164,67 +176,86 @@ class Blobs(Formula):
                 )
 
     def evaluate(self, p: Vec3) -> Sample:
+        """The sample at p: the value and the gradient of f, and a Lipschitz constant that holds
+        everywhere."""
         data = self._prepared(p)
         return self._sample(data.value_at(self.kernel, p))
 
     def _sample(self, sums: SumValue) -> Sample:
-        """The sample at points, from the sum there. Its promise (proved bound of f near a point) is
-        the Lipschitz constant of the field."""
+        """The sample at points: value, gradient, and, as the proved bound of f near the points, a
+        Lipschitz constant that holds everywhere.
+
+        sums: value and gradient of f at the points, with bounds of their errors.
+        """
         promises = () if self.lipschitz is None else (Lipschitz(0 * sums.value + self.lipschitz),)
         return Sample(sums.value, sums.gradient, promises, sums.error, sums.gradient_error)
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
-        """The sample at the position t of a ray, with enclosures: proofs of lengths ahead on which
-        f takes no level. It needs one loop over the blobs nearby. There is no enclosure looking
-        back.
+        """The sample at the position t of a ray, with enclosures: proofs of lengths in front of the
+        point on which f takes none of the levels (the values that rays look for). It needs one loop
+        over the blobs nearby. There is no enclosure behind the point.
 
-        In a grid, enclosures end where the path leaves the enlarged cell of the point. If the cell
-        is empty, f is 0 until the path comes to the first cell that is not empty. The enclosures
-        then begin there and are proved from that cell's list (`DelayedEnclosure`).
+        path: the ray.
+        t: a length along it.
+        ahead: the length in front of the point up to which proofs are wanted.
+        back: the same behind the point; not used.
+
+        In a grid, enclosures end where the ray leaves the cell of the point, enlarged by a margin:
+        up to there the cell's list of blobs is complete. If the cell is empty, f is 0 until the ray
+        comes to the first cell that is not empty. The enclosures then begin there and are proved
+        from that cell's list (`DelayedEnclosure`).
         """
         del back
         p, d = path.point(t), path.direction
         data = self._prepared(p)
-        count = PIECES if data.grid is None else PIECES_IN_CELL
-        recorder = KnotRecorder(count)
+        piece_count = PIECES if data.grid is None else PIECES_IN_CELL
+        # The proofs are asked first at which knots they want ranges of derivatives; those are then
+        # computed in the one loop over the blobs.
+        recorder = KnotRecorder(piece_count)
         no_slope = SlopeRange(0.0, 0.0)
         path.proofs.from_restriction(recorder, no_slope, ahead)
+        # No proof asks for ranges of derivatives: those from the Lipschitz constant are used.
         if recorder.knots is None:
             return path.enclose(self.evaluate(p))
         data = self._prepared(p)
         empty_length: Real | None = None
-        start_point, length = p, fmin(ahead, data.max_path_length)
+        piece_start, length = p, fmin(ahead, data.max_path_length)
         if data.grid is not None:
             empty_length = skipped = data.grid.empty_run(p, d, ahead)
-            start_point = dr.fma(type(p)(skipped), d, p)
-            to_exit = data.grid.cell(start_point).exit_distance(d)
+            piece_start = dr.fma(type(p)(skipped), d, p)
+            # Behind an empty run the length counts from the first cell that is not empty, so
+            # `ahead` says nothing about it.
+            to_exit = data.grid.cell(piece_start).exit_distance(d)
             length = fmin(
                 dr.select(skipped > 0, to_exit, fmin(ahead, to_exit)), data.max_path_length
             )
+        # The knots for the final length.
         path.proofs.from_restriction(recorder, no_slope, length)
         enclosures: tuple[Enclosure, ...]
         if data.groups is None:
             sums = sum_along(
                 self.kernel,
                 data.backend,
-                start_point,
+                piece_start,
                 d,
                 recorder.knots,
-                data.near(start_point),
+                data.near(piece_start),
                 signed=data.has_negative_weights,
             )
             start = (
+                # The sum is that at `piece_start`; at p, in an empty cell, f is 0.
                 sums.start if empty_length is None else _zero_where(empty_length > 0, sums.start)
             )
             slope = dr.dot(start.gradient, d)
             slopes = SlopeRange.around(slope, start.gradient_error)
             enclosures = path.proofs.from_restriction(sums, slopes, length)
         else:
+            # The value at p, not at `piece_start`: over an empty length both are 0.
             start = data.value_at(self.kernel, p)
             slope = dr.dot(start.gradient, d)
             enclosures = (
                 GroupMaximumEnclosure(
-                    self.kernel, data.grouped(start_point), path, start_point, start.value,
+                    self.kernel, data.grouped(piece_start), path, piece_start, start.value,
                     recorder.knots, length, data.has_negative_weights,
                 ),
             )  # fmt: skip
@@ -232,11 +263,12 @@ class Blobs(Formula):
             enclosures = tuple(
                 DelayedEnclosure(empty_length, enclosure) for enclosure in enclosures
             )
-        return RaySample(self._sample(start), enclosures, (), slope, float(count))
+        # The next sample's proofs should reach as many of this step's lengths as there are pieces.
+        return RaySample(self._sample(start), enclosures, (), slope, float(piece_count))
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
-        """The function f at jets of the coordinates (intervals of values and derivatives), or at
-        Dr.Jit numbers. For jets it is a sum over all blobs, without the grid."""
+        """f at jets of the coordinates (intervals that contain values and derivatives), or at
+        Dr.Jit numbers. For jets the sum is over all blobs, because the grid serves only points."""
         if not is_jet(x, type(self).__name__):
             return self.differentiable_value(backend_of(x).Array3f(x, y, z))
         data = self._prepared_for(backend_of(_backend_number(x, y, z)))
@@ -248,7 +280,7 @@ class Blobs(Formula):
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
         """The three rows of the Hessian of f at points p. If blobs have groups, it is the Hessian
-        of the group's sum that is largest at p."""
+        of the largest of the groups' sums at p, which `Formula.hessian` computes with jets."""
         data = self._prepared(p)
         if data.groups is not None:
             return super().hessian(p)
@@ -257,18 +289,19 @@ class Blobs(Formula):
         return vector(xx, xy, xz), vector(xy, yy, yz), vector(xz, yz, zz)
 
     def _prepared(self, p: Vec3) -> _BlobDeviceData:
-        """The data of the blobs on the backend of the point p."""
+        """The uploaded data of the blobs, on the backend of the point p."""
         return self._prepared_for(backend_of(p))
 
     def _prepared_for(self, backend: Backend) -> _BlobDeviceData:
-        """The data of the blobs on a backend. They are uploaded only if `prepare` has not done
-        so."""
+        """The uploaded data of the blobs, on this backend. They are uploaded now unless `prepare`
+        has done so."""
         if self._on is None:
             return _BlobDeviceData.upload(backend, self)
         return self._on
 
     def describe(self) -> dict[str, Any]:
-        """Facts about the field for users, as a dictionary of names and values."""
+        """The number of blobs, the kernel's name and the size of the grid, as a dictionary for
+        users."""
         facts: dict[str, Any] = {"blobs": len(self), "kernel": self.kernel.name}
         lists = self.cell_lists
         if lists is not None:
@@ -279,13 +312,14 @@ class Blobs(Formula):
 
 @dataclass(frozen=True)
 class _BlobDeviceData:
-    """The data of blobs on a backend.
+    """The data of blobs, uploaded to a backend, and sums over them. A blob is a bump that is 0
+    outside of a ball, its support.
 
-    records: one for each blob, as `_blob_records` describes.
-    grid: the lists of blobs near each cell; None for a small number of blobs.
+    records: the table of the blobs' numbers, one row for each blob (`_blob_records`).
+    grid: the lists of the blobs near each cell of a grid; None for a small number of blobs.
     groups: the group of each blob, and the number of groups; None if all blobs are one sum.
-    has_negative_weights: whether amplitudes may be negative.
-    max_path_length: a length greater than that of any path through all supports.
+    has_negative_weights: whether amplitudes (factors of blobs) may be negative.
+    max_path_length: a length greater than that of any straight line through all supports.
     """
 
     backend: Backend
@@ -297,7 +331,7 @@ class _BlobDeviceData:
 
     @classmethod
     def upload(cls, backend: Backend, blobs: Blobs) -> _BlobDeviceData:
-        """The data of `blobs`, uploaded to a backend."""
+        """Upload the data of `blobs` to a backend."""
         lists = blobs.cell_lists
         groups = None
         if blobs.groups is not None:
@@ -314,17 +348,19 @@ class _BlobDeviceData:
         )
 
     def near(self, p: Vec3) -> ForEach:
-        """Make a loop over the blobs whose supports may contain p: the blobs in the list of the
-        grid cell that contains p or, without a grid, all blobs."""
+        """Make a function that loops over the blobs whose supports may contain p: for_each(body,
+        state) sets state = body(record, state) for each of them and returns the last state. They
+        are the blobs in the list of the grid cell that contains p or, without a grid, all blobs."""
         if self.grid is None:
             return for_each_record(self.records)
         return for_each_listed(self.records, self.grid.entries, *self.grid.list_at(p))
 
     def grouped(self, p: Vec3 | None) -> GroupedList:
         """The blobs whose supports may contain p, as a list sorted by groups; all blobs if p is
-        None."""
+        None or there is no grid."""
         assert self.groups is not None
         group_of_blob, count = self.groups
+        # All records of the table, which are sorted by groups.
         if self.grid is None or p is None:
             zero = self.backend.UInt32(0)
             return GroupedList(
@@ -335,18 +371,18 @@ class _BlobDeviceData:
 
     def value_at(self, kernel: BlobKernel, p: Vec3) -> SumValue:
         """f at points p: the sum of all blobs or, if there are groups, the largest of the groups'
-        sums."""
+        sums. kernel: the shape of the blobs."""
         if self.groups is None:
             return value_at(kernel, self.backend, p, self.near(p))
         return group_maximum_at(kernel, self.backend, p, self.grouped(p))
 
 
 def _blob_records(backend: Backend, blobs: Blobs) -> FloatArray:
-    """The records (n, 8) of blobs.
+    """The records (n, 8) of blobs, one row of numbers for each.
 
     A record holds, by columns: 0 to 2 the center, rounded to the precision of the backend; 3 to 5
-    the rest of the center, which rounding has cut off; 6 the inverse of the support's radius; 7 the
-    amplitude w_i A.
+    the rest of the center, which rounding has cut off; 6 one over the radius of the support; 7 the
+    amplitude w_i A (weight times the kernel's amplitude).
 
     Raises:
         BlobError: a blob that is too small, too large or too far away for the precision.
@@ -356,14 +392,15 @@ def _blob_records(backend: Backend, blobs: Blobs) -> FloatArray:
     largest, smallest = float(info.max), float(info.smallest_normal)
     with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
         amplitude = blobs.weights * blobs.kernel.amplitude
-        rounded = blobs.centers.astype(backend.dtype).astype(np.float64)
-        largest_bound = np.abs(amplitude) * max(1.0, blobs.kernel.steepness.bend)
-        inverse = 1 / supports
-        second_bound = largest_bound * inverse * inverse
+        rounded_centers = blobs.centers.astype(backend.dtype).astype(np.float64)
+        # Bounds of the numbers that a sum adds up, which must not overflow.
+        value_bound = np.abs(amplitude) * max(1.0, blobs.kernel.steepness.bend)
+        inverse_radius = 1 / supports
+        second_bound = value_bound * inverse_radius * inverse_radius
     is_invalid = ~((np.abs(blobs.centers) <= largest) & (supports[:, None] * smallest < 1)).all(
         axis=1
     )
-    is_invalid |= ~((inverse < 1e30) & (largest_bound <= largest) & (second_bound <= largest))
+    is_invalid |= ~((inverse_radius < 1e30) & (value_bound <= largest) & (second_bound <= largest))
     if is_invalid.any():
         worst = int(np.argmax(is_invalid))
         precision = "single" if backend.dtype == np.float32 else "double"
@@ -374,31 +411,32 @@ def _blob_records(backend: Backend, blobs: Blobs) -> FloatArray:
             f"too small, too large or too far away for {precision} precision: "
             f"choose units nearer to 1{other}"
         )
-    remainder = blobs.centers - rounded
-    return np.column_stack([rounded, remainder, 1 / supports, amplitude])
+    remainder = blobs.centers - rounded_centers
+    return np.column_stack([rounded_centers, remainder, 1 / supports, amplitude])
 
 
 @dataclass(frozen=True)
 class DelayedEnclosure(Enclosure):
-    """An enclosure (proved bounds of the change along a path) of a function F(s) that is 0 for
-    0 <= s <= run.
+    """A proof about a function F(s) along a path, where F is 0 on the first part of the path: 0 <=
+    s <= run.
 
-    run: the length at the start of the path on which F is 0.
-    then: the enclosure of F from s = run on.
+    run: the length of that first part.
+    then: the proof about F from s = run on.
     """
 
     run: Real
     then: Enclosure
 
     def free_length(self, gaps: LevelGaps) -> Real:
-        """A length of the path that is proved to contain no level. gaps: the differences of F at
-        the start from the next levels below and above."""
+        """A length of the path that is proved to contain no level (a value of F that rays look
+        for): the first part, where F is 0, plus a proved length behind it. gaps: the differences of
+        F at the start, which is 0, from the next levels below and above."""
         return self.run + self.then.free_length(gaps)
 
 
 def _zero_where(mask: Any, sums: SumValue) -> SumValue:
-    """The same sum at points, with value, gradient and errors replaced by 0 on lanes on which the
-    mask is true."""
+    """The sums of blobs at points, with value, gradient and errors replaced by 0 on lanes on which
+    the mask is true."""
     zero = 0 * sums.value
     return SumValue(
         dr.select(mask, zero, sums.value),
@@ -409,10 +447,11 @@ def _zero_where(mask: Any, sums: SumValue) -> SumValue:
 
 
 def _backend_number(*jets: Jet) -> Any:
-    """Any number of the backend among the bounds of jets, for the backend and its number of lanes.
+    """Any Dr.Jit number among the ends of the intervals of jets. It tells the backend and the
+    number of lanes.
 
     Raises:
-        TypeError: all bounds are constants.
+        TypeError: all ends are Python numbers.
     """
     for jet in jets:
         for interval in (jet.value, *jet.first_derivatives):
@@ -425,8 +464,9 @@ def _backend_number(*jets: Jet) -> Any:
 def _checked(
     centers: Any, radii: Any, weights: Any, groups: Any
 ) -> tuple[FloatArray, FloatArray, FloatArray, IntArray | None]:
-    """The centers (n, 3), radii (n,), weights (n,) and groups (n,) as arrays, sorted by groups.
-    Groups are numbered from 0 without gaps; they are None if none are given.
+    """The arguments of `Blobs` as arrays, sorted by groups: centers (n, 3), radii (n,), weights
+    (n,) and groups (n,). Groups are numbered from 0 without gaps; None if none are given. In the
+    code these four arrays are c, r, w and g.
 
     Raises:
         BlobError: wrong shapes, or numbers that are not valid for a blob.
@@ -451,13 +491,18 @@ def _checked(
             f"groups must be {len(c)} integers, one for each blob, not {g.dtype} of shape {g.shape}"
         )
     order = np.argsort(g, kind="stable")
-    return (c[order], r[order], w[order], np.unique(g[order], return_inverse=True)[1])
+    return (
+        c[order],
+        r[order],
+        w[order],
+        np.unique(g[order], return_inverse=True)[1],
+    )
 
 
 def _numbers(values: Any, name: str, count: int) -> FloatArray:
-    """Finite numbers (count,), from an array of that shape, or from one number that is repeated.
+    """The finite numbers `values` as an array (count,). A single number is repeated.
 
-    name: of the argument, for messages.
+    name: what the numbers are, for messages.
 
     Raises:
         BlobError: a wrong shape, or a number that is not finite.
@@ -478,8 +523,9 @@ def _numbers(values: Any, name: str, count: int) -> FloatArray:
 
 class Molecule(Blobs):
     """The surface of a molecule: the level 1 of a sum of Gaussians A exp(-s (d/r)^2) over its
-    atoms. Here d is the distance from the atom, r its van der Waals radius, and s the sharpness.
-    From each Gaussian a tangent is subtracted, so that its support is bounded (`GaussianKernel`).
+    atoms. Here d is the distance from the atom, r its van der Waals radius, s the sharpness, and A
+    makes a single atom a ball of its radius. From each Gaussian its tangent at the end is
+    subtracted, so that it ends at a finite distance (`GaussianKernel`).
 
     source: a .pdb, .ent, .cif or .mmcif file, or `Atoms`.
     sharpness: s. The larger it is, the closer the surface follows the single atoms.
@@ -501,12 +547,14 @@ class Molecule(Blobs):
         sharpness: float = 1.0,
         tail: float = 1 / 32,
     ) -> None:
+        """Read the atoms, and set up a blob with a Gaussian kernel for each."""
         self.atoms = source if isinstance(source, Atoms) else read_molecule(source)
         super().__init__(
             self.atoms.positions, self.atoms.radii, kernel=GaussianKernel(sharpness, tail)
         )
 
     def describe(self) -> dict[str, Any]:
-        """Facts about the field for users, as a dictionary of names and values."""
+        """The number of atoms, the kernel's name and the size of the grid, as a dictionary for
+        users."""
         facts = super().describe()
         return {"atoms": facts.pop("blobs"), **facts}

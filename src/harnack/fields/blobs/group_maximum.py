@@ -1,8 +1,10 @@
-"""The largest of the sums of blobs of several groups. Blobs of one group flow together; different
-groups meet in creases.
-
-The sum of a group is 0 at points that are outside of the supports of its blobs.
-"""
+"""The largest of the sums of blobs of several groups. A blob is a bump around a center that is 0
+outside of a ball, its support. Each blob belongs to a group, and each group has a sum, that of its
+blobs; f is the largest of these sums. So blobs of one group flow together, and different groups
+meet in creases. A list here holds the blobs that may be nonzero near a point or ray, sorted by
+groups; a group without a blob in the list has the sum 0 there. The record of a blob is its row of
+numbers in a table. Loops are recorded by Dr.Jit: the state of a loop is the tuple of arrays that it
+changes from step to step."""
 
 from __future__ import annotations
 
@@ -37,7 +39,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class GroupedList:
-    """A list of blobs, sorted by groups, for each lane.
+    """A list of blobs for each lane: the blobs that may be nonzero near the lane's point or ray.
+    Blobs of the same group, which are added up, follow one another in the list. It holds positions
+    in a table of records (rows of numbers), one record for each blob.
 
     records: the table of the records of all blobs.
     group_of_record: for each record of the table, the index of its group.
@@ -55,27 +59,29 @@ class GroupedList:
     group_count: Any
 
     def record(self, i: Any) -> Any:
-        """The index in the table of the record at position i of the list."""
+        """The index, in the table, of the record of the blob at position i of the list. Positions
+        run from `begin` to `end` - 1."""
         if self.entries is None:
             return i
         return dr.gather(self.records.backend.UInt32, self.entries, i)
 
     def group(self, i: Any) -> Any:
-        """The index of the group of the blob at position i of the list."""
+        """The index of the group of the blob at position i of the list. Positions run from `begin`
+        to `end` - 1."""
         kind = self.records.backend.UInt32
         return dr.gather(kind, self.group_of_record, self.record(i), i < self.end)
 
     def each_group(self, body: Any, state: State, label: str) -> tuple[Any, State]:
-        """Apply `body` to each group that has a blob in this list of blobs near a lane's point or
-        ray, one group after another.
+        """Loop over the groups that have a blob in this list: set state = body(for_each, state) for
+        one group after another.
 
-        body: a function; body(for_each, state) returns the state after one more group. It must call
-            for_each(add_blob, blob_state) once, which calls `add_blob` for each blob of the group
-            and returns the last `blob_state`.
+        body: a function that returns the state after one more group. It must call
+            for_each(add_blob, blob_state) exactly once: this sets blob_state = add_blob(record,
+            blob_state) for each blob of the group and returns the last blob_state.
         state: the first state, a tuple of arrays.
         label: the name of the recorded loop.
 
-        Returns the number of groups that have blobs in the list, and the last state.
+        Returns the number of groups that have a blob in the list, and the last state.
         """
         kind = self.records.backend.UInt32
 
@@ -83,6 +89,7 @@ class GroupedList:
             group = _OneGroup(self, i)
             final = body(group, state)
             assert group.end is not None, "the body has to go over the blobs of its group"
+            # The next group begins where the blobs of this one end.
             return group.end, groups + 1, *final
 
         def has_more(i: Any, *_: Any) -> Mask:
@@ -94,7 +101,9 @@ class GroupedList:
 
 
 class _OneGroup:
-    """The loop over the blobs of one group, for `GroupedList.each_group`.
+    """A function that loops over the blobs of one group, which follow one another in a list of
+    blobs (`GroupedList`). As the blobs are found during the loop, the end of the group is known
+    only afterwards.
 
     begin: the position in the list of the group's first blob.
     end: the position after its last blob, once the loop has run.
@@ -105,7 +114,8 @@ class _OneGroup:
         self.end: Any = None
 
     def __call__(self, body: EachBlob, state: State) -> State:
-        """Apply `body` to all blobs of the group, one after another. Returns the last state."""
+        """Set state = body(record, state) for all blobs of the group, one after another, where
+        `record` is a blob's row of numbers. Returns the last state."""
         blobs = self._blobs
         group = blobs.group(self._begin)
 
@@ -123,16 +133,20 @@ class _OneGroup:
 
 
 def group_maximum_at(kernel: BlobKernel, backend: Backend, p: Vec3, blobs: GroupedList) -> SumValue:
-    """The largest of the groups' sums at points p (3, n), with its gradient. The error bounds are
-    the largest ones of all groups.
+    """The largest of the groups' sums of blobs at points p (3, n), with its gradient. Its error
+    bounds are the largest of those of all groups.
 
+    kernel: the shape of all blobs.
     blobs: the list of the blobs that may be nonzero at p.
     """
     real = backend.Float
 
     def add_group(for_each: ForEach, state: State) -> State:
-        """The state with another group included. It consists of the largest sum, the three
-        components of its gradient, and the largest error bounds of value and gradient."""
+        """The state with another group included. It consists of the largest sum so far, the three
+        components of its gradient, and the largest error bounds so far of value and gradient.
+
+        for_each: the loop over the blobs of the group.
+        """
         value, x, y, z, error, gradient_error = state
         sums = value_at(kernel, backend, p, for_each)
         is_larger = sums.value > value
@@ -148,34 +162,38 @@ def group_maximum_at(kernel: BlobKernel, backend: Backend, p: Vec3, blobs: Group
     start = (real(-dr.inf), *(real(0) for _ in range(5)))
     groups, final = blobs.each_group(add_group, start, "groups")
     value, x, y, z, error, gradient_error = final
-    is_zero = (groups < blobs.group_count) & ~(
-        value > 0
-    )  # then the largest sum is the sum of a far group, which is 0
+    # A group without a blob in the list has the sum 0, which is then the largest.
+    is_zero = (groups < blobs.group_count) & ~(value > 0)
     gradient = dr.select(is_zero, backend.Array3f(0), backend.Array3f(x, y, z))
     return SumValue(dr.select(is_zero, 0, value), gradient, error, gradient_error)
 
 
 def group_maximum_jet(term: Term, like: Jet, zero: Real, blobs: GroupedList) -> Jet:
-    """The jet (ranges of value and derivatives on a piece of a path) of the largest of the groups'
-    sums.
+    """The jet of the largest of the groups' sums of blobs. A jet is a set of intervals that contain
+    the values and the derivatives of a function on a piece of a path.
 
-    term: a function that returns the jet of a blob from its record.
-    like: any jet of the same variables and piece.
+    term: a function that returns the jet of a blob from its record (row of numbers).
+    like: any jet with as many derivatives as those of the blobs, and of the same piece.
     zero: the number 0 on each lane.
     blobs: the list of all blobs.
     """
 
     def add_group(for_each: ForEach, state: State) -> State:
-        """The state with another group included. It consists of a number that is positive before
-        the first group, and the bounds of the maximum's jet."""
-        jet = sum_jets(term, like, zero, for_each)
+        """The state with another group included. It consists of a number that is 1 before the first
+        group and 0 afterwards, and of the ends of the intervals of the maximum's jet so far.
+
+        for_each: the loop over the blobs of the group.
+        """
+        group_jet = sum_jets(term, like, zero, for_each)
         maximum = jet_from_bounds(like, iter(state[1:]))
-        new_maximum = maximum.maximum(jet)
-        is_first = state[0] > 0  # the first group
+        # Before the first group there is no maximum: the jet of the group is taken alone.
+        new_maximum = maximum.maximum(group_jet)
+        is_first = state[0] > 0
         return (
+            # 0 on each lane, as the state must keep its width.
             real(0) + 0 * zero,
             *(dr.select(is_first, a, b) for a, b in zip(
-                jet_bounds(jet, zero), jet_bounds(new_maximum, zero), strict=True
+                jet_bounds(group_jet, zero), jet_bounds(new_maximum, zero), strict=True
             )),
         )  # fmt: skip
 
@@ -187,17 +205,18 @@ def group_maximum_jet(term: Term, like: Jet, zero: Real, blobs: GroupedList) -> 
 
 @dataclass(frozen=True)
 class GroupMaximumEnclosure(Enclosure):
-    """An enclosure of the largest of the groups' sums of blobs along a path: it proves lengths of
-    the path on which this maximum takes no level.
+    """A proof of lengths on which the largest of the groups' sums of blobs takes no level (a value
+    that rays look for). It is about a path: the straight line from a point p along a ray's
+    direction. Each group of blobs has a sum, the sum of its blobs.
 
-    kernel: the kernel of the blobs.
-    blobs: the blobs that may be nonzero there.
+    kernel: the shape of all blobs.
+    blobs: the blobs that may be nonzero on the path.
     path: the ray; it gives the direction of the path, and the proofs to use.
     p: the points at which the path starts.
     value: the largest sum at p.
     knots: the ends of the pieces of the path on which derivatives are bounded, as distances from p.
     length: the distance from p up to which the list of blobs is complete.
-    signed: whether amplitudes may be negative.
+    signed: whether amplitudes (factors of blobs) may be negative.
 
     Along a path the largest sum reaches a level above it as soon as one of the sums does, and falls
     to a level below it only when the last of the sums has. So the free length upwards is the
@@ -216,32 +235,36 @@ class GroupMaximumEnclosure(Enclosure):
     signed: bool
 
     def free_length(self, gaps: LevelGaps) -> Real:
-        """A length of the path from p that is proved to contain no level. It is the smaller of two
-        lengths: the shortest one of any group before its sum rises to the level above, and the
-        longest one of any group before its sum falls to the level below.
+        """A length of the path from p on which the largest of the groups' sums is proved to take no
+        level (a value that rays look for). It is the smaller of two lengths: the shortest length of
+        any group before its sum rises to the level above, and the longest length of any group
+        before its sum falls to the level below.
 
-        gaps: the differences of the largest sum at p from the next levels below and above.
+        gaps: the differences of the largest sum at p from the next levels below and above; infinite
+            if there is no such level.
 
-        Proof. Take a group whose sum is lower than the largest by g. For this group the level above
-        is farther by g, and the level below is nearer by g. The error of g is that of both sums.
-        The larger of these errors has been subtracted from the gaps by the tracer
-        (`samples.value_error_bound`).
+        Proof. The largest sum reaches the level above when the first of the sums does, and falls to
+        the level below only when the last of the sums has. Take a group whose sum at p is lower
+        than the largest by g (`deficit`). For this group the level above is farther by g, and the
+        level below is nearer by g. If it is below that level already, its length downwards is 0.
+        The error of g is that of both sums. The larger of these errors has been subtracted from the
+        gaps by the tracer (`samples.value_error_bound`).
         """
         backend = self.blobs.records.backend
         real = backend.Float
 
         def add_group(for_each: ForEach, state: State) -> State:
-            """Return the state (up, down) after one more group. A group's sum is the sum of all
-            blobs of the group.
+            """Return the state (rise_length, fall_length) after one more group. A group's sum is
+            the sum of all blobs of the group.
 
-            up: the shortest length before the sum of any group rises to the level above. The
-                largest sum reaches that level when the first of the sums does.
-            down: the longest length before the sum of any group falls to the level below. The
-                largest sum falls to that level only when the last of the sums has.
-            for_each: the loop over the blobs of the group; for_each(body, state) returns the last
-                state.
+            rise_length: the shortest length before the sum of any group so far rises to the level
+                above.
+            fall_length: the longest length before the sum of any group so far falls to the level
+                below.
+            for_each: a function that loops over the blobs of the group: for_each(body, state) sets
+                state = body(record, state) for each blob and returns the last state.
             """
-            up, down = state
+            rise_length, fall_length = state
             sums = sum_along(
                 self.kernel, backend, self.p, self.path.direction, self.knots, for_each,
                 signed=self.signed,
@@ -251,19 +274,25 @@ class GroupMaximumEnclosure(Enclosure):
             enclosures = self.path.proofs.from_restriction(sums, slopes, self.length)
             deficit = self.value - sums.start.value
             inf = real(dr.inf)
-            rising = longest_free_length(
+            # One side at a time: an infinite gap stands for no level on the other side.
+            group_rise_length = longest_free_length(
                 enclosures, LevelGaps(inf, gaps.above + deficit, is_one_sided=True)
             )
-            falling = longest_free_length(
+            group_fall_length = longest_free_length(
                 enclosures, LevelGaps(gaps.below - deficit, inf, is_one_sided=True)
             )
             is_above_level = gaps.below > deficit
-            return fmin(rising, up), fmax(dr.select(is_above_level, falling, 0), down)
+            return fmin(group_rise_length, rise_length), fmax(
+                dr.select(is_above_level, group_fall_length, 0), fall_length
+            )
 
         start = (real(0) + self.length, real(0))
-        groups, (up, down) = self.blobs.each_group(add_group, start, "steps of groups")
-        # The sums of far groups stay 0. If the level is below 0, the maximum never falls to it.
+        groups, (rise_length, fall_length) = self.blobs.each_group(
+            add_group, start, "steps of groups"
+        )
+        # A group without a blob in the list has the sum 0 on the whole length. If the level is
+        # below 0, the maximum never falls to it.
         zero_is_above_level = (groups < self.blobs.group_count) & (gaps.below > self.value)
-        down = dr.select(zero_is_above_level, self.length, down)
-        down = dr.select(gaps.below == dr.inf, self.length, down)
-        return fmin(dr.select(gaps.above == dr.inf, self.length, up), down)
+        fall_length = dr.select(zero_is_above_level, self.length, fall_length)
+        fall_length = dr.select(gaps.below == dr.inf, self.length, fall_length)
+        return fmin(dr.select(gaps.above == dr.inf, self.length, rise_length), fall_length)

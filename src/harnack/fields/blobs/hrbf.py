@@ -1,5 +1,9 @@
-"""Hermite radial basis functions: a smooth surface through given points, with given normals
-there."""
+"""Hermite radial basis functions: a smooth surface through given points p_i, with given normals
+there. The surface is f = 0 for a sum f of one term for each point: f(x) = sum over i of a_i r_i^3 +
+b_i . grad r_i^3, with r_i = |x - p_i|, numbers a_i and vectors b_i. The record of a point is its
+row of numbers (p_i, a_i and 3 b_i). Along a path p + s d, a straight line from a point p, each term
+is a function of the length s. A path is cut into pieces at knots, which are values of s. Jets are
+intervals that contain the values and the derivatives of a function."""
 
 from __future__ import annotations
 
@@ -52,17 +56,19 @@ _MARGIN = 0.25
 
 
 class HRBF(Formula):
-    """Hermite radial basis functions: f = sum over i of a_i r_i^3 + b_i . grad r_i^3, with r_i = |x
-    - p_i|. (Aydinlilar and Zanni 2023, eq. 9; Wendland 2005.)
-
-    The numbers a_i and the vectors b_i are chosen so that f = 0 and grad f = n_i at all points p_i.
-    So the surface f = 0 passes through the points and has the normals n_i there.
+    """Hermite radial basis functions: f(x) = sum over i of a_i r_i^3 + b_i . grad r_i^3, with r_i =
+    |x - p_i|, for given points p_i. The numbers a_i and the vectors b_i are chosen so that f = 0
+    and grad f = n_i at all points p_i. So the surface f = 0 passes through the points and has the
+    given normals n_i there.
 
     points: (n, 3), the p_i.
     normals: (n, 3), the n_i, of any length but 0; they are made unit vectors. They point outward,
         so that f is negative inside.
     domain: the volume in which f is drawn; None for the box around the points, enlarged by a
-        quarter on each side. Far from all points such functions may have other zeros.
+        quarter of its longest side on each side. Far from all points such functions may have other
+        zeros.
+
+    Source: Aydinlilar and Zanni 2023, eq. 9; Wendland 2005.
 
     Raises:
         ValueError: arguments that are not points with normals, or a repeated point.
@@ -73,6 +79,7 @@ class HRBF(Formula):
     default_level: float = 0.0
 
     def __init__(self, points: Any, normals: Any, *, domain: Volume | None = None) -> None:
+        """Check the arguments, and solve for the coefficients of the function."""
         check_volume(domain, "domain")
         self.points, self.normals = _checked(points, normals)
         self.value_coefficients, self.gradient_coefficients = _solve_coefficients(
@@ -86,8 +93,8 @@ class HRBF(Formula):
 
     @cached_prepare
     def prepare(self, backend: Backend) -> HRBF:
-        """The same function with its points as records of the backend. Kernels compiled for it
-        serve other points as well."""
+        """The same field with its points uploaded to the backend. Code that Dr.Jit compiles for it
+        serves other points as well, because all numbers are data and none are literals."""
         prepared = copy.copy(self)
         prepared._on = self._uploaded(backend)
         if self.lipschitz is not None:
@@ -95,11 +102,11 @@ class HRBF(Formula):
         return prepared
 
     def _largest_gradient(self) -> float | None:
-        """A bound of |grad f| in the domain; None for a domain without bounds.
+        """A bound of |grad f| in the domain; None if the domain is unbounded.
 
-        It is the sum over the points p_i of bounds of the gradients of their terms,
-        |grad (a r^3 + b . grad r^3)| <= 3 |a| r^2 + 6 |b| r, with r the distance from the point p_i
-        to the farthest corner of the domain's box.
+        It is a sum over the points p_i. The gradient of the term of a point is at most 3 |a| r^2 +
+        6 |b| r, where r is the distance from p_i; the bound takes r as the distance to the farthest
+        corner of the domain's box.
         """
         if self.domain is None or not np.isfinite(corners := np.array(self.domain.bounds())).all():
             return None
@@ -111,47 +118,63 @@ class HRBF(Formula):
         )
 
     def _uploaded(self, backend: Backend) -> tuple[Backend, RecordTable]:
-        """The backend, and the records of the points on it.
+        """The backend, and a table on it with one record (row of 16 numbers) for each point.
 
         A record holds, by columns: 0 to 2 the point, rounded to the precision of the backend; 3 to
         5 the rest of the point, which rounding has cut off; 6 the number a; 7 to 9 the vector 3 b;
-        10 to 15 zeros.
+        10 to 15 zeros, which fill the row.
         """
-        rounded = self.points.astype(backend.dtype).astype(np.float64)
+        rounded_points = self.points.astype(backend.dtype).astype(np.float64)
         rows = np.column_stack(
             [
-                rounded,
-                self.points - rounded,
+                rounded_points,
+                self.points - rounded_points,
                 self.value_coefficients,
                 3 * self.gradient_coefficients,
-                np.zeros((len(rounded), 6)),
+                np.zeros((len(rounded_points), 6)),
             ]
         )
         return backend, RecordTable.upload(backend, rows)
 
     def _prepared_for(self, backend: Backend) -> tuple[Backend, RecordTable]:
-        """The backend, and the records of the points on it. They are uploaded only if `prepare` has
-        not done so."""
+        """The backend, and the table of the points' records (rows of numbers) on it. They are
+        uploaded now unless `prepare` has done so."""
         return self._uploaded(backend) if self._on is None else self._on
 
     def evaluate(self, p: Vec3) -> Sample:
+        """The sample at p: the value and the gradient of f, and a Lipschitz constant that holds in
+        the domain."""
+        # Any direction will do: with a single knot no derivative along the line is computed.
         d = type(p)(1, 0, 0)
         return self._sample(self._along(p, d, (0.0,)).start)
 
     def _sample(self, sums: SumValue) -> Sample:
-        """The sample at points, from the sum there. Its promise (proved bound of f near a point) is
-        the Lipschitz constant of the field in its domain."""
+        """The sample at points: value, gradient, and, as the proved bound of f near the points, a
+        Lipschitz constant that holds in the domain.
+
+        sums: value and gradient of f at the points, with bounds of their errors.
+        """
         promises = () if self.lipschitz is None else (Lipschitz(0 * sums.value + self.lipschitz),)
         return Sample(sums.value, sums.gradient, promises, sums.error, sums.gradient_error)
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
-        """The sample at the position t of a ray, with enclosures: proofs of lengths ahead on which
-        f takes no level. It needs one loop over the points. There is no enclosure looking back."""
+        """The sample at the position t of a ray, with enclosures: proofs of lengths in front of the
+        point on which f takes none of the levels (the values that rays look for). It needs one loop
+        over the points p_i. There is no enclosure behind the point.
+
+        path: the ray.
+        t: a length along it.
+        ahead: the length in front of the point up to which proofs are wanted.
+        back: the same behind the point; not used.
+        """
         del back
         p, d = path.point(t), path.direction
+        # The proofs are asked first at which knots they want ranges of derivatives; those are then
+        # computed in the one loop over the points.
         recorder = KnotRecorder()
         length = ahead
         path.proofs.from_restriction(recorder, SlopeRange(0.0, 0.0), length)
+        # No proof asks for ranges of derivatives: those from the Lipschitz constant are used.
         if recorder.knots is None:
             return path.enclose(self.evaluate(p))
         sums = self._along(p, d, recorder.knots)
@@ -161,16 +184,18 @@ class HRBF(Formula):
         return RaySample(self._sample(sums.start), enclosures, (), slope, PIECES)
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
-        """The function f at jets of the coordinates (intervals of values and derivatives), or at
+        """f at jets of the coordinates (intervals that contain values and derivatives), or at
         Dr.Jit numbers."""
         if not is_jet(x, type(self).__name__):
             return self.differentiable_value(backend_of(x).Array3f(x, y, z))
+        # Ends of intervals that are Dr.Jit numbers: they tell the backend.
         numbers = (end for jet in (x, y, z) for entry in (jet.value, *jet.first_derivatives)
                    for end in (entry.lower, entry.upper) if dr.is_array_v(type(end)))  # fmt: skip
         backend, records = self._prepared_for(backend_of(next(numbers)))
 
         def term(row: list[Real]) -> Jet:
-            """The jet of the term a r^3 + b . grad r^3 of the point with the record `row`."""
+            """The jet of the term a r^3 + b . grad r^3 of one point, which is a r^3 + 3 r (b . v)
+            with v = x - p_i. row: the point's record, whose entries 7 to 9 are 3 b."""
             u, v, w = ((entry - row[k]) - row[3 + k] for k, entry in enumerate((x, y, z)))
             r = (u**2 + v**2 + w**2).apply(sqrt)
             return r**3 * row[6] + r * (u * row[7] + v * row[8] + w * row[9])
@@ -178,25 +203,27 @@ class HRBF(Formula):
         return sum_jets(term, x, backend.Float(0), for_each_record(records))
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
-        """The three rows of the Hessian of f at p, by a sum over the points."""
+        """The three rows of the Hessian of f at p, by a sum over the points p_i."""
         backend, records = self._prepared_for(backend_of(p))
         pairs = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
         def add_point(row: list[Real], state: State) -> State:
-            """The upper triangle of the Hessian, row by row, with the term of the point of record
-            `row` added."""
-            v, b, r, inverse = _offset_of_point(p, row)
-            dot = dr.dot(b, v) * inverse
-            e = v * inverse
+            """The sums so far of the second derivatives xx, xy, xz, yy, yz, zz (`state`), with the
+            term of one more point added. row: the point's record."""
+            # The vector from the point, its length, and three times the vector of the point.
+            v, b, r, inverse_r = _offset_of_point(p, row)
+            b_dot_e = dr.dot(b, v) * inverse_r
+            e = v * inverse_r
 
             def entry(i: int, j: int) -> Real:
-                """The second derivative of the term by coordinates i and j.
+                """The second derivative of the point's term by coordinates i and j.
 
-                With e = v/r, it is 3 a (r delta_ij + v_i e_j) plus (b . e) (delta_ij - e_i e_j) +
-                b_i e_j + b_j e_i, where b is three times the vector of the point.
+                Let v be the vector from the point, r its length, e = v/r, and b three times the
+                vector b_i of the point. Then it is 3 a (r delta_ij + v_i e_j) + (b . e) (delta_ij -
+                e_i e_j) + b_i e_j + b_j e_i.
                 """
                 delta = 1.0 if i == j else 0.0
-                vector_part = dot * (delta - e[i] * e[j]) + b[i] * e[j] + b[j] * e[i]
+                vector_part = b_dot_e * (delta - e[i] * e[j]) + b[i] * e[j] + b[j] * e[i]
                 return 3 * row[6] * (r * delta + v[i] * e[j]) + vector_part
 
             return tuple(total + entry(*pair) for total, pair in zip(state, pairs, strict=True))
@@ -207,75 +234,88 @@ class HRBF(Formula):
         return vector(xx, xy, xz), vector(xy, yy, yz), vector(xz, yz, zz)
 
     def _along(self, p: Vec3, d: Vec3, knots: Sequence[Real]) -> SumOnRay:
-        """The function f along the paths p + s d, with ranges of its first two derivatives by s on
-        the pieces between knots.
+        """f along the paths p + s d, with ranges of its first two derivatives by s on the pieces
+        between knots.
 
         p, d: (3, n) starts of the paths, and their unit directions.
         knots: increasing values of s, the first of them 0. If there is only that one, derivatives
             along the line are left out.
 
-        Proof. Consider the term of one point. Let b be three times the vector of the point, h the
-        distance of the line from the point, w the vector from the point to the nearest point of the
-        line, c = b . w and B = b . d. Let x be the position on the line, measured from that nearest
-        point, r^2 = h^2 + x^2 and u = x/r. Then the term and its first two derivatives in x are
+        Proof. Consider the term of one point p_i. Let b be three times its vector b_i, h the
+        distance of the line from p_i, w the vector from p_i to the nearest point of the line, c = b
+        . w and B = b . d. Let x be the position on the line, measured from that nearest point, r^2
+        = h^2 + x^2 and u = x/r. Then the term and its first two derivatives in x are
 
             a r^3 + r (c + B x),
             3 a r x + c u + B (h^2 + 2x^2)/r,
             3 a (h^2 + 2x^2)/r + c h^2/r^3 + B (3u - u^3).
 
-        The functions r x, u and 3u - u^3 increase. The functions (h^2 + 2x^2)/r and -h^2/r^3
-        decrease until x = 0 and increase from there. So each function has its extreme values on a
-        piece at the ends of the piece, or at 0.
+        The functions r x, u and 3u - u^3 increase. (h^2 + 2x^2)/r decreases until x = 0 and
+        increases from there; h^2/r^3 does the opposite. So each function has its extreme values on
+        a piece at the ends of the piece, or at 0.
 
-        Rounding. The error of positions is at most e = 8 roundings of the largest distance m on the
-        path, as in `harnack.fields.blobs.blob_sums`. It changes the three expressions by at most 3
-        |a| m^2 e + 2 |b| m e, 6 |a| m e + 4 |b| e and 10 |a| e + 8 |b| min(1, e/r), where r is the
-        smallest distance on the path. A sum of n terms adds n roundings of the sum of |a| m^3 + |b|
-        m^2, of 3 |a| m^2 + 3 |b| m and of 6 |a| m + 3 |b|.
+        Rounding. The error of positions is at most e = 8 roundings of the largest distance m from
+        p_i on the path, as in `harnack.fields.blobs.blob_sums`. It changes the three expressions by
+        at most 3 |a| m^2 e + 2 |b| m e, 6 |a| m e + 4 |b| e and 10 |a| e + 8 |b| min(1, e/r), where
+        r is the smallest distance from p_i on the path. A sum of n terms adds n roundings of the
+        sum of |a| m^3 + |b| m^2, of 3 |a| m^2 + 3 |b| m and of 6 |a| m + 3 |b|.
         """
         backend, records = self._prepared_for(backend_of(p))
         real = backend.Float
         count = len(knots) - 1
-        unit = 0.5 * backend.machine_epsilon
+        roundoff = 0.5 * backend.machine_epsilon
         tiny = float(dr.smallest(real))
 
         def add_point(row: list[Real], state: State) -> State:
-            """The state with the term of the point of record `row` added.
+            """The sums so far (`state`), with the term of one more point added. row: the point's
+            record.
 
             The state consists of the value; the three components of the gradient; the sums of |a|
             r^3 + |b| r^2 and of |a| r^2 + |b| r, for the errors of both; and the number of terms.
             If derivatives along the line are bounded, there follow for each piece the ends of the
-            ranges of the first and of the second derivative, and the sums for the errors of these
-            two ranges.
+            range of the first derivative and those of the second, and at the end the sums for the
+            errors of these two ranges.
             """
-            value, gx, gy, gz, value_size, gradient_size, term_count, *sums = state
-            a = row[6]
-            v, b, r, inverse = _offset_of_point(p, row)
-            along_b = dr.dot(b, v)
-            radial = dr.fma(3 * a, r, along_b * inverse)
-            value = value + r * dr.fma(a * r, r, along_b)
+            (
+                value,
+                gradient_x,
+                gradient_y,
+                gradient_z,
+                value_size,
+                gradient_size,
+                term_count,
+                *sums,
+            ) = state
+            piece_begin = row[6]
+            v, piece_end, r, inverse_r = _offset_of_point(p, row)
+            # The term is a r^3 + r (b . v), and its gradient is (3 a r + (b . v)/r) v + r b.
+            along_b = dr.dot(piece_end, v)
+            radial = dr.fma(3 * piece_begin, r, along_b * inverse_r)
+            value = value + r * dr.fma(piece_begin * r, r, along_b)
             gradient = [
-                component + dr.fma(radial, v[k], r * b[k])
-                for k, component in enumerate((gx, gy, gz))
+                component + dr.fma(radial, v[k], r * piece_end[k])
+                for k, component in enumerate((gradient_x, gradient_y, gradient_z))
             ]
-            abs_a, norm_b = dr.abs(a), dr.norm(b)
+            abs_a, norm_b = dr.abs(piece_begin), dr.norm(piece_end)
             value_size = dr.fma(dr.fma(abs_a, r, norm_b), r * r, value_size)
             gradient_size = dr.fma(dr.fma(abs_a, r, norm_b), r, gradient_size)
             term_count = term_count + 1
             if not count:
                 return value, *gradient, value_size, gradient_size, term_count
 
+            # The line's quantities of the proof: x at the start of the path, w, h, c and B
+            # (`rate_b`).
             position = dr.dot(v, d)
             w = v - position * d
-            h2 = dr.dot(w, w)
-            h = dr.sqrt(h2)
-            c, rate_b = dr.dot(b, w), dr.dot(b, d)
-            start_shapes = _term_functions(h2, position, tiny)
+            h_squared = dr.dot(w, w)
+            h = dr.sqrt(h_squared)
+            c, rate_b = dr.dot(piece_end, w), dr.dot(piece_end, d)
+            start_shapes = _term_functions(h_squared, position, tiny)
             # The values at x = 0 of the functions that are not monotone.
-            values_at_zero = (h, h2 / fmax(h2 * h, tiny))
+            values_at_zero = (h, h_squared / fmax(h_squared * h, tiny))
             for k in range(count):
                 end_at = position + knots[k + 1]
-                end_shapes = _term_functions(h2, end_at, tiny)
+                end_shapes = _term_functions(h_squared, end_at, tiny)
                 crosses = (position + knots[k] <= 0) & (end_at >= 0)
                 bowl_min = dr.select(
                     crosses, values_at_zero[0], fmin(start_shapes.bowl, end_shapes.bowl)
@@ -285,14 +325,17 @@ class HRBF(Formula):
                 )
                 bowl = bowl_min, fmax(start_shapes.bowl, end_shapes.bowl)
                 bell = fmin(start_shapes.bell, end_shapes.bell), bell_max
+                # Add the range of each function times its factor: to the first derivative (index 0)
+                # or to the second one (index 2).
                 for index, scale, (lower, upper) in (
-                    (0, 3 * a, (start_shapes.lift, end_shapes.lift)),
+                    (0, 3 * piece_begin, (start_shapes.lift, end_shapes.lift)),
                     (0, c, (start_shapes.sine, end_shapes.sine)),
                     (0, rate_b, bowl),
-                    (2, 3 * a, bowl),
+                    (2, 3 * piece_begin, bowl),
                     (2, c, bell),
                     (2, rate_b, (start_shapes.turn, end_shapes.turn)),
                 ):
+                    # A negative factor exchanges the ends of a range.
                     is_positive = scale > 0
                     lower, upper = (
                         dr.select(is_positive, lower, upper),
@@ -302,50 +345,61 @@ class HRBF(Formula):
                     sums[4 * k + index + 1] = dr.fma(upper, scale, sums[4 * k + index + 1])
                 start_shapes = end_shapes
 
+            # The largest distance from the point on the path, and the smallest.
             max_distance = r + knots[-1]
             nearest = dr.select(
                 position >= 0,
                 r,
                 dr.select(
-                    position + knots[-1] <= 0, dr.sqrt(h2 + dr.square(position + knots[-1])), h
+                    position + knots[-1] <= 0,
+                    dr.sqrt(h_squared + dr.square(position + knots[-1])),
+                    h,
                 ),
             )
-            fraction = fmin(max_distance / fmax(nearest, tiny), 1 / (8 * unit))
+            # m/r, limited as min(1, e/r) is in the bound of the error.
+            fraction = fmin(max_distance / fmax(nearest, tiny), 1 / (8 * roundoff))
             sums[-2] = sums[-2] + max_distance * dr.fma(abs_a, max_distance, norm_b)
             sums[-1] = sums[-1] + dr.fma(abs_a, max_distance, norm_b * fraction)
             return value, *gradient, value_size, gradient_size, term_count, *sums
 
-        size = 7 + (4 * count + 2 if count else 0)
-        state = records.for_each(add_point, tuple(real(0) for _ in range(size)), "points")
-        value, gx, gy, gz, value_size, gradient_size, term_count, *sums = state
+        state_size = 7 + (4 * count + 2 if count else 0)
+        state = records.for_each(add_point, tuple(real(0) for _ in range(state_size)), "points")
+        value, gradient_x, gradient_y, gradient_z, value_size, gradient_size, term_count, *sums = (
+            state
+        )
         start = SumValue(
             value,
-            backend.Array3f(gx, gy, gz),
-            unit * (24 + term_count) * value_size,
-            unit * (64 + 3 * term_count) * gradient_size,
+            backend.Array3f(gradient_x, gradient_y, gradient_z),
+            roundoff * (24 + term_count) * value_size,
+            roundoff * (64 + 3 * term_count) * gradient_size,
         )
         pieces: list[PathPiece] = []
-        for k, (a, b) in enumerate(itertools.pairwise(knots)):
+        for k, (piece_begin, piece_end) in enumerate(itertools.pairwise(knots)):
             lower, upper, min_second, max_second = sums[4 * k : 4 * k + 4]
-            slope_error = unit * (64 + 3 * term_count) * sums[-2]
-            second_error = unit * (100 + 6 * term_count) * sums[-1]
+            slope_error = roundoff * (64 + 3 * term_count) * sums[-2]
+            second_error = roundoff * (100 + 6 * term_count) * sums[-1]
             slopes = SlopeRange(lower - slope_error, upper + slope_error)
             pieces.append(
-                PathPiece(b - a, slopes, min_second - second_error, max_second + second_error)
+                PathPiece(
+                    piece_end - piece_begin,
+                    slopes,
+                    min_second - second_error,
+                    max_second + second_error,
+                )
             )
         return SumOnRay(start, tuple(pieces))
 
     def describe(self) -> dict[str, Any]:
-        """Facts about the field for users, as a dictionary of names and values."""
+        """The number of points, as a dictionary for users."""
         return {"points": len(self.points)}
 
 
 @dataclass(frozen=True)
 class _TermFunctions:
-    """The values, at a position x on a line, of the functions of x whose ranges bound the
-    derivatives of a point's term along the line. Here x is measured from the point of the line
-    nearest to the point p_i of the term, h is the distance of the line from p_i, r^2 = h^2 + x^2
-    and u = x/r. `bowl` and `bell` are named by the shapes of their graphs."""
+    """The values at a position x on a line of five functions of x, whose ranges bound the
+    derivatives of one point's term along the line (`HRBF._along`). Here x is measured from the
+    point of the line nearest to the point p_i of the term, h is the distance of the line from p_i,
+    r^2 = h^2 + x^2 and u = x/r. `bowl` and `bell` are named by the shapes of their graphs."""
 
     lift: Real  # r x
     sine: Real  # u
@@ -355,29 +409,30 @@ class _TermFunctions:
 
 
 def _term_functions(h_squared: Real, x: Real, tiny: float) -> _TermFunctions:
-    """The functions `_TermFunctions` at the position x of a line that passes the point of a term at
-    the distance h.
+    """The five functions `_TermFunctions` at the position x of a line that passes the point p_i of
+    a term at the distance h. x is measured from the point of the line nearest to p_i.
 
     h_squared: h^2.
-    tiny: the smallest positive number, below which no distance is divided by.
+    tiny: the smallest positive normal number; a distance below it counts as this number in
+        divisions.
     """
     x_squared = x * x
     r_squared = h_squared + x_squared
     r = dr.sqrt(r_squared)
-    inverse = 1 / fmax(r, tiny)
-    u = x * inverse
+    inverse_r = 1 / fmax(r, tiny)
+    u = x * inverse_r
     return _TermFunctions(
         r * x,
         u,
-        (r_squared + x_squared) * inverse,
-        h_squared * inverse * inverse * inverse,
+        (r_squared + x_squared) * inverse_r,
+        h_squared * inverse_r * inverse_r * inverse_r,
         u * (3 - u * u),
     )
 
 
 def _offset_of_point(p: Vec3, row: list[Real]) -> tuple[Vec3, Vec3, Real, Real]:
-    """Four results for the point p_i of the record `row`: the vector v from p_i to p; the vector 3
-    b of the record; the length of v; and one over that length."""
+    """Four results for the point p_i with this record: the vector v from p_i to p; the vector 3 b_i
+    of the record; the length of v; and one over that length."""
     v = type(p)(*((p[k] - row[k]) - row[3 + k] for k in range(3)))
     b = type(p)(row[7], row[8], row[9])
     r = dr.norm(v)
@@ -386,9 +441,11 @@ def _offset_of_point(p: Vec3, row: list[Real]) -> tuple[Vec3, Vec3, Real, Real]:
 
 def _solve_coefficients(points: FloatArray, normals: FloatArray) -> tuple[FloatArray, FloatArray]:
     """The numbers a_i (n,) and the vectors b_i (n, 3) of the function f = sum over i of a_i r_i^3 +
-    b_i . grad r_i^3, with r_i the distance from the point p_i (`HRBF`).
+    b_i . grad r_i^3 with r_i = |x - p_i|, for which f = 0 and grad f = the normal at each point
+    p_i.
 
-    They solve a linear system with four equations for each point: f = 0 and grad f = normal.
+    They solve a linear system with four equations and four unknowns for each point. It is solved in
+    coordinates scaled to the size of the point set.
 
     Raises:
         ValueError: the system cannot be solved.
@@ -399,16 +456,18 @@ def _solve_coefficients(points: FloatArray, normals: FloatArray) -> tuple[FloatA
     offsets = scaled[:, None] - scaled[None]  # from column to row
     r = np.linalg.norm(offsets, axis=2)
     with np.errstate(divide="ignore", invalid="ignore"):
-        outer = np.where(
+        unit_outer_products = np.where(
             (r > 0)[..., None, None],
             offsets[..., :, None] * offsets[..., None, :] / r[..., None, None],
             0,
         )
     system = np.empty((n, 4, n, 4))
+    # Equation 0 of a point is the value of f, equations 1 to 3 are the gradient. Unknown 0 of a
+    # point is a, unknowns 1 to 3 are b.
     system[:, 0, :, 0] = r**3
     system[:, 0, :, 1:] = 3 * r[..., None] * offsets
     system[:, 1:, :, 0] = np.moveaxis(3 * r[..., None] * offsets, 2, 1)
-    hessian = 3 * (r[..., None, None] * np.eye(3) + outer)
+    hessian = 3 * (r[..., None, None] * np.eye(3) + unit_outer_products)
     system[:, 1:, :, 1:] = np.moveaxis(hessian, 2, 1)
     right_side = np.zeros((n, 4))
     right_side[:, 1:] = normals
@@ -418,6 +477,7 @@ def _solve_coefficients(points: FloatArray, normals: FloatArray) -> tuple[FloatA
     try:
         solution = cast("Any", scipy.linalg).solve(matrix, right_side.ravel(), assume_a="gen")
     except np.linalg.LinAlgError:
+        # No solution: the residual below is NaN, which is refused.
         solution = np.full(4 * n, np.nan)
     residual = np.abs(matrix @ solution - right_side.ravel()).max()
     if not residual <= 1e-6:
@@ -427,11 +487,14 @@ def _solve_coefficients(points: FloatArray, normals: FloatArray) -> tuple[FloatA
             "some out or add others"
         )
     solution = solution.reshape(n, 4)
+    # Back to unscaled coordinates, in which r^3 is size^3 times and grad r^3 size^2 times as large;
+    # f is multiplied by size, so that its gradients are still the normals.
     return solution[:, 0] / size**2, solution[:, 1:] / size
 
 
 def _checked(points: Any, normals: Any) -> tuple[FloatArray, FloatArray]:
-    """The points (n, 3), and the normals (n, 3) as unit vectors.
+    """The points (n, 3) and the normals (n, 3) after checks, x and n in the code; the normals are
+    made unit vectors.
 
     Raises:
         ValueError: wrong shapes or numbers, or a repeated point.
@@ -450,8 +513,8 @@ def _checked(points: Any, normals: Any) -> tuple[FloatArray, FloatArray]:
     length = np.linalg.norm(n, axis=1)
     if not (length > 0).all():
         raise ValueError(f"normal {int(np.argmin(length))} is zero: it has no direction")
-    _, first, counts = np.unique(x, axis=0, return_index=True, return_counts=True)
+    _, first_index, counts = np.unique(x, axis=0, return_index=True, return_counts=True)
     if (counts > 1).any():
-        index = int(first[np.argmax(counts > 1)])
+        index = int(first_index[np.argmax(counts > 1)])
         raise ValueError(f"point {index} is given more than once: leave out the others")
     return x, n / length[:, None]

@@ -1,11 +1,12 @@
 """Kernels of blobs: functions of the distance from the center, with their derivatives along lines.
+A blob is a bump around a center that ends at a certain distance, the radius of its support. A
+kernel is the shape of the bump: a function k(q) of the squared distance q from the center, with
+lengths in units of the support's radius. It falls from the center to 0 at q = 1, where it ends with
+dk/dq = 0. Take a line that passes the center at the distance h. Its chord is the part inside the
+support, of half length S with S^2 = 1 - h^2. Let x be the position on the line, measured from the
+point nearest to the center; then the kernel along the line is f(x) = k(h^2 + x^2) for |x| <= S.
 
-Lengths are in units of the support, the radius at which a blob ends. A kernel is a function k(q) of
-the squared distance q from the center. It falls from the center to 0 at q = 1, where it ends with
-dk/dq = 0. Take a line that passes the center at the distance h, and let x be the position on the
-line, measured from the point nearest to the center. Along the line the kernel is f(x) = k(h^2 +
-x^2) on the chord |x| <= S, with S^2 = 1 - h^2. The derivatives of f have the same shape for all
-kernels, on which the proofs rest:
+The derivatives of f have the same shape for all kernels, and the proofs rest on it:
 
 - f' is odd. For x > 0 it falls to a single minimum at x = c1, then rises to 0 at S.
 - f'' is even. It rises from a minimum at 0 to a single maximum at c2, then falls until S.
@@ -37,17 +38,18 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ChordProfile:
-    """The extreme values of the first two derivatives of a kernel along a line, and the positions
-    on the line at which the derivatives take them. Positions are measured from the point of the
-    line nearest to the kernel's center, in units of the support's radius.
+    """The largest and smallest values of the first two derivatives of a kernel along a line, and
+    the positions at which they are taken. Positions x are measured along the line from the point
+    nearest to the kernel's center, in units of the support's radius.
 
-    half_length: S: the line is inside the support for positions from -S to S. S is 0 if the line
-        misses the support.
-    steepest_position: c1 >= 0. The first derivative has its maximum at -c1 and its minimum at c1.
+    half_length: S, half the length of the line's part inside the support, which is |x| <= S; 0 if
+        the line misses the support.
+    steepest_position: c1 >= 0. The first derivative has its maximum at x = -c1 and its minimum at
+        c1.
     steepest: the maximum of the first derivative; the minimum is minus this number.
-    max_curvature_position: c2 >= 0. The second derivative has its maximum at -c2 and at c2.
+    max_curvature_position: c2 >= 0. The second derivative has its maximum at x = -c2 and at c2.
     max_second: the maximum of the second derivative.
-    min_second: the minimum of the second derivative, at the position 0.
+    min_second: the minimum of the second derivative, which is taken at x = 0.
     """
 
     half_length: Real
@@ -60,10 +62,9 @@ class ChordProfile:
 
 @dataclass(frozen=True)
 class KernelLipschitz:
-    """Lipschitz constants of a kernel and of its first two derivatives along lines, by which the
-    effect of rounding is bounded. They say how much these numbers change at most if the line or
-    the position on it is displaced, for each unit of the displacement. Lengths are in units of the
-    support's radius.
+    """Lipschitz constants of a kernel and of its first two derivatives along lines. Bounds of
+    rounding use them: if rounding displaces the line, or the position on it, by a length e, the
+    number changes by at most its constant times e. Lengths are in units of the support's radius.
 
     value: the constant of the kernel k.
     slope: the constant of the first derivative along a line; also a bound of |grad k|.
@@ -77,8 +78,12 @@ class KernelLipschitz:
 
 
 class BlobKernel(abc.ABC):
-    """A kernel of blobs: see the module for k, q, S and x. Each blob multiplies the kernel by an
-    amplitude, so that a single blob of weight 1 has the value 1 at its radius."""
+    """The shape of a blob: a function k(q) of the squared distance q from the blob's center, in
+    units of the support's radius; it is 0 for q >= 1, the outside of the support. Along a line at
+    the distance h from the center, at the position x from the line's point nearest to it, q = h^2 +
+    x^2. The part of the line inside the support is |x| <= S with S^2 = 1 - h^2. A blob of weight 1
+    is the kernel times `amplitude`, so that it has the value 1 at the blob's radius, which is
+    smaller than the support's."""
 
     name: ClassVar[str]
     second_derivative_jumps: ClassVar[bool] = True
@@ -87,7 +92,7 @@ class BlobKernel(abc.ABC):
     @property
     @abc.abstractmethod
     def support(self) -> float:
-        """The distance at which a blob ends, in units of its radius."""
+        """The radius of the support, at which a blob ends, divided by the radius of the blob."""
 
     @property
     @abc.abstractmethod
@@ -96,14 +101,14 @@ class BlobKernel(abc.ABC):
 
     @abc.abstractmethod
     def height(self, q: FloatArray) -> FloatArray:
-        """The kernel's values k(q) in NumPy, in double precision. q: squared distances from the
-        center, in units of the support."""
+        """The kernel's values k(q), as a NumPy array in double precision. q: squared distances from
+        the center, in units of the support's radius."""
 
     @abc.abstractmethod
     def profile(self, q: Real) -> tuple[Real, Real, Real]:
-        """Three numbers at the squared distance q from the center, in units of the support: the
-        value k(q); the derivative dk/dq; and a number m that bounds the rounding of k. The error of
-        k is at most 16 unit roundoffs times m plus 16 unit roundoffs times |dk/dq|."""
+        """The kernel at a squared distance from the center, in units of the support's radius, as
+        three numbers: the value k(q); the derivative dk/dq; and a number m for the bound of the
+        rounding. The error of the computed k is at most 16 unit roundoffs times (m + |dk/dq|)."""
 
     @abc.abstractmethod
     def second_derivative(self, q: Real) -> Real:
@@ -111,8 +116,8 @@ class BlobKernel(abc.ABC):
 
     @abc.abstractmethod
     def chord(self, height_squared: Real, half_chord_squared: Real) -> ChordProfile:
-        """The extreme values of the kernel's first two derivatives along lines, one for each lane.
-        Lengths are in units of the support's radius.
+        """The extreme values of the kernel's first two derivatives along lines, one line for each
+        lane. Lengths are in units of the support's radius.
 
         height_squared: h^2 <= 1, with h the distance of the line from the kernel's center.
         half_chord_squared: S^2 = 1 - h^2 >= 0, with S half the length of the line's part inside the
@@ -133,8 +138,9 @@ class BlobKernel(abc.ABC):
         """
 
     def lipschitz_fraction(self, half_chord_squared: Real, nearest: Real) -> Real:
-        """A factor, at most 1, by which the Lipschitz constants `steepness` may be multiplied for a
-        part of a line. Lengths are in units of the support's radius.
+        """A factor by which the Lipschitz constants `steepness` may be multiplied on a part of a
+        line, where the kernel may be less steep than elsewhere. It is at most 1; by default it is
+        1. Lengths are in units of the support's radius.
 
         half_chord_squared: S^2, with S half the length of the line's part inside the support.
         nearest: a lower bound of x^2 on the part, with x the position on the line from the point
@@ -145,22 +151,25 @@ class BlobKernel(abc.ABC):
 
     @abc.abstractmethod
     def derivative_ranges(self, q: Interval) -> tuple[Interval, Interval, Interval]:
-        """Three intervals that contain the kernel k(q), its derivative dk/dq and its second
-        derivative on an interval of squared distances q >= 0."""
+        """Intervals that contain all values of the kernel k(q), of dk/dq and of d2k/dq2 (three
+        intervals) for squared distances q >= 0 in an interval."""
 
     def prepare(self, backend: Backend) -> BlobKernel:
-        """The same kernel with its numbers as kernel parameters of the backend."""
+        """This kernel with its numbers as Dr.Jit arrays of the backend that are not literals:
+        Dr.Jit then need not compile its code again if they change. By default the kernel itself,
+        for kernels without such numbers."""
         del backend
         return self
 
     @property
     def amplitude(self) -> float:
-        """The amplitude of a blob of weight 1: one over the value of k at the radius of a blob,
-        that is at q = 1/support^2."""
+        """The factor of the kernel in a blob of weight 1, which makes the blob's value 1 at the
+        blob's radius: one over k at that radius, where q = 1/support^2."""
         return 1.0 / float(self.height(np.array([self.support**-2.0]))[0])
 
     def function(self) -> ElementaryFunction:
-        """The kernel as a function that can be applied to a jet of q."""
+        """The kernel as an `ElementaryFunction` of q, which can be applied to a jet (ranges of a
+        function and of its derivatives)."""
         return ElementaryFunction(
             self.name, self.derivative_ranges, lambda q: self.profile(q)[0], self.height
         )
@@ -168,12 +177,14 @@ class BlobKernel(abc.ABC):
 
 @dataclass(frozen=True)
 class CompactKernel(BlobKernel):
-    """The compact polynomial kernel (1 - q)^3, whose second derivative is continuous (Aydinlilar
-    and Zanni 2023, eq. 7 with n = 6).
+    """The compact polynomial kernel k = (1 - q)^3, where q is the squared distance from the center
+    in units of the support's radius. Its second derivative is continuous (Aydinlilar and Zanni
+    2023, eq. 7 with n = 6).
 
-    support: where a blob ends, in units of its radius.
+    support: the radius at which a blob ends, in units of the blob's radius.
 
-    Along a line, with w = S^2 - x^2,
+    Let f(x) be the kernel along a line, at the position x from the point nearest to the center. The
+    line's part inside the support is |x| <= S. With w = S^2 - x^2,
 
         f' = -6 x w^2,    f'' = 6 w (4 x^2 - w),    f''' = 24 x (3w - 2x^2).
 
@@ -204,18 +215,29 @@ class CompactKernel(BlobKernel):
         return 6 * fmax(1 - q, 0)
 
     def chord(self, height_squared: Real, half_chord_squared: Real) -> ChordProfile:
-        """The extreme values of the kernel's first two derivatives along lines, by the formulas of
-        the class. The arguments are the squares h^2 and S^2 of the distance of a line from the
-        center and of half its chord, in units of the support's radius."""
-        half, squared = dr.sqrt(half_chord_squared), half_chord_squared * half_chord_squared
-        zero_x = math.sqrt(0.2) * half
+        """The extreme values of the kernel's first two derivatives along lines, with lengths in
+        units of the support's radius.
+
+        height_squared: h^2, with h the distance of a line from the center; not used, as S^2 = 1 -
+            h^2.
+        half_chord_squared: S^2, with S half the length of the line's part inside the support.
+
+        Proof. f' is largest where f'' = 0, at x^2 = S^2/5; there w = S^2 - x^2 = 4/5 S^2, and |f'|
+        = 6 |x| w^2 = 3.84 S^4 |x|. f'' is largest where f''' = 0, at x^2 = 3/5 S^2; there f'' = 4.8
+        S^4.
+        """
+        half_length, fourth_power = (
+            dr.sqrt(half_chord_squared),
+            half_chord_squared * half_chord_squared,
+        )
+        steepest_x = math.sqrt(0.2) * half_length
         return ChordProfile(
-            half,
-            zero_x,
-            3.84 * squared * zero_x,
-            math.sqrt(0.6) * half,
-            4.8 * squared,
-            -6 * squared,
+            half_length,
+            steepest_x,
+            3.84 * fourth_power * steepest_x,
+            math.sqrt(0.6) * half_length,
+            4.8 * fourth_power,
+            -6 * fourth_power,
         )
 
     def derivatives(
@@ -226,9 +248,10 @@ class CompactKernel(BlobKernel):
         return -6 * x * (w * w), 6 * w * dr.fma(4, square, -w)
 
     def derivative_ranges(self, q: Interval) -> tuple[Interval, Interval, Interval]:
-        """Intervals that contain the kernel k(q), dk/dq and d2k/dq2 for q in an interval. For q < 1
-        each of the three is monotone in q, so that the ends are values at the ends of q, widened
-        for rounding."""
+        """Intervals that contain all values of the kernel k(q), of dk/dq and of d2k/dq2 (three
+        intervals) for q in an interval. With w = max(1 - q, 0) they are w^3, -3 w^2 and 6 w. Each
+        is monotone in w, so its values at the ends of w, moved outwards for rounding, are the ends
+        of its interval."""
         w = _one_minus(q)
         epsilon = machine_epsilon(w.lower)
         return (
@@ -240,20 +263,22 @@ class CompactKernel(BlobKernel):
 
 @dataclass(frozen=True)
 class SexticKernel(BlobKernel):
-    """The sextic kernel of soft objects, 1 - 22/9 q + 17/9 q^2 - 4/9 q^3 = w^2 (5 + 4w)/9 with w =
-    1 - q (Wyvill, McPheeters and Wyvill 1986; Hart 1996, appendix D).
+    """The sextic kernel of soft objects, k = 1 - 22/9 q + 17/9 q^2 - 4/9 q^3, where q is the
+    squared distance from the center in units of the support's radius. With w = 1 - q it is w^2 (5 +
+    4w)/9 (Wyvill, McPheeters and Wyvill 1986; Hart 1996, appendix D).
 
-    support: where a blob ends, in units of its radius.
+    support: the radius at which a blob ends, in units of the blob's radius.
 
-    Along a line, with w = S^2 - x^2,
+    Let f(x) be the kernel along a line, at the position x from the point nearest to the center. The
+    line's part inside the support, the chord, is |x| <= S. With w = S^2 - x^2,
 
         f' = -4/9 x w (5 + 6w),    f'' = -4/9 w (5 + 6w) + 8/9 x^2 (5 + 12w),
         f''' = 4/9 x (15 + 36w - 24x^2).
 
     So f''' = 0 at x = 0 and at x^2 = 1/4 + 3/5 S^2. If that second position lies outside of the
-    chord, f'' rises from x = 0 until S. f'' = 0 is a quadratic equation in x^2. The sum of its
-    roots is 1/2 + 6/5 S^2, and their product is S^2 (5 + 6 S^2)/30; the larger root lies outside of
-    the chord.
+    chord, f'' rises from x = 0 to the end x = S of the chord. f'' = 0 is a quadratic equation in
+    x^2. The sum of its roots is 1/2 + 6/5 S^2, and their product is S^2 (5 + 6 S^2)/30; the larger
+    root lies outside of the chord.
     """
 
     support: float = 2.0  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -279,19 +304,30 @@ class SexticKernel(BlobKernel):
         return dr.select(q < 1, dr.fma(8 / 3, 1 - q, 10 / 9), 0)
 
     def chord(self, height_squared: Real, half_chord_squared: Real) -> ChordProfile:
-        """The extreme values of the kernel's first two derivatives along lines, by the formulas of
-        the class. The arguments are the squares h^2 and S^2 of the distance of a line from the
-        center and of half its chord, in units of the support's radius."""
-        total = dr.fma(1.2, half_chord_squared, 0.5)
-        product = half_chord_squared * dr.fma(0.2, half_chord_squared, 1 / 6)
-        zero_x = dr.sqrt(2 * product / (total + dr.sqrt(fmax(total * total - 4 * product, 0))))
+        """The extreme values of the kernel's first two derivatives along lines, with lengths in
+        units of the support's radius.
+
+        height_squared: h^2, with h the distance of a line from the center.
+        half_chord_squared: S^2 = 1 - h^2, with S half the length of the line's part inside the
+            support.
+
+        f' is largest at a zero of f''. There x^2 is the smaller root of a quadratic equation, whose
+        roots have the sum 1/2 + 6/5 S^2 and the product S^2 (5 + 6 S^2)/30. f'' is largest at x^2 =
+        1/4 + 3/5 S^2, or at x = S if that is nearer.
+        """
+        root_sum = dr.fma(1.2, half_chord_squared, 0.5)
+        root_product = half_chord_squared * dr.fma(0.2, half_chord_squared, 1 / 6)
+        # The smaller root, as the product over the larger one: nothing cancels.
+        steepest_x = dr.sqrt(
+            2 * root_product / (root_sum + dr.sqrt(fmax(root_sum * root_sum - 4 * root_product, 0)))
+        )
         peak_x = dr.sqrt(fmin(dr.fma(0.6, half_chord_squared, 0.25), half_chord_squared))
-        first, _ = self.derivatives(height_squared, half_chord_squared, zero_x)
+        min_first, _ = self.derivatives(height_squared, half_chord_squared, steepest_x)
         _, max_second = self.derivatives(height_squared, half_chord_squared, peak_x)
         return ChordProfile(
             dr.sqrt(half_chord_squared),
-            zero_x,
-            -first,
+            steepest_x,
+            -min_first,
             peak_x,
             max_second,
             -half_chord_squared * dr.fma(8 / 3, half_chord_squared, 20 / 9),
@@ -300,15 +336,22 @@ class SexticKernel(BlobKernel):
     def derivatives(
         self, height_squared: Real, half_chord_squared: Real, x: Real
     ) -> tuple[Real, Real]:
+        """The first and the second derivative of the kernel along lines, at the position x from the
+        point nearest to the center. Lengths are in units of the support's radius.
+
+        height_squared: h^2, with h the distance of a line from the center; not used, as S^2 = 1 -
+            h^2.
+        half_chord_squared: S^2, with S half the length of the line's part inside the support.
+        """
         square = x * x
         w = half_chord_squared - square
         part = w * dr.fma(8 / 3, w, 20 / 9)
         return -x * part, dr.fma(square, dr.fma(32 / 3, w, 40 / 9), -part)
 
     def derivative_ranges(self, q: Interval) -> tuple[Interval, Interval, Interval]:
-        """Intervals that contain the kernel k(q), dk/dq and d2k/dq2 for q in an interval. For q < 1
-        each of the three is monotone in q, so that the ends are values at the ends of q, widened
-        for rounding."""
+        """Intervals that contain all values of the kernel k(q), of dk/dq and of d2k/dq2 (three
+        intervals) for q in an interval. For q < 1 each of the three is monotone in q, so its values
+        at the ends of q, moved outwards for rounding, are the ends of its interval."""
         w = _one_minus(q)
         epsilon = machine_epsilon(w.lower)
 
@@ -330,19 +373,20 @@ class SexticKernel(BlobKernel):
 
 @dataclass(frozen=True)
 class CubicKernel(BlobKernel):
-    """The cubic kernel of soft objects, 1 - 3 r^2 + 2 r^3 = (1 - r)^2 (1 + 2r) with r^2 = q (Hart
-    1996, eq. 36).
+    """The cubic kernel of soft objects, k = 1 - 3 r^2 + 2 r^3 = (1 - r)^2 (1 + 2r), where r =
+    sqrt(q) is the distance from the center in units of the support's radius (Hart 1996, eq. 36).
 
-    support: where a blob ends, in units of its radius.
+    support: the radius at which a blob ends, in units of the blob's radius.
 
-    Lengths are in units of the support's radius. Let f(x) be the kernel on a line at the distance h
-    from the center, at the position x from the point nearest to the center. With r^2 = h^2 + x^2,
+    Let f(x) be the kernel on a line at the distance h from the center, at the position x from the
+    point nearest to the center. With r^2 = h^2 + x^2,
 
         f' = -6 x (1 - r),    f'' = -6 (1 - r - x^2/r),    f''' = 6 x/r (3 - x^2/r^2).
 
     As |x| <= r, the third derivative is >= 0 for x >= 0. So f'' rises from x = 0 to the end of the
-    support on the line. |f'| is largest at the zero of f'', which has r + x^2/r = 1. This gives a
-    quadratic equation for x^2, whose solution is x^2 = (1 - 4h^2 + sqrt(1 + 8h^2))/8.
+    line's part inside the support, which is its largest value. |f'| is largest at the zero of f'',
+    where r + x^2/r = 1. This gives a quadratic equation for x^2, whose solution is x^2 = (1 - 4h^2
+    + sqrt(1 + 8h^2))/8.
     """
 
     support: float = 2.0  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -369,17 +413,29 @@ class CubicKernel(BlobKernel):
         return dr.select(q < 1, 1.5 / dr.sqrt(fmax(q, float(dr.smallest(type(q))))), 0)
 
     def chord(self, height_squared: Real, half_chord_squared: Real) -> ChordProfile:
-        """The extreme values of the kernel's first two derivatives along lines, by the formulas of
-        the class. The arguments are the squares h^2 and S^2 of the distance of a line from the
-        center and of half its chord, in units of the support's radius."""
-        half = dr.sqrt(half_chord_squared)
-        zero_x = dr.sqrt(
+        """The extreme values of the kernel's first two derivatives along lines, with lengths in
+        units of the support's radius.
+
+        height_squared: h^2, with h the distance of a line from the center.
+        half_chord_squared: S^2 = 1 - h^2, with S half the length of the line's part inside the
+            support.
+
+        f' is largest at the zero of f'', which has x^2 = (1 - 4h^2 + sqrt(1 + 8h^2))/8. f'' rises
+        from 6 h - 6 at x = 0 to 6 S^2 at the end x = S.
+        """
+        half_length = dr.sqrt(half_chord_squared)
+        steepest_x = dr.sqrt(
             fmax(1 + dr.sqrt(dr.fma(8, height_squared, 1)) - 4 * height_squared, 0) * 0.125
         )
-        zero_x = fmin(zero_x, half)
-        first, _ = self.derivatives(height_squared, half_chord_squared, zero_x)
+        steepest_x = fmin(steepest_x, half_length)
+        min_first, _ = self.derivatives(height_squared, half_chord_squared, steepest_x)
         return ChordProfile(
-            half, zero_x, -first, half, 6 * half_chord_squared, 6 * dr.sqrt(height_squared) - 6
+            half_length,
+            steepest_x,
+            -min_first,
+            half_length,
+            6 * half_chord_squared,
+            6 * dr.sqrt(height_squared) - 6,
         )
 
     def derivatives(
@@ -390,20 +446,22 @@ class CubicKernel(BlobKernel):
         return -6 * x * (1 - r), 6 * (square / r - (1 - r))
 
     def derivative_ranges(self, q: Interval) -> tuple[Interval, Interval, Interval]:
-        """Intervals that contain the kernel k(q), dk/dq and d2k/dq2 for q in an interval. For q < 1
-        each of the three is monotone in q, so that the ends are values at the ends of q, widened
-        for rounding."""
-        low, high = dr.sqrt(fmin(fmax(q.lower, 0), 1)), dr.sqrt(fmin(q.upper, 1))
-        epsilon = machine_epsilon(low)
+        """Intervals that contain all values of the kernel k(q), of dk/dq and of d2k/dq2 (three
+        intervals) for q in an interval. For q < 1 each of the three is monotone in q, so its values
+        at the ends of q, moved outwards for rounding, are the ends of its interval."""
+        low_r, high_r = dr.sqrt(fmin(fmax(q.lower, 0), 1)), dr.sqrt(fmin(q.upper, 1))
+        epsilon = machine_epsilon(low_r)
 
         def value_at(r: Real) -> Real:
             """The kernel at the distance r = sqrt(q) from the center."""
             return (1 - r) * (1 - r) * (1 + 2 * r)
 
-        # Absolute errors: of r half an epsilon, of 1 - r at most as much.
-        slope = Interval(-3 * (1 - low) - 8 * epsilon, fmin(-3 * (1 - high) + 8 * epsilon, 0))
-        value = Interval(fmax(value_at(high) - 8 * epsilon, 0), value_at(low) + 8 * epsilon)
-        second = Interval(1.5 / high, dr.select(low > 0, 1.5 / low, dr.inf)).widened(8 * epsilon)
+        # r has an absolute error of half an epsilon, and 1 - r of at most as much.
+        slope = Interval(-3 * (1 - low_r) - 8 * epsilon, fmin(-3 * (1 - high_r) + 8 * epsilon, 0))
+        value = Interval(fmax(value_at(high_r) - 8 * epsilon, 0), value_at(low_r) + 8 * epsilon)
+        second = Interval(1.5 / high_r, dr.select(low_r > 0, 1.5 / low_r, dr.inf)).widened(
+            8 * epsilon
+        )
         return value, slope, _range_with_support_end(second, q)
 
 
@@ -417,19 +475,23 @@ _ZERO_OF_SECOND = (
 
 @dataclass(frozen=True)
 class GaussianKernel(BlobKernel):
-    """The Gaussian kernel exp(z) - 1 - z with z = b (1 - q). It is a Gaussian minus its tangent in
-    q where the blob ends. (Aydinlilar and Zanni 2023, eq. 6, use a Gaussian that does not end.)
+    """The Gaussian kernel k = exp(z) - 1 - z with z = b (1 - q), where q is the squared distance
+    from the center in units of the support's radius. It is a Gaussian minus its tangent, as a
+    function of q, at the end q = 1 of the support. (Aydinlilar and Zanni 2023, eq. 6, use a
+    Gaussian that does not end.)
 
     A Gaussian that is only cut off jumps, and no step across the jump could be proved. With the
     tangent subtracted, it ends as smoothly as the other kernels, and its ranges are exact. It
     differs from the Gaussian by a parabola, which is small if the tail is small.
 
     sharpness: the number s of the Gaussian exp(-s d^2/radius^2), with d the distance from the
-        center.
-    tail: the value of the Gaussian where the blob ends, as a fraction of its value at the radius.
-    rate: b as a kernel parameter, which `prepare` sets; None otherwise.
+        center and the radius of the blob.
+    tail: the value of the Gaussian where the blob ends, as a fraction of its value at the blob's
+        radius.
+    rate: b as a Dr.Jit number, which `prepare` sets; None otherwise.
 
-    Along a line, with z = b (S^2 - x^2) and y = b x^2,
+    Let f(x) be the kernel along a line, at the position x from the point nearest to the center. The
+    line's part inside the support is |x| <= S. With z = b (S^2 - x^2) and y = b x^2,
 
         f' = -2 b x (e^z - 1),    f'' = 2b (e^z (2y - 1) + 1),    f''' = 4 b^2 x e^z (3 - 2y).
 
@@ -444,6 +506,7 @@ class GaussianKernel(BlobKernel):
     name = "gaussian"
 
     def __post_init__(self) -> None:
+        """Raise ValueError unless sharpness and tail are in the ranges that the kernel allows."""
         if not 0 < as_real(self.sharpness, "sharpness") <= 12:
             raise ValueError(f"sharpness must be in (0, 12], not {self.sharpness!r}")
         if not 1e-6 <= as_real(self.tail, "tail") <= 0.5:
@@ -458,16 +521,18 @@ class GaussianKernel(BlobKernel):
 
     @property
     def _rate(self) -> Any:
-        """The number b of the class: a kernel parameter of the backend if the kernel is prepared,
-        else a Python number."""
+        """The number b of the kernel exp(z) - 1 - z with z = b (1 - q): a Dr.Jit number if the
+        kernel is prepared for a backend, else a Python number."""
         return self.sharpness * self.support**2 if self.rate is None else self.rate
 
     @property
     def steepness(self) -> KernelLipschitz:
+        """The Lipschitz constants of the kernel and of its first two derivatives along lines:
+        multiples of e^b, the kernel's exponential at the center."""
         b = self.sharpness * self.support**2
-        top = math.exp(b)
+        exp_b = math.exp(b)
         return KernelLipschitz(
-            4 * b * top, 8 * b * (1 + math.sqrt(b)) * top, 16 * b * (1 + b) * top
+            4 * b * exp_b, 8 * b * (1 + math.sqrt(b)) * exp_b, 16 * b * (1 + b) * exp_b
         )
 
     def prepare(self, backend: Backend) -> BlobKernel:
@@ -488,19 +553,31 @@ class GaussianKernel(BlobKernel):
         return dr.select(q < 1, self._rate * self._rate * dr.exp(self._rate * (1 - q)), 0)
 
     def chord(self, height_squared: Real, half_chord_squared: Real) -> ChordProfile:
-        """The extreme values of the kernel's first two derivatives along lines, by the formulas of
-        the class. The arguments are the squares h^2 and S^2 of the distance of a line from the
-        center and of half its chord, in units of the support's radius."""
+        """The extreme values of the kernel's first two derivatives along lines, with lengths in
+        units of the support's radius.
+
+        height_squared: h^2, with h the distance of a line from the center; not used, as S^2 = 1 -
+            h^2.
+        half_chord_squared: S^2, with S half the length of the line's part inside the support.
+
+        Let z = b S^2 and y = b x^2 for the position x on the line. f' is largest at the zero of
+        f'', where e^-y (1 - 2y) = e^-z; an approximation of its solution is (1 - u) P(u) with u =
+        e^-z and the polynomial P of `_ZERO_OF_SECOND`. f'' is largest at y = 3/2, or at the end y =
+        z of the chord if z < 3/2.
+        """
         b = self._rate
         z = b * half_chord_squared
         exp_z = dr.exp(z)
         u = 1 / exp_z
+        # P(u), by Horner's scheme.
         polynomial: Any = _ZERO_OF_SECOND[-1]
         for coefficient in reversed(_ZERO_OF_SECOND[:-1]):
             polynomial = dr.fma(polynomial, u, coefficient)
         y = fmax((1 - u) * polynomial, 0)
-        zero_x = dr.sqrt(y / b)
+        steepest_x = dr.sqrt(y / b)
         is_at_end = z < 1.5
+        # f'' = 2b (e^(z - y) (2y - 1) + 1): at y = z it is 4 b z, at y = 3/2 it is 2b (2 e^z e^-1.5
+        # + 1).
         max_second = (
             2
             * b
@@ -508,8 +585,8 @@ class GaussianKernel(BlobKernel):
         )
         return ChordProfile(
             dr.sqrt(half_chord_squared),
-            zero_x,
-            2 * b * zero_x * (dr.exp(z - y) - 1),
+            steepest_x,
+            2 * b * steepest_x * (dr.exp(z - y) - 1),
             dr.sqrt(fmin(1.5, z) / b),
             max_second,
             -2 * b * (exp_z - 1),
@@ -518,22 +595,36 @@ class GaussianKernel(BlobKernel):
     def derivatives(
         self, height_squared: Real, half_chord_squared: Real, x: Real
     ) -> tuple[Real, Real]:
+        """The first and the second derivative of the kernel along lines, at the position x from the
+        point nearest to the center. Lengths are in units of the support's radius.
+
+        height_squared: h^2, with h the distance of a line from the center; not used, as S^2 = 1 -
+            h^2.
+        half_chord_squared: S^2, with S half the length of the line's part inside the support.
+        """
         b = self._rate
         y = b * (x * x)
         e = dr.exp(b * half_chord_squared - y)
         return -2 * b * x * (e - 1), 2 * b * dr.fma(e, dr.fma(2, y, -1), 1)
 
     def lipschitz_fraction(self, half_chord_squared: Real, nearest: Real) -> Real:
-        """A factor, at most 1, by which the Lipschitz constants `steepness` may be multiplied for a
-        part of a line. The arguments are those of `BlobKernel.lipschitz_fraction`.
+        """A factor, at most 1, by which the Lipschitz constants `steepness` may be multiplied on a
+        part of a line. Lengths are in units of the support's radius.
 
-        Proof. All constants are multiples of the largest e^z with z = b (S^2 -
-        x^2), which is at most e^(b (S^2 - 1)) times the value for S = 1 and x = 0. The factor e^(-b
-        x^2) is bounded by e^y >= (1 + y/32)^32 with y = b x^2."""
+        half_chord_squared: S^2, with S half the length of the line's part inside the support.
+        nearest: a lower bound of x^2 on the part, with x the position on the line from the point
+            nearest to the kernel's center.
+
+        Proof. All constants are multiples of the largest e^z with z = b (S^2 - x^2), which is e^b
+        on a line through the center (S = 1 and x = 0). So the factor is e^(b (S^2 - 1)) e^(-b x^2).
+        The last factor is bounded by e^y >= (1 + y/32)^32 with y = b x^2.
+        """
         b = self._rate
+        # (1 + y/32)^32, by squaring five times.
         power = dr.fma(b / 32, nearest, 1)
         for _ in range(5):
             power = power * power
+        # e^(b (S^2 - 1)), with a margin for rounding. A Python number stands for S = 1.
         largest = (
             1.01
             if isinstance(half_chord_squared, float)
@@ -542,22 +633,25 @@ class GaussianKernel(BlobKernel):
         return fmin(largest / power, 1)
 
     def derivative_ranges(self, q: Interval) -> tuple[Interval, Interval, Interval]:
-        """Intervals that contain the kernel k(q), dk/dq and d2k/dq2 for q in an interval. For q < 1
-        each of the three is monotone in q, so that the ends are values at the ends of q, widened
-        for rounding."""
+        """Intervals that contain all values of the kernel k(q), of dk/dq and of d2k/dq2 (three
+        intervals) for q in an interval. With z = b max(1 - q, 0) they are e^z - 1 - z, -b (e^z - 1)
+        and b^2 e^z. Each is monotone in z, so its values at the ends of z, moved outwards for
+        rounding, are the ends of its interval."""
         w = _one_minus(q)
         b, epsilon = self._rate, machine_epsilon(w.lower)
         # The error of the product with b is half an epsilon, that of the exponential eight.
         error = 16 * epsilon
         z = Interval(b * w.lower, b * w.upper).widened(2 * epsilon)
-        low, high = dr.exp(z.lower), dr.exp(z.upper)
+        exp_low, exp_high = dr.exp(z.lower), dr.exp(z.upper)
         value = Interval(
-            fmax(low - 1 - z.lower - error * low, 0), high - 1 - z.upper + error * high
+            fmax(exp_low - 1 - z.lower - error * exp_low, 0),
+            exp_high - 1 - z.upper + error * exp_high,
         )
         slope = Interval(
-            -b * (high - 1) - error * b * high, fmin(-b * (low - 1) + error * b * low, 0)
+            -b * (exp_high - 1) - error * b * exp_high,
+            fmin(-b * (exp_low - 1) + error * b * exp_low, 0),
         )
-        second = Interval(b * b * low, b * b * high).widened(error)
+        second = Interval(b * b * exp_low, b * b * exp_high).widened(error)
         return value, slope, _range_with_support_end(second, q)
 
 
@@ -570,7 +664,8 @@ KERNELS: dict[str, type[BlobKernel]] = {
 
 
 def choose_kernel(kernel: str | BlobKernel) -> BlobKernel:
-    """The kernel with a name, with its default parameters. A kernel is returned as it is.
+    """The kernel with this name, with its default parameters. If `kernel` is a kernel already, it
+    is returned as it is.
 
     Raises:
         ValueError: an unknown name.
@@ -598,26 +693,27 @@ def _check_support(support: float) -> None:
 
 
 def _one_minus(q: Interval) -> Interval:
-    """The interval of the values of max(1 - q, 0) for q in an interval."""
+    """The interval of all values of max(1 - q, 0) for q in the given interval."""
     w = Interval(1.0, 1.0) - q
     return Interval(fmax(w.lower, 0), fmax(w.upper, 0))
 
 
 def _widened_range(lower: Real, upper: Real, relative_error: float) -> Interval:
-    """The interval [lower, upper], with each end moved outwards by a fraction of itself, for
-    rounding.
+    """The interval [lower, upper], with each end moved outwards by the fraction `relative_error` of
+    itself, for rounding.
 
-    lower, upper: the values of an increasing function at both ends of a range.
+    lower, upper: the computed values of a monotone function at the two ends of a range, the smaller
+        one first.
     """
     return Interval(lower, upper).widened(relative_error)
 
 
 def _range_with_support_end(second: Interval, q: Interval) -> Interval:
-    """The interval of the values of a kernel's second derivative by q, if this derivative is
-    positive for q < 1 and 0 for larger q.
+    """The interval of all values of a kernel's second derivative d2k/dq2 for q in an interval, also
+    beyond the end q = 1 of the support, where it is 0.
 
-    second: its range for q < 1.
-    q: the range of q. If it contains 1, the result contains 0.
+    second: an interval of its values for the q < 1, where it is positive.
+    q: the interval of squared distances. If it reaches 1, the result contains 0.
     """
     return Interval(
         dr.select(q.upper < 1, fmax(second.lower, 0), 0), dr.select(q.lower <= 1, second.upper, 0)
