@@ -1,10 +1,10 @@
 """Guaranteed ray tracing of harmonic and other implicit surfaces.
 
-import harnack as hk
-hits = hk.trace(hk.SolidAngle(vertices), origins, directions)
+    import harnack as hk
+    hits = hk.trace(hk.SolidAngle(vertices), origins, directions)
 
-The names that `__init__.pyi` lists, and the namespaces (modules that hold all further names), are
-imported when they are first used, so that `import harnack` is fast.
+The names that `__init__.pyi` lists are imported when they are first used, so that `import harnack`
+is fast. So are the namespaces: modules of the package that hold all further public names.
 """
 
 from __future__ import annotations
@@ -31,8 +31,13 @@ __all__ = [  # pyright: ignore[reportUnsupportedDunderAll]
 
 
 def __getattr__(name: str) -> Any:
-    """Python calls this for an attribute of the package that is not imported yet: import it, or
-    raise `AttributeError` with a hint."""
+    """Return an attribute of the package that is not imported yet: import the namespace or the
+    object of this name. Python calls this function if an attribute is not found.
+
+    Raises:
+        AttributeError: there is no such name. The message names the namespace that has it, or
+            suggests a similar name.
+    """
     if name in _NAMESPACES:
         return import_module(f"{__name__}.{name}")
     if name in __all__:
@@ -49,7 +54,8 @@ def __dir__() -> list[str]:
 
 
 def _namespace_of(name: str) -> str | None:
-    """The name of the namespace that has the public name `name`; None if there is none."""
+    """The namespace (a module of the package) that has the public name `name`; None if there is
+    none."""
     if name.startswith("_"):
         return None
     for namespace in _NAMESPACES:

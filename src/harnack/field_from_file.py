@@ -1,5 +1,7 @@
-"""Makes a field from a surface file. The file decides the kind of field, the axis that points up,
-and how it is drawn by default."""
+"""Makes a field from a surface file. A field is a function whose level set is drawn; the kind of
+field depends on what the file holds: a mesh, a cloud of points, curves, polygons, metaballs or a
+molecule. The file also decides which of its axes points up, and how the surface is drawn by
+default."""
 
 from __future__ import annotations
 
@@ -44,12 +46,13 @@ _LOOP_FILES = (".obj", ".ply", ".loops")
 
 @dataclass(frozen=True, eq=False)
 class FieldFromFile:
-    """The field of a file.
+    """The field that was made from a surface file, and how to draw it.
 
     field: the field, in coordinates in which z points up.
-    summary: the decisions made and their reasons, on one line.
-    show, material: how `render` draws it by default. Surfaces of meshes and clouds are "shaded"
-        with a single ray per pixel, as each ray costs many times a ray of a curve's surface.
+    summary: on one line, what the file holds, and which axis of it points up and why.
+    show, material: the values of these options of `render` that are used by default. Surfaces of
+        meshes and clouds are "shaded" with a single ray per pixel, as each ray takes many times as
+        long as a ray of a curve's surface.
     """
 
     field: Field
@@ -72,10 +75,10 @@ def field_from_file(
     (on request), and metaballs and molecules become `Blobs`.
 
     path: the file.
-    read_as: "winding", "dipole", "loops" or "polygons" replaces the decision of `read_geometry`
-        about what the file holds.
+    read_as: "winding", "dipole", "loops" or "polygons": what the file is taken to hold. None lets
+        `read_geometry` decide.
     take_boundary: whether to use the curves that bound the faces instead of the faces.
-    normals: "estimate" estimates the normals of a point cloud, and ignores normals of the file.
+    normals: "estimate" estimates the normals of a point cloud, and ignores normals in the file.
     smoothing: for noisy point clouds, the length over which noise is evened out, in the file's
         unit; "auto" measures the noise (see `DipolePotential`).
     up: the axis of the file that is turned to z. By default y for glTF, whose standard says so, and
@@ -83,9 +86,10 @@ def field_from_file(
 
     Raises:
         FileFormatError: the file cannot be read by `read_geometry`; or a point cloud has no
-            normals.
-        ValueError: settings that contradict each other or the file, or that no field accepts.
+            normals; or the field does not accept the data.
+        ValueError: options that contradict each other or the file.
     """
+    # Check the options as far as possible before the file is read.
     path = Path(path)
     if take_boundary and read_as not in (None, "loops"):
         raise ValueError(
@@ -102,6 +106,7 @@ def field_from_file(
             f'{surface.summary}; leave out normals="estimate", or take its points with '
             'read_as="dipole"'
         )
+    # Check the options against what the file holds.
     is_curve = isinstance(surface, LoadedCurves)
     if smoothing is not None and not isinstance(surface, LoadedCloud):
         raise ValueError(
@@ -117,8 +122,10 @@ def field_from_file(
 
 
 def _default_up_axis(path: Path, *, is_curve: bool) -> tuple[Axis, str]:
-    """The axis that points up in files with this path's suffix, and the reason in words. is_curve:
-    whether the file holds curves."""
+    """The axis that points up in a file, as far as its suffix tells, and the reason in words.
+
+    is_curve: whether the file holds curves.
+    """
     kind = path.suffix.lower()
     if kind in _Y_UP_FORMATS:
         return "y", "the standard of the format"
@@ -128,8 +135,9 @@ def _default_up_axis(path: Path, *, is_curve: bool) -> tuple[Axis, str]:
 
 
 def _read(path: Path, read_as: ReadAs | None, boundary: bool) -> LoadedGeometry:
-    """The geometry of a file: of type `read_as` if it is given, or the curves that bound its faces
-    if `boundary` is True."""
+    """The geometry in a file: what `read_as` says, or what `read_geometry` finds; or the curves
+    that bound its faces, if `boundary` is True."""
+    # For these formats `read_loops` finds the boundary itself.
     if boundary and path.suffix.lower() in _LOOP_FILES:
         loops = tuple(read_loops(path, boundary=True))
         noun = "loop" if len(loops) == 1 else "loops"
@@ -144,10 +152,12 @@ def _field(
     smoothing: float | Literal["auto"],
     rotation: FloatArray,
 ) -> Field:
-    """The field of some geometry, turned by the matrix `rotation` (3, 3).
+    """The field of some geometry, rotated by a matrix.
 
+    surface: the geometry that was read from a file.
     normals: "estimate" to estimate the normals of a point cloud, otherwise None.
     smoothing: the smoothing of a point cloud, a length or "auto".
+    rotation: (3, 3) the matrix.
 
     Raises:
         ValueError: a point cloud without normals, or data that the field does not accept.
@@ -163,6 +173,7 @@ def _field(
         return Blobs(centers, surface.radii, surface.weights, groups=surface.groups)
     if isinstance(surface, Atoms):
         return Molecule(replace(surface, positions=surface.positions @ rotation.T))
+    # What remains is a cloud of points.
     points = surface.points @ rotation.T
     if normals == "estimate":
         return DipolePotential(points, normals, surface.areas, smoothing=smoothing)

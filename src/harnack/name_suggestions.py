@@ -1,4 +1,5 @@
-"""Suggestions of names in messages about names that do not exist."""
+"""Suggestions of names in error messages: for a name that does not exist, the most similar known
+name."""
 
 from __future__ import annotations
 
@@ -17,8 +18,8 @@ def is_one_of(name: object, names: Iterable[str]) -> bool:
 
 
 def did_you_mean(misspelled: object, candidates: Iterable[str]) -> str:
-    """'; did you mean "gold"?' for the candidate most similar to the misspelled name, '' if none is
-    similar."""
+    """The end of an error message about a misspelled name: '; did you mean "gold"?' for the most
+    similar candidate; '' if no candidate is similar, or the name is not a string."""
     if not isinstance(misspelled, str):
         return ""
     word = misspelled[:100].lower()
@@ -28,7 +29,7 @@ def did_you_mean(misspelled: object, candidates: Iterable[str]) -> str:
 
 
 def _likeness(a: str, b: str) -> float:
-    """The similarity of two strings: difflib's ratio (0 to 1) and a bonus for each letter of their
+    """The similarity of two strings: difflib's ratio (0 to 1), and a bonus for each letter of their
     common prefix."""
     alike = (x == y for x, y in zip(a, b, strict=False))
     prefix = sum(itertools.takewhile(bool, alike))

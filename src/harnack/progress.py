@@ -1,4 +1,5 @@
-"""The progress of long tasks, shown as a bar or as lines of text."""
+"""The progress of long tasks, shown on stderr as a bar or as lines of text. A task reports its
+progress by fractions: numbers that add up to 1 when the task is finished."""
 
 from __future__ import annotations
 
@@ -12,15 +13,16 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
 Advance = Callable[[float], None]
-# Seconds between lines. A task that is done sooner writes none.
+# Seconds between lines of text. A task that is finished sooner writes none.
 _SECONDS_BETWEEN_LINES = 5.0
-# Seconds: parts that were done within them are no measure of the time of the others.
+# What was finished within these first seconds (stored results, for example) does not count in the
+# estimate of the remaining time.
 _INSTANT_SECONDS = 0.5
 
 
 def teller(progress: Callable[[str], None] | None) -> Callable[[str], None]:
-    """The function to which messages about progress are passed: `progress`, or one that ignores
-    them if `progress` is None.
+    """The function to which messages about progress are passed: `progress` itself, or one that
+    ignores them if `progress` is None.
 
     Raises:
         TypeError: progress is neither a function nor None.
@@ -38,11 +40,11 @@ def teller(progress: Callable[[str], None] | None) -> Callable[[str], None]:
 @contextmanager
 def progress_bar(name: str, progress: bool | Advance) -> Generator[Advance]:
     """Context manager that shows on stderr how much of the task `name` is finished. It yields a
-    function, to be called with each fraction of the task that has been finished; all fractions add
-    up to 1.
+    function, which the task calls with each fraction that it has finished; all fractions add up to
+    1.
 
-    progress: whether to show the progress; or a function that receives the fractions instead. It
-        may raise an exception to stop the task.
+    progress: whether to show the progress; or a function that receives the fractions instead. That
+        function may raise an exception to stop the task.
 
     A terminal shows a bar. Notebooks and log files get lines of text, because a bar in a notebook
     would need ipywidgets, and log files would contain a terminal's control codes.
@@ -67,11 +69,14 @@ def progress_bar(name: str, progress: bool | Advance) -> Generator[Advance]:
 
 
 class _TextProgress:
-    """Prints a line of text about the progress of a task every few seconds. name: of the task.
+    """Prints a line of text about the progress of a task every few seconds. It is called with each
+    fraction of the task that was finished.
 
-    _done: the fraction that is finished.
+    name: the name of the task.
+
+    _done: the fraction that is finished so far.
     _cached_fraction: the fraction that was finished within the first half second, for example
-        because stored results were found. It does not count for the estimate of the remaining time.
+        because stored results were found. It does not count in the estimate of the remaining time.
     """
 
     def __init__(self, name: str) -> None:
@@ -81,8 +86,8 @@ class _TextProgress:
         self._start = self._last = time.monotonic()
 
     def __call__(self, part: float) -> None:
-        """Note that the fraction `part` was finished, and print a line if the last one is several
-        seconds old."""
+        """Note that the fraction `part` was finished. Print a line if the last one is several
+        seconds old, unless the task is finished."""
         self._done += part
         now = time.monotonic()
         if now - self._start < _INSTANT_SECONDS:  # parts that are there already

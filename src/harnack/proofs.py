@@ -1,5 +1,6 @@
-"""Namespace for fields of one's own: promises (proved bounds of f near a point), and the enclosures
-(intervals that provably contain f along a ray) that follow from promises."""
+"""Namespace for fields of one's own. It has the promises (proved bounds of a field's function f
+near a point) and the enclosures (intervals, proved to contain the change of f along a ray) that
+follow from promises."""
 
 from __future__ import annotations
 

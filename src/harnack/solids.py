@@ -1,4 +1,4 @@
-"""All solids, and the operations that combine them (`harnack.fields.solids`)."""
+"""Namespace of solids, and of the operations that combine them (`harnack.fields.solids`)."""
 
 from __future__ import annotations
 

@@ -327,7 +327,21 @@ def test_distances_from_absurdly_far_away() -> None:
                 hk.signed_distance(field, 1e160 * x, method=method)  # type: ignore[arg-type]
 
 
-def test_a_curve_too_large_for_its_precision_says_so() -> None:
-    field = hk.SolidAngle([[0, 0, 0], [1e39, 0, 0], [0, 1, 0]])
-    with pytest.raises(ValueError, match="too large for single precision"):
-        hk.trace(field, [[0.1, 0.1, 1.0]], [[0, 0, -1.0]], precision="single")
+@pytest.mark.parametrize("scale", [1e-38, 1e-20, 1e20, 1e37])
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda s: hk.SolidAngle(np.array([[1, 0, 0], [0, 1, 0], [-1, -1, 0.3]]) * s),
+        lambda s: hk.Surface(hk.Gyroid(s), clip=hk.Box((-s, -s, -s), (s, s, s))),
+        lambda s: hk.Torus(0.6 * s, 0.2 * s),
+    ],
+    ids=["curve", "clip", "solid"],
+)
+def test_what_squares_of_lengths_lose_is_refused(make: Any, scale: float) -> None:
+    """All rays missed in single precision, where squares of coordinates overflow or are 0."""
+    ray = [[0.0, 0.0, 0.0]], [[0.0, 0.6, 0.8]]
+    kind = "size of .* too small" if scale < 1 else "coordinates up to .* too large"
+    with pytest.raises(ValueError, match=f"{kind} for single precision"):
+        hk.trace(make(scale), *ray, precision="single")
+    with pytest.raises(ValueError, match=r"origins have coordinates up to 4e[+]20: too large"):
+        hk.trace(make(1.0), [[4e20, 0.0, 0.0]], ray[1], precision="single")

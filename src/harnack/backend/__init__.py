@@ -1,5 +1,6 @@
 """Dr.Jit backends and precisions, arrays, loops and tables on them, and a check that Dr.Jit has
-loaded a usable LLVM. It contains no mathematics of fields.
+loaded a usable LLVM. A backend is the device that runs Dr.Jit's kernels: the CPU by LLVM, or a GPU
+by CUDA or Metal. This package contains no mathematics of fields.
 
 Importing this package decides which LLVM Dr.Jit loads (see `harnack.backend.llvm`). So it must come
 before any other import of drjit: `harnack/__init__.py` imports it first.

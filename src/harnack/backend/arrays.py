@@ -1,4 +1,9 @@
-"""The Dr.Jit array types in use, and conversions between NumPy and Dr.Jit.
+"""The Dr.Jit array types in use, and conversions between NumPy and Dr.Jit. A `Backend` is a device
+with a precision: it holds the array types of Dr.Jit for both. A Dr.Jit array has entries, called
+lanes, which one kernel computes in parallel; a 3-vector is three such arrays. An array is evaluated
+if its numbers are in memory, and otherwise it is only recorded: its numbers are computed when a
+kernel runs. A literal is a constant in a kernel's code; a kernel parameter is read from memory, so
+another value needs no other kernel.
 
 Nothing here changes a Dr.Jit flag, the number of threads or the Mitsuba variant.
 """
@@ -70,14 +75,14 @@ class Backend:
 
 @functools.cache
 def _make_backend(name: BackendName, precision: Precision) -> Backend:
-    """The `Backend` with this name and precision. LLVM or Metal is checked when its `Backend` is
-    first made; later calls return the same object."""
+    """Return the `Backend` with this name and precision. LLVM or Metal is checked when its
+    `Backend` is first made; later calls return the same object."""
     if name == "llvm":
         ensure_llvm()
     module = importlib.import_module(f"drjit.{name}.ad")
     suffix = "64" if precision == "double" else ""
 
-    def real(stem: str) -> Any:
+    def type_named(stem: str) -> Any:
         """The Dr.Jit type of this name in the right precision: Float becomes Float64 for double
         precision."""
         return getattr(module, stem + suffix)
@@ -85,14 +90,14 @@ def _make_backend(name: BackendName, precision: Precision) -> Backend:
     backend = Backend(
         name=name,
         precision=precision,
-        Float=real("Float"),
+        Float=type_named("Float"),
         UInt32=module.UInt32,
         Int32=module.Int32,
         Bool=module.Bool,
-        Array2f=real("Array2f"),
-        Array3f=real("Array3f"),
-        Array4f=real("Array4f"),
-        ArrayXf=real("ArrayXf"),
+        Array2f=type_named("Array2f"),
+        Array3f=type_named("Array3f"),
+        Array4f=type_named("Array4f"),
+        ArrayXf=type_named("ArrayXf"),
     )
     if name == "metal":
         _check_ieee_arithmetic(backend)
@@ -114,15 +119,15 @@ def _check_ieee_arithmetic(backend: Backend) -> None:
     x, one = upload_floats(backend, values), dr.opaque(backend.Float, 1)
     np_one = np.float32(1)
     with np.errstate(all="ignore"):
-        # A quotient and a root may have an error of two units in the last place: bounds allow for
-        # more.
-        cases: dict[str, tuple[Any, Any, int]] = {
+        # Each operation: the device's result, NumPy's, and the allowed error in units in the last
+        # place. A quotient and a root may have an error of two units: proved bounds allow more.
+        operations: dict[str, tuple[Any, Any, int]] = {
             "1 / x": (one / x, np_one / values, 2), "sqrt(x)": (dr.sqrt(x), np.sqrt(values), 2),
             "x - x": (x - x, values - values, 0), "x + 1": (x + one, values + np_one, 0),
             "2 x": (2 * one * x, 2 * values, 0), "x x": (x * x, values * values, 0),
             "x == x": (dr.select(x == x, one, 0), (values == values).astype(np.float32), 0),
         }  # fmt: skip
-        for name, (computed, expected, ulps) in cases.items():
+        for name, (computed, expected, ulps) in operations.items():
             result = to_numpy(computed)
             is_near = np.abs(result - expected) <= ulps * np.spacing(np.abs(expected))
             is_same = (result == expected) | (np.isnan(result) & np.isnan(expected))
@@ -134,8 +139,8 @@ def _check_ieee_arithmetic(backend: Backend) -> None:
 
 
 def choose_backend(precision: Precision = "single") -> Backend:
-    """The backend to compute on: CUDA if there is a usable device; else, for single precision,
-    Metal if there is a usable device; else LLVM.
+    """Return the backend to compute on: CUDA if there is a usable device; else, for single
+    precision, Metal if there is a usable device; else LLVM.
 
     The environment variable HARNACK_BACKEND ("llvm", "cuda" or "metal") forces one of them. Metal
     has no double precision; with "metal", double precision uses LLVM.
@@ -153,6 +158,7 @@ def choose_backend(precision: Precision = "single") -> Backend:
         raise ValueError(
             f'{BACKEND_VARIABLE} is {forced!r}; set it to "llvm", "cuda" or "metal", or unset it'
         )
+    # GPUs are tried in order of preference; LLVM is last.
     for name, (kind, advice) in _DEVICES.items():
         if forced not in ("", name):
             continue
@@ -168,12 +174,12 @@ def choose_backend(precision: Precision = "single") -> Backend:
 
 
 def precision_of_input(*arrays: Any) -> Precision:
-    """The precision in which to compute with arrays or lists: "double" if any of them is an array
-    of float64 or a list with such an array, otherwise "single" (float32, integers, lists of
-    numbers)."""
+    """Return the precision in which to compute with arrays or lists. It is "double" if any of them
+    is an array of float64 or a list with such an array, otherwise "single" (float32, integers,
+    lists of numbers)."""
 
     def is_double(array: Any) -> bool:
-        """Whether an array, or an entry of nested lists, has the type float64."""
+        """Return whether an array, or an entry of nested lists, has the type float64."""
         if isinstance(array, list | tuple):
             return any(map(is_double, cast("list[Any]", array)))
         dtype = getattr(array, "dtype", None)
@@ -183,8 +189,8 @@ def precision_of_input(*arrays: Any) -> Precision:
 
 
 def backend_of(array: Any) -> Backend:
-    """The backend and precision of a Dr.Jit array or vector of floats, with or without automatic
-    differentiation.
+    """Return the backend and precision of a Dr.Jit array or vector of floats, with or without
+    automatic differentiation.
 
     Raises:
         TypeError: not a Dr.Jit array; an array of Dr.Jit's scalar mode, a matrix, tensor or the
@@ -205,6 +211,8 @@ def backend_of(array: Any) -> Backend:
             "drjit.llvm.ad, drjit.cuda.ad or drjit.metal.ad (in Mitsuba, a variant such as "
             '"llvm_ad_rgb")'
         )
+    # Matrices, complex numbers and quaternions are special; more than two levels are vectors of
+    # vectors.
     if dr.is_special_v(kind) or dr.is_tensor_v(kind) or dr.depth_v(kind) > 2:
         raise TypeError(f"expected a Dr.Jit scalar or vector array, got {full_name}")
     precision = _PRECISIONS.get(dr.type_v(kind))
@@ -214,8 +222,8 @@ def backend_of(array: Any) -> Backend:
 
 
 def _untyped_class(value: object) -> Any:
-    """The class of a value, typed as `Any`: static type checkers do not know the attributes of
-    Dr.Jit's classes."""
+    """Return the class of a value, typed as `Any`: static type checkers do not know the attributes
+    of Dr.Jit's classes."""
     return type(value)
 
 
@@ -234,7 +242,8 @@ _PRECISIONS: dict[Any, Precision] = {
 
 
 def to_vector3(backend: Backend, vectors: Any, name: str = "vectors") -> Vec3:
-    """Vectors as backend.Array3f, from an array or list of shape (n, 3) or from a Dr.Jit 3-vector.
+    """Convert vectors to backend.Array3f, from an array or list of shape (n, 3) or from a Dr.Jit
+    3-vector.
 
     The numbers of an array or list must be finite. A Dr.Jit vector is converted to the backend's
     precision. Its numbers are not checked: reading them would evaluate the vector, and so split the
@@ -255,7 +264,7 @@ def to_vector3(backend: Backend, vectors: Any, name: str = "vectors") -> Vec3:
 
 
 def as_finite_vectors(vectors: Any, name: str) -> FloatArray:
-    """Vectors as a float64 array (n, 3) of finite numbers. name: what the vectors are, for
+    """Convert vectors to a float64 array (n, 3) of finite numbers. name: what the vectors are, for
     messages.
 
     Raises:
@@ -271,7 +280,8 @@ def as_finite_vectors(vectors: Any, name: str) -> FloatArray:
 
 
 def upload_vectors(backend: Backend, rows: npt.NDArray[Any], name: str = "vectors") -> Vec3:
-    """Rows (n, 3) as backend.Array3f with n lanes, evaluated. Infinite values and NaN are allowed.
+    """Copy rows (n, 3) into a backend.Array3f with n lanes, evaluated. Infinite values and NaN are
+    allowed.
 
     Raises:
         ValueError: a number is too large for single precision. The message starts with `name`.
@@ -282,7 +292,8 @@ def upload_vectors(backend: Backend, rows: npt.NDArray[Any], name: str = "vector
 
 
 def to_float(backend: Backend, values: Any, name: str = "values") -> Real:
-    """Numbers as backend.Float, from a number, an array or list of shape (n,), or a Dr.Jit array.
+    """Convert numbers to backend.Float, from a number, an array or list of shape (n,), or a Dr.Jit
+    array.
 
     Infinite values are allowed (a ray may have no end), NaN is not. A single number becomes a
     kernel parameter, not a literal in the kernel's code, so that another number compiles no other
@@ -311,9 +322,10 @@ def to_float(backend: Backend, values: Any, name: str = "values") -> Real:
 
 
 def gather_vectors(backend: Backend, vectors: Vec3, index: Index) -> Vec3:
-    """For each lane, the vector at an index, in the backend's precision.
+    """Return the vector at a given index for each lane, in the backend's precision.
 
-    vectors: a Dr.Jit 3-vector of any precision. index: an index for each lane.
+    vectors: a Dr.Jit 3-vector of any precision, from which is read.
+    index: an index for each lane.
 
     A component of width 1, which all lanes share, is not gathered: Dr.Jit would write the
     derivatives of such a gather beyond the end of the array.
@@ -327,16 +339,16 @@ def gather_vectors(backend: Backend, vectors: Vec3, index: Index) -> Vec3:
 
 
 def as_kernel_parameters(array: Any) -> Any:
-    """The array, with literals (constants in the kernel's code) turned into kernel parameters, so
-    that another value uses the same compiled kernel. Derivatives are kept."""
+    """Return the array with literals turned into kernel parameters, so that another value uses the
+    same compiled kernel. A literal is a constant in the kernel's code. Derivatives are kept."""
     kind = _untyped_class(array)
     if dr.depth_v(kind) > 1:
         return kind(*map(as_kernel_parameters, array))
     if array.state != dr.VarState.Literal:
         return array
-    data = dr.detach(kind(array))
-    dr.make_opaque(data)
-    return dr.replace_grad(data, array) if dr.grad_enabled(array) else data
+    parameter = dr.detach(kind(array))
+    dr.make_opaque(parameter)
+    return dr.replace_grad(parameter, array) if dr.grad_enabled(array) else parameter
 
 
 def _check_same_backend(backend: Backend, array: Any, name: str) -> None:
@@ -354,7 +366,10 @@ def _check_same_backend(backend: Backend, array: Any, name: str) -> None:
 
 def _check_rows(is_bad: Any, kind: str, name: str) -> None:
     """Raise `ValueError` if `is_bad` (n,) is True anywhere; the message names the first such row.
-    kind: what is wrong with the row. name: what the rows are."""
+
+    kind: what is wrong with the row, such as "NaN".
+    name: what the rows are.
+    """
     indices = np.flatnonzero(is_bad)
     if indices.size:
         rest = f" and {indices.size - 1} more" if indices.size > 1 else ""
@@ -362,25 +377,31 @@ def _check_rows(is_bad: Any, kind: str, name: str) -> None:
 
 
 def _cast(backend: Backend, values: npt.NDArray[Any], name: str) -> npt.NDArray[Any]:
-    """The numbers of an array in the backend's precision. Raises `ValueError` if a finite number
-    overflows."""
+    """Return the numbers of an array in the backend's precision. name: what they are, for messages.
+
+    Raises:
+        ValueError: a finite number is too large for single precision.
+    """
     if backend.precision == "double" or values.dtype == backend.dtype:
         return values
     with np.errstate(over="ignore"):
-        cast = values.astype(np.float32)
-    overflow = np.isinf(cast) & np.isfinite(values)
+        rounded = values.astype(np.float32)
+    overflow = np.isinf(rounded) & np.isfinite(values)
     if overflow.any():
         raise ValueError(
             f"{name} has {values[overflow][0]:g}, too large for single precision: "
             'use smaller units, or in Python precision="double"'
         )
-    return cast
+    return rounded
 
 
 def upload_floats(backend: Backend, values: npt.NDArray[Any]) -> Real:
-    """A copy of a one-dimensional NumPy array as an evaluated backend.Float in aligned memory (see
-    `_aligned`). Raises `ValueError` for another shape, and for numbers too large for single
-    precision."""
+    """Copy a one-dimensional NumPy array into an evaluated backend.Float in aligned memory (see
+    `_aligned`).
+
+    Raises:
+        ValueError: another shape, or numbers too large for single precision.
+    """
     if values.ndim != 1:
         raise ValueError(f"expected a one-dimensional array, got shape {values.shape}")
     if values.size == 0:
@@ -389,14 +410,14 @@ def upload_floats(backend: Backend, values: npt.NDArray[Any]) -> Real:
 
 
 def upload_integers(backend: Backend, values: npt.NDArray[Any]) -> Index:
-    """A copy of a one-dimensional NumPy array of integers >= 0 as an evaluated backend.UInt32 in
+    """Copy a one-dimensional NumPy array of integers >= 0 into an evaluated backend.UInt32 in
     aligned memory (see `_aligned`)."""
     return backend.UInt32(_aligned(values, np.dtype(np.uint32)))
 
 
 def _aligned(values: npt.NDArray[Any], dtype: np.dtype[Any]) -> npt.NDArray[Any]:
-    """A copy of a one-dimensional array that begins at a multiple of _ALIGNMENT bytes, with at
-    least _ALIGNMENT unused bytes after it.
+    """Return a copy of a one-dimensional array that begins at a multiple of _ALIGNMENT bytes, with
+    at least _ALIGNMENT unused bytes after it.
 
     Dr.Jit uses the memory of a NumPy array in place, and NumPy's memory is aligned to the
     processor's vectors by chance only. Without alignment, Dr.Jit silently replaces packet gathers
@@ -405,6 +426,7 @@ def _aligned(values: npt.NDArray[Any], dtype: np.dtype[Any]) -> npt.NDArray[Any]
     """
     size = values.size * dtype.itemsize
     memory = np.empty(size + 2 * _ALIGNMENT, np.uint8)
+    # The distance from the start of the memory to the next multiple of the alignment.
     start = -memory.ctypes.data % _ALIGNMENT
     copy = memory[start : start + size].view(dtype)
     copy[:] = values
@@ -412,9 +434,8 @@ def _aligned(values: npt.NDArray[Any], dtype: np.dtype[Any]) -> npt.NDArray[Any]
 
 
 def to_numpy(array: Any) -> npt.NDArray[Any]:
-    """A Dr.Jit array of n lanes as a NumPy array of shape (n,), or (n, k) for vectors of k
-    components. Derivatives are dropped. A component with a single lane is repeated n times. The
-    result is a copy.
+    """Copy a Dr.Jit array of n lanes into a NumPy array of shape (n,), or (n, k) for vectors of k
+    components. Derivatives are dropped. A component with a single lane is repeated n times.
 
     Raises:
         TypeError: not a Dr.Jit array, or an array of vectors of vectors.

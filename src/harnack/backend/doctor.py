@@ -1,4 +1,5 @@
-"""The report of `harnack doctor`: versions, the backend, LLVM, and what to do about problems."""
+"""The report of the command `harnack doctor`: versions, the backend (the device that runs kernels),
+LLVM, and what to do about problems. Each line of the report is a `Finding`."""
 
 from __future__ import annotations
 
@@ -26,7 +27,7 @@ _KERNEL_SECONDS = 120
 
 @dataclass(frozen=True)
 class Finding:
-    """One line of the report.
+    """One line of the report on an installation.
 
     subject: what was examined.
     detail: what was found.
@@ -60,7 +61,7 @@ def diagnose() -> tuple[Finding, ...]:
 
 
 def _package_finding(name: str) -> Finding:
-    """The line about the version of a package."""
+    """Return the line about the version of a package."""
     try:
         return Finding(name, importlib.metadata.version(name))
     except importlib.metadata.PackageNotFoundError:
@@ -68,16 +69,16 @@ def _package_finding(name: str) -> Finding:
 
 
 def _device_finding(name: str, kind: Any) -> Finding:
-    """The line that says whether Dr.Jit finds a usable device. kind: Dr.Jit's constant for the
-    backend."""
+    """Return the line that says whether Dr.Jit finds a usable device. kind: Dr.Jit's constant for
+    the backend."""
     if dr.has_backend(kind):
         return Finding(name, "a usable device")
     return Finding(name, "no usable device (none is needed)")
 
 
 def _llvm_findings() -> list[Finding]:
-    """A line about the LLVM that Dr.Jit has loaded, then a line for each LLVM on this machine, best
-    first."""
+    """Return a line about the LLVM that Dr.Jit has loaded, then a line for each LLVM on this
+    machine, best first."""
     loaded = loaded_library()
     requested = os.environ.get(PATH_VARIABLE)
     source = f" ({PATH_VARIABLE})" if requested else ""
@@ -92,7 +93,7 @@ def _llvm_findings() -> list[Finding]:
 
 
 def _backend_finding() -> Finding:
-    """The line about the backend that is chosen, or the reason why there is none."""
+    """Return the line about the backend that is chosen, or the reason why there is none."""
     forced = os.environ.get(BACKEND_VARIABLE)
     source = f", forced by {BACKEND_VARIABLE}" if forced else ""
     try:
@@ -106,8 +107,8 @@ def _backend_finding() -> Finding:
 
 
 def _kernel_finding(precision: str) -> Finding:
-    """The line that says whether a small kernel of this precision runs. It is tried in a separate
-    process, since an unsuitable LLVM may end the process that uses it."""
+    """Return the line that says whether a small kernel of this precision runs. It is tried in a
+    separate process, since an unsuitable LLVM may end the process that uses it."""
     subject = f"kernel, {precision} precision"
     code = f"import harnack.backend.doctor as d; d.try_kernel({precision!r})"
     try:
@@ -122,6 +123,7 @@ def _kernel_finding(precision: str) -> Finding:
         return Finding(subject, f"no answer in {_KERNEL_SECONDS} s", ok=False)
     if process.returncode == 0:
         return Finding(subject, "runs")
+    # A short error output ends with the message; a long one, as of a crash, begins with it.
     lines = process.stderr.strip().splitlines() or ["no message"]
     detail = (
         f"fails with exit status {process.returncode}: {lines[0] if len(lines) > 3 else lines[-1]}"
@@ -144,15 +146,16 @@ def try_kernel(precision: str) -> None:
     x = dr.linspace(backend.Float, 0, 1, 64)
 
     def is_active(i: Index, total: Real) -> Mask:
-        """Whether the loop continues, for the index i of its next step."""
+        """Return whether the loop continues, for the index i of its next step."""
         return i < 8
 
     def add(i: Index, total: Real) -> tuple[Index, Real]:
-        """One step of the loop: add a term that is read from the table."""
+        """Do one step of the loop: add a term that is read from the table."""
         term = dr.gather(backend.Float, table, i)
         return i + 1, total + dr.minimum(term, 4) * dr.sqrt(x)
 
     _, total = dr.while_loop((backend.UInt32(0), dr.zeros(backend.Float, 64)), is_active, add)
+    # At x = 1 the sum is 1 + 2 + 3 + 4 + 4 + 4 + 4 + 4.
     if abs(float(to_numpy(total)[-1]) - 26.0) > 1e-4:
         raise RuntimeError(f"the kernel gave {total[-1]} instead of 26")
 

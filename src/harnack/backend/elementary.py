@@ -22,17 +22,18 @@ if TYPE_CHECKING:
 
 
 def fmin(a: Any, b: Any) -> Any:
-    """The smaller of a and b; b if either is NaN."""
+    """Return the smaller of a and b; b if either is NaN."""
     return dr.select(a < b, a, b)
 
 
 def fmax(a: Any, b: Any) -> Any:
-    """The larger of a and b; b if either is NaN."""
+    """Return the larger of a and b; b if either is NaN."""
     return dr.select(a > b, a, b)
 
 
 def clamp(x: Any, low: Any, high: Any) -> Any:
-    """x limited to [low, high]; low if x is NaN."""
+    """Return x limited to [low, high]; low if x is NaN."""
+    # fmax returns low for NaN.
     return fmin(fmax(x, low), high)
 
 
@@ -46,8 +47,8 @@ _SCALING_EXPONENTS_SINGLE, _SCALING_EXPONENTS_DOUBLE = (
 
 
 def safe_norm(v: Vec3) -> Real:
-    """The length |v| of a vector, also for vectors whose squares would underflow or overflow; NaN
-    if a component is NaN.
+    """Return the length |v| of a vector, also if its squares would underflow or overflow; NaN if a
+    component is NaN.
 
     `drjit.norm` squares the components first: in single precision it is 0 for vectors shorter than
     1e-19. Such a vector is the gradient of a polynomial of degree 12 near a zero of order 12, at a
@@ -64,23 +65,24 @@ def safe_norm(v: Vec3) -> Real:
 
 
 def safe_normalize(v: Vec3) -> Vec3:
-    """The unit vector v / |v|, for every vector whose largest component is a normal floating-point
-    number, also if its square would underflow or overflow."""
+    """Return the unit vector v / |v|. This holds for every vector whose largest component is a
+    normal floating-point number, also if its square would underflow or overflow."""
     largest = dr.detach(max_norm(v))
     (low, _), (high, _) = _norm_scaling_exponents(largest)
     is_ordinary = (largest >= 2.0**low) & (largest <= 2.0**high)
+    # Very short and very long vectors are divided by their largest component first.
     scaled = v / dr.select(is_ordinary, 1, largest)
     return scaled / dr.norm(scaled)
 
 
 def max_norm(v: Vec3) -> Real:
-    """The largest of |x|, |y| and |z| of a vector."""
+    """Return the largest of |x|, |y| and |z| of a vector."""
     return fmax(fmax(dr.abs(v.x), dr.abs(v.y)), dr.abs(v.z))
 
 
 def _norm_scaling_exponents(x: Real) -> tuple[tuple[int, int], tuple[int, int]]:
-    """The exponents by which `safe_norm` scales vectors, for the precision of x: ((low, up), (high,
-    down)). Vectors shorter than 2^low are multiplied by 2^up, vectors longer than 2^high by
+    """Return the exponents by which `safe_norm` scales vectors, for the precision of x: ((low, up),
+    (high, down)). Vectors shorter than 2^low are multiplied by 2^up, vectors longer than 2^high by
     2^down."""
     return (
         _SCALING_EXPONENTS_DOUBLE
@@ -99,11 +101,11 @@ _COSINE = (2.443315711809948e-5, -1.388731625493765e-3, 4.166664568298827e-2)
 
 
 def sincos(x: Any) -> tuple[Any, Any]:
-    """sin x and cos x, each with an error of at most 2u (u is the unit roundoff of the precision).
-    If |x| is larger than `max_sincos_argument`, the results are NaN.
+    """Return sin x and cos x, each with an error of at most 2u (u is the unit roundoff of the
+    precision). If |x| is larger than `max_sincos_argument`, the results are NaN.
 
     Method: with k = x / (pi/2), rounded to an integer, the angle x - k pi/2 is small. Its sine and
-        cosine are exchanged and negated as k modulo 4 says.
+    cosine are exchanged and negated as k modulo 4 says.
 
     In single precision, Dr.Jit's own functions are not accurate enough. On CUDA they are one
     instruction, with an error of 2^-20.5 = 11u, and of 600u for an angle of 300 (PTX ISA,
@@ -113,8 +115,10 @@ def sincos(x: Any) -> tuple[Any, Any]:
     rounded once for each part of pi/2, as the products are fused.
     """
     is_double = dr.type_v(type(x)) == dr.VarType.Float64
+    # 0.6366... is 2/pi.
     k = dr.round(x * 0.6366197723675814)
     reduced = dr.select(dr.abs(x) <= max_sincos_argument(type(x)), x, dr.nan)
+    # Subtract k pi/2 part by part, from the largest part of pi/2 to the smallest.
     for part in _HALF_PI_DOUBLE if is_double else _HALF_PI:
         reduced = dr.fma(k, -part, reduced)
     if is_double:
@@ -135,15 +139,15 @@ def sincos(x: Any) -> tuple[Any, Any]:
 
 
 def max_sincos_argument(real: Any) -> float:
-    """The largest angle, in radians, for which `sincos` gives numbers in the precision of the type
-    `real`. The rounding of an angle of this size is up to 0.06 in single precision, and 0.01 in
-    double precision."""
+    """Return the largest angle, in radians, for which `sincos` gives numbers in the precision of
+    the type `real`. The rounding of an angle of this size is up to 0.06 in single precision, and
+    0.01 in double precision."""
     return 2.0**47 if dr.type_v(real) == dr.VarType.Float64 else 1e6
 
 
 def _polynomial(coefficients: tuple[float, ...], x: Any) -> Any:
-    """The value at x of the polynomial with these coefficients, the coefficient of the highest
-    power first."""
+    """Return the value at x of the polynomial with these coefficients, the coefficient of the
+    highest power first."""
     value = coefficients[0]
     for coefficient in coefficients[1:]:
         value = dr.fma(value, x, coefficient)
@@ -151,7 +155,7 @@ def _polynomial(coefficients: tuple[float, ...], x: Any) -> Any:
 
 
 def orthonormal_basis(d: Vec3) -> tuple[Vec3, Vec3]:
-    """Two unit vectors u and v for each unit vector d such that (u, v, d) is orthonormal and
+    """Return two unit vectors u and v for each unit vector d such that (u, v, d) is orthonormal and
     right-handed (Duff et al. 2017, "Building an Orthonormal Basis, Revisited")."""
     vector = cast("Any", type(d))
     sign = dr.select(d.z >= 0, type(d.z)(1), -1)
@@ -163,9 +167,9 @@ def orthonormal_basis(d: Vec3) -> tuple[Vec3, Vec3]:
 
 
 def orthonormal_basis_rows(d: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Two arrays u and v (n, 3) of unit vectors for an array d (n, 3) of unit vectors: (u, v, d) is
-    orthonormal and right-handed in each row. The same formula as `orthonormal_basis`, for NumPy
-    arrays."""
+    """Return two arrays u and v (n, 3) of unit vectors for an array d (n, 3) of unit vectors: (u,
+    v, d) is orthonormal and right-handed in each row. It is the formula of `orthonormal_basis`, for
+    NumPy arrays."""
     x, y, z = d.T
     sign = np.copysign(1.0, z)
     a = -1.0 / (sign + z)

@@ -35,14 +35,15 @@ PATH_VARIABLE = "DRJIT_LIBLLVM_PATH"
 
 
 class LLVMNotFoundError(RuntimeError):
-    """There is no LLVM that Dr.Jit can use. The message ends with a command that mends this."""
+    """The error if there is no LLVM that Dr.Jit can use. The message ends with a command that mends
+    this."""
 
 
 @dataclass(frozen=True)
 class LLVMLibrary:
     """A shared LLVM library on this machine.
 
-    path: its path, with links not resolved.
+    path: its path; links are not resolved.
     major: its major version, None if it cannot be determined without loading the library.
     """
 
@@ -56,8 +57,8 @@ class LLVMLibrary:
 
 
 def rejection_reason(major: int | None) -> str | None:
-    """Why an LLVM of this major version must not be used; None if it may be used. major: None if
-    the version is unknown."""
+    """Return why an LLVM of this major version must not be used; None if it may be used. major:
+    None if the version is unknown."""
     if major is None:
         return "its version cannot be told"
     if major < 15:
@@ -68,31 +69,32 @@ def rejection_reason(major: int | None) -> str | None:
 
 
 def library_version(path: Path) -> int | None:
-    """The major version of the LLVM library at `path`, determined without loading it; None if
+    """Determine the major version of the LLVM library at `path` without loading it; None if
     unknown.
 
     The version is looked for in the file name (libLLVM-15.so.1, libLLVM.so.19.1), in the name of
     the file to which links lead, in the SONAME that the library stores, and in the folders of the
     path (Homebrew: Cellar/llvm/21.1.0/lib).
     """
-    real = Path(os.path.realpath(path))
-    for name in (path.name, real.name):
+    resolved_path = Path(os.path.realpath(path))
+    for name in (path.name, resolved_path.name):
         match = re.match(r"libLLVM(?:-|\.so\.|\.)(\d+)", name)
         if match:
             return int(match[1])
-    major = _version_from_soname(real)
+    major = _version_from_soname(resolved_path)
     if major is not None:
         return major
-    for folder in reversed(real.parts[:-1]):
+    # From the innermost folder outwards; a number counts only below a folder of LLVM.
+    for folder in reversed(resolved_path.parts[:-1]):
         match = re.fullmatch(r"(?:llvm[-@]?)?(\d\d)(?:\.\d+){0,2}(?:_\d+)?", folder)
-        if match and "llvm" in str(real.parent).lower():
+        if match and "llvm" in str(resolved_path.parent).lower():
             return int(match[1])
     return None
 
 
 def _version_from_soname(path: Path) -> int | None:
-    """The major version in the SONAME (the name that a shared library stores for the linker); None
-    if there is none."""
+    """Return the major version in the SONAME of a library (the name that the library stores for the
+    linker); None if there is none."""
     try:
         with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
             match = re.search(rb"\0libLLVM(?:-(\d+)[.\d]*\.so|\.so\.(\d+))[.\d]*\0", data)
@@ -121,15 +123,16 @@ def _search_folders() -> Iterator[Path]:
 
 
 def find_libraries(folders: Iterable[Path] | None = None) -> tuple[LLVMLibrary, ...]:
-    """All LLVM libraries in `folders` (by default, the folders where this platform keeps them),
-    best first. Each file is listed once, however many links lead to it. No library is loaded."""
+    """Find all LLVM libraries in `folders` (by default, the folders where this platform keeps
+    them). Returns them, best first. Each file is listed once, however many links lead to it. No
+    library is loaded."""
     libraries: dict[str, LLVMLibrary] = {}
     for folder in _search_folders() if folders is None else folders:
         for pattern in ("libLLVM.so*", "libLLVM-*.so*", "libLLVM.dylib", "libLLVM-*.dylib"):
             for path in sorted(folder.glob(pattern)):
-                real = os.path.realpath(path)
-                if real not in libraries and os.path.isfile(real):
-                    libraries[real] = LLVMLibrary(path, library_version(path))
+                resolved_path = os.path.realpath(path)
+                if resolved_path not in libraries and os.path.isfile(resolved_path):
+                    libraries[resolved_path] = LLVMLibrary(path, library_version(path))
     # The sort is stable, so among equals the order of the folders decides.
     best_first = sorted(
         libraries.values(), key=lambda library: preference_key(library.major), reverse=True
@@ -138,8 +141,8 @@ def find_libraries(folders: Iterable[Path] | None = None) -> tuple[LLVMLibrary, 
 
 
 def preference_key(major: int | None) -> tuple[bool, bool, bool, int]:
-    """A key by which LLVM versions are sorted: the greatest key belongs to the version to use.
-    major: None if the version is unknown."""
+    """Return a key by which LLVM versions are sorted: the greatest key belongs to the version to
+    use. major: None if the version is unknown."""
     version = major or 0
     return (
         rejection_reason(major) is None,
@@ -150,14 +153,14 @@ def preference_key(major: int | None) -> tuple[bool, bool, bool, int]:
 
 
 def best_library() -> LLVMLibrary | None:
-    """The acceptable LLVM library on this machine that is used by default; None if there is
+    """Return the acceptable LLVM library on this machine that is used by default; None if there is
     none."""
     return next((library for library in find_libraries() if library.rejection_reason is None), None)
 
 
 def import_drjit() -> None:
-    """Import Dr.Jit and have it load the best acceptable LLVM. The LLVM that it loads is not
-    checked here.
+    """Import Dr.Jit such that it loads the best acceptable LLVM. Whether the loaded LLVM works is
+    not checked here.
 
     Dr.Jit loads LLVM while it is imported, so this must come before any other `import drjit`. If
     Dr.Jit was imported already, or the user set DRJIT_LIBLLVM_PATH, that choice stands, and
@@ -185,7 +188,8 @@ def import_drjit() -> None:
 
 
 def loaded_library() -> LLVMLibrary | None:
-    """The LLVM library that Dr.Jit has loaded in this process; None if it has loaded none."""
+    """Return the LLVM library that Dr.Jit has loaded in this process; None if it has loaded
+    none."""
     major = _loaded_major()
     if major is None:
         return None
@@ -198,7 +202,7 @@ def loaded_library() -> LLVMLibrary | None:
 
 
 def _loaded_major() -> int | None:
-    """The major version of the LLVM that Dr.Jit has loaded; None if it has none."""
+    """Return the major version of the LLVM that Dr.Jit has loaded; None if it has none."""
     import_drjit()
     import drjit as dr  # not at the top: importing it loads LLVM, and import_drjit says which
 
@@ -208,7 +212,8 @@ def _loaded_major() -> int | None:
 
 
 def _mapped_libraries() -> tuple[Path, ...]:
-    """LLVM libraries in this process's memory map (Linux only)."""
+    """Return the LLVM libraries in this process's memory map. There are none on systems other than
+    Linux."""
     maps = Path("/proc/self/maps")
     if not maps.exists():
         return ()
@@ -238,8 +243,9 @@ def ensure_llvm() -> int:
 
 
 def _load_failure_message() -> str:
-    """The message of an error: why Dr.Jit has loaded no LLVM, and what to do."""
+    """Return the message of an error: why Dr.Jit has loaded no LLVM, and what to do."""
     requested = os.environ.get(PATH_VARIABLE)
+    # The user has chosen a file; otherwise one was looked for.
     if requested:
         reason = rejection_reason(library_version(Path(requested)))
         if not Path(requested).exists():
@@ -255,18 +261,18 @@ def _load_failure_message() -> str:
 
 
 def repair_advice() -> str:
-    """What to do on this machine so that Dr.Jit loads an acceptable LLVM, as a sentence with a
-    command."""
+    """Return what to do on this machine so that Dr.Jit loads an acceptable LLVM, as a sentence with
+    a command."""
     best = best_library()
     requested = os.environ.get(PATH_VARIABLE)
     if best is None or (requested and os.path.realpath(requested) == os.path.realpath(best.path)):
         return f"Install LLVM {PREFERRED_MAJOR}: `{install_command()}`"
-    first = "" if requested else "import harnack before drjit and mitsuba, or "
-    return f"LLVM {best.major} is installed: {first}run `export {PATH_VARIABLE}={best.path}`"
+    import_hint = "" if requested else "import harnack before drjit and mitsuba, or "
+    return f"LLVM {best.major} is installed: {import_hint}run `export {PATH_VARIABLE}={best.path}`"
 
 
 def install_command() -> str:
-    """The command that installs an acceptable LLVM on this kind of system."""
+    """Return the command that installs an acceptable LLVM on this kind of system."""
     if "CONDA_PREFIX" in os.environ:
         return f"conda install -c conda-forge libllvm{PREFERRED_MAJOR}"
     if sys.platform == "darwin":

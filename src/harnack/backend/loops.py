@@ -1,12 +1,14 @@
 """Recorded loops whose state is a record with named fields, and computations on only the lanes that
-need them.
+need them. A lane is one entry of Dr.Jit's arrays, here a ray. A record is a dataclass whose fields
+are arrays with an entry for each lane, or further records; the arrays in it are called its leaves.
+A recorded loop becomes part of a kernel, and runs on each lane until that lane is no longer active.
 
-A lane is one entry of Dr.Jit's arrays, here a ray; a packet is the group of lanes that a processor
-computes together. A recorded loop runs until the last ray of a packet has ended, and lanes whose
-ray has ended cost as much as all others. Outside of a recording, where arrays may be evaluated,
-there are two remedies: `compute_on_active` gathers the active lanes into shorter arrays, and in
-`loop_with_queue` a lane whose ray has ended takes the next ray. Both evaluate their results. The
-result of a ray does not depend on the other rays or on their order.
+A packet is the group of lanes that a processor computes together. A recorded loop runs until the
+last ray of a packet has ended, and lanes whose ray has ended take as much time as all others.
+Outside of a recording, where arrays may be evaluated, there are two remedies: `compute_on_active`
+gathers the active lanes into shorter arrays, and in `loop_with_queue` a lane whose ray has ended
+takes the next ray. Both evaluate their results. The result of a ray does not depend on the other
+rays or on their order.
 """
 
 from __future__ import annotations
@@ -28,7 +30,7 @@ class LoopState(Protocol):
 
     @property
     def active(self) -> Mask:
-        """The lanes on which the loop continues."""
+        """Mask of the lanes on which the loop continues."""
         ...
 
 
@@ -36,20 +38,21 @@ State = TypeVar("State", bound=LoopState)
 
 
 def loop_while_active(state: State, body: Callable[[State], State], label: str) -> State:
-    """Run `body` on the active lanes of the state until no lane is active, and return the final
+    """Run a recorded loop: apply `body` to the state until no lane is active. Returns the final
     state.
 
-    body: returns the next state from a state. label: the name of the loop in Dr.Jit's output.
+    body: returns the next state from a state.
+    label: the name of the loop in Dr.Jit's output.
 
     Errors that the body raises while it is recorded are raised unchanged.
     """
 
     def is_active(*leaves: Any) -> Mask:
-        """The lanes on which the loop continues. leaves: the arrays of the state."""
+        """Return the mask of lanes on which the loop continues. leaves: the arrays of the state."""
         return rebuild_record(state, iter(leaves)).active
 
     def run_body(*leaves: Any) -> tuple[Any, ...]:
-        """The arrays of the next state, from the arrays of the state."""
+        """Return the arrays of the next state, from the arrays of the state."""
         return tuple(array_leaves(body(rebuild_record(state, iter(leaves)))))
 
     try:
@@ -67,16 +70,18 @@ def update_where_active(
     of a recorded loop of at most one iteration, so that a packet without active lanes skips the
     work.
 
-    change: returns new arrays of the state from its arrays. label: the name of the loop.
+    active: mask of the lanes on which the state changes; other lanes keep theirs.
+    change: returns the new arrays of the state from its arrays.
+    label: the name of the loop in Dr.Jit's output.
     """
     index = dr.uint32_array_t(active)
 
     def run_once(iteration: Any, *state: Any) -> tuple[Any, ...]:
-        """The body of the loop: count the iteration, and change the state."""
+        """Do the only iteration: count it, and change the state."""
         return iteration + 1, *change(state)
 
     def is_first(iteration: Any, *_: Any) -> Mask:
-        """The lanes on which the loop runs its only iteration."""
+        """Return the mask of lanes on which the loop runs its only iteration."""
         return active & (iteration < 1)
 
     return dr.while_loop((index(0), *state), is_first, run_once, label=label)[1:]
@@ -93,8 +98,8 @@ def array_leaves(record: Any) -> Iterator[Any]:
 
 
 def rebuild_record(like: Any, leaves: Iterator[Any]) -> Any:
-    """A record of the same type and structure as `like`, with other arrays. leaves: the arrays, in
-    the order of `array_leaves`."""
+    """Return a record of the same type and structure as `like`, with other arrays. leaves: the
+    arrays, in the order of `array_leaves`."""
     values: list[Any] = []
     for value in _entries(like):
         if dataclasses.is_dataclass(value):
@@ -105,7 +110,7 @@ def rebuild_record(like: Any, leaves: Iterator[Any]) -> Any:
 
 
 def _entries(record: Any) -> list[Any]:
-    """The values of a record's fields, in order."""
+    """Return the values of a record's fields, in order."""
     return [getattr(record, field.name) for field in dataclasses.fields(record)]
 
 
@@ -119,21 +124,23 @@ _LANES_PER_THREAD, _LANES_ON_GPU = 1024, 1 << 17
 
 
 def active_lanes(mask: Mask) -> tuple[Any, int]:
-    """The indices of the lanes where the mask is set, as a Dr.Jit array, and their number.
+    """Return the indices of the lanes where the mask is set, as a Dr.Jit array, and their number.
 
     If there is only one such lane, its index is listed twice: Dr.Jit compiles separate kernels for
     arrays of length 1.
     """
-    rows = dr.compress(mask)
-    count = len(rows)
+    lane_indices = dr.compress(mask)
+    count = len(lane_indices)
     if count == 1:
-        rows = _evaluate_in_own_memory(lambda: dr.full(type(rows), int(rows[0]), 2))
-    return rows, count
+        lane_indices = _evaluate_in_own_memory(
+            lambda: dr.full(type(lane_indices), int(lane_indices[0]), 2)
+        )
+    return lane_indices, count
 
 
 def broadcast_copy(record: Lanes, width: int, index: Any) -> Lanes:
-    """An evaluated copy of a record in which every array has `width` lanes; an array of a single
-    lane is repeated. index: the Dr.Jit type of lane indices."""
+    """Return an evaluated copy of a record in which every array has `width` lanes; an array of a
+    single lane is repeated. index: the Dr.Jit type of lane indices."""
     copies = _evaluate_in_own_memory(
         lambda: [_broadcast(leaf, width, index) for leaf in array_leaves(record)]
     )
@@ -141,11 +148,11 @@ def broadcast_copy(record: Lanes, width: int, index: Any) -> Lanes:
 
 
 def gather_record(record: Lanes, rows: Any) -> Lanes:
-    """The record at the lanes `rows` (an array of indices). An array of width 1, which all lanes
-    share, stays as it is."""
+    """Return the record with only some of its lanes. An array of width 1, which all lanes share,
+    stays as it is. rows: the indices of the lanes."""
 
     def gather(leaf: Any) -> Any:
-        """One array of the record at the lanes `rows`."""
+        """Return one array of the record, with only these lanes."""
         return leaf if dr.width(leaf) == 1 else dr.gather(type(leaf), leaf, rows)
 
     return rebuild_record(record, map(gather, array_leaves(record)))
@@ -155,36 +162,41 @@ def compute_on_active(
     mask: Mask, compute: Callable[[Lanes], Result], lanes: Lanes, inactive_result: Result
 ) -> Result:
     """Run `compute` on the lanes where `mask` is set, and use `inactive_result` on all other lanes.
+    Returns the results of all lanes.
 
     The active lanes are gathered into shorter arrays, and the results are scattered back. Inputs
     and results are evaluated, so that kernels do not depend on the number of active lanes.
 
-    compute: returns a record from the record of lanes; each lane's result must not depend on other
+    compute: returns a record from the record of inputs; each lane's result must not depend on other
         lanes.
     lanes: the record of inputs.
     inactive_result: a record with the structure of the result.
     """
     width = dr.width(mask)
     dr.eval(mask, *array_leaves(lanes), *array_leaves(inactive_result))
-    rows, count = active_lanes(mask)
-    result = broadcast_copy(inactive_result, width, type(rows))
-    if not count:
-        _begin_new_scope(rows)
+    lane_indices, active_count = active_lanes(mask)
+    result = broadcast_copy(inactive_result, width, type(lane_indices))
+    if not active_count:
+        _begin_new_scope(lane_indices)  # as the computation would have done
         return result
-    targets, values = [*array_leaves(result)], [*array_leaves(compute(gather_record(lanes, rows)))]
+    # The results of the active lanes replace the inactive ones in place.
+    targets, values = (
+        [*array_leaves(result)],
+        [*array_leaves(compute(gather_record(lanes, lane_indices)))],
+    )
     dr.eval(values)
     for target, value in zip(targets, values, strict=True):
-        dr.scatter(target, value, rows)
+        dr.scatter(target, value, lane_indices)
     dr.eval(targets)
-    _begin_new_scope(rows)
+    _begin_new_scope(lane_indices)
     return rebuild_record(result, iter(targets))
 
 
 def loop_with_queue(
     start: State, body: Callable[[State], State], result: Callable[[State], Result], label: str
 ) -> Result:
-    """Run `loop_while_active(start, body, label)`, and return `result` of the final states,
-    evaluated.
+    """Run the loop `loop_while_active(start, body, label)` for many rays with few lanes. Returns
+    `result` of the final states, evaluated.
 
     Only a fixed number of lanes run at a time, far fewer than `start` has. A lane whose ray has
     ended stores its result and takes the next ray from a queue, so that no lane waits for the
@@ -199,20 +211,22 @@ def loop_with_queue(
     dr.eval(*array_leaves(start))
     width = max(dr.width(leaf) for leaf in array_leaves(start))
     active = dr.full(type(start.active), True, width) & start.active
-    rows, count = active_lanes(active)
-    results = broadcast_copy(result(start), width, type(rows))
-    if count:
-        _run_queue(start, body, result, rows, count, [*array_leaves(results)], label)
-    _begin_new_scope(rows)
+    ray_indices, ray_count = active_lanes(active)
+    # Rays that are not active from the start have the results of their initial states.
+    results = broadcast_copy(result(start), width, type(ray_indices))
+    if ray_count:
+        _run_queue(start, body, result, ray_indices, ray_count, [*array_leaves(results)], label)
+    _begin_new_scope(ray_indices)
     return results
 
 
 @dataclass(frozen=True)
 class _QueueLane:
-    """The state of the lanes that process the queue of rays.
+    """The state of the lanes that process the queue of rays, which lists the rays still to be
+    traced.
 
     queue_index: for each lane, the position in the queue of the ray that it follows now.
-    state: for each lane, the state of that ray.
+    state: for each lane, the loop state of that ray.
     """
 
     queue_index: Any
@@ -220,62 +234,69 @@ class _QueueLane:
 
     @property
     def active(self) -> Mask:
-        """The lanes that follow a ray."""
+        """Mask of the lanes that follow a ray."""
         return self.state.active
 
 
 def _run_queue(
     start: Any, body: Callable[[Any], Any], result: Callable[[Any], Any],
-    rows: Any, total: int, results: list[Any], label: str,
+    ray_indices: Any, ray_count: int, results: list[Any], label: str,
 ) -> None:  # fmt: skip
     """Run the loop of `loop_with_queue`, with the same start, body and result.
 
-    rows: the indices in `start` of the rays in the queue.
-    total: the number of these rays.
+    ray_indices: the indices in `start` of the rays in the queue.
+    ray_count: the number of these rays; `ray_indices` may be longer.
     results: the arrays, one entry per ray, into which the results are written.
     """
-    index = cast("Any", type(rows))
-    count = dr.opaque(index, total)
-    threads = dr.thread_count() if dr.backend_v(rows) == dr.JitBackend.LLVM else 0
-    width = min(len(rows), _LANES_PER_THREAD * threads or _LANES_ON_GPU)
-    counter, first_indices = _evaluate_in_own_memory(
-        lambda: [dr.full(index, width, 1), dr.arange(index, width)]
+    index_type = cast("Any", type(ray_indices))
+    opaque_ray_count = dr.opaque(index_type, ray_count)
+    # The number of lanes is fixed by the device, and not by the number of rays.
+    threads = dr.thread_count() if dr.backend_v(ray_indices) == dr.JitBackend.LLVM else 0
+    width = min(len(ray_indices), _LANES_PER_THREAD * threads or _LANES_ON_GPU)
+    next_position, first_indices = _evaluate_in_own_memory(
+        lambda: [dr.full(index_type, width, 1), dr.arange(index_type, width)]
     )
 
     def fetch_rays(queue_index: Any, mask: Mask) -> Any:
-        """The initial states of the rays at the positions `queue_index` of the queue, for the lanes
-        of `mask`."""
-        ids = dr.gather(index, rows, queue_index, mask)
+        """Return the initial states of the rays at the positions `queue_index` of the queue, for
+        the lanes of `mask`."""
+        ray_ids = dr.gather(index_type, ray_indices, queue_index, mask)
 
         def gather(leaf: Any) -> Any:
-            """One array of the initial states, at these rays."""
-            return leaf if dr.width(leaf) == 1 else dr.gather(type(leaf), leaf, ids, mask)
+            """Return one array of the initial states, at these rays."""
+            return leaf if dr.width(leaf) == 1 else dr.gather(type(leaf), leaf, ray_ids, mask)
 
         return rebuild_record(start, map(gather, array_leaves(start)))
 
     def step_lanes(lane: _QueueLane) -> _QueueLane:
         """Apply the body to the rays of all lanes. In each lane whose ray ends, store the result
-        and take the next ray of the queue. `counter` holds the position of the next ray that no
-        lane has taken."""
+        and take the next ray of the queue.
+
+        `next_position` is a counter in memory. `scatter_inc` adds 1 for each such lane and returns
+        the number before, so each lane gets a position of its own.
+        """
         new_state = body(lane.state)
         is_ended = lane.active & ~new_state.active
-        ids = dr.gather(index, rows, lane.queue_index, is_ended)
+        # Results are written at the index of the ray, whatever its lane was.
+        ray_ids = dr.gather(index_type, ray_indices, lane.queue_index, is_ended)
         for target, value in zip(results, array_leaves(result(new_state)), strict=True):
-            dr.scatter(target, value, ids, is_ended)
+            dr.scatter(target, value, ray_ids, is_ended)
         queue_index = dr.select(
-            is_ended, dr.scatter_inc(counter, index(0), is_ended), lane.queue_index
+            is_ended, dr.scatter_inc(next_position, index_type(0), is_ended), lane.queue_index
         )
-        is_fetching = is_ended & (queue_index < count)
-        pairs = zip(
+        is_fetching = is_ended & (queue_index < opaque_ray_count)
+        fetched_and_new = zip(
             array_leaves(fetch_rays(queue_index, is_fetching)), array_leaves(new_state), strict=True
         )
         return _QueueLane(
             queue_index,
-            rebuild_record(new_state, (dr.select(is_fetching, *pair) for pair in pairs)),
+            rebuild_record(
+                new_state, (dr.select(is_fetching, *states) for states in fetched_and_new)
+            ),
         )
 
     loop_while_active(
-        _QueueLane(first_indices, fetch_rays(first_indices, first_indices < count)),
+        _QueueLane(first_indices, fetch_rays(first_indices, first_indices < opaque_ray_count)),
         step_lanes,
         label,
     )
@@ -290,7 +311,7 @@ def _begin_new_scope(array: Any) -> None:
 
 
 def _evaluate_in_own_memory(compute: Callable[[], Any]) -> Any:
-    """Evaluate the arrays that `compute` returns, each in memory of its own.
+    """Evaluate the arrays that `compute` returns, each in memory of its own, and return them.
 
     Normally Dr.Jit stores equal arrays once, and a kernel depends on which of its inputs are the
     same array. Two arrays that are equal by accident, such as index arrays of the same length,
@@ -303,6 +324,7 @@ def _evaluate_in_own_memory(compute: Callable[[], Any]) -> Any:
 
 
 def _broadcast(leaf: Any, width: int, index: Any) -> Any:
-    """A copy of an array with `width` lanes; an array of a single lane is repeated. index: the
-    Dr.Jit type of lane indices."""
+    """Return a copy of an array with `width` lanes; an array of a single lane is repeated. index:
+    the Dr.Jit type of lane indices."""
+    # All indices are 0 for an array of a single lane.
     return dr.gather(type(leaf), leaf, dr.arange(index, width) * (dr.width(leaf) > 1))

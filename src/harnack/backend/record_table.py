@@ -1,5 +1,5 @@
-"""Tables of numbers on a backend. A kernel reads a row of a table (a record) in packets of eight
-numbers.
+"""Tables of numbers on a backend (the device that runs kernels). A row of a table is called a
+record, such as all numbers of one triangle. Kernels read a record in packets of eight numbers.
 
 A packet gather fetches eight numbers at once, which is several times faster than eight gathers, if
 the memory is aligned (see `backend.arrays`). A loop over all records is recorded once, whatever
@@ -30,8 +30,9 @@ RecordBody: TypeAlias = "Callable[[list[Real], LoopValues], LoopValues]"
 
 @dataclass(frozen=True)
 class RecordTable:
-    """A table on a backend. Each row (record) is padded with zeros to a multiple of eight numbers
-    (packets).
+    """A table of numbers on a backend (the device that runs kernels). Each row, called a record, is
+    padded with zeros to a multiple of eight numbers (packets). `for_each` is a recorded loop over
+    the records.
 
     buffer: all numbers, row after row, with padding.
     packets_per_record: the number of packets of a record.
@@ -54,7 +55,7 @@ class RecordTable:
         cls, backend: Backend, table: npt.NDArray[Any], padding_row: npt.NDArray[Any] | None = None,
         at_once: int = 1,
     ) -> RecordTable:  # fmt: skip
-        """Upload a table (n, c), rounded to the backend's precision.
+        """Upload a table (n, c), rounded to the backend's precision. Returns the `RecordTable`.
 
         padding_row: (c,) a row without effect on the loop, appended until `at_once` divides the
             number of rows; it may be None if `at_once` divides n.
@@ -75,18 +76,20 @@ class RecordTable:
             table = np.concatenate([table, np.tile(padding_row, (missing_rows, 1))])
         rows, width = table.shape
         padded_width = -(-width // PACKET) * PACKET
-        flat = upload_floats(backend, np.ascontiguousarray(table).ravel())
+        unpadded = upload_floats(backend, np.ascontiguousarray(table).ravel())
+        # Entry `position` of the padded table is row `row` and column `column`; columns beyond the
+        # width are 0.
         position = dr.arange(backend.UInt32, rows * padded_width)
         row, column = position // padded_width, position % padded_width
-        copy = dr.gather(backend.Float, flat, row * width + column, column < width)
-        dr.eval(copy)
+        padded = dr.gather(backend.Float, unpadded, row * width + column, column < width)
+        dr.eval(padded)
         return cls(
-            backend, copy, padded_width // PACKET, at_once, dr.opaque(backend.UInt32, iterations)
+            backend, padded, padded_width // PACKET, at_once, dr.opaque(backend.UInt32, iterations)
         )
 
     def view(self, first: Any, trips: Any) -> RecordTable:
-        """The part of the table that consists of `trips` consecutive records, from record `first`
-        on. Both numbers may differ between lanes. The table must have one record per iteration.
+        """Return a part of the table: `trips` consecutive records, from record `first` on. Both
+        numbers may differ between lanes. The table must have one record per iteration.
 
         Raises:
             ValueError: an iteration reads several records.
@@ -98,8 +101,11 @@ class RecordTable:
         return replace(self, first_record=first, iteration_count=trips)
 
     def read_record(self, i: Any, active: Mask = True) -> list[Real]:
-        """The numbers of record i, padding included, as a list of Dr.Jit arrays. i: an index for
-        each lane. active: the lanes that need the numbers; all others get zeros."""
+        """Return the numbers of record i, padding included, as a list of Dr.Jit arrays.
+
+        i: the index of a record for each lane.
+        active: mask of the lanes that need the numbers; all others get zeros.
+        """
         numbers: list[Real] = []
         i = i if self.first_record is None else i + self.first_record
         for k in range(self.packets_per_record):
@@ -117,21 +123,25 @@ class RecordTable:
             state.
         state: a tuple of arrays.
         label: the name of the loop in Dr.Jit's output.
+        active: mask of the lanes on which the loop runs; other lanes keep their state.
 
-        A packet of lanes skips the loop if all of its lanes are inactive.
+        A packet of lanes, which a processor computes together, skips the loop if all of its lanes
+        are inactive.
         """
+        # Inactive lanes make no iteration.
         iterations = (
             self.iteration_count if active is True else dr.select(active, self.iteration_count, 0)
         )
 
         def read_and_apply(i: Any, *state: Any) -> LoopValues:
-            """Apply `body` to the records of iteration i."""
+            """Apply `body` to the records of iteration i. Returns the index of the next iteration
+            and the new state."""
             for j in range(self.records_per_iteration):
                 state = body(self.read_record(i * self.records_per_iteration + j), state)
             return i + 1, *state
 
         def is_active(i: Any, *_: Any) -> Mask:
-            """The lanes on which iteration i runs."""
+            """Return the mask of lanes on which iteration i runs."""
             return i < iterations
 
         start = (self.backend.UInt32(0), *state)

@@ -1,4 +1,8 @@
-"""Converts between Dr.Jit's tensors and vectors, and wraps functions for PyTorch and JAX.
+"""Converts between Dr.Jit's tensors and vectors, and wraps functions for PyTorch and JAX. A tensor
+is an array with a shape, such as (n, 3). A vector is three Dr.Jit arrays with an entry, called a
+lane, for each of n points. A wrapped function takes and returns arrays of the other framework, and
+its derivatives are passed on; a cotangent is the gradient of some later result with respect to one
+of its results.
 
 Arrays of other frameworks reach Dr.Jit as tensors (n, 3) or (n,): `drjit.wrap` passes tensors to a
 function and expects tensors from it. This package computes with vectors instead, with a lane for
@@ -34,16 +38,17 @@ Method = TypeVar("Method", bound=Callable[..., Any])
 
 
 def is_tensor(value: Any) -> bool:
-    """Whether a value is a Dr.Jit tensor."""
+    """Return whether a value is a Dr.Jit tensor."""
     return dr.is_tensor_v(cast("Any", type(value)))
 
 
 def tensor_to_vectors(
     tensor: Any, name: str = "vectors", error: type[Exception] = ValueError
 ) -> Vec3:
-    """The rows of a tensor (n, 3) as a 3-vector of n lanes.
+    """Return the rows of a tensor (n, 3) as a 3-vector of n lanes.
 
-    name: what the tensor is, for messages. error: the class of errors about its shape.
+    name: what the tensor is, for messages.
+    error: the class of errors about its shape.
 
     Raises:
         TypeError: not of 32- or 64-bit floats.
@@ -53,14 +58,19 @@ def tensor_to_vectors(
     numbers = tensor_to_array(tensor, name)
     backend = backend_of(numbers)
     count = 3 * tensor.shape[0]
+    # The numbers 0, 3, 6, ... of the rows are x coordinates, and so on.
     indices = (dr.arange(backend.UInt32, k, count, 3) for k in range(3 if count else 0))
-    rows = [dr.gather(backend.Float, numbers, index) for index in indices]
-    return backend.Array3f(*rows) if rows else dr.zeros(backend.Array3f, 0)
+    components = [dr.gather(backend.Float, numbers, index) for index in indices]
+    return backend.Array3f(*components) if components else dr.zeros(backend.Array3f, 0)
 
 
 def tensor_to_array(tensor: Any, name: str = "values") -> Real:
-    """All numbers of a tensor, row by row, as a Dr.Jit array. name: what the tensor is, for
-    messages. Raises `TypeError` if they are not 32- or 64-bit floats."""
+    """Return all numbers of a tensor, row by row, as a Dr.Jit array. name: what the tensor is, for
+    messages.
+
+    Raises:
+        TypeError: the numbers are not 32- or 64-bit floats.
+    """
     array = tensor.array
     try:
         return backend_of(array).Float(array)
@@ -69,7 +79,8 @@ def tensor_to_array(tensor: Any, name: str = "values") -> Real:
 
 
 def array_to_tensor(array: Any, shape: tuple[int, ...]) -> Any:
-    """A Dr.Jit array as a tensor of the given shape; a 3-vector as a tensor of shape (*shape, 3).
+    """Return a Dr.Jit array as a tensor of the given shape; a 3-vector as a tensor of shape
+    (*shape, 3).
 
     A value that all lanes share is repeated. Unsigned integers become signed ones, since PyTorch
     has no unsigned integers.
@@ -96,6 +107,7 @@ def accepts_tensors(method: Method) -> Method:
         if not is_tensor(points):
             return method(self, points, **settings)
         *shape, _ = points.shape or (0,)
+        # A single point is a table of one row.
         rows = cast("Any", type(points))(points.array, (1, 3)) if points.shape == (3,) else points
         return array_to_tensor(
             method(self, tensor_to_vectors(rows, "points"), **settings), tuple(shape)
@@ -120,7 +132,8 @@ def wrap_for_torch(function: Callable[..., Any]) -> Callable[..., Any]:
         in a tuple, list or dictionary; 3-vectors become tensors (n, 3). All other arguments are
         passed unchanged; tensors within lists and other containers are not converted.
 
-    Raises ImportError if PyTorch is not installed.
+    Raises:
+        ImportError: PyTorch is not installed.
     """
     torch: Any = importlib.import_module("torch")
 
@@ -128,8 +141,8 @@ def wrap_for_torch(function: Callable[..., Any]) -> Callable[..., Any]:
         """Call `function`. Returns its tensor arguments as Dr.Jit tensors with derivatives, and its
         result.
 
-        arguments: the arguments in order, with None in place of tensors. tensors: PyTorch tensors
-            for these places.
+        arguments: the arguments in order, with None in place of tensors.
+        tensors: PyTorch tensors for these places.
         """
         inputs = [_differentiable_tensor(tensor.detach()) for tensor in tensors]
         remaining = iter(inputs)
@@ -137,17 +150,21 @@ def wrap_for_torch(function: Callable[..., Any]) -> Callable[..., Any]:
         return inputs, function(*all_arguments)
 
     class Wrapped(torch.autograd.Function):
-        """The function in the form that PyTorch's automatic differentiation calls."""
+        """The function in the form that PyTorch's automatic differentiation calls. `ctx` is
+        PyTorch's object that keeps values from the forward pass for the backward pass."""
 
         @staticmethod
         def forward(ctx: Any, arguments: list[Any], container: list[Any], *tensors: Any) -> Any:
-            """The results as PyTorch tensors. The result of `function` itself, whose type (tuple,
-            list, ...) the caller needs, is appended to the list `container`."""
+            """Return the results as PyTorch tensors. The result of `function` itself, whose type
+            (tuple, list, ...) the caller needs, is appended to the list `container`."""
             inputs, outputs = run_function(arguments, tensors)
             container.append(outputs)
+            # PyTorch keeps the tensors for a second backward pass, and Dr.Jit's graph serves the
+            # first.
             ctx.save_for_backward(*tensors)
             ctx.arguments, ctx.graph = arguments, (inputs, _results(outputs))
             results = tuple(dr.detach(_as_tensor(value)).torch() for value in ctx.graph[1])
+            # PyTorch asks for no gradients of integers.
             integral = (result for result in results if not result.is_floating_point())
             ctx.mark_non_differentiable(*integral)
             return results
@@ -155,8 +172,12 @@ def wrap_for_torch(function: Callable[..., Any]) -> Callable[..., Any]:
         @staticmethod
         @torch.autograd.function.once_differentiable
         def backward(ctx: Any, *cotangents: Any) -> Any:
-            """The gradients with respect to the arguments of `forward` (None for the first two).
-            cotangents: the gradients with respect to its results."""
+            """Return the gradients with respect to the arguments of `forward` (None for the first
+            two). cotangents: the gradients with respect to its results.
+
+            Dr.Jit's graph of the forward pass can be traversed only once. If it is used up,
+            `function` is called again.
+            """
             graph, ctx.graph = ctx.graph, None
             if graph is None:  # a repeated backward pass
                 inputs, outputs = run_function(ctx.arguments, ctx.saved_tensors)
@@ -173,6 +194,7 @@ def wrap_for_torch(function: Callable[..., Any]) -> Callable[..., Any]:
     def wrapped(*args: Any) -> Any:
         """Call the function with PyTorch tensors."""
         tensors = [value for value in args if isinstance(value, torch.Tensor)]
+        # Tensors are passed one by one, as PyTorch differentiates by direct arguments only.
         arguments = [None if isinstance(value, torch.Tensor) else value for value in args]
         container: list[Any] = []
         return _in_container(container, iter(Wrapped.apply(arguments, container, *tensors)))
@@ -181,16 +203,20 @@ def wrap_for_torch(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _results(outputs: Any) -> list[Any]:
-    """The results of a function as a list, from a single result or a tuple, list or dictionary."""
+    """Return the results of a function as a list, from a single result or a tuple, list or
+    dictionary."""
     if isinstance(outputs, dict):
         return list(cast("dict[Any, Any]", outputs).values())
     return list(cast("list[Any]", outputs)) if isinstance(outputs, (tuple, list)) else [outputs]
 
 
 def _in_container(container: list[Any], results: Any) -> Any:
-    """Results in a container of the same type (and with the same keys) as the function's own
-    result. container: a list whose only entry is the function's own result. results: an
-    iterator."""
+    """Put results into a container of the same type (and with the same keys) as the function's own
+    result.
+
+    container: a list whose only entry is the function's own result.
+    results: an iterator.
+    """
     outputs = container.pop()
     if isinstance(outputs, dict):
         return dict(zip(cast("dict[Any, Any]", outputs), results, strict=True))
@@ -198,7 +224,7 @@ def _in_container(container: list[Any], results: Any) -> Any:
 
 
 def _gradients(inputs: list[Any], outputs: list[Any], cotangents: list[Any]) -> list[Any]:
-    """The gradients, as tensors, with respect to each input that holds floats.
+    """Return the gradients, as tensors, with respect to each input that holds floats.
 
     inputs: tensors with derivatives enabled.
     outputs: the results of the function for these inputs.
@@ -215,8 +241,10 @@ def _gradients(inputs: list[Any], outputs: list[Any], cotangents: list[Any]) -> 
         if dr.grad_enabled(tensor):
             dr.accum_grad(tensor, cotangent_tensor)  # an output may occur twice, or be an input
             dr.enqueue(dr.ADMode.Backward, tensor)
+        # The output has no derivative: a gradient of 0 does no harm.
         elif dr.any(cotangent_tensor.array != 0, axis=None):
             raise NotImplementedError(_NO_DERIVATIVE)
+    # All outputs are propagated back to the inputs at once.
     dr.traverse(dr.ADMode.Backward)
     return [dr.grad(source) for source in inputs if dr.is_float_v(source)]
 
@@ -254,14 +282,15 @@ def wrap_for_jax(
     those of reverse mode (`jax.grad`, `jax.vjp`, `jax.jacrev`). A derivative calls `function` a
     second time: JAX may keep the values of a forward pass, but it cannot keep Dr.Jit's graph.
 
-    Raises ImportError if JAX is not installed.
+    Raises:
+        ImportError: JAX is not installed.
     """
     jax: Any = importlib.import_module("jax")
     run = functools.partial(_run_for_jax, jax, function)
     pull_back = functools.partial(_pull_back, jax, function)
 
     def call(*args: Any) -> Any:
-        """The result of the function, also inside of `jax.jit`."""
+        """Return the result of the function, also inside of `jax.jit`."""
         if not _is_traced(jax, args):
             return run(*args)
         if result_like is None:
@@ -269,14 +298,16 @@ def wrap_for_jax(
         return _pure_callback(jax, run, jax.eval_shape(result_like, *args), *args)
 
     def forward(*args: Any) -> tuple[Any, Any]:
-        """The result, and the arguments, which JAX passes to `backward`."""
+        """Return the result, and the arguments, which JAX passes to `backward`."""
         return call(*args), args
 
     def backward(args: Any, cotangents: Any) -> Any:
-        """The gradients with respect to all arguments. cotangents: the gradients with respect to
-        the result."""
+        """Return the gradients with respect to all arguments. cotangents: the gradients with
+        respect to the result."""
         leaves: list[Any] = jax.tree.leaves(args)
         if _is_traced(jax, (args, cotangents)):
+            # Inside jax.jit only shapes are known: the gradients are computed by a callback when
+            # the compiled program runs.
             shapes = [
                 jax.ShapeDtypeStruct(leaf.shape, leaf.dtype)
                 for leaf in leaves
@@ -294,12 +325,13 @@ def wrap_for_jax(
         ]
         return jax.tree.unflatten(jax.tree.structure(args), gradients)
 
+    # Where derivatives are needed, JAX calls `forward` and `backward` in place of `call`.
     differentiable: Any = jax.custom_vjp(call)
     differentiable.defvjp(forward, backward)
 
     @functools.wraps(function)
     def wrapped(*args: Any) -> Any:
-        """Call the function with arrays or numbers."""
+        """Call `function` with JAX arrays or numbers."""
         return differentiable(*jax.tree.map(jax.numpy.asarray, args))
 
     return wrapped
@@ -314,8 +346,12 @@ def _run_for_jax(jax: Any, function: Callable[..., Any], *args: Any) -> Any:
 
 
 def _pull_back(jax: Any, function: Callable[..., Any], args: Any, cotangents: Any) -> list[Any]:
-    """The gradients, as JAX arrays, with respect to each argument that holds floats. cotangents:
-    the gradients with respect to the result of `function`."""
+    """Return the gradients, as JAX arrays, with respect to each argument that holds floats.
+
+    jax: the module.
+    args: the arguments of `function`.
+    cotangents: the gradients with respect to the result of `function`.
+    """
     inputs = jax.tree.map(_differentiable_tensor, args)
     outputs = jax.tree.leaves(function(*inputs))
     gradients = _gradients(jax.tree.leaves(inputs), outputs, jax.tree.leaves(cotangents))
@@ -323,17 +359,17 @@ def _pull_back(jax: Any, function: Callable[..., Any], args: Any, cotangents: An
 
 
 def _is_traced(jax: Any, values: Any) -> bool:
-    """Whether a value is a placeholder without numbers, as JAX passes while it transforms or
-    compiles a function."""
+    """Return whether one of the values is a placeholder without numbers, as JAX passes while it
+    transforms or compiles a function."""
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(values))
 
 
 def _pure_callback(jax: Any, compute: Callable[..., Any], shapes: Any, *args: Any) -> Any:
-    """The result of `compute`, which JAX calls while a compiled program runs. shapes: the shapes
-    and types of the result."""
+    """Return the result of `compute`, which JAX calls while a compiled program runs. shapes: the
+    shapes and types of the result."""
 
     def compute_on_host(*values: Any) -> Any:
-        """The result of `compute` for NumPy arrays, as NumPy arrays."""
+        """Return the result of `compute` for NumPy arrays, as NumPy arrays."""
         # NumPy arrays, as a callback must not wait for work that JAX itself has to do.
         return jax.tree.map(np.asarray, compute(*jax.tree.map(np.asarray, values)))
 
@@ -341,18 +377,18 @@ def _pure_callback(jax: Any, compute: Callable[..., Any], shapes: Any, *args: An
 
 
 def _is_float(jax: Any, array: Any) -> bool:
-    """Whether an array or number holds floats for JAX."""
+    """Return whether an array or number holds floats for JAX."""
     return jax.numpy.issubdtype(jax.numpy.result_type(array), jax.numpy.floating)
 
 
 def _import_tensor(array: Any) -> Any:
-    """A JAX, PyTorch or NumPy array as a Dr.Jit tensor of the same shape and precision, on the same
-    device."""
+    """Return a JAX, PyTorch or NumPy array as a Dr.Jit tensor of the same shape and precision, on
+    the same device."""
     return dr.detail.import_tensor(array, True)
 
 
 def _differentiable_tensor(array: Any) -> Any:
-    """An array of another framework as a Dr.Jit tensor, with derivatives enabled if it holds
+    """Return an array of another framework as a Dr.Jit tensor, with derivatives enabled if it holds
     floats."""
     tensor = _import_tensor(array)
     if dr.is_float_v(tensor):
@@ -361,8 +397,11 @@ def _differentiable_tensor(array: Any) -> Any:
 
 
 def _as_tensor(value: Any) -> Any:
-    """A result of a function, a Dr.Jit array or tensor, as a Dr.Jit tensor. Raises `TypeError` for
-    other values."""
+    """Return a Dr.Jit array or tensor, the result of a function, as a Dr.Jit tensor.
+
+    Raises:
+        TypeError: another value.
+    """
     if not dr.is_array_v(cast("Any", type(value))):
         raise TypeError(
             "a function for JAX returns Dr.Jit arrays or tensors, in tuples, lists and "
@@ -372,5 +411,5 @@ def _as_tensor(value: Any) -> Any:
 
 
 def _as_jax(value: Any) -> Any:
-    """A Dr.Jit array or tensor as a JAX array, without derivatives."""
+    """Return a Dr.Jit array or tensor as a JAX array, without derivatives."""
     return dr.detach(_as_tensor(value)).jax()

@@ -1,4 +1,6 @@
-"""Checks of the numbers that a caller passes, single ones or in NumPy arrays.
+"""Checks of the numbers that a caller passes, single ones or in NumPy arrays. Each check returns
+the numbers in a fixed type, or raises an error whose message begins with `name`, which says what
+the numbers are.
 
 Checks of arrays raise the error class that the calling code names, with the same wording
 everywhere. Limits that differ between curves, meshes and clouds are checked by their own modules.
@@ -12,11 +14,14 @@ import inspect
 import math
 import operator
 from collections.abc import Callable, Sequence
-from typing import Any, TypeAlias, TypeVar, cast
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar, cast
 
 import drjit as dr
 import numpy as np
 import numpy.typing as npt
+
+if TYPE_CHECKING:
+    from harnack.backend.arrays import Precision
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -33,6 +38,10 @@ _MAX_ENTRIES, _MAX_TEXT_LENGTH = 4, 60
 MAX_COORDINATE = 1e100
 """Larger coordinates are refused: products of their squares would overflow."""
 
+LENGTH_RANGE = {"single": (1e-18, 1e18), "double": (1e-150, 1e150)}
+"""The smallest size of a surface, and the largest coordinate of surfaces and rays, by precision.
+Squares of distances between them neither overflow nor underflow, as proofs of steps need."""
+
 
 def as_real_array(
     values: Any,
@@ -43,8 +52,8 @@ def as_real_array(
     ragged: str = "must be a rectangular array of numbers, not ragged",
     other: str = "must hold real numbers",
 ) -> npt.NDArray[Any]:
-    """The values as an array of integers or floats. An array of such numbers is returned itself,
-    not copied.
+    """Return the values as an array of integers or floats. An array of such numbers is returned
+    itself, not copied.
 
     name: what the values are, for messages.
     error: the class of errors.
@@ -74,8 +83,11 @@ def check_vectors(
     planar: str = "",
     transposed: str = "",
 ) -> None:
-    """Raise `error` unless an array has shape (n, 3). name: what it is, for messages. planar,
-    transposed: advice to append for the shapes (n, 2) and (3, n)."""
+    """Raise `error` unless an array has shape (n, 3).
+
+    name: what the array is, for messages.
+    planar, transposed: advice to append for the shapes (n, 2) and (3, n).
+    """
     if array.ndim == 2 and array.shape[1] == 3:
         return
     hint = ""
@@ -91,8 +103,11 @@ def check_vectors(
 def check_finite(
     rows: FloatArray, name: str, error: type[Exception], advice: str = "coordinates must be finite"
 ) -> None:
-    """Raise `error` unless all numbers of an array (n, k) are finite. name: what a row is, for the
-    message, with {} for its index. advice: the end of the message."""
+    """Raise `error` unless all numbers of an array (n, k) are finite.
+
+    name: what a row is, for the message, with {} for its index.
+    advice: the end of the message.
+    """
     ids = np.flatnonzero(~np.isfinite(rows).all(axis=1))
     if ids.size:
         raise error(
@@ -107,13 +122,49 @@ def check_coordinate_size(x: FloatArray, error: type[Exception]) -> None:
         raise error(f"coordinates up to {size:g} are too large: choose units nearer to 1")
 
 
+def check_length_range(box: tuple[Any, Any], precision: Precision, subject: str) -> None:
+    """Check that the sizes of objects fit a precision (see `LENGTH_RANGE`).
+
+    box: the lower and the upper corner (3,) of a box around the objects. Coordinates may be
+        infinite, and the box may be empty.
+    subject: the beginning of the message, with its verb, such as "the surface has".
+
+    Raises:
+        ValueError: a finite coordinate is too large, or the longest side is too short.
+    """
+    corners = np.array(box, np.float64)
+    if not (corners[0] <= corners[1]).all():
+        return
+    check_largest_coordinate(
+        float(np.abs(corners[np.isfinite(corners)]).max(initial=0.0)), precision, subject
+    )
+    smallest = LENGTH_RANGE[precision][0]
+    if np.isfinite(corners).all() and 0 < (side := float(np.ptp(corners, axis=0).max())) < smallest:
+        raise ValueError(
+            f"{subject} a size of {side:g}: too small for {precision} precision, in which "
+            f"it must be at least {smallest:g}; choose units nearer to 1"
+        )
+
+
+def check_largest_coordinate(size: float, precision: Precision, subject: str) -> None:
+    """Raise ValueError if the largest absolute coordinate `size` of objects is too large for a
+    precision (see `LENGTH_RANGE`). subject: as in `check_length_range`."""
+    largest = LENGTH_RANGE[precision][1]
+    if size > largest:
+        raise ValueError(
+            f"{subject} coordinates up to {size:g}: too large for {precision} precision, in "
+            f"which they must be at most {largest:g}; choose units nearer to 1"
+        )
+
+
 def format_vector(row: FloatArray) -> str:
-    """A vector as text for messages: "(1, 2, 3)"."""
+    """Write a vector as text for messages: "(1, 2, 3)"."""
     return "(" + ", ".join(f"{v:g}" for v in row) + ")"
 
 
 def others_suffix(count: int) -> str:
-    """The end of a message about the first of `count` wrong entries: how many more there are."""
+    """Return the end of a message about the first of `count` wrong entries: how many more there
+    are."""
     return f" (and {count - 1:,} more)" if count > 1 else ""
 
 
@@ -134,8 +185,8 @@ def check_no_derivatives(name: str, *values: Any) -> None:
 
 
 def no_derivatives(function: Function) -> Function:
-    """Decorator for a function that would lose derivatives: it refuses arguments that carry them,
-    by a `NotImplementedError` (see `check_no_derivatives`)."""
+    """Decorator for a function that would lose derivatives. The function then refuses arguments
+    that carry them, by a `NotImplementedError` (see `check_no_derivatives`)."""
 
     @functools.wraps(function)
     def wrapper(*args: Any, **kwargs: Any) -> Any:
@@ -147,8 +198,8 @@ def no_derivatives(function: Function) -> Function:
 
 
 def has_derivatives(value: Any) -> bool:
-    """Whether a value is, or contains, a Dr.Jit or PyTorch array with derivatives enabled. The
-    entries of containers, the objects that functions refer to, and the attributes of fields,
+    """Return whether a value is, or contains, a Dr.Jit or PyTorch array with derivatives enabled.
+    The entries of containers, the objects that functions refer to, and the attributes of fields,
     callables and dataclasses are searched too."""
     visited: set[int] = set()
     pending: list[Any] = [value]
@@ -170,7 +221,7 @@ def has_derivatives(value: Any) -> bool:
 
 
 def is_plain_data(value: Any) -> bool:
-    """Whether a value consists of plain data only: Python's and NumPy's numbers, strings and
+    """Return whether a value consists of plain data only: Python's and NumPy's numbers, strings and
     arrays, in tuples, dictionaries and dataclasses of this package. Plain data never carries
     derivatives; Dr.Jit arrays and functions can."""
     pending: list[Any] = [value]
@@ -190,8 +241,8 @@ def is_plain_data(value: Any) -> bool:
 
 
 def make_read_only(value: Any) -> None:
-    """Make all NumPy arrays in a value read-only, those in nested tuples, lists, dictionaries and
-    dataclasses of this package included."""
+    """Make all NumPy arrays in a value read-only. Nested tuples, lists, dictionaries and
+    dataclasses of this package are searched too."""
     if isinstance(value, np.ndarray):
         cast("npt.NDArray[Any]", value).setflags(write=False)
     elif isinstance(value, tuple | list):
@@ -212,8 +263,8 @@ _KNOWN_PACKAGES = frozenset(("harnack", "drjit", "numpy", "math"))
 
 
 def _contained_values(value: Any) -> list[Any]:
-    """The values that a value contains or refers to, in which `has_derivatives` searches
-    further."""
+    """Return the values that a value contains or refers to, in which `has_derivatives` searches
+    further: entries of containers, what functions use from outside, and attributes."""
     if isinstance(value, _CONTAINER_TYPES):
         return [entry for entry in cast("Any", value) if type(entry) not in _PLAIN_TYPES]
     if isinstance(value, dict):
@@ -221,17 +272,20 @@ def _contained_values(value: Any) -> list[Any]:
     if inspect.isfunction(value):
         if str(value.__module__).partition(".")[0] in _KNOWN_PACKAGES and not value.__closure__:
             return []
+        # The values that a function uses from outside: its closure, globals and defaults.
         closure, defaults = inspect.getclosurevars(value), value.__kwdefaults__ or {}
         groups = closure.globals.values(), defaults.values(), value.__defaults__ or ()
         return [*closure.nonlocals.values(), *(entry for group in groups for entry in group)]
     if inspect.ismethod(value):
         return [value.__func__, value.__self__]
+    # Of other objects, only dataclasses, callables and fields (with `parameters`) are searched.
     is_known = dataclasses.is_dataclass(value) or callable(value) or hasattr(value, "parameters")
     return [*getattr(value, "__dict__", {}).values()] if is_known else []
 
 
 def format_short(value: Any) -> str:
-    """A short text for a value in a message: an array by its shape, a long list by its length."""
+    """Write a short text for a value in a message: an array by its shape, a long list by its
+    length."""
     if isinstance(value, float):  # of NumPy too
         return f"{value:.6g}"
     if isinstance(value, np.ndarray):
@@ -252,26 +306,28 @@ def format_short(value: Any) -> str:
 
 
 def is_same_or_equal(a: Any, b: Any) -> bool:
-    """Whether two values are the same object, or equal numbers, strings or tuples of these."""
+    """Return whether two values are the same object, or equal numbers, strings or tuples of
+    these."""
     plain = (int, float, str, tuple)
     return a is b or (isinstance(a, plain) and isinstance(b, plain) and bool(np.all(a == b)))
 
 
 def as_real(value: Any, name: str) -> float:
-    """A number of Python or NumPy as a float; infinities and NaN are allowed. name: what it is, for
-    messages.
+    """Return a number of Python or NumPy as a float; infinities and NaN are allowed. name: what it
+    is, for messages.
 
     Raises:
         TypeError: it is not a number.
     """
     try:
+        # float("none") raises ValueError, so texts and bools are refused.
         return float("none" if isinstance(value, str | bytes | bool | np.bool_) else value)
     except (TypeError, ValueError, OverflowError):
         raise TypeError(f"{name} must be a number, not {value!r}") from None
 
 
 def as_positive(value: Any, name: str) -> float:
-    """A positive finite number as a float. name: what it is, for messages.
+    """Return a positive finite number as a float. name: what it is, for messages.
 
     Raises:
         TypeError: it is not a number.
@@ -284,7 +340,7 @@ def as_positive(value: Any, name: str) -> float:
 
 
 def as_finite(value: Any, name: str) -> float:
-    """A finite number as a float. name: what it is, for messages.
+    """Return a finite number as a float. name: what it is, for messages.
 
     Raises:
         TypeError: it is not a number.
@@ -297,12 +353,13 @@ def as_finite(value: Any, name: str) -> float:
 
 
 def as_integer_in_range(value: Any, name: str, minimum: int, maximum: int) -> int:
-    """A number as an int, if it is an integer from `minimum` to `maximum`. name: what it is, for
-    messages.
+    """Return a number as an int, if it is an integer from `minimum` to `maximum`. name: what it is,
+    for messages.
 
     Raises:
         ValueError: it is not an integer in that range.
     """
+    # A number below the minimum stands for what is no integer; bools are none here.
     try:
         number = minimum - 1 if isinstance(value, bool | np.bool_) else operator.index(value)
     except TypeError:
@@ -314,7 +371,7 @@ def as_integer_in_range(value: Any, name: str, minimum: int, maximum: int) -> in
 
 
 def flag(value: Any, name: str) -> bool:
-    """A bool of Python or NumPy as Python's bool. name: what it is, for messages.
+    """Return a bool of Python or NumPy as Python's bool. name: what it is, for messages.
 
     Raises:
         TypeError: it is not a bool.
@@ -325,20 +382,23 @@ def flag(value: Any, name: str) -> bool:
 
 
 def integer(value: Any, name: str) -> int:
-    """An integer of Python or NumPy as an int. name: what it is, for messages.
+    """Return an integer of Python or NumPy as an int. name: what it is, for messages.
 
     Raises:
         TypeError: it is not an integer.
     """
     try:
+        # operator.index(None) raises TypeError, so bools are refused.
         return operator.index(cast("Any", None if isinstance(value, bool | np.bool_) else value))
     except TypeError:
         raise TypeError(f"{name} must be a whole number, not {format_short(value)}") from None
 
 
 def as_triple(value: Any, name: str, *, all_positive: bool = False) -> tuple[float, float, float]:
-    """Three finite numbers as a tuple of floats. name: what they are, for messages. all_positive:
-    whether they must be positive.
+    """Return three finite numbers as a tuple of floats.
+
+    name: what they are, for messages.
+    all_positive: whether they must be positive.
 
     Raises:
         TypeError, ValueError: they are not three such numbers.

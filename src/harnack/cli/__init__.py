@@ -1,5 +1,6 @@
-"""The command line `harnack`: it turns arguments into calls of the library, and writes results to
-files."""
+"""The command line `harnack`. It turns arguments into calls of the library, and writes results to
+files. A "command" is the first argument, such as `render`.
+"""
 
 from __future__ import annotations
 
@@ -14,8 +15,8 @@ __all__ = ["main"]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command with these arguments (by default those of the process), and return the exit
-    code: 0 for success, 1 for an error, 2 for wrong usage, 130 for Ctrl-C."""
+    """Run the command line with these arguments (by default those of the process), and return the
+    exit code: 0 for success, 1 for an error, 2 for wrong usage, 130 for Ctrl-C."""
     with track_interrupts() as interrupts, print_warnings():
         try:
             options = parse(arguments)

@@ -1,5 +1,9 @@
-"""The argument parser of the command `harnack`: its commands, their options (from the table of all
-options, `rendering.option_table`), and messages about wrong arguments."""
+"""The argument parser of the command `harnack`: its commands, their options, and messages about
+wrong arguments. Most options come from the table of all options (`rendering.option_table`), which
+says for each function of the library (such as `render` or `mesh`) what options it has. argparse,
+Python's library, does the parsing. A "source" is what a command draws or meshes: a scene of the
+gallery, a file or a formula.
+"""
 
 from __future__ import annotations
 
@@ -41,16 +45,17 @@ class _Parser(argparse.ArgumentParser):
         self._negative_number_matcher = re.compile(r"-([\d.]|[xyz]$)")
 
     def error(self, message: str) -> NoReturn:
-        """Print an error message, and end the process with exit code 2."""
+        """Print an error message on one line, and end the process with exit code 2."""
         self.exit(2, f"{printable(f'{self.prog}: error: {message}')} (see {self.prog} --help)\n")
 
     def options(self) -> list[str]:
-        """The names of all options as they are written, such as "--level"."""
+        """The names of all options of this parser as they are written, such as "--level"."""
         return [name for action in self._actions for name in action.option_strings]
 
 
 class _Once(argparse.Action):
-    """Stores the value of an option, which may be given once: argparse would take the last."""
+    """The action of argparse for an option that may be given only once: it stores the value. (By
+    default argparse would take the last of several values.)"""
 
     def __call__(
         self,
@@ -59,6 +64,7 @@ class _Once(argparse.Action):
         values: Any,
         option_string: str | None = None,
     ) -> None:
+        """Store the value of the option. It is an error if it has one already."""
         if getattr(namespace, self.dest, None) is not None:
             parser.error(f"{option_string} is given twice")
         setattr(namespace, self.dest, values)
@@ -68,25 +74,26 @@ def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
     """Parse the arguments of a command, by default those of this process. The result has an
     attribute for each option, and the name of the command in `command`.
 
-    Ends the process with exit code 2 for wrong usage.
-    """
+    Ends the process with exit code 2 for wrong usage, and after printing a help text if there are
+    no arguments."""
     whole, commands = parsers()
     if not (sys.argv[1:] if arguments is None else arguments):
         whole.print_help(sys.stderr)
         whole.exit(2)
-    namespace, rest = whole.parse_known_args(arguments)
-    if rest:
+    namespace, unknown = whole.parse_known_args(arguments)
+    if unknown:
         command: _Parser = commands[namespace.command]
         known = command.options()
-        if rest[0] in known:  # behind "--"
-            command.error(f"{text.quoted(rest[0])} is an option: write it before --")
-        problem = "there is no option" if rest[0].startswith("-") else "there is no use for"
-        command.error(f"{problem} {text.quoted(rest[0])}{did_you_mean(rest[0], known)}")
+        if unknown[0] in known:  # behind "--"
+            command.error(f"{text.quoted(unknown[0])} is an option: write it before --")
+        problem = "there is no option" if unknown[0].startswith("-") else "there is no use for"
+        command.error(f"{problem} {text.quoted(unknown[0])}{did_you_mean(unknown[0], known)}")
     return namespace
 
 
 def parsers() -> tuple[_Parser, dict[str, _Parser]]:
-    """The parser of the whole command line, and the parser of each command by name."""
+    """Make the parser of the whole command line, and the parser of each command by the
+    command's name."""
     whole = _Parser(
         prog="harnack", description="Guaranteed ray tracing of harmonic and other surfaces."
     )
@@ -111,7 +118,7 @@ def parsers() -> tuple[_Parser, dict[str, _Parser]]:
 
 
 def _add_render(commands: Any) -> None:
-    """Add the command `render` to the parsers of commands."""
+    """Add the command `render`, which draws one picture, to the parsers of commands."""
     parser = commands.add_parser(
         "render", help="draw one picture",
         description="Draw a gallery scene, the surface of a file, a formula, or a Mitsuba scene "
@@ -160,7 +167,7 @@ def _add_view(commands: Any) -> None:
 
 
 def _add_mesh(commands: Any) -> None:
-    """Add the command `mesh` to the parsers of commands."""
+    """Add the command `mesh`, which writes a surface as triangles, to the parsers of commands."""
     parser = commands.add_parser(
         "mesh", help="make triangles of a surface, or a closed part to print",
         description="Write the triangles of a gallery scene's surface, of a formula, or of the "
@@ -182,7 +189,7 @@ def _add_mesh(commands: Any) -> None:
 
 
 def _add_repair(commands: Any) -> None:
-    """Add the command `repair` to the parsers of commands."""
+    """Add the command `repair`, which closes a damaged mesh, to the parsers of commands."""
     parser = commands.add_parser(
         "repair", help="close a damaged mesh",
         description="Write a mesh with its holes filled; its triangles stay as they are. Where "
@@ -226,8 +233,8 @@ def _add_check(commands: Any) -> None:
 
 def _add_drawing(parser: Any, verb: str, output: str | None) -> None:
     """Add the arguments that all commands that draw have: the source, the output, and the options
-    of the function `verb`, the camera and surface files. output: the help text of -o; None for no
-    such option."""
+    of the function `verb` of the library (such as "render"), of the camera and of surface files.
+    output: the help text of -o; None for no such option."""
     _add_source(parser, output)
     _add_options(parser, verb)
     _add_camera(parser)
@@ -235,8 +242,8 @@ def _add_drawing(parser: Any, verb: str, output: str | None) -> None:
 
 
 def _add_source(parser: Any, output: str | None) -> None:
-    """Add the argument SOURCE, the option -o (unless its help text `output` is None), and the
-    option --parameter."""
+    """Add three arguments: the source; the option -o, unless its help text `output` is None; and
+    the option --parameter."""
     parser.add_argument(
         "source",
         metavar="SOURCE",
@@ -257,12 +264,11 @@ def _add_options(
     only: Sequence[str] | None = None,
     without: Sequence[str] = (),
 ) -> None:
-    """Add the options that the table of all options lists for a function, in groups.
+    """Add the options that the table of all options lists for a function of the library, in groups.
 
     verb: the name of the function, such as "render".
     only: the names of the options to add; None for all.
-    without: names of options to leave out.
-    """
+    without: names of options to leave out."""
     groups: dict[str, Any] = {}
     for option in options_of(verb):
         if option.name in without or not option.is_on_command_line:
@@ -277,21 +283,26 @@ def _add_options(
 
 
 def _add_option(group: Any, option: Option, verb: str) -> None:
-    """Add an option of the table to a group of a parser. verb: the function that the command
-    calls."""
+    """Add an option of the table to a group of a parser. verb: the function of the library that the
+    command calls, such as "render"."""
     if option.is_switch:
         group.add_argument(option.flag, action="store_true", default=None, help=option.help)
         return
-    form: dict[str, Any] = {"type": _argument(cast("Any", option.parse)), "metavar": option.value}
+    settings: dict[str, Any] = {
+        "type": _argument(cast("Any", option.parse)),
+        "metavar": option.value,
+    }
+    # Brackets mean that the value may be left out.
     if option.value.startswith("["):
-        form |= {"nargs": "?", "const": True, "metavar": option.value[1:-1]}
+        settings |= {"nargs": "?", "const": True, "metavar": option.value[1:-1]}
     help_text = option.help
+    # Pages and views have fewer kinds of pictures.
     if option.name == "show" and verb in ("page", "view"):
         names = "{" + ",".join(LIVE_MODES) + "}"
-        form |= {"type": _argument(text.parse_choice(*LIVE_MODES)), "metavar": names}
+        settings |= {"type": _argument(text.parse_choice(*LIVE_MODES)), "metavar": names}
         help_text = "picture at first (shaded)"
     action = "append" if option.name == "isolines" else _Once
-    group.add_argument(option.flag, dest=option.name, help=help_text, action=action, **form)
+    group.add_argument(option.flag, dest=option.name, help=help_text, action=action, **settings)
 
 
 def _add_isolines_style(group: Any) -> None:
@@ -307,7 +318,7 @@ def _add_isolines_style(group: Any) -> None:
 
 
 def _add_camera(parser: Any) -> None:
-    """Add the options of the camera."""
+    """Add the options that say where the camera is."""
     group = parser.add_argument_group("camera")
     helps: dict[str, tuple[Callable[[str], Any], str, str]] = {
         "azimuth": (text.parse_number, "DEGREES", "direction it looks from, around up (-50)"),
@@ -324,7 +335,7 @@ def _add_camera(parser: Any) -> None:
 
 
 def _add_sliders(parser: Any) -> None:
-    """Add the option --slider."""
+    """Add the option --slider, for pages and views."""
     parser.add_argument(
         "--slider", type=_argument(_parse_slider), metavar="NAME=LOW:HIGH[:STEP]", action="append",
         default=[],
@@ -334,7 +345,7 @@ def _add_sliders(parser: Any) -> None:
 
 
 def _add_file_options(parser: Any) -> Any:
-    """Add the options for surface files, and return their group."""
+    """Add the options for surface files to a parser, and return their group."""
     group = parser.add_argument_group("surface files")
     kinds = ("winding", "dipole", "loops", "polygons")
     group.add_argument(
@@ -360,13 +371,13 @@ def _add_file_options(parser: Any) -> Any:
 
 
 def _add_quiet(parser: Any) -> None:
-    """Add the option --quiet."""
+    """Add the option --quiet, which shows no progress."""
     parser.add_argument("--quiet", action="store_true", help="show no progress")
 
 
 def _argument(parse_text: Callable[[str], Any]) -> Callable[[str], Any]:
-    """A function that parses an option's text by `parse_text`, and turns its errors into
-    argparse's, so that they are shown as errors of that option."""
+    """Make a function for argparse that parses an option's text by `parse_text`. Its errors become
+    errors of argparse, so that they are shown as errors of that option."""
 
     def parsed(value: str) -> Any:
         """The parsed value of an option's text."""
@@ -379,12 +390,13 @@ def _argument(parse_text: Callable[[str], Any]) -> Callable[[str], Any]:
 
 
 def _parse_smoothing(value: str) -> float | str:
-    """A length in text as a number; "auto" stays as it is."""
+    """The number that a text gives, a positive length; or "auto", which stays as it is."""
     return value if value == "auto" else text.parse_positive(value)
 
 
 def _parse_parameter(value: str) -> tuple[str, float]:
-    """A name and a number from text: "a=0.5" as ("a", 0.5)."""
+    """A name and a number from text: "a=0.5" as ("a", 0.5). Raises a ValueError for any other
+    text."""
     name, equals, number = value.partition("=")
     if not equals or not name.strip().isidentifier():
         raise ValueError(f"{text.quoted(value)}: write a name and a number as a=0.5")
@@ -392,7 +404,8 @@ def _parse_parameter(value: str) -> tuple[str, float]:
 
 
 def _parse_slider(value: str) -> tuple[str, Slider]:
-    """A name and a slider from text: "a=0:2:0.5" as ("a", Slider(0, 2, step=0.5))."""
+    """A name and a slider from text: "a=0:2:0.5" as ("a", Slider(0, 2, step=0.5)). Raises a
+    ValueError for any other text."""
     name, _, interval_text = value.partition("=")
     numbers = interval_text.split(":")
     if not name.strip().isidentifier() or len(numbers) not in (2, 3):

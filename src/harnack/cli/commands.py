@@ -1,4 +1,7 @@
-"""The commands of the command line. Each takes the parsed arguments and returns the exit code."""
+"""The commands of the command line, such as `render`. Each is a function that takes the parsed
+arguments (an object with an attribute for each option) and returns the exit code. The "source" is
+what is drawn or meshed: a scene of the gallery, a file or a formula.
+"""
 
 from __future__ import annotations
 
@@ -40,7 +43,7 @@ _DEMO_SIZE = (480, 360)
 
 
 def _render(arguments: Any) -> int:
-    """Draw a picture of the source, and write it to a file."""
+    """Run the command `render`: draw a picture of the source, and write it to a file."""
     path = source_path(arguments)
     target = check_picture_path(_output(arguments, path, ".png", "picture"))
     if is_mitsuba_scene(arguments, path):
@@ -53,7 +56,8 @@ def _render(arguments: Any) -> int:
 
 
 def _animate(arguments: Any) -> int:
-    """Write a film in which the camera goes around a surface."""
+    """Run the command `animate`: write a film in which the camera goes around the source's
+    surface."""
     path = source_path(arguments)
     target = check_film_path(_output(arguments, path, ".gif", "film"))
     if is_mitsuba_scene(arguments, path):
@@ -66,7 +70,7 @@ def _animate(arguments: Any) -> int:
 
 
 def _page(arguments: Any) -> int:
-    """Write an HTML file in which a surface turns."""
+    """Run the command `page`: write an HTML file in which the source's surface turns."""
     path = source_path(arguments)
     target = _output(arguments, path, ".html", "page")
     surfaces, settings, _ = load_live_content("page", arguments, path)
@@ -76,7 +80,7 @@ def _page(arguments: Any) -> int:
 
 
 def _view(arguments: Any) -> int:
-    """Serve a page to the browser until Ctrl-C is pressed."""
+    """Run the command `view`: serve a page to the browser until Ctrl-C is pressed."""
     surfaces, settings, sources = load_live_content("view", arguments, source_path(arguments))
     view(surfaces, sources=sources, open_browser=not arguments.no_browser, block=True, **settings)
     return 0
@@ -84,18 +88,21 @@ def _view(arguments: Any) -> int:
 
 def _output(arguments: Any, path: Path, suffix: str, kind: str) -> str:
     """The path of the file to write: the argument -o or, without it, the name of the source with
-    `suffix`. path: of the source. kind: what is written, for messages."""
+    the extension `suffix`. path: of the source. kind: what is written, such as "picture", for
+    messages."""
     if arguments.output == "":
         raise ValueError(f"-o is empty: name the {kind} to write, such as a{suffix}")
     return arguments.output or f"{path.stem or kind}{suffix}"
 
 
 def _mesh(arguments: Any) -> int:
-    """Write the triangles of the source's surface, and print facts about them."""
+    """Run the command `mesh`: write the source's surface as triangles, and print facts about
+    them."""
     path = source_path(arguments)
     target = check_mesh_path(_output(arguments, path, ".stl", "mesh"))
     surface = load_single_surface(arguments, path)
     given_options = options_set("mesh", arguments)
+    # The options of the surface are applied already, when it is loaded.
     settings = {
         name: value
         for name, value in given_options.items()
@@ -126,7 +133,7 @@ def _mesh(arguments: Any) -> int:
 
 
 def _repair(arguments: Any) -> int:
-    """Close a damaged mesh, write it, and print what was changed."""
+    """Run the command `repair`: close a damaged mesh, write it, and print what was changed."""
     import trimesh  # here: half a second that few need
 
     source = Path(arguments.mesh)
@@ -157,11 +164,10 @@ def _repair(arguments: Any) -> int:
 
 
 def _repaired(facts: dict[str, Any], old: int, new: int) -> str:
-    """One line about a repair: what was kept, changed and added, and why not more was kept.
+    """Describe a repair in one line: what was kept, changed and added, and why not more was kept.
 
     facts: the metadata that `harnack.repair` returns with a mesh.
-    old, new: the numbers of triangles before and after.
-    """
+    old, new: the numbers of triangles before and after."""
     parts = _counted(len(facts["parts"]), "part")
     if facts["dropped"]:
         parts += f", of which {facts['dropped']:,} dropped"
@@ -188,12 +194,13 @@ def _repaired(facts: dict[str, Any], old: int, new: int) -> str:
 
 
 def _counted(count: int, noun: str) -> str:
-    """A count and its noun, such as "1 hole" or "2 holes"."""
+    """A count and its noun, as text such as "1 hole" or "2 holes"."""
     return f"{count:,} {noun}" + ("" if count == 1 else "s")
 
 
 def _check(arguments: Any) -> int:
-    """Print the problems of a mesh for 3D printing. Returns 0 if there is none, else 1."""
+    """Run the command `check`: print the problems of a mesh for 3D printing, and write it with its
+    thickness as colors if that is asked for. Returns 0 if there is no error, else 1."""
     if arguments.colors is not None:
         if arguments.min_thickness is None:
             raise ValueError(
@@ -218,6 +225,7 @@ def _check(arguments: Any) -> int:
         walls = wall_thickness(arguments.mesh)
         with write_atomically(Path(arguments.colors)) as partial:
             kind = Path(arguments.colors).suffix.lower()[1:]
+            # Red below the smallest thickness, gray from three times that on.
             cast(
                 "Any", walls.to_colored_mesh(arguments.min_thickness, 3 * arguments.min_thickness)
             ).export(partial, kind)
@@ -227,7 +235,7 @@ def _check(arguments: Any) -> int:
 
 
 def _gallery(arguments: Any) -> int:
-    """List the scenes of the gallery, or draw them into a folder."""
+    """Run the command `gallery`: list the scenes of the gallery, or draw them into a folder."""
     console = Console()
     if arguments.list:
         width = max(map(len, SCENES)) + 2
@@ -249,6 +257,7 @@ def _gallery(arguments: Any) -> int:
             f"{index}/{len(scenes)} [bold]{scene.name}[/]: {scene.title}", highlight=False
         )
         target = folder / f"{scene.name}.png"
+        # Pictures of the demo are small; options that were given count nevertheless.
         small = {"size": _DEMO_SIZE, "spp": scene.demo_spp} if arguments.demo else {}
         scene.render(
             target, **{**small, **options_set("render", arguments), "progress": not arguments.quiet}
@@ -259,8 +268,8 @@ def _gallery(arguments: Any) -> int:
 
 
 def _create_folder(name: str) -> Path:
-    """Create the folder to write to if it does not exist, and return its path. Raises `ValueError`
-    if that is impossible."""
+    """Create the folder with this name if it does not exist, and return its path. Raises a
+    ValueError if that is impossible."""
     if not name:
         raise ValueError("-o is empty: name the folder to write to, such as out")
     folder = Path(name)
@@ -275,7 +284,8 @@ def _create_folder(name: str) -> Path:
 
 
 def _doctor(arguments: Any) -> int:
-    """Print a report about this installation. Returns 0 if harnack can work, else 1."""
+    """Run the command `doctor`: print a report about this installation. Returns 0 if harnack can
+    work, else 1."""
     del arguments
     return 0 if doctor.print_report(Console()) else 1
 

@@ -1,4 +1,6 @@
-"""Messages of the command line, and the handling of Ctrl-C while a command runs.
+"""Messages of the command line, and the handling of Ctrl-C while a command runs. Messages of the
+library name keywords of Python, such as `max_steps=`; here they become options of the command line,
+such as --max-steps.
 
 Errors are printed on a single line, with options of the command line in place of Python's keywords.
 """
@@ -29,15 +31,15 @@ _SAME = 1.0
 
 @dataclass
 class Interrupts:
-    """Whether Ctrl-C was pressed, and when (in seconds of `time.monotonic`). It is the handler of
-    the signal."""
+    """A record of whether Ctrl-C was pressed, and when (in seconds of `time.monotonic`). The object
+    is called as the handler of the signal SIGINT, which Ctrl-C sends."""
 
     pressed: bool = False
     when: float = -_SAME
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
-        """Raise `KeyboardInterrupt`. A second signal within a second is ignored: a terminal and a
-        parent process may both pass on the same Ctrl-C."""
+        """Note the signal, and raise `KeyboardInterrupt`. A second signal within a second is
+        ignored: a terminal and a parent process may both pass on the same Ctrl-C."""
         del number, frame
         now = time.monotonic()
         if self.pressed and now - self.when < _SAME:
@@ -66,8 +68,8 @@ def track_interrupts() -> Generator[Interrupts]:
 
 @contextmanager
 def print_warnings() -> Generator[None]:
-    """Context manager that prints each warning raised within it on a single line, in the terms of
-    the command line."""
+    """Context manager that prints each warning raised within it on a single line of the error
+    output, in the terms of the command line."""
     with warnings.catch_warnings():
         shown = warnings.showwarning
 
@@ -105,13 +107,14 @@ def error_line(error: Exception) -> str:
 
 
 def printable(text: str) -> str:
-    """The text with control characters, which a terminal would obey, written as escapes."""
+    """The text with its unprintable characters, such as control characters that a terminal would
+    obey, written as escapes."""
     return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
 
 
 def _explanation(error: Exception) -> str:
-    """The message of an exception in the terms of the command line, with an option to try for the
-    most frequent errors."""
+    """The message of an exception in the terms of the command line; for the most frequent errors,
+    with an option to try."""
     if isinstance(error, UnboundedSurfaceError):
         if error.bounded_level is not None:
             return (
@@ -124,15 +127,15 @@ def _explanation(error: Exception) -> str:
 
 
 def python_to_cli_terms(text: str) -> str:
-    """A message of the library with keywords of Python, such as `max_steps=`, replaced by options
-    of the command line, such as --max-steps."""
+    """Replace keywords of Python in a message of the library, such as `max_steps=`, by options of
+    the command line, such as --max-steps."""
     text = _PARAMETER.sub(r"--parameter \1=1", text)
     return _KEYWORD.sub(_option, text)
 
 
 def _option(match: re.Match[str]) -> str:
-    """The option of the command line that replaces a match of `_KEYWORD`. A call such as f(level=1)
-    stays as it is."""
+    """The option of the command line that replaces a match of `_KEYWORD`, with its value if the
+    match has one. A call such as f(level=1) stays as it is."""
     if match["call"]:
         return match["call"]
     name = match["name"] or match["first"] or match["quoted"] or match["alone"]
@@ -143,7 +146,8 @@ def _option(match: re.Match[str]) -> str:
 
 
 def level_text(level: float | None) -> str:
-    """A level as it is written on the command line, such as "2pi" or "0.5"."""
+    """A level as it is written on the command line, such as "2pi" or "0.5": as a multiple of pi if
+    it is a multiple of pi/2."""
     ratio = (level or 0.0) / 3.141592653589793
     if ratio and abs(2 * ratio - round(2 * ratio)) < 1e-9:
         return f"{ratio:g}pi" if ratio != 1 else "pi"

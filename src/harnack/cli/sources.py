@@ -1,5 +1,9 @@
-"""Loads the SOURCE of a command (a scene of the gallery, a file or a formula), and combines it with
-the options of the command line to arguments of `render`, `animate`, `mesh` and the like."""
+"""Loads the "source" of a command (a scene of the gallery, a file or a formula), and combines it
+with the options of the command line to arguments of the library's functions, such as `render` or
+`mesh`. `arguments` is the result of the argument parser, with an attribute for each option (None if
+it was not given). "Content" consists of surfaces, options by their names in Python, and for each
+field the place where it comes from (for scene files).
+"""
 
 from __future__ import annotations
 
@@ -50,14 +54,15 @@ def options_set(verb: str, arguments: Any) -> dict[str, Any]:
     if style and "isolines" not in given_options:
         raise ValueError(f"--isolines-{next(iter(style))} without isolines: give --isolines too")
     if style:
+        # The style applies to all isolines.
         lines = given_options["isolines"]
         given_options["isolines"] = [replace(line, **style) for line in lines]
     return given_options
 
 
 def source_path(arguments: Any) -> Path:
-    """The source as a path: a file, the name of a scene, or "formula" for a formula. The output is
-    named after it.
+    """The source as a path: a file, the name of a scene, or "formula" for a formula. The output
+    file is named after it.
 
     Raises:
         ValueError: the source is none of these, or --parameter was given without a formula.
@@ -77,13 +82,15 @@ def source_path(arguments: Any) -> Path:
 
 
 def is_formula(name: str) -> bool:
-    """Whether the source `name` is a formula."""
+    """Whether the source with this name is a formula, and neither a scene of the gallery nor a
+    file."""
     is_file = Path(name).suffix.lower() in _SUFFIXES
     return name not in SCENES and not is_file and looks_like_formula(name)
 
 
 def is_mitsuba_scene(arguments: Any, path: Path) -> bool:
-    """Whether the source is the file of a Mitsuba scene (.xml)."""
+    """Whether the source is the file of a Mitsuba scene (.xml). path: the source as `source_path`
+    returns it."""
     return arguments.source not in SCENES and path.suffix.lower() == ".xml"
 
 
@@ -106,12 +113,11 @@ def load_mitsuba_scene(arguments: Any) -> tuple[str, dict[str, Any]]:
 def load_content(
     verb: str, arguments: Any, path: Path, moved: Mapping[str, float] | None = None
 ) -> Content:
-    """The surfaces of the source, the options of the function `verb`, and the sources of the fields
-    for scene files.
+    """Load the source: its surfaces, the options of the function `verb` (such as "render"), and
+    where the fields come from, for scene files.
 
     path: the source as `source_path` returns it.
-    moved: numbers of names in a formula, besides those of --parameter.
-    """
+    moved: numbers of names in a formula, besides those of --parameter."""
     given_options = options_set(verb, arguments)
     if arguments.source in SCENES:
         _refuse_file_options(arguments)
@@ -127,8 +133,9 @@ def load_content(
 
 
 def load_live_content(verb: str, arguments: Any, path: Path) -> Content:
-    """The content of a page or a view, its options, and the sources of its fields. Options that are
-    moved by sliders have sliders as values; a formula with sliders is a function of them.
+    """Load the source of a page or a view: its surfaces, options, and where the fields come from.
+    Options that are moved by sliders have sliders as values; a formula with sliders becomes a
+    function of them, which takes the place of the surfaces.
 
     verb: "page" or "view".
     path: the source as `source_path` returns it.
@@ -140,51 +147,59 @@ def load_live_content(verb: str, arguments: Any, path: Path) -> Content:
         raise ValueError("a page needs a scene, a surface file or a formula, no Mitsuba scene")
     sliders = dict(arguments.slider)
     if path.suffix.lower() == ".json" and arguments.source not in SCENES:
+        # A scene file has sliders of its own; those of the command line replace them.
         sliders = {**read_scene(path).sliders, **sliders}
-    known = [option.name for option in options_of(verb)]
-    of_formula = [name for name in sliders if name not in known]
+    option_names = [option.name for option in options_of(verb)]
+    formula_names = [name for name in sliders if name not in option_names]
     for name in sliders:
-        value = getattr(arguments, name, None) if name in known else None
+        # A slider begins at the value that is given as an option.
+        value = getattr(arguments, name, None) if name in option_names else None
         if value is not None:
             sliders[name] = replace(sliders[name], start=value)
-    if of_formula and not is_formula(arguments.source):
+    if formula_names and not is_formula(arguments.source):
         raise ValueError(
-            f"--slider {of_formula[0]}: there are sliders of options that are numbers, such as "
+            f"--slider {formula_names[0]}: there are sliders of options that are numbers, such as "
             "level, and of names in formulas"
         )
-    starts = {name: cast("float", sliders[name].start) for name in of_formula}
-    surfaces, settings, sources = load_content(verb, arguments, path, starts)
+    # The formula is read once with each name at the start of its slider.
+    start_values = {name: cast("float", sliders[name].start) for name in formula_names}
+    surfaces, settings, sources = load_content(verb, arguments, path, start_values)
     show = getattr(arguments, "show", None)
     if path.suffix.lower() == ".json" and arguments.source not in SCENES:
-        left_out = sorted(
+        # A scene file may have options of pictures that pages lack.
+        dropped_options = sorted(
             name
             for name, value in settings.items()
             if name in STILL_OPTIONS or (name == "show" and value not in LIVE_MODES)
         )
-        if left_out:
-            print_line(f"left out, as a {verb} does not have them: {', '.join(left_out)}")
+        if dropped_options:
+            print_line(f"left out, as a {verb} does not have them: {', '.join(dropped_options)}")
     settings = live_options(settings) | ({} if show is None else {"show": show})
+    # A slider can move an option of the surface only if it is an option of the page.
     if any(name in SURFACE_OPTIONS for name in sliders):
         surfaces, settings = _unpacked(surfaces, settings)
     settings = _with_flat_options(settings, sliders) | sliders
-    if not of_formula:
+    if not formula_names:
         return surfaces, settings, sources
-    formula, fixed = arguments.source, dict(arguments.parameters)
+    formula_text, fixed = arguments.source, dict(arguments.parameters)
 
     def field(**values: float) -> Field:
         """The formula's field for these values of its sliders."""
-        return expression(formula, parameters={**fixed, **values})
+        return expression(formula_text, parameters={**fixed, **values})
 
-    kind = inspect.Parameter.KEYWORD_ONLY
+    keyword_only = inspect.Parameter.KEYWORD_ONLY
+    # Pages read the names of sliders from the function's signature.
     cast("Any", field).__signature__ = inspect.Signature(
-        [inspect.Parameter(name, kind) for name in of_formula]
+        [inspect.Parameter(name, keyword_only) for name in formula_names]
     )
     return field, settings, sources
 
 
 def load_single_surface(arguments: Any, path: Path) -> Field | Surface:
-    """The only surface of the source, from which a mesh is made, with the options of surfaces that
-    were given.
+    """Load the only surface of the source, from which a mesh is made, with the options of surfaces
+    that were given.
+
+    path: the source as `source_path` returns it.
 
     Raises:
         ValueError: the source has several surfaces, or an option does not apply to it.
@@ -217,7 +232,8 @@ def load_single_surface(arguments: Any, path: Path) -> Field | Surface:
 
 
 def formula_field(arguments: Any, moved: Mapping[str, float] | None = None) -> Field:
-    """The field of the formula. moved: numbers of its names, besides those of --parameter."""
+    """The field of the formula that is the source. moved: numbers of names in the formula, besides
+    those of --parameter."""
     return expression(arguments.source, parameters={**dict(arguments.parameters), **(moved or {})})
 
 
@@ -228,8 +244,12 @@ def print_line(line: str) -> None:
 
 
 def _of_scene(scene: Scene, arguments: Any, given_options: dict[str, Any]) -> Content:
-    """A scene of the gallery as surfaces, options and sources; the given options replace the
-    scene's."""
+    """A scene of the gallery as content (surfaces, options, and where the fields come from). The
+    given options replace the scene's.
+
+    Raises:
+        ValueError: a level or side was given, and the scene has several surfaces.
+    """
     surfaces = scene.surfaces()
     of_surface, other_options = _split(given_options, SURFACE_OPTIONS)
     single_surface_options = [name for name in ("level", "side") if name in of_surface]
@@ -237,6 +257,7 @@ def _of_scene(scene: Scene, arguments: Any, given_options: dict[str, Any]) -> Co
         raise ValueError(
             f"scene {scene.name} has several surfaces; --{single_surface_options[0]} does not apply"
         )
+    # A scene file can name a field of the gallery by its scene and its number there.
     sources = [
         (surface.field, {"scene": scene.name, "number": number})
         for number, surface in enumerate(surfaces)
@@ -249,24 +270,29 @@ def _of_scene(scene: Scene, arguments: Any, given_options: dict[str, Any]) -> Co
 
 
 def _of_scene_file(scene: SceneFile, arguments: Any, given_options: dict[str, Any]) -> Content:
-    """A scene file's content as surfaces, options and sources; the given options replace the
-    file's."""
+    """The scene that a scene file (.json) describes as content (surfaces, options, and where the
+    fields come from). The given options replace the file's.
+
+    Raises:
+        ValueError: a level was given, and the scene has several surfaces.
+    """
     settings = dict(scene.settings)
     settings |= _camera(arguments, settings.get("camera") or Camera())
     if "level" in given_options and len(scene.surfaces) != 1:
         raise ValueError("a scene of several surfaces has their levels; --level does not apply")
-    of_surface, other_options = _split(given_options, SURFACE_OPTIONS)
+    surface_options, other_options = _split(given_options, SURFACE_OPTIONS)
     surfaces = [
-        _replaced(surface, of_surface) if isinstance(surface, Surface) else surface
+        _replaced(surface, surface_options) if isinstance(surface, Surface) else surface
         for surface in scene.surfaces
     ]
     if not all(isinstance(surface, Surface) for surface in surfaces):
-        settings |= of_surface
+        settings |= surface_options
     return surfaces, {**settings, **other_options}, scene.sources
 
 
 def _of_file(path: Path, arguments: Any, given_options: dict[str, Any]) -> Content:
-    """A surface file as a field, options and sources. What the file was taken for is printed."""
+    """A surface file as content (its field, options, and where the field comes from). What the file
+    was taken for is printed."""
     given_options = {name: value for name, value in given_options.items() if name != "up"}
     opened = field_from_file(path, **_file_options(arguments))
     print_line(f"{path}: {python_to_cli_terms(opened.summary)}")
@@ -281,12 +307,13 @@ def _of_file(path: Path, arguments: Any, given_options: dict[str, Any]) -> Conte
 
 
 def _file_options(arguments: Any) -> dict[str, Any]:
-    """The options for surface files, by name."""
+    """The options for surface files, by name, also those that were not given."""
     return {name: getattr(arguments, name) for name in FILE_OPTIONS}
 
 
 def _refuse_file_options(arguments: Any) -> None:
-    """Raise `ValueError` if an option for surface files was given (the source is none)."""
+    """Raise a ValueError if an option for surface files was given. It is called if the source is no
+    such file."""
     for name in FILE_OPTIONS:
         if name != "up" and getattr(arguments, name):  # pictures have an axis that is up, too
             raise ValueError(
@@ -296,15 +323,16 @@ def _refuse_file_options(arguments: Any) -> None:
 
 
 def _split(values: Mapping[str, Any], names: Sequence[str]) -> tuple[dict[str, Any], ...]:
-    """Two dictionaries: the values whose names are among `names`, and the values of all other
-    names."""
+    """Split the dictionary `values` in two: the entries whose names are among `names`, and all
+    other entries."""
     named = {name: value for name, value in values.items() if name in names}
     return named, {name: value for name, value in values.items() if name not in names}
 
 
 def _replaced(surface: Field | Surface, keywords: Mapping[str, Any]) -> Field | Surface:
-    """The surface (or field) with these keywords of `Surface` changed. A new level of a solid that
-    lies between two levels turns it into a level set."""
+    """A copy of a surface with the given keywords of `Surface` changed; of a field, the surface
+    with these keywords. Without keywords it is returned unchanged. A new level of a solid that lies
+    between two levels turns it into a level set."""
     if not keywords:
         return surface
     if isinstance(surface, Field):
@@ -316,8 +344,9 @@ def _replaced(surface: Field | Surface, keywords: Mapping[str, Any]) -> Field | 
 
 
 def _unpacked(surfaces: Any, settings: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
-    """A single surface as its field, with its keywords added to the options, so that a slider can
-    be the value of a keyword. Fields stay as they are.
+    """Replace a single surface by its field, and add the surface's keywords to the options, so that
+    a slider can be the value of a keyword. Fields stay as they are. Returns the fields and the
+    options.
 
     Raises:
         ValueError: there are several surfaces with keywords of their own, or a solid between two
@@ -336,8 +365,9 @@ def _unpacked(surfaces: Any, settings: dict[str, Any]) -> tuple[Any, dict[str, A
 
 
 def _with_flat_options(settings: dict[str, Any], sliders: Mapping[str, Any]) -> dict[str, Any]:
-    """The settings by name. If a slider moves an option of traces, the entry "options" (a
-    `TraceOptions`) is replaced by its tolerance and its number of steps."""
+    """The settings by name. If one of the sliders (by name) moves an option of traces, the entry
+    "options" (a `TraceOptions`) is replaced by two entries, its tolerance and its number of steps,
+    since a slider can only be the value of an entry."""
     options = settings.get("options")
     if not isinstance(options, TraceOptions) or not any(name in TRACE_OPTIONS for name in sliders):
         return settings
@@ -352,8 +382,8 @@ def _camera_options(arguments: Any) -> dict[str, Any]:
 
 
 def _camera(arguments: Any, camera: Camera) -> dict[str, Any]:
-    """{"camera": `camera` changed by the given options}; empty if no option of the camera was
-    given."""
+    """The entry {"camera": camera}, in which `camera` was changed by the given options; an empty
+    dictionary if no option of the camera was given."""
     given_options = _camera_options(arguments)
     if not given_options:
         return {}

@@ -1,5 +1,6 @@
 """Runs jobs, split into tasks, on the workers of a Dask cluster, and keeps their results in a
-folder.
+folder. A "job" is an object with methods that compute arrays; a "task" is one call of such a
+method; a "worker" is a process of the cluster that runs tasks, which its "scheduler" distributes.
 
 `serialization` turns an object into bytes and computes a hash of its contents. `executor` runs
 tasks and stores their results. `workers` checks that the workers of a cluster can run them.

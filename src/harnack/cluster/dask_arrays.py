@@ -1,5 +1,7 @@
-"""Applies functions of points and rays to Dask arrays, block by block, when the result is
-computed."""
+"""Lets functions of points and rays accept Dask arrays. A Dask array is divided into "blocks" of
+rows; the function is applied block by block when the result is computed, on a worker of a Dask
+cluster or in this process.
+"""
 
 from __future__ import annotations
 
@@ -18,23 +20,23 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def is_dask_array(value: Any) -> bool:
-    """Whether a value is a Dask array; this does not import Dask."""
+    """Whether a value is a Dask array. This does not import Dask."""
     return type(value).__module__.startswith("dask.array") and hasattr(value, "dask")
 
 
 def accepts_dask_arrays(*names: str) -> Callable[[Function], Function]:
-    """A decorator for functions and methods of points or rays that lets them accept Dask arrays. If
-    one of the arguments `names` is a Dask array, the results are Dask arrays too, and each of their
-    blocks is the function's result for the same block of the arguments. All other arguments, such
-    as a field, are sent to each worker once.
+    """Make a decorator for functions and methods of points or rays that lets them accept Dask
+    arrays. If one of the arguments `names` is a Dask array, the results are Dask arrays too, and
+    each of their blocks is the function's result for the same block of the arguments. All other
+    arguments, such as a field, are sent to each worker once.
 
-    It must be the outermost decorator, since workers look the function up by its name.
-    """
+    It must be the outermost decorator, since workers look the function up by its name."""
 
     def decorate(function: Function) -> Function:
-        """The function with support for Dask arrays."""
+        """Return `function` with support for Dask arrays."""
         signature = inspect.signature(function)
-        variadic = next(
+        # The name of the parameter **keywords, if there is one.
+        variadic_name = next(
             (
                 name
                 for name, parameter in signature.parameters.items()
@@ -51,7 +53,7 @@ def accepts_dask_arrays(*names: str) -> Callable[[Function], Function]:
             arguments = signature.bind(*positional, **settings).arguments
             # The first argument, `self` of a method, is passed by position, all others by name.
             first_argument = arguments.pop(next(iter(signature.parameters)))
-            named = {**arguments.pop(variadic, {}), **arguments}
+            named = {**arguments.pop(variadic_name, {}), **arguments}
             return _map_blocks(functools.partial(wrapper, first_argument), names, named)
 
         return cast("Function", wrapper)
@@ -87,37 +89,43 @@ def _map_blocks(call: Callable[..., Any], names: tuple[str, ...], arguments: dic
             raise TypeError(f"{name} must hold real numbers, not {array.dtype}")
     call = functools.partial(call, **constants)
     # A call with no points gives the type of the result; wrong settings raise here as well.
-    result = call(
+    empty_result = call(
         **{name: np.zeros((0, *array.shape[1:]), array.dtype) for name, array in dask_args.items()}
     )
-    empty_arrays = _arrays_of(result)
+    empty_arrays = _arrays_of(empty_result)
     serialized = SerializedObject.serialize(call, purpose)
-    token = content_hash(
+    # The results' names in Dask: equal for equal calls of equal arrays.
+    result_hash = content_hash(
         (serialized.content_hash, [(name, array.name) for name, array in dask_args.items()]),
         purpose,
     )
-    task = delayed(serialized, name=f"harnack-{serialized.content_hash}", traverse=False)
+    sent_call = delayed(serialized, name=f"harnack-{serialized.content_hash}", traverse=False)
     run_block = delayed(_run_block, pure=False)
     block_lists = [array.to_delayed().reshape(-1).tolist() for array in dask_args.values()]
     lengths: tuple[int, ...] = next(iter(dask_args.values())).chunks[0]
     outputs: dict[str, list[Any]] = {name: [] for name in empty_arrays}
+    # One delayed call for each block; it returns the result's arrays by name.
     for block_index, blocks in enumerate(zip(*block_lists, strict=True)):
-        inputs = dict(zip(dask_args, blocks, strict=True))
+        block_of_argument = dict(zip(dask_args, blocks, strict=True))
         output = run_block(
-            task, inputs, sum(lengths[:block_index]), dask_key_name=f"harnack-{token}-{block_index}"
+            sent_call,
+            block_of_argument,
+            sum(lengths[:block_index]),
+            dask_key_name=f"harnack-{result_hash}-{block_index}",
         )
         for name, array in empty_arrays.items():
             shape = (lengths[block_index], *array.shape[1:])
             outputs[name].append(dask_array.from_delayed(output[name], shape, array.dtype))
-    results = {name: dask_array.concatenate(pieces) for name, pieces in outputs.items()}
-    return type(result)(**results) if is_dataclass(result) else results[""]
+    result_arrays = {name: dask_array.concatenate(pieces) for name, pieces in outputs.items()}
+    return type(empty_result)(**result_arrays) if is_dataclass(empty_result) else result_arrays[""]
 
 
 def _align_blocks(
     dask_array: Any, dask_args: dict[str, Any], others: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """The Dask arrays by name, all divided into the same blocks of rows.
+    """Divide Dask arrays into the same blocks of rows. Returns them by name.
 
+    dask_array: the module dask.array.
     dask_args: the Dask arrays by name; the blocks are those of the first array.
     others: further arguments by name; an array among them with as many rows becomes a Dask array
         too.
@@ -138,6 +146,7 @@ def _align_blocks(
     aligned = dict(dask_args)
     for name, array in others.items():
         shape = np.shape(array)
+        # A number or a single point or direction belongs to all rows.
         if name not in dask_args and shape not in ((), (3,)) and shape[0] == count:
             aligned[name] = dask_array.from_array(np.asarray(array), chunks=-1)
     for name, array in aligned.items():
@@ -150,17 +159,16 @@ def _align_blocks(
 
 
 def _arrays_of(result: Any) -> dict[str, np.ndarray[Any, Any]]:
-    """The arrays of a result by name: the attributes of a dataclass, or the array itself under the
-    name ""."""
+    """The arrays of a function's result by name: the attributes of a dataclass, or the array itself
+    under the name ""."""
     return dict(vars(result)) if is_dataclass(result) else {"": np.asarray(result)}
 
 
 def _run_block(packed: SerializedObject, blocks: dict[str, Any], start: int) -> dict[str, Any]:
-    """Run on a worker: the result's arrays for one block of rows.
+    """Apply the function to one block of rows, on a worker. Returns the result's arrays by name.
 
     packed: the serialized function. blocks: the block of each Dask array by the argument's name.
-    start: the first row of the block, for messages.
-    """
+    start: the first row of the block, for messages."""
     with exclusive_compute():
         try:
             return _arrays_of(packed.deserialize()(**blocks))

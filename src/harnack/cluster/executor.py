@@ -1,5 +1,11 @@
-"""Runs jobs as tasks, in this process or on a Dask cluster. Results may be kept in a checkpoint
-folder.
+"""Runs jobs as tasks, in this process or on a Dask cluster, and may keep results in a checkpoint
+folder. A "job" is an object; a "task" is one call of a method of the job, which returns arrays by
+name. A "future" is Dask's handle for a task that may still run.
+
+Each task is named by a hash of its contents, including files and users' code but not cached values
+(`serialization`, `users_code`). The name alone identifies a stored result. So a checkpoint folder
+can be used again after a crash, with other workers, or for a film with more frames: finished tasks
+are not repeated, and results of other jobs are left alone.
 
 Each task is named by a hash of its contents, including files and users' code but not cached values
 (`serialization`, `users_code`). The name alone identifies a stored result. So a checkpoint folder
@@ -62,7 +68,7 @@ class CheckpointFolder:
 
     @classmethod
     def open(cls, path: str | os.PathLike[str]) -> CheckpointFolder:
-        """Open a folder; it is created if it does not exist.
+        """Open a checkpoint folder; it is created if it does not exist.
 
         Raises:
             TypeError: `path` is not the path of a folder.
@@ -80,7 +86,7 @@ class CheckpointFolder:
         return cls(folder)
 
     def load(self, name: str) -> TaskResult | None:
-        """The stored result of the task `name`; None if the folder has none.
+        """The stored result of the task with this name; None if the folder has none.
 
         Raises:
             ValueError: the file is damaged.
@@ -97,16 +103,16 @@ class CheckpointFolder:
             ) from None
 
     def has(self, name: str) -> bool:
-        """Whether the folder has a result of the task `name`."""
+        """Whether the folder has a result of the task with this name."""
         return self._file(name).exists()
 
     def save(self, name: str, arrays: TaskResult) -> None:
-        """Store the result of the task `name`."""
+        """Store the result of the task with this name."""
         with write_atomically(self._file(name)) as partial:
             np.savez(partial, allow_pickle=False, **arrays)
 
     def _file(self, name: str) -> Path:
-        """The path of the file for the result of the task `name`."""
+        """The path of the file for the result of the task with this name."""
         return self.path / f"{name}.npz"
 
 
@@ -124,9 +130,10 @@ class Executor:
     chunks: int | None = None
 
     def split_range(self, count: int, max_size: int) -> list[tuple[int, int]]:
-        """Split range(count) into intervals (start, stop) of at most `max_size` numbers each. The
-        intervals are shorter if otherwise there were fewer tasks than `chunks` or, if `chunks` is
-        None, fewer than `_TASKS_PER_THREAD` for each thread of the client's workers."""
+        """Split range(count) into intervals (start, stop) of at most `max_size` numbers each; each
+        interval is to be a task. They are made shorter if there would be fewer tasks than `chunks`
+        or, if `chunks` is None and there is a client, fewer than six for each thread of its
+        workers."""
         size = max(1, min(max_size, count))
         if self.chunks is not None:
             size = max(1, min(size, -(-count // self.chunks)))
@@ -143,10 +150,9 @@ class Executor:
         job: an object that `SerializedObject.serialize` accepts. It is sent to each worker once,
             and deserialized there once.
         step: the name of a method that returns arrays by name.
-        parts: a tuple of arguments for each task.
+        parts: for each task, a tuple of the method's arguments.
 
-        Raises the errors of the method.
-        """
+        Raises the errors of the method."""
         if self.client is None and self.checkpoint is None:
             method: TaskFunction = getattr(job, step)
             for part in parts:
@@ -162,12 +168,14 @@ class Executor:
         try:
             yield from _ordered_results(names, parts, self.checkpoint, runner, self._max_pending)
         finally:
+            # After an error, results that are finished already are stored.
             for name, arrays in runner.cancel():
                 if self.checkpoint is not None:
                     self.checkpoint.save(name, arrays)
 
     def _max_pending(self) -> int:
-        """The largest number of tasks that may be running or whose results wait to be yielded."""
+        """The largest number of tasks that may be running or whose results wait to be yielded:
+        three for each thread of the workers, or one in this process."""
         return 1 if self.client is None else _PENDING_PER_THREAD * self._threads()
 
     def _threads(self) -> int:
@@ -179,7 +187,8 @@ class Executor:
 def open_executor(
     client: Any = None, checkpoint: Any = None, chunks: int | None = None
 ) -> Generator[Executor]:
-    """Context manager that yields an `Executor`.
+    """Context manager that yields an `Executor` for the workers of a Dask cluster or for this
+    process.
 
     client: a Dask client, the address of a scheduler, or None for this process.
     checkpoint: the path of a folder that stores results, or None.
@@ -200,41 +209,46 @@ def open_executor(
 
 
 class _LocalTasks:
-    """Runs tasks in this process, one after the other.
+    """Runs the tasks of a job in this process, one after the other. It has the same methods as
+    `_DaskTasks`.
 
-    do: the job's method. waiting: (name, arguments) of the tasks that were submitted and not run
-        yet.
-    """
+    do: the job's method that a task calls.
+    waiting: (name, arguments) of the tasks that were submitted and not run yet."""
 
     def __init__(self, packed: SerializedObject, step: str) -> None:
+        """Prepare the tasks of the serialized job `packed`. step: the name of the job's method that
+        a task calls."""
         self.do: TaskFunction = getattr(packed.deserialize(), step)
         self.waiting: list[tuple[str, tuple[Any, ...]]] = []
 
     def submit(self, name: str, part: tuple[Any, ...]) -> None:
-        """Add a task to those to be run."""
+        """Add a task to the waiting ones. name: the name of the task. part: the arguments of the
+        method."""
         self.waiting.append((name, part))
 
     def next_completed(self) -> tuple[str, TaskResult]:
-        """Run the next task, and return its name and its result."""
+        """Run the next waiting task, and return its name and its result."""
         name, part = self.waiting.pop(0)
         return name, self.do(*part)
 
     def cancel(self) -> list[tuple[str, TaskResult]]:
-        """The (name, result) of tasks that are finished but were not fetched: always none here."""
+        """The (name, result) of the tasks that are finished but whose results were not fetched:
+        always none here."""
         return []
 
 
 class _DaskTasks:
-    """Runs tasks on the workers of a Dask cluster. If a worker is lost, Dask runs its tasks on
-    another one.
+    """Runs the tasks of a job on the workers of a Dask cluster. If a worker is lost, Dask runs its
+    tasks on another one.
 
     completed: Dask's iterator of finished futures.
-    names: the task's name of each future that was not fetched yet.
-    checked_workers: addresses of the workers whose rounding was compared with this process.
-    packed: the future of the serialized job.
-    """
+    names: the name of the task of each future that was not fetched yet.
+    checked_workers: addresses of the workers whose rounding was compared with that of this process.
+    packed: the future of the serialized job."""
 
     def __init__(self, client: Any, packed: SerializedObject, step: str) -> None:
+        """Send the serialized job `packed` to the cluster of `client`. step: the name of the job's
+        method that a task calls."""
         distributed = import_optional("distributed", "client")
         self.client, self.step = client, step
         self.worker_lost = distributed.KilledWorker
@@ -248,14 +262,15 @@ class _DaskTasks:
             self.packed = client.submit(_unchanged, packed, key=f"harnack-{packed.content_hash}")
 
     def submit(self, name: str, part: tuple[Any, ...]) -> None:
-        """Send a task to the cluster."""
+        """Send a task to the cluster. name: the name of the task. part: the arguments of the
+        method."""
         future = self.client.submit(_run_task, self.packed, self.step, part, key=name)
         self.names[future] = name
         self.completed.add(future)
 
     def next_completed(self) -> tuple[str, TaskResult]:
         """Wait for a finished task, and return its name and its result. An error of the task is
-        raised here.
+        raised here. Warns if the worker that ran it rounds differently from this process.
 
         Raises:
             RuntimeError: several workers were lost while they ran the task, or the scheduler is
@@ -281,8 +296,8 @@ class _DaskTasks:
         return name, arrays
 
     def _wait(self) -> None:
-        """Wait until a task is finished, and warn if there is no worker to run a task for a
-        while."""
+        """Wait until a task is finished, and warn once if the cluster has no worker for 20
+        seconds."""
         idle_since, has_warned = None, False
         next_check = time.monotonic() + 1
         while not self.completed.has_ready():
@@ -300,8 +315,8 @@ class _DaskTasks:
                 warnings.warn("the cluster has no worker: this waits for one", stacklevel=2)
 
     def cancel(self) -> list[tuple[str, TaskResult]]:
-        """Cancel unfinished tasks, and return (name, result) of tasks that are finished but were
-        not fetched."""
+        """Cancel unfinished tasks, and return (name, result) of the tasks that are finished but
+        whose results were not fetched."""
         finished = [future for future in self.names if future.status == "finished"]
         results: list[tuple[str, TaskResult]] = []
         # Without a scheduler there are no results to fetch; the error that is raised says so.
@@ -329,14 +344,13 @@ def _ordered_results(
     folder: the folder in which results are looked up and stored; None for no folder.
     runner: runs the tasks.
     max_pending: returns the largest number of tasks that may be running or whose results wait to be
-        yielded.
-    """
+        yielded."""
     results: dict[str, TaskResult] = {}
     pending: set[str] = set()
-    remaining_uses, next_index = Counter(names), 0
+    uses_left, next_index = Counter(names), 0
 
     def submit(index: int) -> None:
-        """Start the task `index`."""
+        """Start the task with this index."""
         runner.submit(names[index], arguments[index])
         pending.add(names[index])
 
@@ -348,6 +362,7 @@ def _ordered_results(
         if name not in results and name not in pending:
             submit(index)
         next_index = max(next_index, index + 1)
+        # Until the next result in order is there: start as many tasks as allowed, and wait for one.
         while name not in results:
             limit = max_pending()
             while next_index < len(names) and len(pending) + len(results) < limit:
@@ -364,20 +379,23 @@ def _ordered_results(
             results[finished_name] = arrays
             if folder is not None:
                 folder.save(finished_name, arrays)
-        remaining_uses[name] -= 1
-        yield results[name] if remaining_uses[name] else results.pop(name)
+        uses_left[name] -= 1
+        # A result is dropped when no later task has the same name.
+        yield results[name] if uses_left[name] else results.pop(name)
 
 
 def _unchanged(packed: SerializedObject) -> SerializedObject:
-    """Return the argument. This is the Dask task whose result is the serialized job."""
+    """Return the argument, a serialized job. This is the Dask task on whose result all tasks of the
+    job depend."""
     return packed
 
 
 def _run_task(
     packed: SerializedObject, step: str, arguments: tuple[Any, ...]
 ) -> tuple[TaskResult, str, str]:
-    """Run one task on this worker. Returns its result, the worker's address, and the worker's
-    `rounding_fingerprint`."""
+    """Run one task on this worker: call the method `step` of the serialized job `packed` with
+    `arguments`. Returns its result, the worker's address, and the worker's `rounding_fingerprint`.
+    """
     with exclusive_compute() as address:
         method: TaskFunction = getattr(packed.deserialize(), step)
         return method(*arguments), address, rounding_fingerprint()

@@ -1,5 +1,8 @@
-"""Turns objects into bytes that can be sent to other processes, and computes hashes of their
-contents.
+"""Turns objects into bytes that can be sent to other processes (pickles), and computes hashes of
+their contents. A "pickler" is an object that writes such bytes. To "rebuild" an object is to make
+it from them. A user's module is one that is neither a part of Python nor of an installed package.
+"Words" are the identifiers and strings in users' code; an attribute of a user's module is sent only
+if its name is among them.
 
 Cached values are left out: sending them would be useless, and they would give equal objects
 different hashes. Cached values are those of `functools.cached_property` and of a `TransientCache`,
@@ -67,7 +70,7 @@ _MISSING_MESSAGE = (
 
 
 def import_optional(name: str, feature: str) -> Any:
-    """Import a module that the extra `cluster` installs.
+    """Import a module that the extra `cluster` of this package installs.
 
     feature: the feature that needs it, for the message.
 
@@ -82,8 +85,8 @@ def import_optional(name: str, feature: str) -> Any:
 
 @functools.cache
 def package_versions() -> str:
-    """The versions, as text, of this library and of the libraries on which the bits of its results
-    depend."""
+    """The versions, as one text, of this library and of the libraries on which the bits of its
+    results depend."""
     versions = (f"{name} {importlib.metadata.version(name)}" for name in _PACKAGES)
     return ", ".join((f"harnack {__version__}", *versions))
 
@@ -93,12 +96,14 @@ class TransientCache(dict[Key, Value]):
     the object."""
 
     def __reduce__(self) -> Any:
+        """How pickle rebuilds the cache: as an empty one."""
         return TransientCache, ()
 
 
 @dataclass(frozen=True)
 class SerializedObject:
-    """A pickled object.
+    """An object as bytes (a pickle), with what is needed to check on another machine that it means
+    the same there.
 
     content_hash: 32 hexadecimal digits, equal for equal contents and equal versions of this
         library, of `package_versions` and of `other_versions`.
@@ -106,8 +111,7 @@ class SerializedObject:
     file_digests: (path, hash of the contents) of each file that the object names.
     package_versions: the versions in the process that pickled the object; `deserialize` refuses
         others.
-    other_versions: (name, version) of the other installed packages that the object uses.
-    """
+    other_versions: (name, version) of the other installed packages that the object uses."""
 
     content_hash: str
     data: bytes
@@ -149,8 +153,8 @@ class SerializedObject:
 
 @functools.lru_cache(maxsize=4)
 def _deserialize_cached(packed: SerializedObject) -> Any:
-    """Unpickle an object after checks of versions and files (see `SerializedObject.deserialize`);
-    the cache holds the four objects that were deserialized last."""
+    """Unpickle an object after checks of versions and files (see `SerializedObject.deserialize`).
+    The cache of this function holds the four objects that were deserialized last."""
     sent = [
         packed.package_versions,
         *(f"{name} {version}" for name, version in packed.other_versions),
@@ -166,6 +170,7 @@ def _deserialize_cached(packed: SerializedObject) -> Any:
         )
     for name, expected in packed.file_digests:
         digest = _file_digest(name)
+        # A plain word that named a file there may be no file here: it need not be meant as one.
         if digest != expected and not (digest is None and name.isidentifier()):
             raise ValueError(
                 f"the file {name} is not here, or not as it was where it was named: put it on all "
@@ -197,8 +202,9 @@ def _hash_and_files(
 
     label: what the value is, for messages.
     identifiers: identifiers in users' code that are known already; they select the attributes of
-        users' modules that are written.
-    """
+        users' modules that are written."""
+    # The fast way writes equal parts at each place, so it fails for an object that contains itself.
+    # The other way writes a reference for a part that was written before.
     try:
         pickler = _pickle(_make_hashing_pickler, value, label, identifiers, fast=True)
     except (RecursionError, TypeError, ValueError):  # an object that contains itself
@@ -214,7 +220,7 @@ def _pickle(
     make_class: Callable[[Any], Any], value: Any, label: str,
     identifiers: frozenset[str] = frozenset(), *, fast: bool = False,
 ) -> Any:  # fmt: skip
-    """Write a value into the attribute `file` of a new pickler, and return the pickler.
+    """Write a value into the buffer `file` of a new pickler, and return the pickler.
 
     make_class: makes the class of the pickler from cloudpickle's class `Pickler`.
     label: what the value is, for messages.
@@ -246,14 +252,15 @@ def _pickle(
 
 
 def _by_value(definition: Any, reduce: Callable[[Any], Any]) -> Any:
-    """How to pickle a function, class or type variable: the result of cloudpickle's function
-    `reduce`. If the definition is in a user's module, this describes its contents; otherwise its
-    name."""
+    """How pickle rebuilds a function, class or type variable: the result of cloudpickle's function
+    `reduce`. If the definition is in a user's module, the result describes its contents; otherwise
+    its name."""
     module = sys.modules.get(str(getattr(definition, "__module__", None)))
     if module is None or not is_sent_itself(module):
         return reduce(definition)
     with _REGISTRY_LOCK:
         cloudpickle = import_optional("cloudpickle", "to send code")
+        # cloudpickle describes the contents of definitions in the modules on its list.
         was_listed = module.__name__ in cloudpickle.list_registry_pickle_by_value()
         cloudpickle.register_pickle_by_value(module)
         try:
@@ -264,7 +271,7 @@ def _by_value(definition: Any, reduce: Callable[[Any], Any]) -> Any:
 
 
 def _file_digest(name: str) -> str | None:
-    """A hash of the contents of a file; None if there is no such file."""
+    """A hash of the contents of the file with this name, as text; None if there is no such file."""
     try:
         if not Path(name).is_file():  # pipes never end
             return None
@@ -278,14 +285,14 @@ def _file_digest(name: str) -> str | None:
 
 
 def _cached_property(function: Callable[..., Any], name: str) -> functools.cached_property[Any]:
-    """A cached property that pickle makes again from its function and its name."""
+    """Make a cached property from its function and its name. Pickle calls this to rebuild one."""
     cached = functools.cached_property(function)
     cached.__set_name__(object, name)
     return cached
 
 
 def _cached_function(function: Callable[..., Any], settings: dict[str, Any]) -> Any:
-    """A function with an empty cache that pickle makes again. settings: arguments of
+    """Make a function with an empty cache. Pickle calls this to rebuild one. settings: arguments of
     `functools.lru_cache`."""
     return functools.lru_cache(**settings)(function)
 
@@ -295,8 +302,8 @@ _CachedFunction = type(functools.cache(_cached_property))
 
 @functools.cache
 def _make_cacheless_pickler(base: Any) -> Callable[..., Any]:
-    """A subclass of cloudpickle's class Pickler (`base`) that leaves out cached values (see the
-    module's docstring) and pickles users' code by value.
+    """Make a subclass of cloudpickle's class Pickler (`base`) that leaves out cached values (see
+    the module's docstring) and pickles users' code by value.
 
     Attributes of its instances:
 
@@ -305,12 +312,13 @@ def _make_cacheless_pickler(base: Any) -> Callable[..., Any]:
     words: identifiers and strings that occur in the users' code pickled so far.
     modules: for each user's module pickled so far, the module and the words known when it was
         pickled, which decided which of its attributes were written.
-    spaces: the namespaces in which pickled functions look up global names, by the id of the
-        module's dictionary.
-    """
+    spaces: the objects that stand for the global names of modules, by the id of the module's
+        dictionary."""
 
     class CachelessPickler(base):
-        """The pickler class; `context` becomes its attribute `label`."""
+        """A pickler that leaves out cached values and writes users' code by value. It writes into
+        the attribute `file`. context: what the pickled object is, for messages; it becomes the
+        attribute `label`. words: identifiers in users' code that are known already."""
 
         def __init__(self, context: str, words: frozenset[str]) -> None:
             self.file = io.BytesIO()
@@ -339,6 +347,7 @@ def _make_cacheless_pickler(base: Any) -> Callable[..., Any]:
             transient = _transient_attributes(obj_type)
             if not transient:
                 return _refuse_user_names(obj)
+            # Replace cached values in the state by their defaults, or leave them out.
             constructor, arguments, state, *rest = (*obj.__reduce_ex__(_PROTOCOL), None)[:6]
             if isinstance(state, dict):
                 state_attributes = cast("dict[str, Any]", state)
@@ -347,8 +356,8 @@ def _make_cacheless_pickler(base: Any) -> Callable[..., Any]:
             return constructor, arguments, state, *rest[:3]
 
         def of_module(self, module: ModuleType) -> Any:
-            """How a module is rebuilt: by its name; or, for a user's module, by those of its
-            attributes whose names are among the words."""
+            """How a module is rebuilt: by its name; or, if it is a user's module, as a new module
+            with those of its attributes whose names are among the words."""
             if not is_sent_itself(module):
                 return importlib.import_module, (module.__name__,)
             words = frozenset(self.words)
@@ -358,11 +367,10 @@ def _make_cacheless_pickler(base: Any) -> Callable[..., Any]:
             return itself, (self.space(vars(module)),), (attributes, left_out), None, None, fill
 
         def of_function(self, function: FunctionType, reduced: Any) -> Any:
-            """How a function is rebuilt, in the namespace of its module. Its identifiers and
-            strings are added to the words.
+            """How a user's function is rebuilt, with its global names looked up in its rebuilt
+            module. Its identifiers and strings are added to the words.
 
-            reduced: how cloudpickle rebuilds it.
-            """
+            reduced: how cloudpickle rebuilds it; returned unchanged if that is by name only."""
             if not isinstance(reduced, tuple):
                 return reduced
             refuse_imports_within(function)
@@ -371,21 +379,20 @@ def _make_cacheless_pickler(base: Any) -> Callable[..., Any]:
             return function_in, (self.space(function.__globals__), code, closure), *rest
 
         def space(self, names: dict[str, Any]) -> Namespace:
-            """The object that stands for the global names of a module in the pickle. It is always
-            the same one for the same dictionary, so that all functions of a module share their
-            globals after unpickling.
+            """The `Namespace` that stands for the global names of a module in the pickle. It is the
+            same object at each call for the same module, so that all functions of the module share
+            their global names after unpickling.
 
-            names: the dictionary of the module, `vars(module)`.
-            """
+            names: the dictionary of the module, `vars(module)`."""
             return self.spaces.setdefault(id(names), Namespace.of(names))
 
     return CachelessPickler
 
 
 def _without_generated_id(reduced: Any) -> Any:
-    """`reduced`, the way in which cloudpickle rebuilds a class, without the id that it generated.
-    By this id cloudpickle would find a class that it rebuilt before, and replace the methods of
-    that class."""
+    """Remove the id that cloudpickle generated from its description `reduced` of how a class is
+    rebuilt. By this id cloudpickle would find a class that it rebuilt before, and replace the
+    methods of that class."""
     if not isinstance(reduced, tuple):
         return reduced
     constructor, arguments, *rest = cast("tuple[Any, ...]", reduced)
@@ -397,9 +404,9 @@ def _without_generated_id(reduced: Any) -> Any:
 
 
 def _refuse_user_names(obj: Any) -> Any:
-    """How to rebuild an object that pickle would describe only by its name in a user's module: a
-    cached function is rebuilt from its contents. NotImplemented for all other objects, which are
-    pickled as usual.
+    """How to rebuild an object that pickle would describe only by its name in a user's module. A
+    cached function is rebuilt from its contents. The result is NotImplemented for all other
+    objects, which are pickled as usual.
 
     Raises:
         TypeError: the contents cannot be determined.
@@ -419,21 +426,22 @@ def _refuse_user_names(obj: Any) -> Any:
 
 @functools.cache
 def _make_hashing_pickler(base: Any) -> Callable[..., Any]:
-    """A pickler class whose output is only hashed. It leaves out everything that changes from run
-    to run (line numbers, generated ids, the order of sets), and adds a hash of each file that a
+    """Make a pickler class whose output is only hashed. It leaves out everything that changes from
+    run to run (line numbers, generated ids, the order of sets), and adds a hash of each file that a
     string or a path names. base: cloudpickle's class Pickler.
 
     Attributes of its instances besides those of `_make_cacheless_pickler`:
 
     files: the hash of each file by its path.
     other_versions: the versions of the installed packages that are used, by name.
-    begun: for each function, class and module whose writing has begun, by id: the object and its
-        number.
-    """
+    begun: the functions, classes and modules whose writing has begun: by the id of each, the object
+        itself and its number in the order in which they were begun."""
     base_pickler: Any = _make_cacheless_pickler(base)
 
     class HashingPickler(base_pickler):
-        """The pickler class; `context` becomes its attribute `label`."""
+        """A pickler whose output is only hashed. context: what the pickled object is, for messages;
+        it becomes the attribute `label`. words: identifiers in users' code that are known already.
+        """
 
         def __init__(self, context: str, words: frozenset[str]) -> None:
             super().__init__(context, words)
@@ -442,13 +450,12 @@ def _make_hashing_pickler(base: Any) -> Callable[..., Any]:
             self.begun: dict[int, tuple[Any, int]] = {}
 
         def persistent_id(self, obj: Any) -> Any:
-            """Pickle calls this for each object: it returns a value to write in place of the
-            object, or None to pickle the object as usual.
+            """Return a value to write in place of the object, or None to pickle the object as
+            usual. Pickle calls this for each object.
 
             A function, class or module whose writing has begun is replaced by its number, as it may
             refer to itself. A set is replaced by the sorted hashes of its members, since its order
-            changes from run to run. The name of a file is replaced by a hash of the file.
-            """
+            changes from run to run. The name of a file is replaced by a hash of the file."""
             obj_type = cast("type[Any]", type(obj))
             if id(obj) in self.begun:  # classes, functions and modules may name themselves
                 return f"number {self.begun[id(obj)][1]}"
@@ -465,8 +472,9 @@ def _make_hashing_pickler(base: Any) -> Callable[..., Any]:
             return self.of_file(obj) if isinstance(obj, str | os.PathLike) else None
 
         def of_file(self, obj: Any) -> str | None:
-            """The text "file" and the hash of the contents, for a name or path of an existing file;
-            None for a file of code and for any other string. The hash is noted in `files`."""
+            """The text "file" and a hash of the contents, if the object is the name or path of an
+            existing file; None for a file of code and for any other string. The hash is noted in
+            `files`."""
             path = os.fsdecode(cast("str | os.PathLike[str]", obj))
             if path.endswith(_CODE_SUFFIXES) or (contents := _file_digest(path)) is None:
                 return None
@@ -474,9 +482,10 @@ def _make_hashing_pickler(base: Any) -> Callable[..., Any]:
             return f"file {contents}"
 
         def reducer_override(self, obj: Any) -> Any:
-            """A description of an object in the form of pickle's reduce values. It needs to
-            determine only the contents, as the object is never rebuilt from it."""
-            if obj is tuple:  # all other recipes are written as tuples
+            """Describe an object in the form of pickle's reduce values (function, arguments,
+            state). The description needs to determine only the contents, as the object is never
+            rebuilt from it."""
+            if obj is tuple:  # the descriptions below begin with it
                 return NotImplemented
             if isinstance(obj, CodeType):
                 values = [getattr(obj, attribute, None) for attribute in _CODE_ATTRIBUTES]
@@ -488,6 +497,7 @@ def _make_hashing_pickler(base: Any) -> Callable[..., Any]:
             is_code = isinstance(obj, type | FunctionType | ModuleType)
             if reduced is NotImplemented and type(obj) not in base.dispatch_table:
                 reduced = obj.__qualname__ if is_code else obj.__reduce_ex__(_PROTOCOL)
+            # An object that is described by its name only.
             if isinstance(reduced, str):
                 return tuple, ([str(getattr(obj, "__module__", None)).encode(), reduced.encode()],)
             if not isinstance(reduced, tuple) or len(cast("tuple[Any, ...]", reduced)) < 3:
@@ -497,13 +507,14 @@ def _make_hashing_pickler(base: Any) -> Callable[..., Any]:
                 state, _ = state
             state = _with_encoded_keys(state)
             if is_code:
+                # From here on the object is written as a number where it occurs again.
                 self.begun[id(obj)] = (obj, len(self.begun))
                 return tuple, ([*map(_encoded, arguments), state],)
             return constructor, arguments, state, *rest
 
         def note_origin(self, obj: Any) -> None:
-            """Note, for the definition of an object, the version of its package (in `others`) or
-            the hash of its compiled file (in `files`)."""
+            """Note which code defines an object: the version of its installed package (in
+            `other_versions`), or the hash of its compiled file (in `files`)."""
             name = obj.__name__ if isinstance(obj, ModuleType) else getattr(obj, "__module__", None)
             if not isinstance(name, str):
                 return
@@ -526,13 +537,14 @@ _NAMESPACE_ATTRIBUTES = ("__globals__", "__kwdefaults__")
 
 
 def _with_encoded_keys(state: Any) -> Any:
-    """The state of an object with the names of attributes as bytes. As strings, they would be taken
-    for names of files."""
+    """The state of an object, with the names of its attributes as bytes instead of strings. Strings
+    would be taken for names of files, and hashed as such if there is such a file."""
     if isinstance(state, tuple):
         return tuple(map(_with_encoded_keys, cast("tuple[Any, ...]", state)))
     if not isinstance(state, dict):
         return state
     attributes = dict(cast("dict[Any, Any]", state))
+    # Some values are names, too, and some are dictionaries of names.
     attributes |= {key: _encoded(attributes[key]) for key in _NAME_ATTRIBUTES if key in attributes}
     attributes |= {
         key: _with_encoded_keys(attributes[key])
@@ -543,8 +555,8 @@ def _with_encoded_keys(state: Any) -> Any:
 
 
 def _encoded(names: Any) -> Any:
-    """A string as bytes; a dictionary as a list of pairs, with all of its strings as bytes; any
-    other value unchanged."""
+    """A string as bytes; a dictionary as a list of pairs, with its strings as bytes; any other
+    value unchanged."""
     if isinstance(names, dict):
         mapping = cast("dict[Any, Any]", names)
         return [(_encoded(key), _encoded(value)) for key, value in mapping.items()]
@@ -558,15 +570,15 @@ _CODE_ATTRIBUTES = (
 
 
 def _is_generated_id(argument: Any) -> bool:
-    """Whether a value is an id that cloudpickle generated."""
+    """Whether a value is an id that cloudpickle generated for a class: 32 hexadecimal digits."""
     return isinstance(argument, str) and _GENERATED_ID.fullmatch(argument) is not None
 
 
 @functools.lru_cache(maxsize=1024)
 def _transient_attributes(kind: type) -> dict[str, Any]:
     """The attributes in which objects of the class `kind` cache computed values. The value of each
-    is what replaces it in a pickle: the default of a private dataclass field, or `_OMIT` to leave
-    it out."""
+    entry is what replaces the cached value in a pickle: the default of a private dataclass field,
+    or `_OMIT` to leave the attribute out."""
     replacements: dict[str, Any] = {
         name: _OMIT
         for definition in kind.__mro__
@@ -575,6 +587,7 @@ def _transient_attributes(kind: type) -> dict[str, Any]:
     }
     if dataclasses.is_dataclass(kind):
         for definition in dataclasses.fields(kind):
+            # Private fields that are not compared hold what is computed from the others.
             private = definition.name.startswith("_")
             if private and not definition.compare and definition.default is not dataclasses.MISSING:
                 replacements[definition.name] = definition.default

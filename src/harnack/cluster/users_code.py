@@ -1,5 +1,15 @@
 """Code of users: how it is recognized, which attributes of users' modules it uses, and how such
-modules are sent.
+modules are sent to other processes. A user's module is one that belongs neither to Python, nor to
+an installed package, nor to this library. To send a module "by value" is to send its attributes; to
+send it "by name" is to import it there. "Words" are the identifiers and strings that occur in code:
+an attribute of a user's module is sent if its name is among them.
+
+Code of Python itself and of installed packages is sent by name. A user's module is sent by value,
+in its present state: a worker may lack the module, or may have imported it before it was changed,
+and a checkpoint folder must distinguish two states of it. But the whole module would be too much,
+since modules also hold locks, clients and pictures. So an attribute is sent only if its name occurs
+in the code that is sent. A sent module raises an error when any other attribute is used, so that
+nothing is missing silently.
 
 Code of Python itself and of installed packages is sent by name. A user's module is sent by value,
 in its present state: a worker may lack the module, or may have imported it before it was changed,
@@ -44,6 +54,8 @@ class SentModule(ModuleType):
     sys.modules, and is not the module that `import` finds there under its name."""
 
     def __getattr__(self, name: str) -> Any:
+        """Raise the error for an attribute that the module does not have: a RuntimeError if it was
+        not sent, else an AttributeError."""
         # Not an AttributeError, which `hasattr` would take for "no such attribute".
         if name in vars(self).get(_LEFT_OUT, ()):
             raise RuntimeError(
@@ -55,33 +67,33 @@ class SentModule(ModuleType):
 
 @dataclass(frozen=True)
 class Namespace:
-    """The module in which pickled functions look up global names. Unpickling it gives a
-    `SentModule`.
+    """A stand-in, in a pickle, for the module in which pickled functions look up global names.
+    Unpickling it gives a `SentModule`.
 
-    known: the attributes that are sent whatever names the functions use, such as `__name__`.
-    """
+    known: the attributes that are sent whatever names the functions use, such as `__name__`."""
 
     known: Mapping[str, Any]
 
     @classmethod
     def of(cls, names: Mapping[str, Any]) -> Namespace:
-        """The namespace of a module. names: the attributes of the module by name."""
+        """The namespace that stands for a module. names: the attributes of the module by name."""
         return cls({key: names[key] for key in _ALWAYS_SENT if key in names})
 
     def __reduce__(self) -> Any:
+        """How pickle rebuilds it: by `sent_module`, as a module with the known attributes."""
         return sent_module, (self.known,)
 
 
 def sent_module(known: Mapping[str, Any]) -> SentModule:
-    """A new module that has only the attributes `known`."""
+    """Make a new module that has only the attributes `known`."""
     module = SentModule(str(known.get("__name__", "")))
     vars(module).update(known)
     return module
 
 
 def itself(module: SentModule) -> SentModule:
-    """The module, unchanged. Pickle calls this to rebuild a module from a namespace, so that the
-    module is the one in which its functions look up names."""
+    """Return the module, unchanged. Pickle calls this with a rebuilt `Namespace` to rebuild a
+    module, so that the module is the one in which its functions look up names."""
     return module
 
 
@@ -93,14 +105,14 @@ def fill(module: SentModule, contents: tuple[Mapping[str, Any], frozenset[str]])
 
 
 def function_in(module: SentModule, code: CodeType, closure: Any) -> FunctionType:
-    """A function of the given code and closure whose global names are those of a module."""
+    """Make a function of the given code and closure whose global names are those of a module."""
     return FunctionType(code, vars(module), None, None, closure)
 
 
 def attributes_named(module: ModuleType, words: frozenset[str] | set[str]) -> dict[str, Any]:
-    """The attributes of a module that code may use, sorted by name: those whose names are among
-    `words`, and all of them if `words` contains a function such as `vars`. words: identifiers and
-    strings in the code."""
+    """The attributes of a module that code may use, by name, in alphabetical order: those whose
+    names are among `words`, or all of them if `words` contains a function such as `vars`.
+    Attributes that belong to a process are left out. words: identifiers and strings in the code."""
     uses_all = bool(words & _ALL_ATTRIBUTES)
     return {
         name: value
@@ -110,7 +122,8 @@ def attributes_named(module: ModuleType, words: frozenset[str] | set[str]) -> di
 
 
 def codes_within(code: CodeType) -> Iterator[CodeType]:
-    """Yield a code object, and the code objects of all functions and classes that it defines."""
+    """Yield a code object, and the code objects of all functions and classes that it defines, at
+    any depth."""
     yield code
     for constant in code.co_consts:
         if isinstance(constant, CodeType):
@@ -118,8 +131,8 @@ def codes_within(code: CodeType) -> Iterator[CodeType]:
 
 
 def words_of(function: FunctionType) -> set[str]:
-    """All names in the code of a function, and its string constants, as attributes may be looked up
-    by them."""
+    """The words of a function: all names in its code, and its string constants, as attributes may
+    be looked up by them."""
     return {
         word
         for code in codes_within(function.__code__)
@@ -128,7 +141,7 @@ def words_of(function: FunctionType) -> set[str]:
 
 
 def _strings_in(constants: Iterable[Any]) -> Iterator[str]:
-    """The strings among constants, and in their tuples and frozen sets."""
+    """Yield the strings among the constants of a code object, and in its tuples and frozen sets."""
     for constant in constants:
         if isinstance(constant, str):
             yield constant
@@ -146,6 +159,7 @@ def refuse_imports_within(function: FunctionType) -> None:
     package = function.__globals__.get("__package__") or ""
     for code in codes_within(function.__code__):
         names = [_imported_module(statement, package) for statement in _imports(code)]
+        # Any string that could be the name of a module may be imported by a function.
         if _IMPORTERS.intersection(code.co_names):
             names += [
                 text
@@ -162,8 +176,8 @@ def refuse_imports_within(function: FunctionType) -> None:
 
 
 def _imports(code: CodeType) -> Iterator[tuple[int, str]]:
-    """Yield the imports in a code object as (level, name): the number of packages to go up (0 for
-    an absolute import), and the module's name relative to that package."""
+    """Yield the import statements in a code object as (level, name): the number of packages to go
+    up (0 for an absolute import), and the module's name relative to that package."""
     instructions = [
         instruction
         for instruction in dis.get_instructions(code)
@@ -175,8 +189,9 @@ def _imports(code: CodeType) -> Iterator[tuple[int, str]]:
 
 
 def _imported_module(statement: tuple[int, str], package: str) -> str:
-    """The full name of the module that an import imports. statement: the import as (level, name),
-    see `_imports`. package: the package of the module in which the import stands."""
+    """The full name of the module that an import statement imports. statement: the import as
+    (level, name), see `_imports`. package: the package of the module in which the statement stands.
+    """
     level, name = statement
     with suppress(ImportError):  # the function will raise this error itself
         return importlib.util.resolve_name("." * level + name, package)
@@ -184,7 +199,8 @@ def _imported_module(statement: tuple[int, str], package: str) -> str:
 
 
 def _is_user_root(root: str) -> bool:
-    """Whether the top-level module named `root`, imported or not, is a user's module."""
+    """Whether the top-level module named `root` is a user's module. It may be imported already
+    or not."""
     module = sys.modules.get(root)
     if module is not None:
         return is_users(module)
@@ -199,15 +215,15 @@ def _is_user_root(root: str) -> bool:
 
 def is_users(module: ModuleType) -> bool:
     """Whether a module is a user's: not a part of Python, of an installed package or of this
-    library."""
+    library. `__main__` is one, and so is a module that is not in sys.modules."""
     name = module.__name__
     root = name.partition(".")[0]
     if name == "__main__" or sys.modules.get(name) is not module:
         return True
     location = _location_of(module)
-    if location is None and root != name and (top := sys.modules.get(root)) is not None:
-        return is_users(top)
-    if location is None:  # one that is built in has a specification
+    if location is None and root != name and (top_module := sys.modules.get(root)) is not None:
+        return is_users(top_module)
+    if location is None:  # a built-in module has a specification
         return getattr(module, "__spec__", None) is None
     return _is_user_location(root, location)
 
@@ -221,7 +237,8 @@ def is_sent_itself(module: ModuleType) -> bool:
 
 
 def compiled_file(module: ModuleType) -> str | None:
-    """The path of a compiled module of a user; None for any other module."""
+    """The path of the file of a user's module, if it is a compiled one; None for any other
+    module."""
     path = _location_of(module)
     return path if path is not None and is_users(module) and not is_sent_itself(module) else None
 
@@ -236,8 +253,8 @@ def _location_of(module: ModuleType) -> str | None:
 
 @functools.cache
 def _is_user_location(root: str, location: str) -> bool:
-    """Whether a file or folder belongs to a user, that is neither to Python nor to an installed
-    package nor to this library. root: the name of its top-level module."""
+    """Whether the file or folder `location` belongs to a user, not to Python, an installed package
+    or this library. root: the name of the top-level module that it is a part of."""
     if root == "harnack":
         return False
     path = Path(location).resolve()
@@ -253,7 +270,7 @@ def _is_user_location(root: str, location: str) -> bool:
 @functools.cache
 def installed_version(root: str) -> str | None:
     """The version of the installed package that has the top-level module `root`; None if no package
-    has it, as for Python's own and users' modules."""
+    has it, as for Python's own modules and users' modules."""
     if root in sys.stdlib_module_names or root in ("__main__", "harnack") or _is_user_root(root):
         return None
     with suppress(importlib.metadata.PackageNotFoundError, ValueError):

@@ -1,5 +1,7 @@
 """Connects to a Dask cluster, and checks that its workers can run tasks before anything is sent to
-them."""
+them. A "worker" is a process of the cluster that runs tasks; its "scheduler" distributes them; a
+"client" is the connection of this process to the scheduler.
+"""
 
 from __future__ import annotations
 
@@ -47,6 +49,7 @@ def connect_client(client: Any) -> Generator[Any]:
         return
     distributed = import_optional("distributed", "client")
     own_client = None
+    # A client that is opened here is closed here.
     if isinstance(client, str):
         try:
             client = own_client = distributed.Client(
@@ -90,12 +93,13 @@ def exclusive_compute() -> Generator[str]:
         raise RuntimeError(f"worker {worker and worker.address} cannot work: {error}") from None
     if worker is not None:
         adopt_worker_threads(worker.nanny is not None, worker.state.nthreads)
+    # A lock of this name is the same one for all tasks of this process.
     with import_optional("dask.utils", "client").SerializableLock("harnack"):
         yield "" if worker is None else worker.address
 
 
 def worker_threads(client: Any) -> dict[str, int]:
-    """The number of threads of each worker, by the worker's address.
+    """The number of threads of each worker of a client, by the worker's address.
 
     Raises:
         RuntimeError: the scheduler is gone.
@@ -139,8 +143,8 @@ def _check_workers(client: Any) -> None:
 
 
 def warn_rounding_differs(workers: Iterable[str]) -> None:
-    """Warn that the processors of some workers round differently from this one. workers: their
-    addresses."""
+    """Warn that the processors of some workers round differently from that of this process.
+    workers: the addresses of these workers."""
     warnings.warn(
         f"the processors of {', '.join(sorted(workers))} round differently from this one: "
         "results are right, but not the same bit for bit as without them",
@@ -149,7 +153,8 @@ def warn_rounding_differs(workers: Iterable[str]) -> None:
 
 
 def _worker_state(dask_worker: Any = None) -> tuple[str, str]:
-    """Run on a worker: return its `package_versions` and its `rounding_fingerprint`.
+    """Return the `package_versions` and the `rounding_fingerprint` of a worker. It is run on the
+    worker.
 
     dask_worker: Dask passes the worker under this name.
 
@@ -163,27 +168,26 @@ def _worker_state(dask_worker: Any = None) -> tuple[str, str]:
 
 @functools.cache
 def adopt_worker_threads(has_nanny: bool, threads: int) -> None:
-    """Set Dr.Jit's number of threads to the number that Dask gave this worker, if the process
-    belongs to this worker alone.
+    """Set Dr.Jit's number of threads to the number `threads` that Dask gave this worker, if the
+    process belongs to this worker alone.
 
     has_nanny: whether Dask runs a supervising process (a nanny) for this worker; then the process
-        belongs to it alone.
-    """
+        belongs to it alone."""
     if has_nanny:
         dr.set_thread_count(threads)
 
 
 def rounding_fingerprint() -> str:
-    """The backend's name and a hash of numbers that kernels compute on this machine. It is equal on
-    machines whose kernels give the same bits."""
+    """A text that is equal on machines whose kernels give the same bits: the backend's name, and a
+    hash of numbers that kernels compute on this machine."""
     name = choose_backend().name
     return f"{name} {_rounding(name)}"
 
 
 @functools.cache
 def _rounding(_name: str) -> str:
-    """A hash of numbers that kernels of the chosen backend compute. _name: the backend's name, by
-    which the hash is cached."""
+    """A hash of numbers that kernels of the chosen backend compute: functions that processors may
+    round differently. _name: the backend's name, by which the hash is cached."""
     x = dr.linspace(choose_backend().Float, 0.01, 40, 4096)
     s, c = dr.sincos(x)
     results = (dr.rcp(x), dr.rsqrt(x), s, c, dr.exp(-x), dr.log(x), dr.fma(s, c, x), dr.sqrt(x),

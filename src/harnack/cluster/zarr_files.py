@@ -1,4 +1,7 @@
-"""Writes Dask arrays to Zarr files. Chunks that are already in the file are not computed again."""
+"""Writes Dask arrays to Zarr files. A Zarr file is a folder with one file for each "chunk" of the
+array; a chunk is one block of the Dask array. Chunks that are already in the file are not computed
+again.
+"""
 
 from __future__ import annotations
 
@@ -36,7 +39,8 @@ def to_zarr(
         name.
     path: the folder to write, usually with the ending .zarr; workers must see it under the same
         path.
-    client: a `dask.distributed.Client` or the address of a scheduler; by default as Dask chooses.
+    client: a `dask.distributed.Client` or the address of a scheduler; by default the array is
+        computed as Dask chooses.
     progress: whether to show the progress; or a function that is called with each fraction of the
         work that was finished (they add up to 1).
 
@@ -57,6 +61,7 @@ def to_zarr(
             )
     target = Path(path).resolve()
     file = _open_or_create(zarr, array, target)
+    # The indices of the chunks that are not empty and whose file does not exist.
     missing_chunks = [
         index
         for index in np.ndindex(*array.numblocks)
@@ -83,8 +88,8 @@ def to_zarr(
 
 
 def _compute_tasks(client: Any, tasks: list[Any]) -> Iterator[None]:
-    """Compute tasks, and yield after each finished one: all at once on the cluster of `client`, or
-    one after the other in this process if `client` is None."""
+    """Compute delayed Dask tasks, and yield after each finished one: all at once on the cluster of
+    `client`, or one after the other in this process if `client` is None."""
     if client is None:
         for task in tasks:
             task.compute()
@@ -98,11 +103,14 @@ def _compute_tasks(client: Any, tasks: list[Any]) -> Iterator[None]:
             future.result()
             yield
     finally:
+        # After an error, tasks that have not begun are canceled.
         client.cancel([pending for pending in futures if pending.status == "pending"])
 
 
 def _open_or_create(zarr: Any, array: Any, target: Path) -> Any:
-    """Open the Zarr file of a Dask array, or create it if it does not exist.
+    """Open the Zarr file `target` of a Dask array, or create it if it does not exist.
+
+    zarr: the module of this name.
 
     Raises:
         FileNotFoundError: the parent folder does not exist.
@@ -130,8 +138,8 @@ def _open_or_create(zarr: Any, array: Any, target: Path) -> Any:
 
 
 def _chunk_path(file: Any, target: Path, index: tuple[int, ...]) -> Path:
-    """The path of the file of a chunk. This file exists only if the chunk is complete: Zarr writes
-    it under another name first, and then renames it."""
+    """The path of the file of the chunk with this index. This file exists only if the chunk is
+    complete: Zarr writes it under another name first, and then renames it."""
     return target / file.metadata.encode_chunk_key(index)
 
 
@@ -143,8 +151,8 @@ def _chunk_slices(array: Any, index: tuple[int, ...]) -> tuple[slice, ...]:
 
 
 def _write_block(path: str, slices: tuple[slice, ...], block: Any) -> None:
-    """Run on a worker: write a block into the Zarr array at `path`. slices: the place of the
-    block."""
+    """Write a block of numbers into the Zarr array at `path`. It is run on a worker. slices: the
+    place of the block in the array."""
     zarr = import_optional("zarr", "to_zarr")
     # By default Zarr leaves out chunks of zeros, which would then be computed again.
     with zarr.config.set({"array.write_empty_chunks": True}):

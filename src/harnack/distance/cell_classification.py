@@ -111,6 +111,7 @@ class ClipCurveDescent:
             k: the number of points tried so far.
             active: whether the search goes on.
             """
+            # Is the point y on the curve, and nearer to x than the best one?
             trial = self._at(y)
             distance = safe_norm(x - y)
             has_best = dr.isfinite(nearest)
@@ -129,7 +130,7 @@ class ClipCurveDescent:
             crosses_face = has_best & is_new_face & has_no_face & ~accepted & (corner != _TURNING)
             is_corrected = ~trial.is_on & ~crosses_face & (tries < _MAX_CURVE_CORRECTIONS)
             is_corrected &= dr.isfinite(dr.squared_norm(trial.correction))
-            failed = ~accepted & ~is_corrected
+            is_rejected = ~accepted & ~is_corrected
             # A point on the curve that is nearer to x is accepted: the next Newton step.
             curvature_term = 1 - dr.dot(x - y, trial.second_derivative)
             step = dr.dot(x - y, trial.tangent) / fmax(
@@ -148,7 +149,7 @@ class ClipCurveDescent:
             )
             normal = dr.select(accepted, trial.normal, normal)
             factor = dr.select(accepted, fmin(4 * factor, 1), factor)
-            factor = dr.select(failed & ~crosses_face, 0.25 * factor, factor)
+            factor = dr.select(is_rejected & ~crosses_face, 0.25 * factor, factor)
             # The step s meets the face where face_rate |s| + s^2/2 face_normal.ddy = face_gap.
             s, face_gap = factor * w, fmax(face_offset - dr.dot(face_normal, best), 0)
             face_rate = dr.sign(w) * dr.dot(face_normal, tangent)
@@ -161,6 +162,7 @@ class ClipCurveDescent:
             is_limited = ~(has_no_face & ~crosses_face) & (limit < dr.abs(s))
             s = dr.select(is_limited, clamp(s, -limit, limit), s)
             target = dr.fma(vector(s), tangent, best) + vector(0.5 * s * s) * ddy
+            # The search ends at short steps, unless a face has shortened them.
             min_step = dr.select(is_limited, 0, _MIN_RELATIVE_STEP * nearest)
             is_short = dr.abs(s) <= fmax(min_step, trial.near)
             corner = dr.select((corner == _TURNING) & ~is_corrected, _TURNED, corner)
@@ -188,6 +190,7 @@ class ClipCurveDescent:
         def is_active(*state: Any) -> Mask:
             return state[-1]
 
+        # Nothing of the curve is known at the start; Newton's step is a whole one.
         undefined, zero = vector(dr.nan), vector(0)
         state = (
             vector(start), undefined, real(dr.inf), real(0), zero, undefined, zero, zero, real(0),
@@ -221,16 +224,15 @@ class ClipCurveDescent:
             real(sample.value_error) / gradient_norm,
         )
         cosine = dr.dot(n, u)
-        sine = 1 - cosine * cosine
+        sine_squared = 1 - cosine * cosine
 
         def solution(along_u: Real, along_n: Real) -> Vec3:
             """Return the shortest vector whose inner products with u and n are `along_u` and
-            `along_n`.
-            """
+            `along_n`."""
             first, second = along_u - cosine * along_n, along_n - cosine * along_u
-            return (vector(first) * u + vector(second) * n) / sine
+            return (vector(first) * u + vector(second) * n) / sine_squared
 
-        t = dr.cross(u, n) * dr.rsqrt(sine)
+        t = dr.cross(u, n) * dr.rsqrt(sine_squared)
         # The step of the differences.
         h = self.backend.machine_epsilon**0.5 * fmax(scale, real(1e-30))
         next_point = dr.fma(vector(h), t, y)
@@ -290,8 +292,7 @@ def taylor_remainder(sample: Sample, radius: Real, degree: int = 1) -> Real:
     the sample, and T the Taylor polynomial of f about p, of degree 1 or 2. The bound follows from
     the sample's promises (proved bounds of f near p); it is infinite if these imply none. When the
     radius decreases, the bound falls at least as fast as radius^(degree + 1), except for the errors
-    of value and gradient, which are included.
-    """
+    of value and gradient, which are included."""
     bound: Real = dr.inf
     for promise in sample.all_promises:
         bound = fmin(bound, promise.taylor_remainder_bound(sample.value, radius, degree))
@@ -325,6 +326,8 @@ class CellClassifier:
     surface: TracedSurface
 
     def __post_init__(self) -> None:
+        """Prepare the surface in double precision, and the descent to the clip curve if its domain
+        cuts it."""
         self._backend = choose_backend("double")
         self._prepared = self.surface.prepare(self._backend)
         self._levels = self._prepared.levels
@@ -370,8 +373,7 @@ class CellClassifier:
     def with_surface_points(self, cells: SurfaceCells) -> SurfaceCells:
         """Return the same cells with more of their attributes known: a point of the surface in each
         cell, and the normal and curvature of the surface there; and a point of the clip curve. A
-        cell in which such a point is not found has `FAR_SENTINEL` in its place.
-        """
+        cell in which such a point is not found has `FAR_SENTINEL` in its place."""
         if not len(cells):
             return cells
         radius, start = _CUBE_CIRCUMRADIUS * cells.half, cells.center
@@ -429,8 +431,7 @@ class CellClassifier:
 
     def _pulled_inside(self, p: Vec3) -> tuple[Real, Vec3]:
         """Return a lower bound of the signed distance of p from the domain (positive outside); and
-        the point p if it is inside, otherwise a point of the domain's boundary near p.
-        """
+        the point p if it is inside, otherwise a point of the domain's boundary near p."""
         assert self._volume is not None
         distance = self._volume.signed_distance(p)
         normal = self._volume.outward_normal(p)
@@ -470,9 +471,9 @@ class CellClassifier:
         )
         if len(self._levels.values) > 1 or self.surface.field.has_jumps:
             is_slab &= False
-        # |f - level| changes by at most |g| radius + error in the ball. So f cannot reach the next
-        # period.
-        elif self._levels.period is not None:  # no other level lies in the ball
+        elif self._levels.period is not None:
+            # f - level changes by at most |g| radius + error in the ball, so that no other level
+            # (a period away) lies in it.
             is_slab &= dr.fma(gradient_norm, radius, linear_error) < self._levels.period - dr.abs(
                 value
             )
@@ -540,8 +541,8 @@ class CellClassifier:
         """Return the point of the level set to which Newton's method along the gradient leads from
         p; `FAR_SENTINEL` if it does not converge to a point within the distance 2 `radius` of p.
 
-        After six steps the method goes on only towards a multiple root, with longer steps
-        (`multiplicity`).
+        After six steps the method goes on only while its steps shrink, as they do towards a
+        multiple root, and they are made longer (`multiplicity`).
         """
         real, vector, count = self._backend.Float, self._backend.Array3f, self._backend.UInt32
         zero = dr.opaque(real, 0.0)  # keeps constant components of a gradient in the loop
@@ -581,24 +582,27 @@ class CellClassifier:
     def _nearest_ray_hit(self, p: Vec3, radius: Real) -> Vec3:
         """Return, for functions that jump, the point nearest to p among the first hits of four rays
         through the ball around p, along the diagonals of the cell; `FAR_SENTINEL` without a hit.
+
+        radius: the radius of the ball.
         """
         real, vector, count = self._backend.Float, self._backend.Array3f, self._backend.UInt32
 
         def body(point: Vec3, best: Real, k: Any) -> tuple[Any, ...]:
             """Trace ray k, and keep its hit if that is nearer to p. best: the squared distance of
-            `point`.
-            """
+            `point`."""
+            # The direction of ray k.
             d = vector(*_DIAGONALS[0]) / 3**0.5
             for number, diagonal in enumerate(_DIAGONALS[1:], 1):
                 d = dr.select(k == number, vector(*diagonal) / 3**0.5, d)
+            # It begins at the surface of the ball and ends at its other side.
             o = dr.fma(vector(-radius), d, p)
             ray_hit = self._prepared.first_hit(o, d, real(0), 2 * radius, self._backend.Bool(True))
             is_hit = ray_hit.status == int(RayStatus.HIT)
             y = dr.fma(vector(ray_hit.t), d, o)
             square = dr.squared_norm(y - p)
-            nearer = is_hit & (square < best)
-            nearer &= is_on_surface(self._prepared, y, ray_hit, nearer)
-            return dr.select(nearer, y, point), dr.select(nearer, square, best), k + 1
+            is_nearer = is_hit & (square < best)
+            is_nearer &= is_on_surface(self._prepared, y, ray_hit, is_nearer)
+            return dr.select(is_nearer, y, point), dr.select(is_nearer, square, best), k + 1
 
         def is_active(point: Vec3, best: Real, k: Any) -> Mask:
             del point, best
@@ -610,6 +614,5 @@ class CellClassifier:
 
 def _domain(surface: TracedSurface) -> Any:
     """Return the volume in which the surface lies: the intersection of the field's domain and the
-    clip volume, as far as there are any.
-    """
+    clip volume, as far as there are any."""
     return surface.field.domain if surface.clip_volume is None else surface.volume

@@ -74,8 +74,7 @@ class DescentMethods(Protocol):
     """Interface of the iterations (descents) that lead from a point near a surface to the surface
     point closest to a query x. Each method returns points of the surface (n, 3), NaN where it finds
     none; and for each of these the radius of a ball about it that is proved to hold no surface
-    point nearer to x.
-    """
+    point nearer to x."""
 
     def newton_in_kernel(self, x: Vec3, start: Vec3, limit: Real) -> tuple[Vec3, Real, Mask]:
         """Iterate as part of another kernel, from points `start` near the surface, for the queries
@@ -155,8 +154,7 @@ class _Cube:
     @classmethod
     def around(cls, lower: FloatArray, upper: FloatArray) -> _Cube:
         """Return the smallest cube around the box with corners `lower` and `upper`, slightly
-        enlarged.
-        """
+        enlarged."""
         half = 0.5 * float((upper - lower).max()) * (1 + 1e-6)
         half += 1e-12 * float(np.abs([lower, upper]).max())
         return cls(0.5 * (lower + upper), max(half, 1e-30))
@@ -209,8 +207,7 @@ def search(
 
 def _bounding_box(surface: TracedSurface) -> tuple[FloatArray, FloatArray] | None:
     """Return the corners (lower, upper) of a box that contains the surface; None if no finite one
-    is known.
-    """
+    is known."""
     volume = surface.volume
     if volume is None:
         return None
@@ -243,6 +240,7 @@ def _search_in_batches(
     min_cells = min(max(_MIN_CELLS, int(cells_per_point * len(points))), _MAX_CELLS, max_cells)
     if surface.field.has_jumps:
         min_cells = _MIN_JUMP_CELLS
+    # The cells depend on the surface and the number of queries alone, so all batches share them.
     coarse, cells = _split(classifier, root, min_cells, progress)
     backend, trees = choose_backend("double"), None
     if len(cells):
@@ -250,6 +248,7 @@ def _search_in_batches(
     results: list[SearchResult] = []
     for start in range(0, max(len(points), 1), _BATCH_SIZE):
         rows = slice(start, start + _BATCH_SIZE)
+        # Without proofs cells are not subdivided further.
         limit = max_cells if tolerance.prove else 0
         cell_search = _CellSearch(
             classifier,
@@ -269,8 +268,7 @@ def _search_in_batches(
 
 def _max_cells(surface: TracedSurface, count: int, is_proved: bool) -> int:
     """Return the largest number of cells into which space is divided for a search of `count`
-    queries. is_proved: whether lower bounds are to be made as large as possible.
-    """
+    queries. is_proved: whether lower bounds are to be made as large as possible."""
     if surface.field.has_jumps:
         return _MAX_JUMP_CELLS
     limit = min(max(_MAX_CELLS, count // 2), _MAX_PROOF_CELLS) if is_proved else _MAX_CELLS
@@ -298,6 +296,7 @@ def _split(
             break
         if len(coarse) < _MIN_COARSE_CELLS:
             coarse = cells
+        # The larger half is split; a flat single piece of surface counts as small.
         sizes = np.where(cells.is_single_piece, 0.25 * cells.thickness, cells.half)
         is_split = sizes >= np.median(sizes)
         children = _subdivide(classifier, cells, is_split)
@@ -310,8 +309,7 @@ def _subdivide(
     classifier: CellClassifier, cells: SurfaceCells, is_split: BoolArray
 ) -> SurfaceCells:
     """Return the children of the cells selected by the mask `is_split` (n,), without those that are
-    proved empty. Each cell has eight children of half its size.
-    """
+    proved empty. Each cell has eight children of half its size."""
     half = 0.5 * cells.half[is_split]
     center = cells.center[is_split, None] + half[:, None, None] * _CORNERS
     return classifier.nonempty_cells(center.reshape(-1, 3), np.repeat(half, 8))
@@ -345,6 +343,9 @@ class _CellSearch:
         tolerance: float,
         max_cells: int,
     ) -> None:
+        """Store the search's inputs. points: (n, 3) the queries. descents: the iterations that lead
+        from a point near the surface to a closest point. The other parameters are attributes of the
+        class."""
         self.trees = trees
         self.classifier, self.cells, self.points, self.descents = (
             classifier,
@@ -389,6 +390,7 @@ class _CellSearch:
         """
         # A mark for each cell that may hold a nearer point, if cells are to be split.
         marks = dr.zeros(self.backend.Bool, len(self.cells)) if self.max_cells else None
+        # Functions that jump have no descents in a kernel; expensive ones start in a fine cell.
         if has_jumps or self._is_expensive:
             tried_starts, ids = self._descend_from_best_start(tree), np.arange(len(self.points))
             if not has_jumps:
@@ -401,6 +403,7 @@ class _CellSearch:
             if marks is None:
                 break
             ids = np.flatnonzero(self._is_unproved())
+            # Split the marked cells, unless no query needs it or there would be too many cells.
             is_split = to_numpy(marks)
             count = int(is_split.sum())
             if not count or not len(ids) or len(self.cells) + 4 * count > self.max_cells:
@@ -433,16 +436,17 @@ class _CellSearch:
         def compute(x: Vec3, guess_point: Vec3) -> tuple[Real | Vec3, ...]:
             """Return for a query x: the best point and the radius of its ball without nearer
             points, the lower bound, the surface point where the descent began, the candidates for
-            the next round, and 1 where Newton's method did not converge.
-            """
+            the next round, and 1 where Newton's method did not converge."""
             real, missing = backend.Float, backend.Array3f(FAR_SENTINEL)
             limit = safe_norm(guess_point - x)
             limit = dr.select(dr.isfinite(limit), limit, FAR_SENTINEL)
             start = coarse.best_start(x, limit)
             y, free, unresolved = self.descents.newton_in_kernel(x, start, limit)
             has_start, end_distance = start.x < 0.5 * FAR_SENTINEL, safe_norm(y - x)
+            # Lanes without a start have nothing to resolve.
             unresolved &= has_start
             is_nearer = has_start & ~unresolved & (end_distance < limit)
+            # The nearer of the end of the descent and the initial guess, or none.
             point = dr.select(
                 is_nearer, y, dr.select(limit < 0.5 * FAR_SENTINEL, guess_point, missing)
             )
@@ -476,8 +480,7 @@ class _CellSearch:
     @staticmethod
     def _rounded(lower: FloatArray, points: FloatArray) -> FloatArray:
         """Return lower bounds (n,) of the distances of `points` (n, 3) that hold in spite of
-        rounding: `lower` (n,) less a bound of its rounding error.
-        """
+        rounding: `lower` (n,) less a bound of its rounding error."""
         return lower * (1 - 1e-12) - 1e-15 * np.abs(points).max(axis=1)
 
     @property
@@ -489,27 +492,23 @@ class _CellSearch:
 
     def _is_unproved(self) -> BoolArray:
         """Return the mask (n,) of queries for which a point may exist that is nearer than the best
-        one by more than the tolerance.
-        """
+        one by more than the tolerance."""
         return self.lower < self._distance(slice(None)) - self.tolerance
 
     def _distance(self, rows: IntArray | slice) -> FloatArray:
         """Return the distances (k,) of the queries `rows` from their best points so far;
-        `FAR_SENTINEL` where there is none.
-        """
+        `FAR_SENTINEL` where there is none."""
         distances = np.linalg.norm(self.points[rows] - self.closest[rows], axis=1)
         return np.where(np.isnan(distances), FAR_SENTINEL, distances)
 
     def _is_boundary(self, rows: IntArray | slice) -> BoolArray:
         """Return the mask (k,) of those of the queries `rows` whose best point is still the initial
-        guess and lies on the curve at which the surface ends.
-        """
+        guess and lies on the curve at which the surface ends."""
         return self.guess.on_boundary & (self.closest[rows] == self.guess.closest[rows]).all(axis=1)
 
     def _descend_from_best_start(self, tree: CellTree) -> FloatArray:
         """Descend for each query from the surface point of the cell with the smallest estimated
-        distance. Returns these surface points (n, 3), `FAR_SENTINEL` for none.
-        """
+        distance. Returns these surface points (n, 3), `FAR_SENTINEL` for none."""
         limit = upload_floats(self.backend, self._distance(slice(None)))
         start = to_numpy(tree.best_start(upload_vectors(self.backend, self.points), limit))
         rows = np.flatnonzero(start[:, 0] < 0.5 * FAR_SENTINEL)
@@ -537,6 +536,7 @@ class _CellSearch:
             if self._is_expensive:
                 starts = starts[:1]
             improved_ids = self._descend_from_candidates(rows, starts)
+            # Queries without a further chance are left out of the next round.
             active = np.isin(rows, improved_ids)
             if self._is_expensive or self.classifier.surface.field.has_jumps:
                 active |= starts[0][:, 0] < 0.5 * FAR_SENTINEL
@@ -548,8 +548,7 @@ class _CellSearch:
     def _descend_from_candidates(self, rows: IntArray, starts: Sequence[FloatArray]) -> IntArray:
         """Descend for each of the queries `rows` (k,) from its surface point in each of the arrays
         `starts`, (k, 3), with `FAR_SENTINEL` for none. Returns the queries of `rows` whose distance
-        became smaller.
-        """
+        became smaller."""
         old_distance = self._distance(rows)
         start_index, selected = np.nonzero([start[:, 0] < 0.5 * FAR_SENTINEL for start in starts])
         self._descend(rows[selected], np.stack(starts)[start_index, selected])
@@ -585,8 +584,7 @@ class _CellSearch:
 
     def _leave_boundary(self) -> IntArray:
         """Descend along the surface for each query whose best point lies on the curve at which the
-        surface ends. Returns the indices of the queries whose distance became smaller.
-        """
+        surface ends. Returns the indices of the queries whose distance became smaller."""
         ids = np.flatnonzero(self._is_boundary(slice(None)))
         distance = self._distance(ids)
         ids, distance = ids[distance > 0], distance[distance > 0]
@@ -599,8 +597,7 @@ class _CellSearch:
 
     def _descend(self, ids: IntArray, start: FloatArray) -> None:
         """Descend for the queries `ids` (k,) from `start` (k, 3): surface points, or the queries
-        themselves. Surface points in `start` become best points at once if they are nearer.
-        """
+        themselves. Surface points in `start` become best points at once if they are nearer."""
         if not len(ids):
             return
         x = self.points[ids]

@@ -127,8 +127,7 @@ class BestCandidate:
 class CellTree:
     """A bounding-volume tree over at least one cell (a cube that may hold a surface), stored on a
     backend. Each cell has a record: its box, a slab that contains the surface in it, and a known
-    point of the surface.
-    """
+    point of the surface."""
 
     tree: PackedTree
 
@@ -184,8 +183,7 @@ class CellTree:
         """Return the surface point at which a search for the point closest to x should start. It is
         the known surface point of the cell in which the surface has the smallest estimated distance
         from x (`_CellRecord.estimate`). It is `FAR_SENTINEL` if no estimate is below `limit`, a
-        length.
-        """
+        length."""
         vector = self.tree.backend.Array3f
 
         def visit_cell(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
@@ -231,6 +229,7 @@ class CellTree:
             """
             lower, *listed = state
             cell = _CellRecord.of(vector, row)
+            # Cells in the ball about the best point hold no nearer point.
             is_relevant = active & ~cell.is_within(best.point, best.exclusion_radius)
             cell_bound = cell.lower_bound(x)
             is_open_cell = is_relevant & (cell_bound < best.distance - tolerance)
@@ -239,6 +238,8 @@ class CellTree:
                 dr.scatter(marks, backend.Bool(True), cell_index, is_open_cell & cell.is_cell)
             lower = dr.select(is_relevant & cell.is_cell, fmin(lower, cell_bound), lower)
             estimate = cell.estimate(x)
+            # The point is worth a descent if the estimate, less its slack, is below the best
+            # distance.
             is_listed = is_open_cell & (estimate < best.distance + cell.estimate_slack)
             is_listed &= cell.is_separated(best.point, best.separation_factor)
             for other in points:
@@ -270,12 +271,14 @@ class CellTree:
 
         def may_contain(low: Vec3, high: Vec3) -> Mask:
             """Return whether a box, with the corners `low` and `high`, extends outside of the ball
-            about the best point that is proved to hold no nearer point.
-            """
+            about the best point that is proved to hold no nearer point."""
             y = best.point
+            # The corner of the box that is farthest from the best point.
             corner = vector(*(fmax(high[k] - y[k], y[k] - low[k]) for k in range(3)))
             return dr.squared_norm(corner) >= best.exclusion_radius * best.exclusion_radius
 
+        # Boxes farther away than the best point are skipped; the list begins with infinite
+        # estimates.
         limit = backend.Float(best.distance)
         empty_list = (
             entry
@@ -284,6 +287,7 @@ class CellTree:
         )
         start = limit, *empty_list
         lower, *listed = self._walk(x, visit_cell, start, lambda state: limit * limit, may_contain)
+        # The points only, without their estimates.
         return lower, listed[1::2]
 
     def _walk(
@@ -305,8 +309,7 @@ class CellTree:
 
         def visit(node: VisitedNode, state: LoopValues) -> tuple[Mask, LoopValues]:
             """Return whether a node's box is to be visited, and the state after its cells, if it is
-            a leaf.
-            """
+            a leaf."""
             low, high = vector(*node.head[:3]), vector(*node.head[3:6])
             offset = dr.select(x < low, low - x, dr.select(x > high, x - high, 0))
             is_near = (dr.squared_norm(offset) < limit(state)) & may_contain(low, high)
@@ -343,8 +346,7 @@ class _CellRecord:
     @classmethod
     def of(cls, vector: Any, row: list[Real]) -> _CellRecord:
         """Make the record that is stored in a row of 16 numbers, in the order in which
-        `CellTree.of` writes them. vector: the type of 3-vectors.
-        """
+        `CellTree.of` writes them. vector: the type of 3-vectors."""
         return cls(
             vector(*row[:3]), row[3], vector(*row[4:7]), row[7], vector(*row[8:11]), *row[11:16]
         )
@@ -356,8 +358,7 @@ class _CellRecord:
 
     def lower_bound(self, x: Vec3) -> Real:
         """Return a lower bound of the distance from x to the surface in the cell: the larger of the
-        distances from the cell's box and from its slab within the ball around the cell.
-        """
+        distances from the cell's box and from its slab within the ball around the cell."""
         vector = cast("Any", type(x))
         offset = x - self.center
         box_distance = dr.norm(vector(*(fmax(dr.abs(offset[k]) - self.half, 0) for k in range(3))))
@@ -386,8 +387,7 @@ class _CellRecord:
 
     def is_separated(self, y: Vec3, times: Real) -> Mask:
         """Return the mask of lanes on which the surface point is at least `times` * `separation`
-        away from y.
-        """
+        away from y."""
         return dr.squared_norm(self.surface_point - y) >= dr.square(times * self.separation)
 
     def is_within(self, y: Vec3, radius: Real) -> Mask:

@@ -77,8 +77,7 @@ class _DescentState:
         """Return this state, with changes in the lanes `is_flat`, in which both f - level and the
         gradient are 0, so that the gradient has no direction. There it gets the gradient of the
         previous state, and an uncertainty of the level that consists of the rounding of coordinates
-        only.
-        """
+        only."""
         epsilon = float(dr.epsilon(type(self.level_uncertainty)))
         rounding = 4 * epsilon * lengths.max_norm(self.y)
         gradient = dr.select(is_flat, previous.gradient, self.gradient)
@@ -91,8 +90,7 @@ class _DescentState:
 
     def where(self, mask: Mask, other: _DescentState) -> tuple[Any, ...]:
         """Return the attributes of this state in the lanes of the mask, and of the other state in
-        all other lanes, as a tuple in the order of the constructor.
-        """
+        all other lanes, as a tuple in the order of the constructor."""
         pairs = zip(self.parts(), other.parts(), strict=True)
         return tuple(dr.select(mask, first, second) for first, second in pairs)
 
@@ -152,6 +150,7 @@ class ClosestPointDescent:
             """
             # The rounding error of f takes as long as f itself, and does not matter here.
             sample = dataclasses.replace(self.field.evaluate(y), value_error=0.0)
+            # The step to the level and the step along the surface, both from y.
             residual, state = self._state_at(y, sample)
             move, _ = self._tangential_step(x, state, real(1))
             step = -residual / lengths.safe_norm(state.gradient)
@@ -160,12 +159,13 @@ class ClosestPointDescent:
             length, distance = dr.norm(move), dr.norm(x - y)
             max_length = 0.5 * state.smooth_radius
             is_lost = dr.select(active, length > max_length, is_lost)
-            shrinks = (k > 0) & (length < 0.5 * last)
-            is_far = dr.select(active, shrinks & (distance - 2 * length > limit), is_far)
+            is_shrinking = (k > 0) & (length < 0.5 * last)
+            # If steps halve, the end is within two steps of y.
+            is_far = dr.select(active, is_shrinking & (distance - 2 * length > limit), is_far)
             # The expected length of the next step.
             next_length = length * dr.square(length / last)
             is_last = (
-                shrinks
+                is_shrinking
                 & ~is_lost
                 & (next_length <= dr.fma(_NEWTON_TOLERANCE, distance, state.level_uncertainty))
             )
@@ -202,12 +202,16 @@ class ClosestPointDescent:
         _, is_minimum = self._tangential_step(x, state, self.backend.Float(1), rows)
         gradient_norm = lengths.safe_norm(state.gradient)
         step = -residual / gradient_norm
+        # Rounding is no part of the remainder: the step cannot reduce it.
         exact = dataclasses.replace(sample, value_error=0.0, gradient_error=0.0)
-        arrives = taylor_remainder(exact, dr.abs(step)) <= gradient_norm * state.level_uncertainty
+        # The step ends on the level up to its uncertainty.
+        is_arriving = (
+            taylor_remainder(exact, dr.abs(step)) <= gradient_norm * state.level_uncertainty
+        )
         end, is_short = self._step_to_level(x, residual, state)
-        arrives &= is_short
+        is_arriving &= is_short
         is_found = is_minimum & (
-            self._is_on_level(residual, state) | (self._is_level_resolved(state) & arrives)
+            self._is_on_level(residual, state) | (self._is_level_resolved(state) & is_arriving)
         )
         radius = exclusion_radius(exact, rows, x, y)
         return end, is_found, dr.select(is_found, radius, 0)
@@ -249,10 +253,12 @@ class ClosestPointDescent:
             active: whether the descent goes on.
             """
             current, is_first = _DescentState(y, g, uncertainty, radius), iteration == 0
+            # In iteration 0 the start is first brought to the level, without a move along it.
             move, is_minimum = self._tangential_step(x, current, factor)
             is_minimum &= ~is_first
             goes_on = active & ~is_minimum
             trial, is_arrived = self._to_level(dr.select(is_first, y, y + move), goes_on)
+            # No farther from x than before, up to rounding.
             limit = dr.norm(x - y) * (1 + 8 * self.backend.machine_epsilon) + 4 * uncertainty
             is_better = goes_on & is_arrived & (dr.norm(x - trial.y) <= limit)
             new_factor = dr.select(is_better, fmin(4 * factor, 1), 0.25 * factor)
@@ -287,22 +293,19 @@ class ClosestPointDescent:
 
     def newton_to_level(self, start: Vec3) -> Vec3:
         """Return the point of a level to which Newton's method along the gradient converges from
-        `start`; NaN where it does not.
-        """
+        `start`; NaN where it does not."""
         end, is_found = self._to_level(start, self.backend.Bool(True))
         return dr.select(is_found, end.y, dr.nan)
 
     def noise(self, y: Vec3) -> Real:
         """Return a bound of the length by which rounding and approximation may have moved the level
-        set at a point y of it.
-        """
+        set at a point y of it."""
         return self._evaluate(y)[1].level_uncertainty
 
     def last_step(self, x: Vec3, y: Vec3) -> Vec3:
         """Make the last step of a search for the point closest to x: move y onto the level along
         the gradient. Returns the end of the step; NaN if the step is too long for the result to be
-        a closest point up to rounding.
-        """
+        a closest point up to rounding."""
         residual, state = self._evaluate(y)
         end, is_short = self._step_to_level(x, residual, state)
         return dr.select(is_short & self._is_level_resolved(state), end, dr.nan)
@@ -336,6 +339,7 @@ class ClosestPointDescent:
         scale = lengths.max_norm(y)
         epsilon, gradient_norm = self.backend.machine_epsilon, lengths.safe_norm(sample.gradient)
         total_error = dr.fma(8 * epsilon, dr.abs(sample.value), sample.value_error)
+        # Rounding of coordinates, and of f divided by its slope.
         uncertainty = dr.fma(4 * epsilon, scale, total_error / gradient_norm)
         smooth_radius = real(0)
         for promise in sample.all_promises:
@@ -345,6 +349,7 @@ class ClosestPointDescent:
             smooth_radius = fmax(
                 smooth_radius, dr.select(dr.isfinite(promised_radius), promised_radius, 0)
             )
+        # No promise of smoothness: steps have no limit.
         smooth_radius = dr.select(smooth_radius > 0, smooth_radius, dr.inf)
         residual = real(-self.levels.offset_to_nearest(sample.value))
         return residual, _DescentState(
@@ -367,8 +372,7 @@ class ClosestPointDescent:
     def _is_level_resolved(state: _DescentState) -> Mask:
         """Return whether the position of the level set near the point of a state is known in spite
         of rounding: its uncertainty is at most a sixteenth of the coordinates or of the ball on
-        which f is smooth.
-        """
+        which f is smooth."""
         size = lengths.max_norm(state.y)
         return state.level_uncertainty <= _MAX_RELATIVE_UNCERTAINTY * fmax(
             size, state.smooth_radius
@@ -409,16 +413,18 @@ class ClosestPointDescent:
                 lengths.safe_norm(g),
                 iteration == 0,
             )
+            # Iteration 0 evaluates the start; later ones try a step from y.
             step = -residual / gradient_norm
-            boost = dr.select(iteration > _SIMPLE_ROOT_STEPS, multiplicity(step, last), 1)
-            length = factor * clamp(boost * step, -radius, radius)
+            step_factor = dr.select(iteration > _SIMPLE_ROOT_STEPS, multiplicity(step, last), 1)
+            length = factor * clamp(step_factor * step, -radius, radius)
             point = dr.fma(vector(length / gradient_norm), g, y)
             new_residual, trial = self._evaluate(dr.select(is_first, y, point))
             is_flat = ~is_first & (new_residual == 0) & (lengths.safe_norm(trial.gradient) == 0)
             trial = trial.flat_after(is_flat, current)
             is_better = active & (is_first | (dr.abs(new_residual) < dr.abs(residual)))
-            boost = dr.select(is_better, fmin(2 * factor, 1), 0.25 * factor)
-            factor = dr.select(is_first, factor, boost)
+            # The fraction for the next step.
+            step_factor = dr.select(is_better, fmin(2 * factor, 1), 0.25 * factor)
+            factor = dr.select(is_first, factor, step_factor)
             on_level |= is_better & self._is_on_level(new_residual, trial)
             active &= ~on_level & (iteration <= _MAX_LEVEL_STEPS) & (factor > _MIN_STEP_FRACTION)
             residual = dr.select(is_better, new_residual, residual)
@@ -468,17 +474,21 @@ class ClosestPointDescent:
         eigen = SymmetricEigen2.of(
             dr.fma(height_ratio, uu, 1), dr.fma(height_ratio, vv, 1), height_ratio * uv
         )  # of B
+        # The tangential part of x - y. If it is 0 up to rounding, x - y is normal to the surface.
         tu, tv = dr.dot(to_x, plane.u), dr.dot(to_x, plane.v)
         tangential = dr.sqrt(dr.fma(tu, tu, tv * tv))
         is_normal = tangential <= dr.fma(
             4 * self.backend.machine_epsilon**0.5, distance, 8 * state.level_uncertainty
         )
         is_saddle = is_normal & (eigen.smallest < _INDEFINITE)
+        # Newton's step in the basis of eigenvectors; at a saddle along that of the smaller
+        # eigenvalue.
         along_largest, along_smallest = eigen.coordinates(tu, tv)
         along_largest = along_largest / fmax(dr.abs(eigen.largest), _MIN_EIGENVALUE)
         along_smallest = along_smallest / fmax(dr.abs(eigen.smallest), _MIN_EIGENVALUE)
         along_smallest = dr.select(is_saddle, 0.5 * distance, along_smallest)
         length = dr.sqrt(dr.fma(along_largest, along_largest, along_smallest * along_smallest))
+        # No longer than the ball on which f is smooth and the distance from x allow.
         max_length = factor * dr.select(is_saddle, length, fmin(state.smooth_radius, distance))
         scale = dr.select(length > 0, fmin(max_length / length, 1), 0)
         # The step w = a u + b v along the surface.

@@ -152,6 +152,7 @@ def _find_sorted(
         guess = evaluator.with_jump_points(x, guess)
     tolerance = StoppingRule(_TOLERANCE * _size(surface, x), is_proved)
     batch_field = surface.field.for_ray_count(_SAMPLES_PER_POINT * len(x))
+    # Off the facets of a mesh without a clip, f differs from a smooth function by constants.
     smooth = batch_field.without_jumps() if surface.clip_volume is None else None
     if smooth is None:
         result = search(surface, x, InitialGuess(guess, estimate), evaluator, tolerance, progress)
@@ -174,6 +175,7 @@ def _find_sorted(
     is_refused = distance < lower - allowed_error
     closest = np.where(is_refused[:, None], np.nan, result.closest)
     distance = np.where(is_refused, np.nan, distance)
+    # The cells may prove more than f at the query alone.
     lower = np.fmin(np.maximum(lower, result.lower_bounds), distance)
     return ClosestPoints(x, closest, distance, residual, lower, is_refused)
 
@@ -221,12 +223,14 @@ def _search_smooth_part(
     )
     lower = np.maximum(np.minimum(result.lower_bounds, jump_gap - rounding), 0)
     distance, closest = _length(points - known.closest), known.closest.copy()
+    # Only these can improve the result: points nearer than the known ones on jump surfaces.
     nearer_rows = np.flatnonzero(
         _length(points - result.closest) < np.nan_to_num(distance, nan=np.inf) - rounding
     )
     candidates = smooth_evaluator.remove_truncation(
         points[nearer_rows], result.closest[nearer_rows]
     )
+    # f itself must have the level there, not only `smooth`.
     values = np.asarray(surface.field.value(candidates, precision="double"))
     is_level = np.abs(values[:, None] - surface.level_values).min(axis=1) < _LEVEL_MATCH
     closest[nearer_rows[is_level]] = candidates[is_level]
@@ -236,6 +240,7 @@ def _search_smooth_part(
     unsettled_rows = np.flatnonzero(~is_settled)
     if len(unsettled_rows):
         guess = InitialGuess(closest[unsettled_rows], known.estimate[unsettled_rows])
+        # Search again with f itself, by rays.
         retry = search(surface, points[unsettled_rows], guess, evaluator, tolerance, progress)
         closest[unsettled_rows], lower[unsettled_rows] = (
             retry.closest,
@@ -324,6 +329,8 @@ class _QueryEvaluator:
     levels: Levels
 
     def __post_init__(self) -> None:
+        """Make the attributes with an underscore; `object.__setattr__`, as the dataclass is
+        frozen."""
         backend, field = self.backend, self.surface.evaluator(self.backend)
         assign = object.__setattr__
         assign(self, "_field", field)
@@ -363,10 +370,9 @@ class _QueryEvaluator:
         """
 
         def compute(p: Vec3) -> tuple[Real | Vec3, ...]:
-            """Return for the query p: p as rounded; a point of the surface known near it, or NaN; f
-            - level; a proved lower bound of the distance from the level set; and the first-order
-            estimate of that distance.
-            """
+            """Return five results for the query p: p as rounded; a point of the surface known near
+            it, or NaN; f - level; a proved lower bound of the distance from the level set; and the
+            first-order estimate of that distance."""
             sample = self._field.evaluate(p)
             residual = -self.levels.offset_to_nearest(sample.value)
             boundary = self._field.closest_boundary_point(p)
@@ -388,6 +394,7 @@ class _QueryEvaluator:
         x, surface_point, residual, lower, estimate = in_batches(self.backend, compute, points)
         domain = self.surface.field.domain
         if domain is not None and len(x):
+            # Nothing is promised outside the domain.
             lower[~domain.contains_points(x)] = 0
         return x, self._inside_domain_or_nan(surface_point), residual, lower, estimate
 
@@ -408,8 +415,7 @@ class _QueryEvaluator:
     def _nearest_face_points(self, points: FloatArray) -> FloatArray:
         """Return the nearest points (n, 3) of the triangles across which f jumps. A point is kept
         only if a level lies between the values of f right beside it, on both sides of the triangle;
-        else it is NaN.
-        """
+        else it is NaN."""
         mesh, surface = self.surface.field.jump_mesh(), self._tracer
         closest = np.full_like(points, np.nan)
         if mesh is None or not len(points):
@@ -440,8 +446,7 @@ class _QueryEvaluator:
 
     def distance_to_jumps(self, points: FloatArray) -> FloatArray:
         """Return the distances (n,) of points (n, 3) from the facets across which f jumps, whether
-        these are part of the surface or not.
-        """
+        these are part of the surface or not."""
         surface = self._tracer
 
         def compute(p: Vec3) -> tuple[Real]:
@@ -452,8 +457,7 @@ class _QueryEvaluator:
     def _search_facets(self, points: FloatArray, guess: FloatArray) -> FloatArray:
         """Return the closest points (n, 3) that `JumpSurfaceSearch` finds on facets, nearer than
         `guess` (n, 3); `guess` where it finds none. It examines at most `_MAX_JUMPS_EXAMINED`
-        facets for each query.
-        """
+        facets for each query."""
         coordinates = np.concatenate([points, np.nan_to_num(guess)])
         search = JumpSurfaceSearch(
             self._tracer, max(float(np.abs(coordinates).max(initial=0)), 1e-30), _MAX_JUMPS_EXAMINED
@@ -468,8 +472,7 @@ class _QueryEvaluator:
 
     def _inside_domain_or_nan(self, points: FloatArray) -> FloatArray:
         """Return the points (n, 3), with NaN for those outside the field's domain, which cuts the
-        surface.
-        """
+        surface."""
         domain = self.surface.field.domain
         if domain is None or not len(points):
             return points
@@ -490,10 +493,10 @@ class _QueryEvaluator:
 
         Returns:
             The closest points (n, 3), NaN where none is found or it is farther than the limit. One
-                that lies outside the field's domain is replaced by the closest point of the clip
-                curve, in which the boundary of the domain cuts the surface. And radii (n,): in the
-                ball of this radius about the closest point, no point of the surface is nearer to
-                the query; 0 if that is not proved.
+            that lies outside the field's domain is replaced by the closest point of the clip curve,
+            in which the boundary of the domain cuts the surface. And radii (n,): in the ball of
+            this radius about the closest point, no point of the surface is nearer to the query; 0
+            if that is not proved.
         """
         if self.surface.field.has_jumps:
 
@@ -516,6 +519,7 @@ class _QueryEvaluator:
         closest, y, free, is_unfinished, is_far = in_batches(
             self.backend, self._newton_with_float_masks, points, start, limits
         )
+        # Newton's method did not converge there: the slower descent goes on from its last point.
         rows = np.flatnonzero(is_unfinished)
         if len(rows):
             closest[rows], free[rows] = in_batches(
@@ -550,8 +554,7 @@ class _QueryEvaluator:
 
         def arc_to_level(p: Vec3, b: Vec3, lengths: Vec3) -> tuple[Real]:
             """Return the first-order distance of the level from the point that lies at the distance
-            lengths.x from b in the direction of p.
-            """
+            lengths.x from b in the direction of p."""
             to_query = p - b
             sample = self._field.evaluate(b + lengths.x / safe_norm(to_query) * to_query)
             return (
@@ -561,8 +564,7 @@ class _QueryEvaluator:
         def near_edge(p: Vec3, b: Vec3, lengths: Vec3) -> tuple[Vec3]:
             """Return the surface point to which Newton's method leads from the point that lies at
             the distance lengths.x from b in the direction of p; NaN if the surface point is on the
-            side of b away from p.
-            """
+            side of b away from p."""
             to_query = p - b
             y = self._descent.newton_to_level(b + lengths.x / safe_norm(to_query) * to_query)
             is_on_query_side = dr.dot(to_query, y - b) > -_MAX_OPPOSING_COSINE * safe_norm(
@@ -641,8 +643,7 @@ class _QueryEvaluator:
     def _descend(self, p: Vec3, start: Vec3) -> tuple[Vec3, Real]:
         """Descend from `start` to a surface point closest to p. Returns this point, NaN if the
         descent does not end on the level; and the radius of a ball about it in which no surface
-        point is nearer to p, 0 if the descent does not converge.
-        """
+        point is nearer to p, 0 if the descent does not converge."""
         y, is_converged, on_level = self._descent.descend(p, start)
         return dr.select(on_level, y, dr.nan), dr.select(
             is_converged, self._descent.finish(p, y)[2], 0
@@ -669,9 +670,12 @@ class _QueryEvaluator:
 
         closest = closest.copy()
         corrected = self._corrected(exact, points[rows], closest[rows])
-        failed = np.flatnonzero(np.isnan(corrected[:, 0]))
-        if len(failed):
-            (corrected[failed],) = in_batches(self.backend, to_level, closest[rows[failed]])
+        failed_rows = np.flatnonzero(np.isnan(corrected[:, 0]))
+        if len(failed_rows):
+            (corrected[failed_rows],) = in_batches(
+                self.backend, to_level, closest[rows[failed_rows]]
+            )
+        # Points that the correction moved out of the domain keep their place.
         is_inside = ~np.isnan(self._inside_domain_or_nan(corrected)[:, 0])
         closest[rows[is_inside]] = corrected[is_inside]
         return closest
@@ -695,8 +699,7 @@ class _QueryEvaluator:
 
         def truncation(y: Vec3) -> tuple[Vec3, Vec3]:
             """Return the truncation errors at y: of the value (as a vector of equal components),
-            and of the gradient.
-            """
+            and of the gradient."""
             full, sample = exact.field.evaluate(y), approximate.field.evaluate(y)
             vector = self.backend.Array3f
             return vector(full.value - sample.value), vector(full.gradient) - vector(
@@ -725,6 +728,7 @@ class _QueryEvaluator:
                     *in_batches(self.backend, truncation, closest[rows]),
                 )
                 (closest[rows],) = in_batches(self.backend, newton, *newton_arguments)
+                # Points that were not found are left out of the next correction.
                 rows = rows[~np.isnan(closest[rows, 0])]
         if len(rows):
             (closest[rows],) = in_batches(self.backend, on_level, points[rows], closest[rows])
@@ -732,8 +736,7 @@ class _QueryEvaluator:
 
     def level_uncertainty(self, points: FloatArray) -> FloatArray:
         """Return bounds (n,), lengths, of how far rounding and approximation may have moved the
-        level set at points (n, 3) that lie on it.
-        """
+        level set at points (n, 3) that lie on it."""
         if not len(points):
             return np.zeros(0)
 
@@ -757,8 +760,7 @@ class _LinearlyShiftedField(Field):
 
     def evaluate(self, p: Vec3) -> Sample:
         """Return the sample of the sum at p. The value error of the field includes its truncation
-        error, which is subtracted here.
-        """
+        error, which is subtracted here."""
         sample = self._field.evaluate(p)
         shifted = sample.shifted(dr.dot(self._slope, p - self._anchor) + self._offset)
         return replace(
@@ -782,8 +784,7 @@ def _length(vectors: FloatArray) -> FloatArray:
 def _size(surface: TracedSurface, points: FloatArray) -> float:
     """Return the size of a surface, a length: the diagonal of the box that is known to contain it.
     If there is no finite one, it is the largest extent of the query points (n, 3) along an axis, at
-    least 1.
-    """
+    least 1."""
     if surface.volume is not None:
         lower, upper = surface.volume.bounds()
         if np.isfinite([lower, upper]).all():

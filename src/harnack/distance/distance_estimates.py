@@ -116,6 +116,7 @@ def signed_distance(
     if method == "lower_bound":
         _check_domain(field, x)
     if field.has_jumps and method != "lower_bound":
+        # These methods do not see facets: the nearest one of the surface is searched for.
         jump_distance = find_closest(backend, traced, levels, x, teller(None)).distance
         result = np.copysign(np.fmin(jump_distance, np.abs(result)), result)
     return _outwards(field) * result
@@ -123,8 +124,7 @@ def signed_distance(
 
 def _outwards(field: Field) -> float:
     """Return the factor, 1 or -1, that makes a distance with the sign of f - level negative inside.
-    It is -1 for fields that are larger inside.
-    """
+    It is -1 for fields that are larger inside."""
     return -1.0 if field.is_larger_inside else 1.0
 
 
@@ -139,7 +139,7 @@ def closest_points(
     options: TraceOptions | None = None,
     **keywords: Unpack[TraceKeywords],
 ) -> FloatArray:
-    """The closest points (n, 3) of a level set to `points` (n, 3), found by a search.
+    """Find the closest points (n, 3) of a level set of a field's function to `points` (n, 3).
 
     For the winding number of a closed mesh, and for its solid, they are exact: the level set
     consists of triangles, which are cut where they intersect, and the nearest one is found. For
@@ -183,7 +183,8 @@ def distance_bounds(
     options: TraceOptions | None = None,
     **keywords: Unpack[TraceKeywords],
 ) -> DistanceBounds:
-    """Distances of points (n, 3) from a level set, with proved lower bounds.
+    """Compute distances of points (n, 3) from a level set of a field's function f, with proved
+    lower bounds.
 
     `lower` is proved by the field's promises (proved bounds of f near a point). These imply that
     some cubic cells of space hold no surface; that in others the surface lies in a slab between two
@@ -272,7 +273,7 @@ def _warn_of_failures(name: str, result: ClosestPoints) -> None:
     """Warn if no surface was found for some queries; and if, for some, the point found is nearer
     than the field's promises (proved bounds of f near a point) allow, so that they are wrong.
 
-    name: the name of the public function, for messages.
+    name: the name of the public function, for messages. result: what its search found.
     """
     count = len(result.closest)
     unresolved = int(np.isnan(result.closest[:, 0]).sum())
@@ -309,8 +310,7 @@ def _check_domain(field: Field, points: FloatArray) -> None:
 
 def _first_order(backend: Backend, field: Field, levels: Levels, p: Vec3) -> Real:
     """Return the first-order estimate (f - level)/|grad f| of the signed distance of p from the
-    level set, for the level nearest in value.
-    """
+    level set, for the level nearest in value."""
     del backend
     sample = field.evaluate(p)
     return first_order_distance(-levels.offset_to_nearest(sample.value), sample.gradient)
@@ -318,8 +318,7 @@ def _first_order(backend: Backend, field: Field, levels: Levels, p: Vec3) -> Rea
 
 def _second_order(backend: Backend, field: Field, levels: Levels, p: Vec3) -> Real:
     """Return the second-order estimate of the signed distance of p from the level set, with the
-    sign of f - level, for the level nearest in value.
-    """
+    sign of f - level, for the level nearest in value."""
     del backend
     sample, rows = field.evaluate(p), field.hessian(p)
     return second_order_distance(-levels.offset_to_nearest(sample.value), sample.gradient, rows)
@@ -327,8 +326,7 @@ def _second_order(backend: Backend, field: Field, levels: Levels, p: Vec3) -> Re
 
 def _signed_lower_bound(backend: Backend, field: Field, levels: Levels, p: Vec3) -> Real:
     """Return the proved lower bound of the distance of p from the level sets of all levels, with
-    the sign of f - level for the level nearest in value.
-    """
+    the sign of f - level for the level nearest in value."""
     sample = field.evaluate(p)
     residual = -levels.offset_to_nearest(sample.value)
     return dr.copysign(level_distance_lower_bound(backend, field, levels, p, sample), residual)

@@ -30,13 +30,14 @@ epsilon."""
 
 
 def exclusion_radius(sample: Sample, rows: Rows | None, x: Vec3, y: Vec3) -> Real:
-    """Radius of a ball about y in which no surface point is nearer to x than y; 0 if none is
-    proved.
+    """Return the radius of a ball about y in which no surface point is nearer to x than y; 0 if
+    none is proved.
 
     sample: f at y, without rounding errors.
     rows: the rows of the Hessian of f at y; None if it is not known.
     x, y: a query, and a surface point such that x - y is normal to the surface at y.
 
+    Radii that are powers of two times the distance |x - y| are tried, the largest first.
     Proof. Let g = grad f(y), n = g/|g| and x = y + d n with d >= 0; if x is on the side of smaller
     f, take -f for f. Let y + w be a point of the surface with |w| <= r. Let R1 be the bound of the
     Taylor remainder of degree 1 within r. As it falls at least as the square of the radius,

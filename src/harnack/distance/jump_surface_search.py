@@ -106,6 +106,7 @@ class JumpSurfaceSearch:
             """
             last = NearestFacet(*state[:5])
             probe, best, nearest, count, active = state[5:]
+            # The next facet is fetched when the probes of the last one are done.
             is_first = active & (probe == 0)
             candidate = next_facet((last.sort_key, last.facet), limit, is_first)
             facet = _select(is_first, candidate, last)
@@ -139,8 +140,11 @@ class JumpSurfaceSearch:
     ) -> tuple[Mask, Any, Vec3]:
         """Trace the segment from y + scale * start to y + scale * end.
 
-        Returns the mask of lanes on which it hits the surface, the index of the facet that it hits,
-        and the hit point. A hit counts only if f takes values on both sides of a level around y.
+        active: mask of lanes that are traced.
+
+        Returns the mask of lanes on which the segment hits the surface, the index of the facet that
+        it hits, and the hit point. A hit counts only if f takes values on both sides of a level
+        around y.
         """
         backend = self.surface.backend
         real, vector = backend.Float, backend.Array3f
@@ -162,6 +166,7 @@ class JumpSurfaceSearch:
         """
         field, backend = self.surface.field, self.surface.backend
         real, index = backend.Float, backend.UInt32
+        # Asked for no lane, only to learn whether the field can list its facets.
         first_facet = field.nearest_facet(
             x, (real(-1), index(NO_FACET)), real(0), backend.Bool(False)
         )
@@ -170,8 +175,7 @@ class JumpSurfaceSearch:
 
             def single_facet(after: tuple[Real, Any], limit: Real, active: Mask) -> NearestFacet:
                 """Return the nearest facet if `after` stands for the start of the list, otherwise
-                no facet.
-                """
+                no facet."""
                 del active
                 is_first = (after[0] < 0) & (facet.sort_key < limit)
                 sort_key = dr.select(is_first, facet.sort_key, dr.inf)
@@ -182,8 +186,7 @@ class JumpSurfaceSearch:
 
         def listed_facet(after: tuple[Real, Any], limit: Real, active: Mask) -> NearestFacet:
             """Return the facet that follows the facet `after` (its sort key and index) in the
-            field's list, if it is not farther than `limit`.
-            """
+            field's list, if it is not farther than `limit`."""
             nearest = field.nearest_facet(x, after, limit, active)
             if nearest is None:
                 raise RuntimeError("nearest_sheet tells sheets at some times and not at others")
@@ -193,8 +196,8 @@ class JumpSurfaceSearch:
 
 
 def straddles_level(surface: SurfaceTracer, y: Vec3, radius: Real, active: Mask) -> Mask:
-    """Return the mask of lanes on which f takes values on both sides of a level within 1.74 radii
-    of y.
+    """Return the mask of lanes on which f takes values on both sides of a level within 1.74 times
+    `radius` of y.
 
     active: mask of lanes that are tested.
 
@@ -210,13 +213,13 @@ def straddles_level(surface: SurfaceTracer, y: Vec3, radius: Real, active: Mask)
     def body(k: Any, lower: Real, upper: Real, active: Mask) -> tuple[Any, ...]:
         """Extend the range [lower, upper] of values of f by two values on edge k of the
         tetrahedron: at its start, and before the first facet on it (or the middle if there is
-        none).
-        """
+        none)."""
         start, end = _probe(vector, k + 1, zero)
         o = dr.fma(vector(radius), start, y)
         edge_norm = dr.norm(end - start)
         direction, edge_length = (end - start) / edge_norm, radius * edge_norm
         start_crossing = JumpCrossing(real(0), index(NO_FACET), real(0), zero)
+        # Up to the first facet on the edge; the two values are taken on the same side of it.
         t = real(field.next_jump(o, direction, start_crossing, edge_length, active).t)
         before_jump = dr.select(t < edge_length, t, 0.5 * edge_length)
         for distance in (real(0), _FRACTION_TO_FACET * before_jump):
@@ -307,8 +310,7 @@ _HIT_TEST_RADIUS = 1024.0
 @dataclass(frozen=True)
 class _HitPlane:
     """The plane tangent to the surface at the hit of a ray from the query x. It consists of the
-    points x + r with r . normal = offset, where |normal| = 1. normal = 0 stands for no plane.
-    """
+    points x + r with r . normal = offset, where |normal| = 1. normal = 0 stands for no plane."""
 
     normal: Vec3
     offset: Real
@@ -321,8 +323,7 @@ class _HitPlane:
 
     def is_apart(self, other: _HitPlane) -> Mask:
         """Return the mask of lanes in which both this and the other one are planes (not the
-        placeholder for none), and not nearly parallel.
-        """
+        placeholder for none), and not nearly parallel."""
         return (
             dr.squared_norm(dr.cross(self.normal, other.normal)) > _MIN_PLANE_SINE * _MIN_PLANE_SINE
         )
@@ -342,8 +343,7 @@ class _HitPlane:
 
     def intersection_point(self, second: _HitPlane, third: _HitPlane) -> Vec3:
         """Return the vector from x to the point in which three planes intersect; not finite if the
-        three normals are linearly dependent (Cramer's rule).
-        """
+        three normals are linearly dependent (Cramer's rule)."""
         vector = cast("Any", type(self.normal))
         a, b, c = self.normal, second.normal, third.normal
         normals = (dr.cross(b, c), dr.cross(c, a), dr.cross(a, b))
@@ -360,8 +360,7 @@ class _HitPlanes:
     """Three planes tangent to the surface at hits of rays from the query x, from which a compass
     search guesses where creases are. The first is the plane at the best point so far. The other two
     are the planes of the last two hits that are parallel neither to the first plane nor to each
-    other.
-    """
+    other."""
 
     first: _HitPlane
     second: _HitPlane
@@ -395,11 +394,13 @@ class _HitPlanes:
         first, second, third = self.first, self.second, self.third
         select = _HitPlane.where
         is_apart = first.is_apart(plane)
+        # If the plane becomes the first one.
         if_best = _HitPlanes(
             plane,
             select(is_apart, first, second),
             select(is_apart & second.is_apart(plane), second, third),
         )
+        # If it does not.
         is_new = is_hit & ~is_best & is_apart
         otherwise = _HitPlanes(
             first,
@@ -415,8 +416,7 @@ class _HitPlanes:
     def shortest_to_intersection(self, number: Any) -> Vec3:
         """Return the shortest vector from x to an intersection of planes: of all three (number 0),
         of the first and the second (1), of the first and the third (2); or to the first plane alone
-        (3). It is not finite where there is no intersection.
-        """
+        (3). It is not finite where there is no intersection."""
         first, second, third = self.first, self.second, self.third
         vector = cast("Any", type(first.normal))
         to_line = dr.select(
@@ -466,6 +466,7 @@ def compass_search(surface: SurfaceTracer, x: Vec3, foot: Vec3) -> Vec3:
         values: the planes of hits, `_HitPlanes.parts`.
         """
         hit_planes, is_global = _HitPlanes.of(values), ray < _SPHERE_RAYS
+        # The first rays of a round go to intersections of planes, the others are tilted.
         to_planes = ~is_global & (failed < _PLANE_RAYS)
         direction = dr.select(
             to_planes,
@@ -483,6 +484,8 @@ def compass_search(surface: SurfaceTracer, x: Vec3, foot: Vec3) -> Vec3:
         is_nearer &= is_on_surface(surface, point, hit, is_nearer)
         normal = dr.normalize(hit.gradient)
         has_plane = is_hit & dr.isfinite(dr.squared_norm(normal))
+        # The tangent plane at the hit; its distance from x is that of the hit, projected on the
+        # normal.
         plane = _HitPlane(normal, dr.dot(normal, direction) * hit.t)
         hit_planes = hit_planes.updated(plane, has_plane, has_plane & is_nearer)
         d, t = dr.select(is_nearer, direction, d), dr.select(is_nearer, hit.t, t)
@@ -528,8 +531,7 @@ def is_on_surface(surface: SurfaceTracer, y: Vec3, hit: MarchResult, active: Mas
 def _tilt_direction(d: Vec3, step: Real, angle: Real) -> Vec3:
     """Return the unit vector along d + step w. d is a unit vector, and w the unit vector at right
     angles to d that is given by the angle `angle` (in radians) about d. So `step` is the tangent of
-    the angle between d and the result.
-    """
+    the angle between d and the result."""
     vector = cast("Any", type(d))
     u, v = orthonormal_basis(d)
     sine, cosine = dr.sincos(angle)
@@ -538,8 +540,7 @@ def _tilt_direction(d: Vec3, step: Real, angle: Real) -> Vec3:
 
 def _spiral_direction(vector: Any, n: Real) -> Vec3:
     """Return the unit vector with number n of `_SPHERE_RAYS` unit vectors that are spread evenly
-    over the sphere, along a spiral. vector: the type of 3-vectors.
-    """
+    over the sphere, along a spiral. vector: the type of 3-vectors."""
     z = 1 - (2 * n + 1) / _SPHERE_RAYS
     radius = dr.sqrt(1 - z * z)
     sine, cosine = dr.sincos(_GOLDEN_ANGLE * n)

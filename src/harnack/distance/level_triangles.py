@@ -73,26 +73,28 @@ class LevelTriangles:
         mesh = surface.field.jump_mesh()
         if mesh is None or surface.clip_volume is not None or surface.field.domain is not None:
             return None
-        vertices, faces, is_closed = mesh
+        vertices, faces, is_integer_off_faces = mesh
         is_jumps_only = surface.field.is_of_sheets_alone(surface.level_values)
         lower, upper = vertices[faces].min(axis=(0, 1)), vertices[faces].max(axis=(0, 1))
         size = float(2.0 ** np.ceil(np.log2(0.5 * (upper - lower).max())))
         center = round_to_single(0.5 * (lower + upper))
         scaled = (vertices - center) / size
+        # The field says that every triangle belongs to the level set, and nothing else.
         if is_jumps_only:
             return cls(scaled[faces], center, size, True)
         tree = _tree(choose_backend("double"), scaled, faces)
         pieces, _ = split_intersecting_faces(tree, scaled, faces)
-        if is_closed:
+        # Off the faces of such a mesh f is an integer, so that the triangles are the whole level
+        # set.
+        if is_integer_off_faces:
             on_level = separates_levels(tree, pieces, surface.level_values)
         else:
             on_level = _proved_on_level(surface, center + size * pieces, size)
-        return cls(pieces[on_level], center, size, is_closed)
+        return cls(pieces[on_level], center, size, is_integer_off_faces)
 
     def upload(self, backend: Backend) -> Callable[[Vec3], Vec3]:
         """Upload the triangles. Returns a function of points that gives the vector from each to the
-        nearest triangle point; NaN if there are no triangles.
-        """
+        nearest triangle point; NaN if there are no triangles."""
         vector, real = backend.Array3f, backend.Float
         if not len(self.corners):
             return lambda p: vector(dr.nan) + 0 * p
@@ -147,9 +149,11 @@ def _proved_on_level(surface: TracedSurface, corners: FloatArray, size: float) -
 
     center = corners.mean(axis=1)
     (clearances,) = in_batches(backend, clearance, center)
+    # The ball about the center that contains the triangle.
     radius = np.linalg.norm(corners - center[:, None], axis=2).max(axis=1)
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     length = np.linalg.norm(normal, axis=1, keepdims=True)
+    # f right beside the center, on both sides.
     offset = _SIDE_DISTANCE * size * normal / np.maximum(length, 1e-300)
     side_values = [field.value(center + sign * offset, precision="double") for sign in (1, -1)]
     lower, upper = np.minimum(*side_values), np.maximum(*side_values)

@@ -78,7 +78,8 @@ def curvature(
     options: TraceOptions | None = None,
     **keywords: Unpack[TraceKeywords],
 ) -> CurvatureSamples:
-    """Mean and Gaussian curvature of the level sets of a field through points (n, 3).
+    """Compute the mean and Gaussian curvature of the level sets of a field's function f through
+    points (n, 3).
 
     surface: a field, or a `Surface`. The curvature at a point is that of the level set through the
         point, whatever its level is; levels, clip and section of a `Surface` have no effect.
@@ -105,6 +106,8 @@ def curvature(
     """
     target, choices = surface_and_options("curvature", surface, options, keywords, ("precision",))
     field, backend = target.field, choose_backend(choices.precision or "double")
+    # Fields that are evaluated within a kernel, and fields that are evaluated in batches by tree
+    # sums.
     if not isinstance(field, BatchedField):
         prepared = field.prepare(backend)
 
@@ -174,6 +177,7 @@ def _refine_accuracy(
     if not can_refine:
         return CurvatureSamples(*columns)
     x = np.asarray(points, np.float64)
+    # The allowed error where the mean curvature itself is nearly 0.
     flat_error = _ACCURACY / _size(field, x)
     for acceptance in _ACCEPTANCE_FACTORS[1:]:
         mean, error = columns[0], columns[3]
@@ -182,6 +186,7 @@ def _refine_accuracy(
         rows = np.flatnonzero(~is_accurate & (is_truncated > 0))
         if not rows.size:
             break
+        # Only the rows whose error is too large are evaluated again.
         *refined, is_truncated[rows] = in_batches(backend, with_acceptance(acceptance), x[rows])
         for column, values in zip(columns, refined, strict=True):
             column[rows] = values
@@ -191,8 +196,7 @@ def _refine_accuracy(
 def _size(field: Field, points: FloatArray) -> float:
     """Return the size of a field's surface, a length: the diagonal of the box that is proved to
     contain it. If there is no finite box, it is the largest absolute coordinate of the points (n,
-    3).
-    """
+    3)."""
     volume = field.extent((field.default_level,))
     if volume is not None:
         lower, upper = volume.bounds()
@@ -295,8 +299,7 @@ class _Derivatives:
 
 def _or_infinite(is_known: Any, error: Real) -> Real:
     """Return an error bound rounded up, so that it stays a bound. It is infinite in lanes in which
-    the bound is not known (the mask `is_known` is False) or not finite.
-    """
+    the bound is not known (the mask `is_known` is False) or not finite."""
     return dr.select(is_known & dr.isfinite(error), error * (1 + 1e-5), dr.inf)
 
 
@@ -371,6 +374,7 @@ def curvature_lines(
         hint = did_you_mean(family, get_args(Family))
         raise ValueError(f"unknown family {family!r}; choose one of {names}{hint}")
     step, length = as_positive(step, "step"), as_positive(length, "length")
+    # Steps on either side of the seed.
     count = math.ceil(length / step)
     if count > _MOST_STEPS:
         raise ValueError(f"length/step asks for {count:,} steps: at most {_MOST_STEPS:,}")
@@ -445,7 +449,9 @@ class _CurvatureLineTracer:
         x = self._on_surface(x, _SEED_NEWTON_STEPS)
         direction, is_known = self._direction(x, None)
         lane = dr.arange(integer, 2 * n)
+        # An eigenvector and its negative: the two directions from each seed.
         direction = dr.select(lane < n, direction, -direction)
+        # The points of all lines after all steps.
         points = vector(*(dr.full(self.backend.Float, dr.nan, 2 * n * (count + 1)) for _ in "xyz"))
         dr.scatter(points, x, lane, is_known)
         dr.eval(points, x, direction, is_known)
@@ -510,8 +516,7 @@ class _CurvatureLineTracer:
 
     def _on_surface(self, x: Vec3, steps: int) -> Vec3:
         """Return the point to which `steps` steps of Newton's method along the gradient lead from
-        x, toward the level set.
-        """
+        x, toward the level set."""
 
         def step(x: Vec3) -> Vec3:
             """Make one Newton step from x."""
@@ -526,8 +531,7 @@ class _CurvatureLineTracer:
 
 def _iterate(step: Callable[[Vec3], Vec3], x: Vec3, times: int, backend: Backend) -> Vec3:
     """Apply the function `step` to x `times` times, and return the result. It is a loop of the
-    kernel, so that the compiled kernel contains the code of `step` only once.
-    """
+    kernel, so that the compiled kernel contains the code of `step` only once."""
     if times == 1:
         return step(x)
 
@@ -578,8 +582,7 @@ def _join_halves(
 
 def _after_second_step(count: int) -> BoolArray:
     """Return a mask (count,) of the steps of a line that is False for the first two and True for
-    all others. The first two are near the seed even if the line does not return to it.
-    """
+    all others. The first two are near the seed even if the line does not return to it."""
     return np.arange(count) > 1
 
 

@@ -55,8 +55,7 @@ class TangentPlane:
 
     def restrict_hessian(self, rows: tuple[Vec3, Vec3, Vec3]) -> tuple[Real, Real, Real]:
         """Return the numbers u.Au, v.Av and u.Av for a symmetric 3x3 matrix A, such as a Hessian,
-        where u and v are the unit tangents of the plane. rows: the three rows of A.
-        """
+        where u and v are the unit tangents of the plane. rows: the three rows of A."""
         along_u, along_v = matvec(rows, self.u), matvec(rows, self.v)
         return dr.dot(self.u, along_u), dr.dot(self.v, along_v), dr.dot(self.u, along_v)
 
@@ -84,8 +83,7 @@ class SymmetricEigen2:
 
     def coordinates(self, u: Real, v: Real) -> tuple[Real, Real]:
         """Return the coordinates of the vector (u, v) in the basis of unit eigenvectors; the
-        eigenvector of the larger eigenvalue comes first.
-        """
+        eigenvector of the larger eigenvalue comes first."""
         return (
             dr.fma(self.cosine, u, self.sine * v),
             dr.fma(self.cosine, v, -self.sine * u),
@@ -94,8 +92,7 @@ class SymmetricEigen2:
     def combination(self, along_larger: Real, along_smaller: Real) -> tuple[Real, Real]:
         """Return the vector (u, v) whose coordinates in the basis of unit eigenvectors are
         `along_larger`, for the eigenvector of the larger eigenvalue, and `along_smaller`, for the
-        other.
-        """
+        other."""
         return (
             dr.fma(self.cosine, along_larger, -self.sine * along_smaller),
             dr.fma(self.sine, along_larger, self.cosine * along_smaller),
@@ -117,8 +114,9 @@ def matvec(rows: tuple[Vec3, Vec3, Vec3], vector: Vec3) -> Vec3:
 
 
 def first_order_distance(above: Real, gradient: Vec3) -> Real:
-    """The first-order estimate of the signed distance from a level set: above/|grad f|, where
-    above = f - level. Its error is O(d^2) at the distance d from a smooth surface.
+    """Return the first-order estimate of the signed distance of a point x from a level set:
+    above/|grad f|, where above = f - level and the gradient are taken at x. Its error is O(d^2) at
+    the distance d from a smooth surface.
 
     Proof. Let y be the closest point of the level set, N its normal grad f/|grad f|(y), and
     x = y + d N (x - y is normal at the closest point; d has the sign of above). Taylor's formula
@@ -131,11 +129,11 @@ def first_order_distance(above: Real, gradient: Vec3) -> Real:
 
 
 def second_order_distance(above: Real, gradient: Vec3, rows: tuple[Vec3, Vec3, Vec3]) -> Real:
-    """The second-order estimate of the signed distance d of a point x from a level set:
+    """Return the second-order estimate of the signed distance d of a point x from a level set:
     d1/(1 - k d1/2) with above = f - level, d1 = above/|grad f| and k = n.An/|grad f|. Its error is
     O(d^3).
 
-    gradient, rows: grad f at x, and the three rows of the Hessian A there; n is the unit gradient.
+    gradient, rows: g = grad f at x, and the three rows of the Hessian A there; n = g/|g|.
     k tells how fast the slope changes along n; it is not a curvature of the surface.
 
     Proof. With x = y + d N as in `first_order_distance`, Taylor along that line is
@@ -192,8 +190,7 @@ def in_batches(
 
 def _check_size(points: Any) -> None:
     """Raise a ValueError if a finite coordinate of the points is larger than `MAX_COORDINATE`.
-    Dr.Jit arrays are not checked.
-    """
+    Dr.Jit arrays are not checked."""
     coordinates = None if dr.is_array_v(type(points)) else as_real_array(points, "points")
     if coordinates is None or not coordinates.size:
         return

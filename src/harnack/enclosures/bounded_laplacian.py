@@ -118,6 +118,7 @@ class BoundedLaplacianEnclosure(Enclosure):
     ) -> Self:
         """Return the enclosure from bounds of a function on a ball.
 
+        radius: the radius of the ball.
         ranges: two differences in value: how far the function may fall from its value at the
             center, and how far it may rise.
         laplacian: a lower and an upper bound of its Laplacian on the ball.
@@ -137,8 +138,7 @@ class BoundedLaplacianEnclosure(Enclosure):
 
     def free_length(self, gaps: LevelGaps) -> Real:
         """Return the shorter of the lengths on which f is proved not to reach the level above and
-        the level below.
-        """
+        the level below."""
         above, below = self._conditions(gaps)
         q = fmin(
             largest_free_fraction(above, self.solver_iterations),
@@ -156,8 +156,7 @@ class BoundedLaplacianEnclosure(Enclosure):
 
     def _is_known(self, gaps: LevelGaps) -> Mask:
         """Return the mask of lanes on which the bounds and the gaps (differences between f(p) and
-        the next levels) are numbers, and neither too large nor too small to divide by.
-        """
+        the next levels) are numbers, and neither too large nor too small to divide by."""
         is_valid = (gaps.below >= 0) & (gaps.above >= 0) & dr.isfinite(self.laplacian_mean)
         for x in (self.max_fall + self.max_rise, self.laplacian_spread):
             is_valid = is_valid & ((x == 0) | (dr.isfinite(1 / x) & dr.isfinite(4 * x)))
@@ -238,8 +237,7 @@ class _GreenCondition:
 
     def __call__(self, q: Real) -> Real:
         """Return k(q), in a form that does not cancel near q = 0. Here c is (S - 1)/q + 2, and root
-        is sqrt(S).
-        """
+        is sqrt(S)."""
         s, r, p = q * q, 1 / (1 + q), 1 - q
         log = 2 - dr.log(fmax(q, 1e-30))
         inner = q * dr.fma(self.weight, 5 - s, GREEN_KERNEL_BOUND * self.spread * log)

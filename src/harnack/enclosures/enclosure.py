@@ -1,5 +1,5 @@
 """Enclosures, which bound how far a function f can change along a path, and their inputs. f is
-sampled at a point of the path (mostly a ray); F(s) is the change of f at the length s behind that
+sampled at a point of the path (mostly a ray); F(s) is the change of f at the length s beyond that
 point. A level is a value of f that rays look for; a length is free if f takes no level on it.
 
 - `Enclosure`: the base of all enclosures. A new proof is a class derived from it, in this package.
@@ -66,8 +66,7 @@ class PathRestriction(Protocol):
 @runtime_checkable
 class EvaluableRestriction(Protocol):
     """A function along a path (a ray) that is given by a formula in x, y and z. It can be evaluated
-    in any arithmetic, such as that of intervals.
-    """
+    in any arithmetic, such as that of intervals."""
 
     def evaluate_with(self, coordinates: Callable[[Vec3, Vec3], tuple[Any, Any, Any]]) -> Any:
         """Return the value of the formula at (x, y, z) = coordinates(p, d), in the arithmetic of
@@ -135,14 +134,13 @@ class SlopeRange:
 
     def negated(self) -> SlopeRange:
         """Return the range of the derivative along the opposite direction: the negated ends,
-        exchanged.
-        """
+        exchanged."""
         return SlopeRange(-self.upper, -self.lower)
 
 
 class Enclosure(abc.ABC):
     """A proof that F stays within an interval that depends on s, for 0 <= s < reach. F(s) =
-    f(path(t+s)) - f(path(t)) is the change of f from its value at a sample, at the length s behind
+    f(path(t+s)) - f(path(t)) is the change of f from its value at a sample, at the length s beyond
     it. A level is a value of f that rays look for; a length s is free if F takes no level on it.
     The gaps (`LevelGaps`) are the differences between f at the sample and the next levels below and
     above.
@@ -161,8 +159,7 @@ class Enclosure(abc.ABC):
     @property
     def reach_growth(self) -> float:
         """The length on which the next sample should be enclosed, as a multiple of the length that
-        was proved free at this sample. The best values were found by experiment.
-        """
+        was proved free at this sample. The best values were found by experiment."""
         return 2.0
 
     @classmethod

@@ -75,10 +75,8 @@ class MaximumEnclosure(Enclosure):
 
     def is_free(self, gaps: LevelGaps, length: Real) -> Mask:
         """Return the mask of lanes on which, for the given length, no operand rises to the level
-        above, and at least one operand is proved not to fall to the level below.
-        """
-        # Start with True (where the gap is a number), and with whether there is a level below at
-        # all.
+        above, and at least one operand is proved not to fall to the level below."""
+        # Start with True (where the gap is a number), and with whether no level lies below.
         free_above, free_below = gaps.above == gaps.above, gaps.below == dr.inf
         for operand in self.operands:
             rise_gaps, fall_gaps = self._gaps(gaps, operand)
@@ -86,15 +84,17 @@ class MaximumEnclosure(Enclosure):
             free_below |= (fall_gaps.below > 0) & any_is_free(operand.enclosures, fall_gaps, length)
         return (free_above | (gaps.above == dr.inf)) & free_below
 
-    def _shared_valid_length(self, infty: Real) -> Real:
+    def _shared_valid_length(self, infinity: Real) -> Real:
         """Return the length, from the start of the path, on which the enclosures of all operands
         are valid: the smallest of the lengths that they prove if there is no level.
 
-        infty: infinity, as a number of the backend.
+        infinity: infinity, as a number of the backend.
         """
-        length = infty
+        length = infinity
         for operand in self.operands:
-            length = fmin(longest_free_length(operand.enclosures, LevelGaps(infty, infty)), length)
+            length = fmin(
+                longest_free_length(operand.enclosures, LevelGaps(infinity, infinity)), length
+            )
         return length
 
     @staticmethod
@@ -156,8 +156,7 @@ class ScaledEnclosure(Enclosure):
 
     def _gaps(self, gaps: LevelGaps) -> LevelGaps:
         """Return the gaps of f (differences between its value and the next levels), from those of
-        value_factor * f.
-        """
+        value_factor * f."""
         factor = STEP_SAFETY / self.value_factor
         below, above = _scaled(gaps.below, factor), _scaled(gaps.above, factor)
         return LevelGaps(below, above, gaps.is_one_sided)
@@ -165,8 +164,7 @@ class ScaledEnclosure(Enclosure):
 
 def _scaled(gap: Real, factor: Real) -> Real:
     """Return the gap times a positive factor. A finite gap stays finite, even if the product
-    overflows.
-    """
+    overflows."""
     largest = type(gap)(dr.largest(type(gap)))
     return dr.select(gap == dr.inf, gap, fmin(largest, gap * factor))
 
@@ -329,8 +327,8 @@ class BranchPointEnclosure(Enclosure):
                 + self.closest_parameter * self.closest_parameter
                 < radius * radius
             )
-            valid = (
+            is_valid = (
                 starts_inside & (w > 0) & (squared_half_chord > 0) & dr.isfinite(squared_half_chord)
             )  # squares may overflow
-            best = fmax(dr.select(valid, length, 0), best)
+            best = fmax(dr.select(is_valid, length, 0), best)
         return dr.select(gap_away == dr.inf, best * _POWER_SAFETY, 0)

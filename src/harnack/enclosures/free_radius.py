@@ -54,8 +54,7 @@ class FreeRadiusCondition(Protocol):
 
     def expansion_at_zero(self) -> tuple[Real, Real]:
         """Return k(0) and k'(0), or approximations. They give the solver's first candidate; no
-        proof relies on them.
-        """
+        proof relies on them."""
         ...
 
 
@@ -70,8 +69,7 @@ def condition_rounding(real: Any) -> float:
 
 def is_free_fraction(condition: FreeRadiusCondition, q: Real) -> Mask:
     """Return the mask of lanes on which a condition proves that f takes no level on all of [0, q],
-    for fractions q of the ball's radius, 0 <= q <= 1.
-    """
+    for fractions q of the ball's radius, 0 <= q <= 1."""
     rounding = condition_rounding(type(q))
     return q * (condition(q) + rounding) <= condition.gap * CONDITION_SAFETY
 
@@ -182,8 +180,7 @@ class HarmonicBallEnclosure(Enclosure):
 
     def is_valid(self, gaps: LevelGaps) -> Mask:
         """Return the mask of lanes on which the bounds and the gaps are numbers, and the bounds
-        large enough to divide by.
-        """
+        large enough to divide by."""
         can_prove = (gaps.below >= 0) & (gaps.above >= 0)
         for movement in (self.max_fall, self.max_rise):
             if movement is not None:
@@ -195,8 +192,7 @@ class HarmonicBallEnclosure(Enclosure):
     @classmethod
     def applies_to(cls, dimension: int, is_bounded_below: bool, is_bounded_above: bool) -> bool:
         """Return whether this class has a proof for balls of this dimension, if f is bounded on
-        these sides. One bounded side is enough here.
-        """
+        these sides. One bounded side is enough here."""
         del dimension
         return is_bounded_below or is_bounded_above
 

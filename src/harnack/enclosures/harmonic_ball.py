@@ -61,8 +61,7 @@ class HarnackEnclosure(HarmonicBallEnclosure):
 
     def _fraction(self, gaps: LevelGaps) -> Real:
         """Return the free length divided by the radius. If f is bounded on both sides, it is the
-        larger of the two fractions that the bounds prove.
-        """
+        larger of the two fractions that the bounds prove."""
         lower = upper = None
         if self.max_fall is not None:
             lower = _fraction_from_one_side(self.max_fall, gaps.above, gaps.below, self.dimension)
@@ -199,8 +198,7 @@ class HarnackSlopeEnclosure(HarmonicBallEnclosure):
 
     def free_length(self, gaps: LevelGaps) -> Real:
         """Return the shorter of the lengths proved for the level above and for the level below. For
-        each level this is the longest length that one of its conditions proves.
-        """
+        each level this is the longest length that one of its conditions proves."""
         q = type(gaps.above)(1)
         for alternatives in self._conditions(gaps):
             best = type(q)(0)
@@ -211,8 +209,7 @@ class HarnackSlopeEnclosure(HarmonicBallEnclosure):
 
     def is_free(self, gaps: LevelGaps, length: Real) -> Mask:
         """Return the mask of lanes on which, for each of the two levels, at least one condition
-        proves that f does not reach it on the length.
-        """
+        proves that f does not reach it on the length."""
         q = length / self.radius
         is_covered = q <= 1
         q = clamp(q, 0, 1)
@@ -285,7 +282,8 @@ class _ChordCondition:
 
     @classmethod
     def of(cls, gap: Real, mean: Real, dimension: int) -> _ChordCondition:
-        """Make the condition for a gap that is given in units of u, that is, w - 1."""
+        """Make the condition for a gap that is given in units of u, that is, w - 1. mean,
+        dimension: m and n."""
         # g = w^(1/K) - 1, in forms that do not cancel for small gaps.
         if dimension == 3:
             gap = gap / (dr.sqrt(1 + gap) + 1)
@@ -303,8 +301,7 @@ class _ChordCondition:
 
     def __call__(self, q: Real) -> Real:
         """Return k(q), in a form that does not cancel near q = 0. Here (B - 1)/q is c - K, and root
-        is B^(1/K); so (root - 1)/q follows from c without a difference of large numbers.
-        """
+        is B^(1/K); so (root - 1)/q follows from c without a difference of large numbers."""
         m, r, s = self.mean, 1 / (1 + q), q * q
         if self.dimension == 2:
             return self.gap + 2 * (q + m) * r
@@ -346,8 +343,7 @@ class _JensenCondition:
 
     def __call__(self, q: Real) -> Real:
         """Return k(q), in a form that does not cancel near q = 0. Here d is D, e is (D - 1)/q, and
-        `rise` is (D^(n/2) - 1 + q^2)/q.
-        """
+        `rise` is (D^(n/2) - 1 + q^2)/q."""
         e = q - 2 * self.mean
         d = dr.fma(q, e, 1)
         if self.dimension == 2:
@@ -403,8 +399,7 @@ class SphericalCapEnclosure(HarmonicBallEnclosure):
 
     def free_length(self, gaps: LevelGaps) -> Real:
         """Return the shorter of the lengths on which f is proved not to reach the level above and
-        the level below.
-        """
+        the level below."""
         up, down = self._conditions(gaps)
         q = fmin(
             largest_free_fraction(up, self.solver_iterations),
@@ -488,8 +483,7 @@ class _CapCondition:
 
     def __call__(self, q: Real) -> Real:
         """Return k(q), in a form that does not cancel near q = 0. For each of s1 and s2, s^2 = 1 +
-        q e, so s = 1 + q x with x = e/(s+1). `total` is x1 + x2, and `rise` is (S - 1 + q^2)/q.
-        """
+        q e, so s = 1 + q x with x = e/(s+1). `total` is x1 + x2, and `rise` is (S - 1 + q^2)/q."""
         e1, e2 = q - 2 * (self.rest - self.shift), q + 2 * (self.rest + self.shift)
         one_minus_q, one_plus_q = 1 - q, 1 + q
         s1 = dr.sqrt(dr.fma(one_minus_q, one_minus_q, 2 * q * (self.p + self.shift)))

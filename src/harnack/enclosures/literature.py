@@ -143,8 +143,7 @@ class BandEnclosure(Enclosure):
 
     def _length_below(self, gap: Real, offset: Real, slope: Real) -> Real:
         """Return the length on which the line offset + slope s stays below the gap; 0 if nothing is
-        proved.
-        """
+        proved."""
         no_level = gap == dr.inf
         remaining = gap - offset
         reach = dr.select(slope > 0, remaining / slope * STEP_SAFETY, self.reach)
@@ -192,8 +191,7 @@ class IntervalEnclosure(BandEnclosure):
         cls, function: PathRestriction, slopes: SlopeRange, length: Real
     ) -> Self | None:
         """Return the range from evaluating the formula of f with intervals; None if f is no
-        formula.
-        """
+        formula."""
         if not isinstance(function, EvaluableRestriction):
             return None
         jet = function.evaluate_with(lambda p, d: Jet.along_ray(p, d, 0.0, length, anchored=False))

@@ -162,8 +162,7 @@ def _stays_below(gap: Real, slope: Real, curvature: Real, length: Real) -> Mask:
 def _max_turning_slope(gap: Real, curvature: Real) -> Real:
     """Return sqrt(2 |curvature| gap): the slope at the start of a parabola slope s - |curvature|
     s^2/2 whose largest value is the gap. With a smaller slope it turns back before it reaches the
-    gap.
-    """
+    gap."""
     return dr.sqrt(dr.abs(curvature)) * (_ROOT_OF_TWO * dr.sqrt(gap))
 
 

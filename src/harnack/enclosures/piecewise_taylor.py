@@ -73,8 +73,7 @@ class PiecewiseTaylorEnclosure(Enclosure):
 
     def free_length(self, gaps: LevelGaps) -> Real:
         """Return the shorter of the lengths on which F does not reach the level above and the level
-        below.
-        """
+        below."""
         # With a single level, one side is enough: the one with the finite gap.
         if gaps.is_one_sided:
             rises = gaps.below == dr.inf
@@ -112,8 +111,7 @@ class PiecewiseTaylorEnclosure(Enclosure):
 
         def one_sided(upper: Real, lower: Real) -> Real:
             """Return the largest value for F (`upper`) or, if the level is below, the largest value
-            for -F (-`lower`).
-            """
+            for -F (-`lower`)."""
             return dr.select(rises, upper, -lower)
 
         slope = one_sided(self.slopes.upper, self.slopes.lower)
@@ -164,8 +162,7 @@ class PiecewiseTaylorEnclosure(Enclosure):
 
 class SinglePieceEnclosure(PiecewiseTaylorEnclosure, abc.ABC):
     """Base of the enclosures of the literature that use ranges of the derivatives of f on the whole
-    length of a path, as one piece.
-    """
+    length of a path, as one piece."""
 
     @classmethod
     def _piece_count(cls, function: PathRestriction) -> int:

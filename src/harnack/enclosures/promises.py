@@ -130,8 +130,7 @@ class Promise(abc.ABC):
 
     def shifted(self, offset: Real) -> Self:
         """Return the promise of f + offset. The range of f itself, the first pair of
-        `interval_pairs`, is shifted.
-        """
+        `interval_pairs`, is shifted."""
         numbers = {
             name: getattr(self, name) + offset for pair in self.interval_pairs[:1] for name in pair
         }
@@ -148,8 +147,7 @@ class Promise(abc.ABC):
 
     def space_scaled(self, size: Real) -> Self:
         """Return the promise that x -> f(x / size) makes at the point size * p. A number with the
-        unit (length)^j is multiplied by size^j.
-        """
+        unit (length)^j is multiplied by size^j."""
 
         def rescaled(number: Real, power: int) -> Real:
             """Return number * size^power."""
@@ -188,8 +186,7 @@ class Promise(abc.ABC):
 
     def select(self, mask: Mask, other: Self) -> Self:
         """Return the promise `other`, which is of the same kind, on the lanes of the mask, and this
-        promise on all other lanes.
-        """
+        promise on all other lanes."""
         numbers: dict[str, Any] = {}
         for name, *_ in self.units:
             new, old = getattr(other, name), getattr(self, name)
@@ -312,8 +309,7 @@ class HarmonicBall(Promise):
 
     def _span(self, value: Real) -> Real:
         """Return upper - lower, the length of the range of f on the ball, computed as (upper -
-        value) + (value - lower). With value = f(p) between the two, both terms are at least 0.
-        """
+        value) + (value - lower). With value = f(p) between the two, both terms are at least 0."""
         return (self.upper - value) + (value - self.lower)
 
 
@@ -423,22 +419,19 @@ class TaylorRemainder(Promise):
 
     def movement_bounds(self, value: Any, slopes: SlopeRange, length: Any) -> tuple[Any, Any]:
         """Return the bounds of f(y) - f(p): the slope times the length, and constant length^2/2 to
-        both sides.
-        """
+        both sides."""
         curved = 0.5 * self.constant * length * length
         return slopes.lower * length - curved, slopes.upper * length + curved
 
     def implied_second_derivative_bound(self, value: Real) -> tuple[Real, Real] | None:
         """Return the constant, which bounds |f_vv| for all unit vectors v, and the infinite radius,
-        if the promise has no radius: then it holds at every point. Otherwise return None.
-        """
+        if the promise has no radius: then it holds at every point. Otherwise return None."""
         del value
         return (self.constant, self.radius) if _is_infinite(self.radius) else None
 
     def taylor_remainder_bound(self, value: Real, length: Real, degree: int = 1) -> Real:
         """Return the bound of |f(y) - T(y)| that the promise states for the degree 1 or 2 of the
-        Taylor polynomial T; infinite beyond its radius.
-        """
+        Taylor polynomial T; infinite beyond its radius."""
         if degree == 2 and _is_infinite(self.cubic_constant):
             return dr.inf
         factor = 0.5 * self.constant if degree == 1 else self.cubic_constant * length / 6
@@ -447,6 +440,5 @@ class TaylorRemainder(Promise):
 
 def _is_infinite(end: Any) -> bool:
     """Return whether `end` is an infinite Python float, which is known while a kernel is being
-    recorded.
-    """
+    recorded."""
     return isinstance(end, float) and math.isinf(end)

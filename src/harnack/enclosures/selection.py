@@ -161,6 +161,7 @@ class EnclosureKinds:
                 f"{', '.join(_NAMES_USING_RANGES)}"
             )
         promised = " and ".join(sorted({type(promise).__name__ for promise in promises}))
+        # The names whose first, sharpest class can use one of the promises.
         usable = [
             f'"{name}"'
             for name, (sharpest, *_) in _KINDS_BY_NAME.items()
@@ -231,6 +232,7 @@ def choose_enclosures(enclosures: EnclosureChoice = None) -> EnclosureKinds:
                 f"{did_you_mean(enclosures, _KINDS_BY_NAME)}"
             )
         return EnclosureKinds(_KINDS_BY_NAME[enclosures])
+    # A single class, or several.
     classes = cast("Any", enclosures) if isinstance(enclosures, Iterable) else (enclosures,)
     kinds: tuple[Any, ...] = tuple(classes)
     if not kinds or not all(_is_proof(kind) for kind in kinds):
@@ -262,8 +264,7 @@ def longest_free_length(enclosures: tuple[Enclosure, ...], gaps: LevelGaps) -> R
 
 def any_is_free(enclosures: tuple[Enclosure, ...], gaps: LevelGaps, length: Real) -> Mask:
     """Return the mask of lanes on which at least one of the enclosures proves that f takes no level
-    on the length. gaps: the differences between f and the next levels.
-    """
+    on the length. gaps: the differences between f and the next levels."""
     is_free = length <= 0
     for enclosure in enclosures:
         is_free |= enclosure.is_free(gaps, length)

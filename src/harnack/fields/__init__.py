@@ -1,8 +1,6 @@
-"""Fields: the functions f whose level sets are drawn, with a folder for each family.
-
-This package exports the base classes and all fields but solids, which are in `harnack.solids`; they
-are imported when they are first used, as `__init__.pyi` lists them.
-"""
+"""Fields: the functions f whose level sets are drawn, with a folder for each family. This package
+exports the base classes and all fields but solids, which are in `harnack.solids`. They are imported
+when they are first used, as `__init__.pyi` lists them."""
 
 from __future__ import annotations
 

@@ -1,5 +1,8 @@
-"""Evaluates Dr.Jit kernels at large numbers of NumPy points, batch by batch. The results are NumPy
-arrays."""
+"""Evaluation of a field, or of any Dr.Jit kernel, at large numbers of NumPy points, batch by batch;
+the results are NumPy arrays. A kernel here is a Python function that takes the Dr.Jit points of a
+batch, one point per lane, and returns Dr.Jit arrays. The points of a batch are visited cell by cell
+along a Morton curve (a space-filling curve), so that neighboring lanes visit the same nodes of a
+tree."""
 
 from __future__ import annotations
 
@@ -38,15 +41,15 @@ def evaluate_points(
     kernel: Callable[[Backend, Vec3], tuple[Any, ...]],
     precision: Precision | None,
 ) -> tuple[npt.NDArray[Any], ...]:
-    """The results of `kernel` at points (n, 3), as NumPy arrays in the order of the points; for a
-    single point (3,), without the first axis.
+    """The results of `kernel` at points (n, 3), as NumPy arrays in the order of the points. For a
+    single point (3,) they have no first axis.
 
     kernel: a function that takes a backend and a Dr.Jit 3-vector of points, and returns a tuple of
         Dr.Jit arrays.
     precision: "single" or "double"; None for double if the points are an array of float64, else
         single.
 
-    The points are visited cell by cell along a Morton curve. So neighboring lanes visit the same
+    The points are visited cell by cell along a Morton curve. Neighboring lanes then visit the same
     nodes of a tree, which halves the time.
 
     Raises:
@@ -55,12 +58,13 @@ def evaluate_points(
     backend = choose_backend(precision or precision_of_input(points))
 
     def visit(x: Vec3) -> tuple[Any, ...]:
-        """The results of `kernel` at the Dr.Jit points x, in the order of x; the kernel is given
-        the points in the order of a Morton curve."""
+        """The results of `kernel` at the Dr.Jit points x, in the order of x. The kernel itself is
+        given the points in the order of a Morton curve."""
         order = morton_order(backend, x)
         results = kernel(backend, dr.gather(backend.Array3f, x, order))
         return tuple(_restore_order(array, order, dr.width(x)) for array in results)
 
+    # NumPy arrays would lose derivatives.
     check_no_derivatives("what NumPy's arrays are given of", points)
     vectors = np.asarray(points)
     if vectors.shape == (3,):
@@ -69,14 +73,14 @@ def evaluate_points(
 
 
 def accepts_numpy_points(hessian: Callable[[Any, Vec3], Any]) -> Callable[..., Any]:
-    """Decorator of a field's method `hessian` for Dr.Jit points. The decorated method also takes
-    NumPy points (n, 3) or (3,), for which it returns NumPy matrices (n, 3, 3) or (3, 3)."""
+    """Decorator of a field's method `hessian`, which takes Dr.Jit points. The decorated method also
+    takes NumPy points (n, 3) or (3,), for which it returns NumPy matrices (n, 3, 3) or (3, 3)."""
 
     @accepts_dask_arrays("p")
     @functools.wraps(hessian)
     def general(self: Any, p: Any, *, precision: Precision | None = None) -> Any:
-        """The second derivatives at p (`Field.hessian`): for a Dr.Jit 3-vector the rows of the
-        matrix, for NumPy points NumPy matrices."""
+        """The second derivatives at p (`Field.hessian`): for a Dr.Jit 3-vector p, the three rows of
+        the matrix; for NumPy points, NumPy matrices."""
         if dr.is_array_v(type(p)):
             check_no_derivatives(f"the Hessian of {type(self).__name__}", p, self.parameters())
             return hessian(self, p)
@@ -85,6 +89,7 @@ def accepts_numpy_points(hessian: Callable[[Any, Vec3], Any]) -> Callable[..., A
             """The rows of the Hessian at the Dr.Jit points x."""
             return self.prepare(backend).hessian(x)
 
+        # Three arrays of rows (n, 3) become matrices (n, 3, 3).
         return np.stack(evaluate_points(p, kernel, precision), axis=-2)
 
     return general
@@ -100,11 +105,11 @@ def map_batches(
     """The results of `compute` for points (n, 3), as NumPy arrays (n,) or (n, 3), computed batch by
     batch.
 
-    backend: tells the precision of the arrays.
-    compute: a function that takes the Dr.Jit points of a batch and its rows of `extra_vectors`, and
-        returns a tuple of Dr.Jit arrays and vectors.
-    points: an array-like, or a Dr.Jit 3-vector.
-    extra_vectors: further arguments of `compute`, vectors (n, 3) of any values, one row for each
+    backend: the backend of the computation, which also decides the precision.
+    compute: a function that takes the Dr.Jit points of a batch and its rows of each of
+        `extra_vectors`, and returns a tuple of Dr.Jit arrays and vectors.
+    points: (n, 3), an array-like; or a Dr.Jit 3-vector.
+    extra_vectors: further arguments of `compute`, arrays (n, 3) of any values, one row for each
         point.
     at_once: the number of points of a batch.
 
@@ -121,6 +126,7 @@ def map_batches(
     for start in range(0, max(n, 1), at_once):
         lanes = min(at_once, n - start)
         with dr.suspend_grad():
+            # Without points, `compute` is called with the origin.
             results = compute(
                 *(
                     _slice_vectors(backend, array, start, lanes) if n else backend.Array3f(0)
@@ -135,9 +141,10 @@ def map_batches(
 
 
 def _slice_vectors(backend: Backend, vectors: Any, start: int, lanes: int) -> Vec3:
-    """The `lanes` vectors that begin with the vector number `start`, as a Dr.Jit vector.
+    """The `lanes` vectors of a batch, which begin with the vector of index `start`, as a Dr.Jit
+    vector.
 
-    vectors: a Dr.Jit vector, or an array (n, 3).
+    vectors: all vectors: a Dr.Jit vector, or an array (n, 3).
     """
     if dr.is_array_v(cast("Any", type(vectors))):
         return dr.gather(backend.Array3f, vectors, dr.arange(backend.UInt32, lanes) + start)
@@ -145,8 +152,8 @@ def _slice_vectors(backend: Backend, vectors: Any, start: int, lanes: int) -> Ve
 
 
 def _repeat_single_row(values: npt.NDArray[Any], n: int) -> npt.NDArray[Any]:
-    """The values as an array of n rows. A single row is repeated: it is a result that is the same
-    for all points."""
+    """The values as an array of n rows. If `compute` returned a single row because the result is
+    the same for all points, the row is repeated."""
     return values if len(values) == n else np.repeat(values, n, axis=0)
 
 
@@ -155,7 +162,7 @@ def _restore_order(values: Any, order: Any, n: int) -> Any:
 
     values: a Dr.Jit array, or a vector or matrix of such arrays, in the order in which the points
         were visited.
-    order: the original index of each visited point.
+    order: for each visited point, its index in the original order.
     n: the number of points.
     """
     kind = cast("Any", type(values))
@@ -167,10 +174,13 @@ def _restore_order(values: Any, order: Any, n: int) -> Any:
 
 
 def morton_order(backend: Backend, x: Vec3, bits: int = _BITS_PER_AXIS) -> Any:
-    """The order in which points x are visited cell by cell, with the cells along a Morton curve, as
-    the indices of the points (a Dr.Jit UInt32).
+    """The order in which points x are visited cell by cell along a Morton curve, as the indices of
+    the points (a Dr.Jit UInt32).
 
-    bits: there are 2^bits cells along an axis, and bits is at most 10.
+    The box of the points is cut into 2^bits cells along its longest side. The key of a cell
+    interleaves the bits of its three indices; points are sorted by their keys.
+
+    bits: at most 10.
     """
     index, vector = backend.UInt32, backend.Array3f
     n = dr.width(x)
@@ -179,11 +189,13 @@ def morton_order(backend: Backend, x: Vec3, bits: int = _BITS_PER_AXIS) -> Any:
     lower = vector(*(dr.min(coordinate) for coordinate in x))
     sides = [dr.max(x[k]) - lower[k] for k in range(3)]
     size = dr.maximum(dr.maximum(sides[0], sides[1]), sides[2])
+    # A little less than 2^bits, so that the largest coordinate falls into the last cell.
     scale = (2**bits - 1e-3) / dr.maximum(size, 1e-30)
     key = index(0)
     for axis in range(3):
         cell = index((x[axis] - lower[axis]) * scale)
         for bit in range(bits):
+            # Bit b of axis k becomes bit 3 b + k of the key.
             key |= (cell & (1 << bit)) << (2 * bit + axis)
     keys = to_numpy(key).astype(np.uint16 if 3 * bits <= 16 else np.uint32)
     return upload_integers(backend, np.argsort(keys, kind="stable"))

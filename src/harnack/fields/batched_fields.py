@@ -1,9 +1,9 @@
 """Fields that can be evaluated at large numbers of points at once, and caches that live as long as
-a field.
-
-- `BatchedField`: values, derivatives and error bounds at NumPy points, as NumPy arrays.
-- `FieldCache`, `cached_prepare`: caches for results that are computed or uploaded once per field.
-"""
+a field. A field is a function f of space. `BatchedField` gives its values, derivatives and error
+bounds at NumPy points, as NumPy arrays. The computation itself is a Dr.Jit kernel, with one point
+per lane. Many such fields are sums over sources in a tree, where a far cluster of sources is
+approximated as one source; this causes a truncation error. `FieldCache` and `cached_prepare` cache
+results that are computed or uploaded once per field."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ _MOMENT_ROUNDING = 32 * 2.0**-53
 
 @dataclass(frozen=True)
 class SymmetricMatrix:
-    """A symmetric 3 x 3 matrix in each lane, for the state of a loop that adds up such matrices.
-    xx, xy, ... are its entries."""
+    """A symmetric 3 x 3 matrix in each lane, as a record of its six entries xx, yy, zz, xy, xz, yz.
+    Loops that add up such matrices (Hessians) keep it in their state."""
 
     xx: Real
     yy: Real
@@ -51,12 +51,12 @@ class SymmetricMatrix:
     def zero(cls, real: Any) -> SymmetricMatrix:
         """The matrix of zeros.
 
-        real: the type of its entries.
+        real: the type of its entries, such as a Dr.Jit Float.
         """
         return cls(*(real(0) for _ in range(6)))
 
     def add_outer_product(self, u: Vec3, v: Vec3) -> SymmetricMatrix:
-        """This matrix plus the matrix (u v^T + v u^T)/2."""
+        """This matrix plus the symmetric matrix (u v^T + v u^T)/2."""
         half = 0.5 * v
         return SymmetricMatrix(
             dr.fma(u.x, v.x, self.xx),
@@ -68,8 +68,7 @@ class SymmetricMatrix:
         )
 
     def components(self) -> tuple[Real, ...]:
-        """The entries xx, xy, ... in the order of the constructor, as a tuple for the state of a
-        loop."""
+        """The six entries in the order of the constructor, as a tuple for the state of a loop."""
         return self.xx, self.yy, self.zz, self.xy, self.xz, self.yz
 
     def rows(self, vector: Any) -> tuple[Vec3, Vec3, Vec3]:
@@ -86,14 +85,14 @@ class SymmetricMatrix:
 
 @dataclass(frozen=True)
 class PointValues:
-    """The value of a field at points and, if requested, its gradient and Hessian, with bounds of
-    their truncation and rounding errors.
+    """The value of a field's function f at points and, if requested, its gradient and Hessian, with
+    bounds of their truncation and rounding errors. All are Dr.Jit arrays, with one point per lane.
 
     error: a bound of the error of `value`.
     gradient, hessian: None if they were not requested.
     gradient_error: a bound of the error of `gradient`, as a length.
-    hessian_error: a bound of the error of second derivatives along lines, which is the spectral
-        norm of the Hessian's error.
+    hessian_error: a bound of the error of the second derivative along any line, which is the
+        spectral norm of the Hessian's error.
     """
 
     value: Real
@@ -105,11 +104,11 @@ class PointValues:
 
     def with_far_field_errors(self, x: Vec3, terms: int, weight: float) -> PointValues:
         """The same values, with error bounds that also hold at points far away from the field's
-        data.
+        data. These values are a sum over dipoles.
 
         x: the points, in coordinates in which the field's data have a size of about 1.
         terms: the number of terms that were summed.
-        weight: the weight of all dipoles together.
+        weight: the sum of the absolute weights of all dipoles.
 
         Two errors matter only far away. First, a term of a derivative is the product of a factor
         that falls like |x|^-5 and one that grows like |x|^2, and the first may underflow. Second,
@@ -118,6 +117,7 @@ class PointValues:
         """
         smallest = float(dr.smallest(type(x.x)))
         underflow = 4 * smallest * terms * (1 + dr.squared_norm(x))
+        # Nearer than 4 the second error does not matter, so |x| counts as at least 4.
         inverse = dr.rcp(fmax(dr.norm(x), type(x.x)(4)))
         moment_error = _MOMENT_ROUNDING * weight * dr.square(inverse)
         return dataclasses.replace(
@@ -128,13 +128,14 @@ class PointValues:
         )
 
     def rescaled(self, size: Real) -> PointValues:
-        """The values of the function x -> f(x / size) at the points `size` times x. Where a number
-        has overflowed, its error is infinite."""
+        """The values of the scaled function g(x) = f(x / size) at the points `size` times x, from
+        these values of f at x. Where a number has overflowed, its error is infinite."""
         gradient, hessian, inverse = self.gradient, self.hessian, 1 / size
         gradient_error, hessian_error = self.gradient_error, self.hessian_error
         if gradient is not None:
             gradient = gradient * inverse
             is_finite = dr.isfinite(gradient.x) & dr.isfinite(gradient.y) & dr.isfinite(gradient.z)
+            # By the chain rule derivatives of order k are divided by size^k.
             gradient_error = dr.select(is_finite, gradient_error * inverse, dr.inf)
         if hessian is not None:
             hessian = type(hessian)(*(inverse * inverse * entry for entry in hessian.components()))
@@ -145,29 +146,33 @@ class PointValues:
 
 
 class BatchedField(Field):
-    """A field that can be evaluated at large numbers of points at once: its values, derivatives and
-    error bounds. Subclasses define `values_at`."""
+    """A field whose values, derivatives and error bounds can be evaluated at large numbers of
+    points at once. Points are either Dr.Jit 3-vectors, one point per lane, or NumPy arrays (n, 3),
+    for which results are NumPy arrays. Many such fields are sums in which a far cluster of sources
+    is approximated as one source. Subclasses define `values_at`."""
 
     @abc.abstractmethod
     def values_at(self, x: Vec3, derivatives: int, closer: Real = 1.0) -> PointValues:
-        """Values and derivatives at points x, a Dr.Jit 3-vector of any backend and precision.
+        """Values of f at points x, with error bounds and, if requested, derivatives. x is a Dr.Jit
+        3-vector of any backend and precision.
 
         derivatives: 0 for values only, 1 for gradients too, 2 for Hessians too.
-        closer: a factor, at least 1, by which a cluster of far terms must be farther away than
-            usual to be approximated; with infinity nothing is approximated.
+        closer: the accuracy scale, at least 1; larger is more accurate. It multiplies the distance
+            from which on a cluster of sources is approximated. With infinity nothing is
+            approximated.
 
         It is not called while a loop is being recorded, unless `derivatives` is 2.
         """
 
     def sharp_values_at(self, x: Vec3) -> PointValues:
-        """Values and gradients at points x, as `gradient` returns them to users. The default is
-        `values_at`; subclasses may compute the gradient more accurately. It is not called while a
-        loop is being recorded."""
+        """Values and gradients at points x, as accurate as `gradient` returns them to users. The
+        default is `values_at`; subclasses may compute the gradient more accurately (`sharpened`).
+        It is not called while a loop is being recorded."""
         return self.values_at(x, 1)
 
     def differentiable_value(self, p: Vec3) -> Real:
-        """f at p as an expression that Dr.Jit can differentiate once, in reverse and in forward
-        mode: its derivative is the gradient of f."""
+        """f at p as an expression that Dr.Jit can differentiate once with respect to p, in reverse
+        and in forward mode. Its derivative is the gradient of `sharp_values_at`."""
         with dr.suspend_grad():
             at = self.sharp_values_at(dr.detach(p))
         # A literal 0, the gradient of a closed mesh, would have no derivative in Dr.Jit.
@@ -196,8 +201,8 @@ class BatchedField(Field):
     def value_and_gradient(
         self, points: Any, *, precision: Precision | None = None
     ) -> tuple[FloatArray, FloatArray]:
-        """Values (n,) and gradients (n, 3) at points (n, 3). They cost hardly more than gradients
-        alone."""
+        """Values (n,) and gradients (n, 3) of f at points (n, 3), as NumPy arrays. Together they
+        take hardly more time than gradients alone."""
         value, gradient = self._choose_at_points(
             points, precision, 1, lambda at: (at.value, at.gradient)
         )
@@ -206,9 +211,9 @@ class BatchedField(Field):
     def rough_value_and_gradient(
         self, points: Any, *, precision: Precision | None = None
     ) -> tuple[FloatArray, FloatArray]:
-        """Values (n,) and gradients (n, 3) at points (n, 3), by a single pass over a tree. The
-        errors of the gradients may be large. So they serve for estimates, and at points at which f
-        is steep."""
+        """Values (n,) and gradients (n, 3) at points (n, 3), by a single pass over the tree of
+        sources. The gradients may have large errors. So they serve for estimates, and at points
+        where f is steep."""
 
         def kernel(backend: Backend, x: Vec3) -> tuple[Any, ...]:
             """The values and gradients at the Dr.Jit points x."""
@@ -227,11 +232,9 @@ class BatchedField(Field):
 
     @accepts_dask_arrays("points")
     def error_bound(self, points: Any, *, precision: Precision | None = None) -> FloatArray:
-        """Bounds (n,) of the error of `value` at points (n, 3).
-
-        They include the proved truncation error and the rounding error of f. The rounding of the
-        points themselves, in single precision, is not included.
-        """
+        """Bounds (n,) of the error of `value` at points (n, 3). They include the proved truncation
+        error and the rounding error of f. They do not include the change of f by rounding the
+        points to single precision."""
         return self._choose_at_points(points, precision, 0, lambda at: (at.error,))[0]
 
     @accepts_dask_arrays("points")
@@ -239,8 +242,8 @@ class BatchedField(Field):
         self, points: Any, *, precision: Precision | None = None
     ) -> FloatArray:
         """Bounds (n,) of the error of `gradient`, as a length, at points (n, 3). They include the
-        proved truncation error and the rounding error, but not the rounding of the points
-        themselves.
+        proved truncation error and the rounding error. They do not include the change of the
+        gradient by rounding the points.
 
         For a sum over a tree the bound is about a hundred times the error itself, because the
         accuracy of the sum is chosen by estimates (`sharpened`).
@@ -250,8 +253,8 @@ class BatchedField(Field):
     @accepts_dask_arrays("points")
     def hessian_error_bound(self, points: Any, *, precision: Precision | None = None) -> FloatArray:
         """Bounds (n,) of the error of `hessian`, in the spectral norm, at points (n, 3). They
-        include the proved truncation error and the rounding error, but not the rounding of the
-        points themselves."""
+        include the proved truncation error and the rounding error. They do not include the change
+        of the Hessian by rounding the points."""
         return self._choose_at_points(points, precision, 2, lambda at: (at.hessian_error,))[0]
 
     def _choose_at_points(
@@ -261,17 +264,18 @@ class BatchedField(Field):
         derivatives: int,
         choose: Callable[[PointValues], tuple[Any, ...]],
     ) -> tuple[FloatArray, ...]:
-        """Results of the field at points (n, 3) or (3,), as NumPy arrays in the order of the
-        points.
+        """Some of the results of the field at points (n, 3) or (3,), as a tuple of NumPy arrays in
+        the order of the points.
 
         precision: "single", "double", or None for that of the points.
         derivatives: the order up to which derivatives are computed, 0 to 2.
-        choose: a function that takes the `PointValues` of a batch and returns the wanted Dr.Jit
-            arrays.
+        choose: a function that takes the `PointValues` of a batch of points and returns the wanted
+            Dr.Jit arrays.
         """
 
         def kernel(backend: Backend, x: Vec3) -> tuple[Any, ...]:
-            """The results of `choose` at the Dr.Jit points x."""
+            """What `choose` takes from the field's results at the Dr.Jit points x. Gradients alone
+            are computed more accurately, by `sharp_values_at`."""
             del backend
             sharp = derivatives == 1
             return choose(self.sharp_values_at(x) if sharp else self.values_at(x, derivatives))
@@ -280,12 +284,12 @@ class BatchedField(Field):
 
 
 class SumAtDetail(EvaluateOnly):
-    """A sum over sources at one accuracy scale (the parameter of `VariableAccuracy.at_accuracy`),
-    with second derivatives.
+    """A sum over sources, sampled at one accuracy scale (larger is more accurate; the parameter of
+    `VariableAccuracy.at_accuracy`), with second derivatives. It is made of two functions of a point
+    p, a Dr.Jit 3-vector.
 
-    evaluate: a function that returns the sample at a point.
-    values: a function that returns the `PointValues` at a point, with the Hessian, at the same
-        accuracy scale.
+    evaluate: returns the sample at p: value, gradient and proved bounds of f near p.
+    values: returns the `PointValues` at p with the Hessian, at the same accuracy scale.
     """
 
     def __init__(
@@ -301,36 +305,39 @@ class SumAtDetail(EvaluateOnly):
         return sample.gradient_error, self._values(p).hessian_error
 
 
-# Gradients of a sum over a tree are computed again with these multiples of the distance from which
-# on clusters are taken as one source. It is repeated with the next multiple as long as the last one
+# Accuracy scales at which the gradient of a sum over a tree is computed again: multiples of the
+# distance from which on a cluster is taken as one source. The next scale is used if the last one
 # changed the gradient by more than the fraction `_MAX_CHANGE` of its length. (Measured: twice the
-# distance leaves a sixteenth of the error or less. So the error is 1 % of the length, with a
-# reserve of a factor of four.)
+# distance leaves a sixteenth of the error or less. So the remaining error is below 1 % of the
+# length, with a reserve of a factor of four.)
 _DISTANCE_MULTIPLES, _MAX_CHANGE = (2.0, 4.0, 8.0), 0.04
 # A gradient is not refined if its error is proved to be at most this fraction of its length.
 _ACCEPTED_ERROR = 0.01
 
 
 def sharpened(at: Callable[[Vec3, Real], PointValues], x: Vec3) -> PointValues:
-    """Values and gradients at points x by a sum over a tree, summed so accurately that the error of
-    a gradient is about 1 % of its length.
+    """Values and gradients of a sum over a tree at points x, where gradients are summed so
+    accurately that their errors are about 1 % of their lengths.
 
-    at: a function that takes points and a factor, and returns values and gradients there. A cluster
-        counts as one source only beyond this multiple of the usual distance. The values are those
-        for the factor 1; for the gradients the factor is raised where needed.
+    at: a function that takes points and an accuracy scale, and returns values and gradients there.
+        The scale multiplies the distance from which on a cluster of sources counts as one source.
+        The values are those for the scale 1; for the gradients the scale is raised where needed.
 
     Far terms may nearly cancel, as the triangles of a mesh with small holes do. Then the gradient
     is far smaller than the truncation errors of its clusters. Proved bounds of these errors add up
     absolute values, and would demand that all terms are summed nearly everywhere. So the observed
-    change of the gradient, from one factor to the next, decides whether to refine it. The error
-    bounds that are returned stay proved.
+    change of the gradient from one scale to the next decides whether to refine it further. The
+    error bounds that are returned stay proved.
     """
     real = cast("Any", type(x.x))
     dr.eval(x)
+    # The scale is a kernel parameter, so that all scales use the same compiled kernel.
     values = at(x, dr.opaque(real, 1.0))
     gradient, error = as_kernel_parameters(values.gradient), real(values.gradient_error)
+    # Adding zeros gives arrays of full width, one number per lane, which can be scattered into.
     gradient, error = gradient + dr.zeros(type(x), dr.width(x)), error + dr.zeros(real, dr.width(x))
     dr.eval(values.value, values.error, gradient, error)
+    # The indices of the points whose gradient is to be refined.
     rows = dr.compress(~(error <= _ACCEPTED_ERROR * dr.norm(gradient)))
     for closer in _DISTANCE_MULTIPLES:
         if not len(rows):
@@ -352,7 +359,7 @@ def sharpened(at: Callable[[Vec3, Real], PointValues], x: Vec3) -> PointValues:
 
 
 def _required_hessian(values: PointValues) -> SymmetricMatrix:
-    """The Hessian of `PointValues` that were computed with second derivatives.
+    """The Hessian of `PointValues`, which must have been computed with second derivatives.
 
     Raises:
         RuntimeError: they were computed without second derivatives.
@@ -367,8 +374,8 @@ Value = TypeVar("Value")
 
 
 class FieldCache(Generic[Value]):
-    """A cache that keeps one value per field: the value for the last key. The value is dropped when
-    the field is deleted.
+    """A cache that keeps one value for each field. The value belongs to a key, and is replaced if
+    it is requested for another key. It is dropped when the field is deleted.
 
     A value must not refer to its field, or neither of them would ever be deleted.
     """
@@ -378,34 +385,40 @@ class FieldCache(Generic[Value]):
         self._kept: dict[int, tuple[Any, dict[str, Any], Value]] = {}
 
     def get(self, field: Field, key: Any, make: Callable[[], Value]) -> Value:
-        """The cached value of a field, if it was computed for this key and no attribute of the
-        field was set since then. Otherwise the result of make(), which is then cached."""
+        """The value of a field for this key: the cached one if it was made for the same key and no
+        attribute of the field was set since then; otherwise the result of make(), which is then
+        cached. (A value that is the field itself is not cached, as it would keep the field
+        alive.)"""
         if id(field) in self._kept:
             kept_key, attributes, value = self._kept[id(field)]
             now = vars(field)
             same = attributes.keys() == now.keys()
+            # Attributes are compared by identity: it is fast, and arrays have no single truth value
+            # of ==.
             if same and kept_key == key and all(attributes[name] is now[name] for name in now):
                 return value
         value = make()
         if value is not field:
             if id(field) not in self._kept:
+                # Drop the value when the field is deleted.
                 finalize(field, self._kept.pop, id(field), None).atexit = False
             self._kept[id(field)] = key, {**vars(field)}, value
         return value
 
 
 def cached_prepare(prepare: Prepare) -> Prepare:
-    """Decorator of a field's method `prepare`. With it, a field is uploaded to each backend only
-    once.
+    """Decorator of a field's method `prepare`, which uploads the field's data to a backend. The
+    decorated method uploads a field only once to each backend.
 
-    A field with parameters is uploaded at each call, since a parameter may change in place, and its
+    A field with parameters is uploaded at each call: a parameter may change in place, and its
     derivatives belong to a single trace.
     """
+    # For each backend a cache of prepared fields, without keys.
     caches: defaultdict[Backend, FieldCache[Field]] = defaultdict(FieldCache)
 
     @functools.wraps(prepare)
     def cached(self: Field, backend: Backend) -> Field:
-        """The prepared field: from the cache, unless the field has parameters."""
+        """The prepared field: the cached one, unless the field has parameters."""
         if self.parameters():
             return prepare(self, backend)
         return caches[backend].get(self, None, lambda: prepare(self, backend))

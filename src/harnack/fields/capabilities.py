@@ -1,23 +1,23 @@
-"""Optional capabilities of fields: jumps, patches, boundary curves, variable accuracy.
+"""Optional capabilities of a field, as base classes of `Field`. A field is a function f of space;
+its surface is a level set of f; a sample of it at a point is its value and gradient there, with
+proved bounds of f near the point ("promises"). Each class here has defaults for fields that lack
+the capability:
 
-Each is a base class of `Field`, with defaults for fields that lack the capability:
-
-- `JumpSurface`: the field jumps across a surface, such as the triangles of a mesh.
-- `PatchUnion`: the surface is the union of many level sets, each of its own function and inside its
-  own box.
+- `JumpSurface`: f jumps across a surface made of facets, such as the triangles of a mesh.
+- `PatchUnion`: the surface is the union of many level sets (patches), each of its own function and
+  inside its own box.
 - `CommonBoundary`: every level set ends at the same curves.
-- `VariableAccuracy`: the field can be sampled with different accuracy.
+- `VariableAccuracy`: f can be sampled with different accuracy.
 
-How accurately a tree is summed. The smaller the truncation error of a sum over a tree, the higher
-its cost; and far from the surface a large error does no harm. So `VariableAccuracy.at_accuracy`
-takes any accuracy, from coarse to a direct sum. If truncation decides about a step or a hit, the
-tracer samples the point again with higher accuracy, until a hit is within the tolerance minus the
-truncation error. The uncertainty that is due to rounding alone is reported in `Hits.uncertainty`.
-If it is large, for example because grad f is 0 on the surface, `trace` searches for the surface
-around the hit after the march (`doubtful`), so that other hits cost nothing more. The samples of
-such sums promise a bound of the second derivatives of f near the point (`source_sums`). (The ranges
-of the published proof, which add up absolute values to first order, hold only on a fifth of that
-length.)
+Accuracy of sums over trees. The smaller the truncation error of a sum over a tree, the higher its
+cost; and far from the surface a large error does no harm. So `VariableAccuracy.at_accuracy` takes
+any accuracy, from coarse to a direct sum. If the truncation error decides about a step or a hit,
+the tracer samples the point again with higher accuracy, until a hit is within the tolerance minus
+the truncation error. An uncertainty that is due to rounding alone is reported in
+`Hits.uncertainty`. If it is large, for example because grad f is 0 on the surface, `trace` searches
+for the surface around the hit after the march (`doubtful`). The samples of such sums promise a
+bound of the second derivatives of f near the point (`source_sums`). (The ranges of the published
+proof, which add up absolute values to first order, hold only on a fifth of that length.)
 """
 
 from __future__ import annotations
@@ -39,14 +39,14 @@ NO_FACET = 0xFFFFFFFF
 
 @dataclass(frozen=True)
 class JumpCrossing:
-    """A crossing of a ray with a jump surface. An end of a ray, which lies on no facet, is
-    represented as a crossing too.
+    """A point at which a ray o + t d crosses a facet of the surface across which f jumps. An end of
+    a ray, which lies on no facet, is represented in the same way.
 
-    t: ray parameter; inf if no facet is crossed.
-    facet: index of the facet, a Dr.Jit UInt32; NO_FACET if there is none.
+    t: the ray parameter; inf if no facet is crossed.
+    facet: the index of the facet, a Dr.Jit UInt32; NO_FACET if there is none.
     jump: f just behind the facet minus f just before it, along the ray; 0 if there is no facet.
-    normal: (3,) unit normal of the facet, pointing to the side on which f is larger: (normal . d)
-        jump >= 0, with d the direction of the ray. It is meaningless if there is no facet.
+    normal: (3,) the unit normal of the facet on the side where f is larger: (normal . d) jump >= 0.
+        It is meaningless if there is no facet.
     """
 
     t: Real
@@ -57,16 +57,17 @@ class JumpCrossing:
 
 @dataclass(frozen=True)
 class NearestFacet:
-    """The facet nearest to a point x, among the facets of a query (`Field.nearest_facet`).
+    """The facet nearest to a point x, among the facets that a query allows (`Field.nearest_facet`).
+    Facets are the pieces of the surface across which f jumps.
 
-    sort_key: a number that grows with the distance. Facets are ordered by it, then by index. It is
-        inf if there is no facet.
-    facet: index of the facet, a Dr.Jit UInt32; NO_FACET if there is none.
+    sort_key: a number that grows with the distance from x; inf if there is no facet. Facets are
+        ordered by it, and by index if it is equal.
+    facet: the index of the facet, a Dr.Jit UInt32; NO_FACET if there is none.
     offset: (3,) the vector from x to the closest point of the facet.
-    normal: (3,) unit normal of the facet at that point, to either side; any direction if the facet
-        has no normal.
-    is_inner: whether that point lies inside the facet, so that a line through it along the normal
-        crosses the facet there in spite of rounding. It is False on the edges of a facet.
+    normal: (3,) the unit normal of the facet at that point, to either side; any direction if the
+        facet has no normal.
+    is_inner: whether that point lies so far inside the facet that a line through it along the
+        normal crosses the facet in spite of rounding. It is False on the edges of a facet.
     """
 
     sort_key: Real
@@ -82,10 +83,12 @@ NO_PATCH = 0xFFFFFFFF
 
 @dataclass(frozen=True)
 class PatchEntry:
-    """The entry of a ray into the box in which a patch is proved to lie.
+    """The entry of a ray o + t d into a box that is proved to contain a patch, which is one of the
+    level sets that together form a surface.
 
-    enter, leave: ray parameters; inf if no box is entered.
-    patch: index of the patch, a Dr.Jit UInt32; NO_PATCH if there is none.
+    enter, leave: the ray parameters at which the ray enters and leaves the box; inf if no box is
+        entered.
+    patch: the index of the patch, a Dr.Jit UInt32; NO_PATCH if there is none.
     """
 
     enter: Real
@@ -94,19 +97,22 @@ class PatchEntry:
 
 
 class JumpSurface:
-    """Fields that jump across a surface of facets, such as triangles. Defaults: no facets.
+    """A field whose function f jumps across a surface made of facets, such as triangles. The facets
+    cut a ray o + t d, with |d| = 1, into intervals. On each interval f is smooth, and can be
+    continued smoothly beyond both ends of the interval; this continuation is what the tracer
+    marches along. A crossing is a point where the ray meets a facet (`JumpCrossing`). The defaults
+    describe a field without facets.
 
-    Away from its facets such a field is as smooth as any other. The facets cut a ray into
-    intervals. On each interval f, continued to both of its ends, is a smooth function. The field's
-    promises are about this function, and the tracer marches along it as along any field. Where a
-    ray crosses a facet, the values just before and just behind it are compared with the levels.
+    The promises of a sample (proved bounds of f near a point) are about the continued function.
+    Where a ray crosses a facet, the values just before and just behind it are compared with the
+    levels.
 
     A field with jumps is real-valued (no period), has `has_jumps = True`, and defines two methods:
     `next_jump` gives the next crossing of a ray, and `continuation` gives the field on the interval
     between two crossings. Fields that count jumps also define `initial_offset`.
 
-    All methods may be called while a loop is being recorded. Rays are o + t d with |d| = 1. Results
-    on lanes that are not active are ignored.
+    All methods may be called while a loop is being recorded. Results on lanes that are not active
+    are ignored.
     """
 
     has_jumps: bool = False
@@ -115,19 +121,20 @@ class JumpSurface:
 
     @property
     def has_unknown_branch(self) -> bool:
-        """Whether samples of `continuation` at an accuracy below `coarsest_accuracy` may give f
-        only modulo 1.
+        """Whether samples of `continuation` may give f only modulo 1, at an accuracy scale below
+        `coarsest_accuracy`.
 
-        Then they set `Sample.branch_unknown`, and all jumps are integers. A condition on `extent`
-        must hold for sets of levels of this kind: with each level, the set contains the level that
-        is congruent to it modulo 1 and nearest to 0. Outside the extent of such a set, no periodic
-        level lies between f and 0.
+        If so, those samples set `Sample.branch_unknown`, and all jumps of f are integers. Besides,
+        `extent` must keep a condition for every set of levels that contains, with each level, the
+        level that differs from it by an integer and is nearest to 0: outside the extent of such a
+        set, no number that differs from a level by an integer lies between f and 0.
         """
         return False
 
     def is_of_sheets_alone(self, levels: tuple[float, ...]) -> bool:
-        """Whether the surface of these levels consists of all facets and of nothing else. Then
-        `with_levels` gives a field that takes the levels at every facet and nowhere else."""
+        """Whether the level set of these levels consists of all facets and of nothing else. Then
+        `with_levels` returns a field that takes the levels at every facet and nowhere else. The
+        default is False."""
         del levels
         return False
 
@@ -135,22 +142,24 @@ class JumpSurface:
     """Whether this field takes its levels at its facets only: see `is_of_sheets_alone`."""
 
     def without_jumps(self) -> Field | None:
-        """A field without jumps, whose level sets contain all points of this field's level sets
-        that lie on no facet; None if none is known. Distances use it."""
+        """A field without jumps whose level sets contain all points of this field's level sets,
+        except those on facets; None, the default, if no such field is known. Computations of
+        distances use it."""
         return None
 
     def evaluate_modulo_one(self, p: Vec3) -> Sample:
-        """A sample at p whose value is f minus an integer. The integer is not known and may differ
-        from point to point, so that the sample may take less work than `evaluate`. It is used only
-        for fields with `has_unknown_branch`. The default is `evaluate`."""
+        """A sample at p whose value is f minus an unknown integer, which may differ from point to
+        point. So it may take less time than `evaluate`. It is used only for fields with
+        `has_unknown_branch`. The default is `evaluate`."""
         return cast("Field", self).evaluate(p)
 
     def value_if_cheap(self, p: Vec3, rounding: Real, active: Mask) -> Real:
-        """f at p on active lanes, if it takes less work there than `evaluate`; NaN on all other
-        lanes, and where p may lie on a facet. It is used only for fields with `has_unknown_branch`.
-        The default is NaN everywhere.
+        """f at p, on active lanes on which it takes less time than `evaluate`. It is NaN on all
+        other lanes, and where p may lie on a facet. It is used only for fields with
+        `has_unknown_branch`. The default is NaN everywhere.
 
-        rounding: a bound of the rounding of the coordinates of p, and of the ray on which p lies.
+        rounding: a bound of the rounding errors of the coordinates of p, and of the ray on which p
+            lies.
         """
         del rounding, active
         return 0 * p.x + math.nan
@@ -158,11 +167,12 @@ class JumpSurface:
     def next_jump(
         self, o: Vec3, d: Vec3, after: JumpCrossing, t_max: Real, active: Mask
     ) -> JumpCrossing:
-        """The first crossing of the ray strictly after the crossing `after`, with t <= t_max.
+        """The first crossing of the ray o + t d with a facet strictly after the crossing `after`,
+        with t <= t_max.
 
-        Crossings are ordered by (t, facet): facets crossed at the same t follow each other by
-        index. NO_FACET is the largest index, so that nothing follows it at the same t. Repeated
-        calls must give every crossing of the ray in this order, with a t and a jump that do not
+        Crossings are ordered by (t, facet): facets that are crossed at the same t follow each other
+        by index. NO_FACET is the largest index, so nothing follows it at the same t. Repeated calls
+        must give every crossing of the ray in this order. The t and the jump of a crossing must not
         depend on the crossing at which the calls began. If there is no further crossing, t = inf,
         facet = NO_FACET and jump = 0.
         """
@@ -170,11 +180,12 @@ class JumpSurface:
         return JumpCrossing(float("inf"), NO_FACET, 0.0, (0.0, 0.0, 0.0))
 
     def initial_offset(self, o: Vec3, d: Vec3, t_min: Real, active: Mask) -> Real:
-        """The offset of f at the start of a ray; the field chooses its meaning.
+        """A number that describes f at the start of a ray o + t d, of a kind that the field
+        chooses; for example the sum of the signs of the ray's crossings beyond the start. The
+        tracer adds the jump at each crossing to it, and passes the sum to `continuation`.
 
-        The tracer adds the jump at each crossing and passes the sum to `continuation`. Crossings
-        with t <= t_min are behind the start (`next_jump` after (t_min, NO_FACET)), all others are
-        ahead of it.
+        t_min: the parameter of the start. Crossings with t <= t_min lie behind the start
+            (`next_jump` after (t_min, NO_FACET)); all others lie in front of it.
         """
         del o, d, t_min, active
         return 0.0
@@ -182,45 +193,46 @@ class JumpSurface:
     def continuation(
         self, o: Vec3, d: Vec3, behind: JumpCrossing, ahead: JumpCrossing, offset: Real
     ) -> Field:
-        """f between two consecutive jump crossings of a ray, as a field.
+        """A field for the part of a ray o + t d between two consecutive crossings: it gives f
+        there, continued smoothly beyond both ends.
 
-        behind: the crossing passed last, or the start of the ray with facet NO_FACET.
-        ahead: the next crossing, or t = inf and facet NO_FACET.
+        behind: the crossing passed last; or the start of the ray, with facet NO_FACET.
+        ahead: the next crossing; or t = inf, with facet NO_FACET.
         offset: `initial_offset` at the start of the ray plus all jumps since.
 
         The field's `evaluate` is called at points p = o + t d with behind.t <= t <= ahead.t, up to
         rounding. At the two ends it gives the limit from inside the interval, even if rounding puts
-        p on the other side of the facet, or if the two t are equal. Its promises are about the
-        smooth function that continues these values past both ends. The tracer uses them on the
-        interval only.
+        p on the other side of the facet, or if the two t are equal. Its promises (proved bounds
+        near p) are about the continued function. The tracer uses them only between the two
+        crossings.
         """
         del o, d, behind, ahead, offset
         return cast("Field", self)
 
     def distance_to_jumps(self, p: Vec3) -> Real:
-        """The distance from p to the nearest facet, rounded down; inf if there is none. Lower
-        bounds of distances use it."""
+        """The distance from p to the nearest facet, rounded down; inf, the default, if there are no
+        facets. Lower bounds of distances use it."""
         del p
         return float("inf")
 
     def nearest_facet(
         self, p: Vec3, after: tuple[Real, Any], limit: Real, active: Mask
     ) -> NearestFacet | None:
-        """The facet that follows `after` in the order of distance from p, if it is nearer than
-        `limit`.
+        """The facet that follows the facet `after` in the order of distance from p, if it is nearer
+        than `limit`.
 
-        after: (sort_key, index) of a facet, or (-1, NO_FACET) to begin with.
+        after: (sort_key, index) of a facet; (-1, NO_FACET) to begin with the nearest.
 
         Facets are ordered by `NearestFacet.sort_key`, then by index. Repeated calls must give each
-        facet once. The default is None: distances then search for the nearest facet only, by
-        descent of `distance_to_jumps`.
+        facet once. The default is None: computations of distances then search for the nearest facet
+        only, by descent of `distance_to_jumps`.
         """
         del p, after, limit, active
         return None
 
     def jump_mesh(self) -> tuple[FloatArray, IntArray, bool] | None:
-        """The mesh, for a field that is the winding number of a mesh; None for other fields.
-        Distances use it.
+        """The mesh of the facets, for a field that is the winding number of a mesh; None for other
+        fields. Computations of distances use it.
 
         Returns the vertices (n, 3); the faces (m, 3), each repeated by its multiplicity; and
         whether f is an integer everywhere off the faces.
@@ -229,13 +241,14 @@ class JumpSurface:
 
 
 class PatchUnion:
-    """A surface that is the union of many level sets (patches). Each is a level set of its own
-    function, inside its own box. Defaults: no patches.
+    """A surface that is the union of many level sets, called patches. Each patch is a level set of
+    a function of its own, and lies in a box of its own. In a polygon mesh, for example, each face
+    is a level set of the solid angle of its boundary, and no single function describes all faces.
+    Rays are o + t d with |d| = 1. The defaults describe a field without patches.
 
-    In a polygon mesh, for example, each face is a level set of the solid angle of its boundary, and
-    no single function describes all of them. The first hit of a ray is the first of the hits of all
-    patches. So the tracer marches along the patches whose boxes the ray enters, in the order in
-    which it enters them, and no farther than the first hit so far.
+    The first hit of a ray is the first of its hits with all patches. So the tracer marches along
+    the patches whose boxes the ray enters, in the order in which it enters them, and no farther
+    than the first hit so far.
 
     A field with patches has `has_patches = True` and defines two methods. `next_patch` gives the
     next patch along a ray. `patch` gives the function of a patch, as a field. The patches share the
@@ -249,15 +262,16 @@ class PatchUnion:
     `patch` are needed."""
 
     def with_levels(self, levels: tuple[float, ...]) -> Field:
-        """This field, not yet prepared, with boxes that contain the patches of these levels."""
+        """This field with boxes that contain the patches of these levels, not yet prepared for a
+        backend. The default is the field itself."""
         del levels
         return cast("Field", self)
 
     def next_patch(
         self, o: Vec3, d: Vec3, after: PatchEntry, start: Real, end: Real, active: Mask
     ) -> PatchEntry:
-        """The first entry of a ray into a box after the entry `after`, with start <= t <= end. Each
-        box is proved to contain one patch.
+        """The first box that a ray enters after the entry `after`, with start <= t <= end. Each box
+        is proved to contain one patch.
 
         A ray that begins in a box enters it at `start`. Entries are ordered by (enter, patch).
         Repeated calls, the first of them with an entry before `start`, must give every box that the
@@ -268,32 +282,34 @@ class PatchUnion:
         return PatchEntry(float("inf"), float("inf"), NO_PATCH)
 
     def patch(self, index: Any) -> Field:
-        """The field one of whose level sets is the patch with this index.
+        """The field that has the patch with this index as one of its level sets.
 
         index: a Dr.Jit UInt32, which may differ from lane to lane.
 
-        `evaluate` and `sample_ray` of the field may be called at points of any size. Its promises
-        hold in all of space.
+        Its `evaluate` and `sample_ray` may be called at points of any size, and its promises
+        (proved bounds near a point) hold in all of space.
         """
         del index
         return cast("Field", self)
 
 
 class CommonBoundary:
-    """Fields whose level sets all end at the same curves, such as an angle around these curves.
-    Defaults: no such curves."""
+    """A field whose level sets all end at the same curves, or all come arbitrarily near to the same
+    points. For example, every level set of an angle around a curve ends at the curve. The defaults
+    describe a field without such curves and points."""
 
     @property
     def boundary_curves(self) -> tuple[FloatArray, ...]:
-        """Closed curves (n, 3) at which level sets end; the first point is not repeated."""
+        """The closed curves at which all level sets end, each as an array (n, 3) of points; the
+        first point is not repeated at the end."""
         return ()
 
     def closest_boundary_point(self, p: Vec3) -> Vec3 | None:
-        """The point of the common boundary curves that is closest to p; None if there are no such
-        curves.
+        """The point closest to p on the curves at which all level sets end; None if there are no
+        such curves.
 
-        Only distances use it, while no loop is being recorded. Curves at which `domain` cuts level
-        sets off do not count.
+        It is called only for distances, and while no loop is being recorded. Curves at which
+        `domain` cuts level sets off do not count.
         """
         del p
         return None
@@ -301,13 +317,13 @@ class CommonBoundary:
     @property
     def singular_points(self) -> FloatArray:
         """Points (n, 3) to which all level sets come arbitrarily near, such as the dipoles of a
-        cloud. Distances use them."""
+        cloud. Computations of distances use them."""
         return np.zeros((0, 3))
 
     def continuous_change(self, p: FloatArray, q: FloatArray) -> FloatArray | None:
         """The change (n,) of an angle-valued f along the straight segments from p to q, if f is
-        followed continuously; None if only values modulo the period are known. Meshes use it on
-        long edges.
+        followed continuously, so without jumps by its period. None, the default, if only values
+        modulo the period are known. Meshing uses it on long edges.
 
         p, q: (n, 3).
         """
@@ -320,35 +336,40 @@ EXACT = 1e9
 
 
 class VariableAccuracy:
-    """A field that can be sampled with different accuracy. Defaults: a single accuracy.
+    """A field that can be sampled with different accuracy, such as a sum over a tree of sources,
+    which treats a far cluster of sources as a single source. The farther a cluster must be for
+    that, the smaller is the truncation error and the higher the cost. The defaults describe a field
+    with a single accuracy.
 
-    A sum over a tree treats far clusters as one source. The farther clusters must be for that, the
-    smaller the truncation error and the higher the cost. The tracer starts with coarse samples and
-    refines them where truncation shortens steps.
+    The tracer starts with coarse samples and refines them where the truncation error shortens
+    steps.
     """
 
     has_variable_accuracy: bool = False
     """Whether f can be sampled with different accuracy; then `at_accuracy` is needed."""
 
     coarsest_accuracy: float = 1.0
-    """The accuracy scale in (0, 1] of the coarsest samples, which scale 0 asks for: see
-    `at_accuracy`."""
+    """The accuracy scale of the coarsest samples, in (0, 1]; larger is more accurate. A smaller
+    scale, such as 0, gives no coarser samples. (Only a field with `has_unknown_branch` may then
+    give f modulo 1.) See `at_accuracy`."""
 
     def at_accuracy(self, detail: Real) -> Field:
         """This field, sampled with another accuracy.
 
-        detail: the accuracy scale, which may differ from lane to lane. 0 gives the coarsest samples
-            of the field, 1 the samples of `evaluate`, and a number above 1 more accurate samples.
+        detail: the accuracy scale, which may differ from lane to lane. Larger is more accurate: 0
+            gives the coarsest samples of the field, 1 the samples of `evaluate`, and a number above
+            1 more accurate samples.
 
         `Sample.truncation_error` falls about as detail^-3, and is 0 if detail is large enough. A
-        coarse sample is valid all the same, with a larger `value_error`.
+        coarse sample is as valid as any other; its `value_error` is larger.
         """
         del detail
         return cast("Field", self)
 
     def exact(self, backend: Backend) -> Field:
-        """This field, which must be prepared for the backend, with samples without truncation
-        error: at the accuracy scale `EXACT`."""
+        """This field with samples without truncation error (at the accuracy scale `EXACT`). The
+        field must be prepared for the backend. A field with a single accuracy is returned
+        unchanged."""
         if not self.has_variable_accuracy:
             return cast("Field", self)
         closely: Any = copy.copy(self)

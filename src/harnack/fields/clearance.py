@@ -1,9 +1,10 @@
-"""Clearances (proved lower bounds of the distance to a level set) and the extents that they prove.
-
-`clearance_function` gives clearances at points. `tight_extent` proves in which volume the level
-sets lie, and `occupied_cells` in which cells. Also here: `DeviceField`, the base of fields whose
-data lie on a backend, in coordinates in which they have a size of about 1.
-"""
+"""Proved lower bounds of the distance from a point to the level sets of a field, called clearances,
+and the volumes that follow from them. A field is a function f of space. Its sample at a point holds
+value and gradient there, and promises: proved bounds of f near the point. `clearance_function`
+gives clearances at points. `tight_extent` proves in which volume the level sets lie, and
+`occupied_cells` in which cells of a grid. Also here: `DeviceField`, the base of fields whose data
+lie on a backend (a Dr.Jit device and precision), in coordinates in which they have a size of about
+1."""
 
 from __future__ import annotations
 
@@ -39,8 +40,8 @@ if TYPE_CHECKING:
 
 __all__ = ["clearance_function", "level_distance_lower_bound", "occupied_cells", "tight_extent"]
 
-# The enclosures by which clearances are proved. They use all promises of a field: there are few
-# points, and the longest proof counts.
+# The enclosures (bounds of f along a line) by which clearances are proved. They use all promises of
+# a field: there are few points, so time matters less than a large clearance.
 _PROOFS = choose_enclosures("curvature")
 
 
@@ -48,7 +49,11 @@ def clearance_function(
     field: Field, levels: tuple[float, ...], precision: Precision = "double"
 ) -> Clearance:
     """A function that takes points (n, 3) and returns their clearances (n,): proved lower bounds of
-    the distance to the nearest of the levels' surfaces (`level_distance_lower_bound`)."""
+    the distance to the nearest of the level sets f = level (`level_distance_lower_bound`).
+
+    levels: the levels.
+    precision: of the computation.
+    """
     backend = choose_backend(precision)
     prepared = field.prepare(backend)
     # Kernel parameters, so that other levels compile nothing.
@@ -76,19 +81,20 @@ def tight_extent(
 ) -> ConvexHull:
     """A convex polytope of few planes that contains every point of the level sets inside a box.
 
-    The box is cut into cells. A cell is left out if the ball around it is within the clearance of
-    its center (the proved lower bound of the distance to the level sets). The polytope contains the
-    remaining cells.
+    The box is cut into cells. A cell is left out if the ball around it is smaller than the
+    clearance of its center (the proved lower bound of the distance to the level sets). The polytope
+    contains the remaining cells. If none remains, it contains the whole box.
 
     lower, upper: (3,) corners of the box.
     max_cells: the largest number of cells tested in a round.
     finest: the largest number of rounds; each halves the edges of cells.
-    points: (n, 3) that the polytope must contain in any case. A polytope is put around them first,
-        and no cells inside of it are tested.
+    points: (n, 3) points that the polytope must contain in any case. A first polytope is put around
+        them. Cells inside of it need no test, so they are not tested.
     """
     clearance = clearance_function(field, levels)
     margin = 1e-4 * float(np.linalg.norm(upper - lower))
     if points is not None:
+        # No cell inside the polytope of the given points needs a test.
         given = kdop_of_points(points, margin)
         cells = nonempty_cells(
             lower, upper, _clearance_outside(given, clearance), max_cells, finest
@@ -101,16 +107,17 @@ def tight_extent(
 
 
 def _clearance_outside(polytope: ConvexHull, clearance: Clearance) -> Clearance:
-    """A function that takes points (n, 3) and returns lengths (n,) within which there is no level
-    set outside of a polytope. For a point inside the polytope it is the distance to the nearest
-    face; for a point outside, the result of `clearance`.
+    """A function like `clearance`, but for the part of the level sets that lies outside of a
+    polytope. It takes points (n, 3) and returns lengths (n,). For a point inside the polytope the
+    length is the distance to the nearest face. For a point outside it is the result of `clearance`.
 
     clearance: a function that takes points and returns lower bounds of their distances to the level
         sets.
     """
 
     def clearance_outside(points: FloatArray) -> FloatArray:
-        """The clearances (n,) of points (n, 3)."""
+        """The clearances (n,) of points (n, 3) from the level sets outside the polytope."""
+        # The depth is positive inside.
         depth = (polytope.offsets - points @ polytope.normals.T).min(axis=1)
         outside = depth <= 0
         if outside.any():
@@ -123,8 +130,8 @@ def _clearance_outside(polytope: ConvexHull, clearance: Clearance) -> Clearance:
 def occupied_cells(
     field: Field, levels: tuple[float, ...], extent: Volume, cells_across: int
 ) -> OccupancyGrid:
-    """A grid of cells over an extent. The cells that may contain a point of the level sets are
-    marked; all others are proved to contain none.
+    """A grid of cells over the box of an extent, which contains the level sets. Cells that may
+    contain a point of a level set are marked as occupied; all others are proved to contain none.
 
     cells_across: the approximate number of cells along the longest side.
     """
@@ -136,24 +143,25 @@ def occupied_cells(
 def level_distance_lower_bound(
     backend: Backend, field: Field, levels: Levels, p: Vec3, sample: Sample
 ) -> Real:
-    """A proved lower bound of the distance from the points p to the nearest level set.
+    """A proved lower bound of the distance from the points p to the nearest level set of f.
 
-    field: prepared for the backend.
+    field: the field, prepared for the backend.
+    levels: the levels, with the period of f.
     sample: the sample of the field at p.
 
-    Proof. Let v be a unit direction and s the slope of f at p along v. An enclosure (a proof of
-    bounds of f along a path) holds f(p + t v) within an interval [L(t, s), U(t, s)]. The length
-    that it proves free ends where this interval first meets a level. Neither L nor U falls as s
-    grows, which every enclosure has to prove (`Enclosure`).
+    Proof. Let v be a unit direction and s the slope of f at p along v. An enclosure (a bound of f
+    along a line that follows from a promise) holds f(p + t v) within an interval [L(t, s), U(t,
+    s)]. The length that it proves free of levels ends where this interval first meets a level.
+    Neither L nor U falls as s grows, which every enclosure has to prove (`Enclosure`).
 
-    All slopes at p lie in [-G, G], where G is |grad f(p)| plus its error. So an enclosure with that
-    interval of slopes holds in every direction. The distances to the level above and to the level
-    below are proved separately, each by the promise (a proved bound of f near p) that proves the
-    larger distance.
+    All slopes at p lie in [-G, G], where G is |grad f(p)| plus its error. So an enclosure for that
+    interval of slopes holds in every direction. The distance to the level above and the distance to
+    the level below are proved separately, each by the promise that proves the larger distance.
 
-    As in the tracer, the differences of f to the levels are reduced by the rounding of value and
-    position, and the result is reduced by the rounding of p itself. If f jumps, the bound is for f
-    continued smoothly through all facets, which equals f up to the nearest facet.
+    As in the tracer, the differences of f to the levels are reduced by the rounding errors of the
+    value and of the position, and the result is reduced by the rounding error of p itself. If f
+    jumps across facets, the promises are about f continued smoothly through the facets. This equals
+    f up to the nearest facet, so the result is at most the distance to that facet.
     """
     steepest = safe_norm(sample.gradient) + sample.gradient_error
     size = max_norm(p)
@@ -168,6 +176,7 @@ def level_distance_lower_bound(
         SlopeRange(-steepest, steepest),
     )
     inf = backend.Float(dr.inf)
+    # An infinite gap stands for no level on that side.
     upward = longest_free_length(enclosures, LevelGaps(inf, gaps.above))
     downward = longest_free_length(enclosures, LevelGaps(gaps.below, inf))
     distance = dr.select(gaps.nearest > 0, fmin(upward, downward), 0)
@@ -178,15 +187,16 @@ def level_distance_lower_bound(
 
 @dataclass(frozen=True)
 class UnitFrame:
-    """Data of a field on a backend, in unit coordinates. A point x in unit coordinates stands for
-    the point p = center + size * x. Subclasses add the data."""
+    """Data of a field on a backend (a Dr.Jit device and precision), in unit coordinates, in which
+    the data have a size of about 1. A point x in unit coordinates stands for the point p = center +
+    size * x of space. Subclasses add the data."""
 
     backend: Backend
     center: Vec3
     size: Real
 
     def to_unit(self, p: Vec3) -> Vec3:
-        """The point p in unit coordinates."""
+        """The point p of space in unit coordinates: (p - center) / size."""
         return (self.backend.Array3f(p) - self.center) / self.size
 
 
@@ -194,7 +204,10 @@ Uploaded = TypeVar("Uploaded", bound=UnitFrame)
 
 
 class DeviceField(Field, Generic[Uploaded]):
-    """A field that is evaluated from data on a backend. Subclasses define `_upload`."""
+    """A field that is evaluated from data on a backend (a Dr.Jit device and precision), such as a
+    tree of triangles. A prepared field holds its data; a field that is not prepared uploads them
+    when they are needed. There may be two sets of data: one for tracing rays, and one for values at
+    large numbers of points. Subclasses define `_upload`."""
 
     def __init__(self) -> None:
         self._device: Uploaded | None = None
@@ -202,9 +215,9 @@ class DeviceField(Field, Generic[Uploaded]):
 
     @abc.abstractmethod
     def _upload(self, backend: Backend, *, traced: bool) -> Uploaded:
-        """The data on a backend.
+        """The field's data, uploaded to a backend.
 
-        traced: whether they are for tracing; else they are for values at points.
+        traced: True for the data for tracing rays; False for the data for values at points.
         """
 
     @cached_prepare
@@ -216,14 +229,14 @@ class DeviceField(Field, Generic[Uploaded]):
         return prepared
 
     def _data_for(self, p: Vec3) -> Uploaded:
-        """The data for tracing, on the backend for which the field is prepared; if it is not
-        prepared, they are uploaded to the backend of p."""
+        """The data for tracing: those of the prepared field; or, if the field is not prepared, data
+        that are uploaded now to the backend of the points p."""
         if self._device is None:
             return self._upload(backend_of(p), traced=True)
         return self._device
 
     def _require_data(self) -> Uploaded:
-        """The data for tracing, on the backend for which the field is prepared.
+        """The data for tracing, which `prepare` uploaded.
 
         Raises:
             RuntimeError: `prepare` was not called.
@@ -233,14 +246,16 @@ class DeviceField(Field, Generic[Uploaded]):
         return self._device
 
     def _batch_data(self, backend: Backend) -> Uploaded:
-        """The data for values at points, uploaded once for each backend."""
+        """The data for values at points, which are uploaded once for each backend and then
+        cached."""
         if backend not in self._batches:
             self._batches[backend] = self._upload(backend, traced=False)
         return self._batches[backend]
 
 
 class VariableAccuracyField(DeviceField[Uploaded], BatchedField):
-    """A field that is a sum over sources on a backend, and can be sampled at any accuracy
+    """A field that is a sum over sources, whose data lie on a backend, and that can be sampled at
+    any accuracy. The accuracy scale says how accurately: larger is more accurate
     (`Field.at_accuracy`). Subclasses define `_sample`."""
 
     has_variable_accuracy = True
@@ -250,11 +265,11 @@ class VariableAccuracyField(DeviceField[Uploaded], BatchedField):
 
     @abc.abstractmethod
     def _sample(self, on: Uploaded, p: Vec3, detail: Real) -> Sample:
-        """The sample of f at p.
+        """The sample of f at p with a given accuracy.
 
         on: the field's data on a backend.
-        detail: the accuracy scale: 0 for the coarsest samples, 1 for those of `evaluate`, more for
-            more accurate ones.
+        detail: the accuracy scale: 0 gives the coarsest samples, 1 those of `evaluate`, a larger
+            number more accurate ones.
         """
 
     def evaluate(self, p: Vec3) -> Sample:
@@ -269,8 +284,8 @@ class VariableAccuracyField(DeviceField[Uploaded], BatchedField):
         )
 
     def _batch_data(self, backend: Backend) -> Uploaded:
-        """The data for values at points. If the data for tracing do not differ from them, those are
-        taken."""
+        """The data for values at points. They are the data for tracing if the field is prepared for
+        this backend and does not distinguish the two (`has_separate_batch_data`)."""
         device = self._device
         if self.has_separate_batch_data or device is None or device.backend is not backend:
             return super()._batch_data(backend)
@@ -278,8 +293,9 @@ class VariableAccuracyField(DeviceField[Uploaded], BatchedField):
 
 
 def round_to_single(center: FloatArray) -> FloatArray:
-    """A center (3,), rounded to numbers that single precision represents exactly. Subtracting it
-    from nearby points is then exact, however far the origin is."""
+    """The center (3,) rounded to numbers of single precision, so that subtracting it from nearby
+    points is exact, however far the origin is. Coordinates that are too large for single precision
+    are left as they are."""
     with np.errstate(over="ignore"):
         rounded = center.astype(np.float32).astype(np.float64)
     return np.where(np.isfinite(rounded), rounded, center)
@@ -288,12 +304,17 @@ def round_to_single(center: FloatArray) -> FloatArray:
 def frame_parameters(
     backend: Backend, center: FloatArray, size: float
 ) -> tuple[Backend, Vec3, Real]:
-    """The attributes of `UnitFrame`, as kernel parameters."""
+    """The three attributes of a `UnitFrame`, with center and size as kernel parameters, so that
+    other numbers use the same compiled kernel.
+
+    center: (3,) the point that becomes the origin.
+    size: the length that becomes 1.
+    """
     opaque = (dr.opaque(backend.Float, float(c)) for c in center)
     return backend, backend.Array3f(*opaque), dr.opaque(backend.Float, size)
 
 
 def coordinate_rounding(x: Vec3) -> Real:
-    """A bound of the rounding of the coordinates of x, a point in unit coordinates, and of vertices
-    of size about 1."""
+    """A bound of the rounding errors of the coordinates of x, a point in unit coordinates
+    (`UnitFrame`), and of the coordinates of data, whose absolute values are about 1."""
     return float(dr.epsilon(x)) * (1 + dr.max(dr.abs(x)))

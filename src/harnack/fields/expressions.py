@@ -1,5 +1,7 @@
-"""A user's own formula as a field. The formula is a Python function, or a text such as "x^2 + y^2 +
-z^2 = 1"."""
+"""A user's own formula f(x, y, z) as a field, whose level sets are drawn. The formula is a Python
+function of the coordinates, or a text such as "x^2 + y^2 + z^2 = 1". A text is parsed to a syntax
+tree of Python's `ast`, the tree is checked node by node (a node is an operation, a number, a name
+or a call of a function), and then evaluated; it is never run as Python."""
 
 from __future__ import annotations
 
@@ -54,7 +56,8 @@ _MAX_LENGTH, _MAX_DEPTH = 4000, 200
 
 @dataclass(frozen=True)
 class TextFormula:
-    """A formula f(x, y, z) as a text. It is called like any function of three coordinates.
+    """A formula f(x, y, z) that is given as a text. An object of this class is called like any
+    function of three coordinates.
 
     text: it is made of + - * / ^ (or **), brackets, numbers, x, y, z, pi, e, parameters and the
         functions `_FUNCTIONS`. An equation "left = right" means left - right.
@@ -69,13 +72,13 @@ class TextFormula:
 
     @classmethod
     def parse(cls, text: str, parameters: Mapping[str, float] | None = None) -> TextFormula:
-        """The formula that a text describes.
+        """Parse a text to a formula.
 
         parameters: numbers by their names in the text.
 
         Raises:
-            ValueError: the text is not a formula (the message states the position and the mistake),
-                or a parameter is not in it, or the name of a parameter is already that of a
+            ValueError: the text is not a formula (the message states the position and the mistake);
+                or a parameter is not in it; or the name of a parameter is already that of a
                 function, a constant or a coordinate.
         """
         parameters = {name: as_finite(number, name) for name, number in (parameters or {}).items()}
@@ -84,6 +87,7 @@ class TextFormula:
         unknown = re.search(r"[^A-Za-z0-9\s.,+*/^()=<>!-]|\b0[xob]", text, re.IGNORECASE)
         if unknown:
             raise _formula_error(text, f"{unknown[0]!r} has no meaning here")
+        # Split at each = that is not part of <=, >=, != or ==.
         sides = [cls._parse_side(text, side) for side in re.split(r"(?<![<>=!])=(?!=)", text)]
         if len(sides) > 2:
             raise _formula_error(text, "more than one = sign")
@@ -99,9 +103,10 @@ class TextFormula:
 
     @staticmethod
     def _parse_side(text: str, side: str) -> ast.expr:
-        """The syntax tree of one side of an equation.
+        """Parse one side of an equation to a syntax tree.
 
         text: the whole formula, for messages.
+        side: the side, as a text.
 
         Raises:
             ValueError: the side is not an expression; the message guesses the mistake.
@@ -110,6 +115,8 @@ class TextFormula:
             return ast.parse(" ".join(side.replace("^", "**").split()), mode="eval").body
         except (SyntaxError, ValueError, RecursionError, MemoryError):
             pass
+        # Guess the mistake: a function without brackets, as in "sin x", or a missing *, as in "2
+        # x".
         bare = re.search(rf"\b({'|'.join(_FUNCTIONS)})\s+[A-Za-z0-9]", side)
         if bare:
             raise _formula_error(text, f"the argument of {bare[1]} stands in brackets")
@@ -118,7 +125,8 @@ class TextFormula:
         raise _formula_error(text, hint)
 
     def __call__(self, x: Any, y: Any, z: Any) -> Any:
-        """The value of the formula at coordinates of any kind.
+        """The value of the formula at coordinates of any kind: numbers, NumPy or Dr.Jit arrays, or
+        numbers with proved ranges.
 
         Raises:
             ValueError: a constant part divides by zero, is too large, or is not real.
@@ -143,7 +151,7 @@ def looks_like_formula(text: str) -> bool:
 
 
 def _formula_error(text: str, why: str) -> ValueError:
-    """The error that says that a text is not a formula, and why."""
+    """The error which says that a text is not a formula, and why."""
     shown = text if len(text) <= 80 else text[:77] + "..."
     return ValueError(
         f'{shown!r} is no formula in x, y and z: {why}; write it as in "x^2 + y^2 = 1 + sin(2*z)"'
@@ -151,15 +159,17 @@ def _formula_error(text: str, why: str) -> ValueError:
 
 
 def _check_tree(text: str, node: ast.expr, parameters: Iterable[str], depth: int = 0) -> None:
-    """Raise ValueError if a syntax tree has a part that is not allowed, or a name that is not
-    known.
+    """Raise ValueError if a syntax tree contains anything that is not allowed in a formula, or an
+    unknown name.
 
     text: the formula, for messages.
-    parameters: the names of its parameters.
-    depth: how many operations the node is nested in.
+    node: the root of the tree.
+    parameters: the names of the formula's parameters.
+    depth: the number of operations around the node.
     """
     if depth > _MAX_DEPTH:
         raise _formula_error(text, f"more than {_MAX_DEPTH} operations are within each other")
+    # An operation with two operands; then signs, names, numbers, calls; all else is refused.
     if isinstance(node, ast.BinOp):
         if not isinstance(node.op, ast.Pow) and type(node.op) not in _OPERATORS:
             raise _formula_error(text, "the operators are + - * / ^")
@@ -197,10 +207,12 @@ def _check_tree(text: str, node: ast.expr, parameters: Iterable[str], depth: int
 
 
 def _as_float(text: str, value: float) -> float:
-    """A number of a formula as a float.
+    """A number in a formula as a float.
+
+    text: the formula, for the message.
 
     Raises:
-        ValueError: it is too large.
+        ValueError: the number is too large.
     """
     try:
         return float(value)
@@ -209,15 +221,23 @@ def _as_float(text: str, value: float) -> float:
 
 
 def _check_call(text: str, node: ast.Call, parameters: Iterable[str], depth: int) -> None:
-    """Raise ValueError for a call of an unknown function, for a wrong number of arguments, and for
-    arguments that are not allowed."""
+    """Raise ValueError if a call in a syntax tree is not allowed in a formula: the function is
+    unknown, the number of arguments is wrong, or an argument is not allowed.
+
+    text: the formula, for messages.
+    node: the call.
+    parameters: the names of the formula's parameters.
+    depth: the number of operations around the arguments.
+    """
     name = node.func.id if isinstance(node.func, ast.Name) else ast.unparse(node.func)
+    # Brackets after a number or a parameter, as in x(y + 1), mean a missing *.
     if name in (*_COORDINATES, *_CONSTANTS, *parameters) or not isinstance(node.func, ast.Name):
         raise _formula_error(text, f"is a * missing after {name!r}")
     if name not in _FUNCTIONS:
         names = ", ".join(_FUNCTIONS)
         hint = did_you_mean(name, _FUNCTIONS)
         raise _formula_error(text, f"{name!r} is no known function, there are {names}{hint}")
+    # Most functions take one argument.
     fewest, largest = _ARGUMENT_COUNTS.get(name, (1, 1))
     if node.keywords or not fewest <= len(node.args) <= largest:
         count = (
@@ -234,10 +254,10 @@ def _check_call(text: str, node: ast.Call, parameters: Iterable[str], depth: int
 def _value(node: ast.expr, names: Mapping[str, Any]) -> Any:
     """The value of a syntax tree that `_check_tree` accepted.
 
-    names: the values of coordinates, constants and parameters.
+    names: the values of coordinates, constants and parameters, by their names.
 
     Raises:
-        OverflowError: a constant part of the tree is not finite.
+        OverflowError: a constant part of the tree is infinite or NaN.
     """
     value = _evaluate_node(node, names)
     if isinstance(value, float) and not math.isfinite(value):
@@ -246,10 +266,10 @@ def _value(node: ast.expr, names: Mapping[str, Any]) -> Any:
 
 
 def _evaluate_node(node: ast.expr, names: Mapping[str, Any]) -> Any:
-    """The value of a node of a syntax tree that `_check_tree` accepted. A constant part may be
-    infinite or NaN.
+    """The value of a node of a syntax tree that `_check_tree` accepted, from the values of its
+    operands. It may be infinite or NaN, which `_value` refuses for constants.
 
-    names: the values of coordinates, constants and parameters.
+    names: the values of coordinates, constants and parameters, by their names.
     """
     match node:
         case ast.BinOp(left, ast.Pow(), right):
@@ -264,6 +284,7 @@ def _evaluate_node(node: ast.expr, names: Mapping[str, Any]) -> Any:
         case ast.Name(name):
             return names[name]
         case ast.Constant(value):
+            # Integers become floats, too.
             return float(value)  # pyright: ignore
         case ast.Call(ast.Name(name), arguments):
             return _FUNCTIONS[name](*(_value(argument, names) for argument in arguments))
@@ -272,11 +293,11 @@ def _evaluate_node(node: ast.expr, names: Mapping[str, Any]) -> Any:
 
 
 def _power(base: Any, exponent: Any) -> Any:
-    """base^exponent. An exponent that is a whole number is taken as an integer, because negative
+    """base^exponent. An exponent that is a whole number is turned into an integer, because negative
     numbers have such powers too.
 
     Raises:
-        OverflowError: the power of two constants is not real.
+        OverflowError: both are constants, and the power is not real.
     """
     if isinstance(exponent, float) and exponent.is_integer():
         exponent = int(exponent) if abs(exponent) < 2**31 else exponent
@@ -290,8 +311,8 @@ def _power(base: Any, exponent: Any) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class Expression(Formula):
-    """A field f(x, y, z) given by a Python function, which is written with plain operators and the
-    functions of `harnack.math`.
+    """A field whose function f(x, y, z) is a Python function of the coordinates. It is written with
+    plain operators and the functions of `harnack.math`.
 
     function: takes three coordinates. It is called while a kernel is being recorded, and numbers in
         it become literals of that kernel.
@@ -322,13 +343,13 @@ def expression(
     level: float = 0.0,
     is_convex: bool = False,
 ) -> Expression:
-    """The implicit surface f(x, y, z) = level of a user-defined formula.
+    """The implicit surface f(x, y, z) = level of a user's own formula, as a field.
 
-    function: takes three coordinates. It is written with + - * / **, abs, and the functions of
-        `harnack.math`: `sin`, `cos`, `tan`, `exp`, `log`, `sqrt`, `tanh`, `atan`, `atan2`, `asin`,
-        `acos`, `sinh`, `cosh`, `maximum`, `minimum`, `norm`. NumPy's functions of the same names
-        work too. Or it is a text, such as "x^2 + y^2 = 1 + sin(2*z)", in which maximum and minimum
-        are `max` and `min`; an equation means left - right.
+    function: a Python function of three coordinates. It is written with + - * / **, abs, and the
+        functions of `harnack.math`: `sin`, `cos`, `tan`, `exp`, `log`, `sqrt`, `tanh`, `atan`,
+        `atan2`, `asin`, `acos`, `sinh`, `cosh`, `maximum`, `minimum`, `norm`. NumPy's functions of
+        the same names work too. Or a text, such as "x^2 + y^2 = 1 + sin(2*z)", in which maximum and
+        minimum are `max` and `min`; an equation means left - right.
     parameters: for a text, numbers by their names, such as {"a": 2.0} for "x^2 + y^2 = a".
     domain: the volume in which the surface is drawn, such as `harnack.Ball()`; None for all of
         space.
@@ -336,9 +357,7 @@ def expression(
     is_convex: your promise that the function is convex, as quadrics and norms are. Then steps
         towards the surface are longer. `harnack.testing.check_field` tests the promise at samples.
 
-        torus = hk.expression(lambda x, y, z: (hk.math.norm(x, y) - 1) ** 2 + z**2 - 0.1)
-
-    It warns if the formula is so long that its first trace takes more than about ten seconds to
+    Warns if the formula is so long that its first trace takes more than about ten seconds to
     compile.
 
     Raises:
@@ -362,6 +381,7 @@ def expression(
     check_volume(domain, "domain")
     level, is_convex = as_finite(level, "level"), flag(is_convex, "is_convex")
     field = Expression(function, domain, default_level=level, is_convex=is_convex)
+    # Evaluate the formula once at an arbitrary point, which raises the errors above.
     point = probe_jets()
     check_no_derivatives("an expression", as_jet(field.formula(*point), point[0], "expression"))
     warn_if_slow_to_compile(field)
@@ -369,7 +389,8 @@ def expression(
 
 
 def _check_arguments(function: Callable[..., Any]) -> None:
-    """Raise TypeError if a function cannot be called with three coordinates."""
+    """Raise TypeError if a function cannot be called with three coordinates. A function whose
+    signature is not known is accepted."""
     try:
         signature = inspect.signature(function)
     except (TypeError, ValueError):  # of what is not written in Python nothing may be known

@@ -1,7 +1,9 @@
-"""The class `Field`: the interface between functions of space and the rest of the library.
+"""The class `Field`: a scalar function f on space whose level sets (surfaces f = level) are drawn.
+It is the interface between functions and the rest of the library. One evaluation of a field at a
+point p gives a sample: value and gradient of f at p, and promises, which are proved bounds of f
+near p (`harnack.enclosures.promises`), such as a Lipschitz constant on a ball about p. Promises
+must be *true*: every step of the tracer along a ray rests on them.
 
-One evaluation of a field gives its value, its gradient, and promises that hold near the point
-(`harnack.enclosures.promises`). Promises must be *true*: every step of the tracer rests on them.
 `harnack.testing.check_field` tests whether a field fulfills this interface.
 """
 
@@ -72,7 +74,10 @@ _SOLID_METHODS = frozenset(
 
 
 class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
-    """A scalar function f on R^3 whose level sets can be traced with a proof.
+    """A scalar function f on R^3 whose level sets can be traced with a proof. A level is a number,
+    and its level set is the surface f = level. A sample at a point holds value and gradient of f
+    there, and promises: proved bounds of f near the point. Points p are Dr.Jit 3-vectors, one point
+    per lane. A prepared field has its data on a backend (a Dr.Jit device and precision).
 
     Subclasses define `evaluate`. The class attributes are defaults, which an instance may override.
     The base classes declare optional capabilities: jumps, patches, variable accuracy, and curves at
@@ -114,18 +119,22 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
     """Whether the gradient may jump, as it does where the surfaces of a union meet."""
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Self:
-        """Refuse arguments with derivatives enabled, unless the class defines `parameters`."""
+        """Make a field. Raises NotImplementedError for arguments with derivatives enabled, unless
+        the class defines `parameters`: their derivatives would be lost."""
         if cls.has_no_parameters():
             check_no_derivatives(cls.__name__, args, kwargs)
         return super().__new__(cls)
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
-        """Wrap methods of the subclass. The wrapped `evaluate` checks its result; the wrapped
-        `hessian` also takes NumPy arrays; and public class methods refuse arguments with
-        derivatives, as the constructor does."""
+        """Wrap methods of a new subclass. The wrapped `evaluate` checks its result. The wrapped
+        `hessian` also takes NumPy arrays. Public class methods refuse arguments with derivatives
+        enabled, as the constructor does. `__repr__` becomes that of `Field` unless the subclass
+        defines its own. A subclass that defines `evaluate`, but not `sample_ray`, gets the
+        `sample_ray` of `Field`."""
         super().__init_subclass__(**kwargs)
         if "__repr__" not in vars(cls):  # a dataclass would write out all numbers
             cls.__repr__ = Field.__repr__
+        # Public class methods are further constructors.
         for name, attribute in list(vars(cls).items()):
             if isinstance(attribute, classmethod) and not name.startswith("_"):
                 checked_maker = no_derivatives(cast("Any", attribute).__func__)
@@ -145,15 +154,15 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
         return other
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Restore a deep copy or a pickled field, and make its arrays read-only again. (NumPy
-        forgets that arrays were read-only. Writing to them would not change the values that were
+        """Restore a pickled field or a deep copy, and make its arrays read-only again, because
+        NumPy forgets that they were. (Writing to them would not change the results that were
         computed from them.)"""
         vars(self).update(state)
         make_read_only(state)
 
     def __repr__(self) -> str:
-        """The constructor call, with the arguments that the field still stores and that differ from
-        their defaults; arrays are written as their shapes."""
+        """The constructor call as text, with those arguments that the field still stores as
+        attributes and that differ from their defaults. Arrays are written as their shapes."""
         parameters = inspect.signature(type(self).__init__).parameters
         values = {key.removeprefix("_"): value for key, value in vars(self).items()}
         arguments = [
@@ -164,17 +173,17 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
         return f"{type(self).__name__}({', '.join(arguments)})"
 
     def __getattr__(self, name: str) -> Any:
-        """Raise AttributeError. For the name of a method that only solids have, the message says
-        how to make a solid of the field."""
+        """Raise AttributeError, as Python calls this only for an attribute that does not exist. For
+        the name of a method that only solids have, the message says how to make a solid of the
+        field."""
         message = f"{type(self).__name__!r} object has no attribute {name!r}"
         if name in _SOLID_METHODS:
             message += ": make a solid of the field first, by harnack.solid(field, below=level)"
         raise AttributeError(message)
 
     def _is_no_number(self, *operands: Any) -> Any:
-        """Refuse arithmetic and comparisons with fields.
-
-        `Solid` defines -, and all fields keep ==.
+        """Refuse arithmetic and comparisons with a field: it is the method of all these operators.
+        `Solid` replaces the operator -. Every field keeps ==.
 
         Raises:
             TypeError: always.
@@ -192,8 +201,8 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
 
     @abc.abstractmethod
     def evaluate(self, p: Vec3) -> Sample:
-        """The sample at p: value, gradient and promises. p is a Dr.Jit 3-vector of any backend and
-        precision.
+        """The sample at p: value and gradient of f, and promises (proved bounds of f near p). p is
+        a Dr.Jit 3-vector of any backend and precision.
 
         It is called while a loop is being recorded. So use `drjit` functions of p, and no Python
         branches on its values.
@@ -201,12 +210,14 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
 
     def prepare(self, backend: Backend) -> Field:
         """A field equal to this one whose data lie on the backend. Each function of the library
-        calls this method once, before a kernel is recorded, in which nothing can be uploaded.
+        calls this method once, before a kernel is recorded, because nothing can be uploaded during
+        the recording.
 
-        The default suits fields that hold only Python numbers, and fields of your own that hold
-        other fields: it prepares those that are attributes, or entries of attributes that are lists
-        or tuples. It returns the field itself if there are none.
+        The default is for fields that hold only Python numbers, and for user-defined fields that
+        hold other fields. It prepares fields that are attributes, or entries of attributes that are
+        lists or tuples. If there are none, it returns the field itself.
         """
+        # The library's own fields define `prepare` where they need it.
         if type(self).__module__.startswith("harnack."):
             return self
         attributes = {name: _prepared(value, backend) for name, value in vars(self).items()}
@@ -218,29 +229,30 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
         return prepared
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
-        """A volume that is proved to contain every point of the level sets; None if no such volume
-        is known.
+        """A volume that is proved to contain every point of the level sets of these levels; None if
+        no such volume is known.
 
-        It may be smaller than `domain`. With an extent, a ray without an end can be a proved miss.
+        The default is `domain`. An extent may be smaller than `domain`. With an extent, a ray
+        without an end can be a proved miss.
         """
         del levels
         return self.domain
 
     def occupied_cells(self, levels: tuple[float, ...]) -> OccupancyGrid | None:
-        """A grid of cells; None if no such grid is known. Cells that are not marked as occupied are
-        proved to contain no point of the level sets.
+        """A grid of cells, some of which are marked as occupied: all other cells are proved to
+        contain no point of the level sets of these levels. None if no such grid is known.
 
-        Searches for first hits skip these cells, which pays for fields that are expensive to
-        evaluate. If the field has jumps, f continued across its facets takes no level in these
-        cells either.
+        The default is None. Searches for first hits skip the cells that are not occupied. This
+        saves time for fields that are expensive to evaluate. If f jumps across facets, f continued
+        smoothly across the facets takes no level in these cells either.
         """
         del levels
         return None
 
     def for_ray_count(self, count: int) -> Field:
-        """The field to use for this many rays: for many rays a larger preparation may pay. Equal
-        counts must return the same object, so that nothing is prepared twice. The default is the
-        field itself."""
+        """The field to use when `count` rays are traced: for many rays, a longer preparation may
+        save time. Equal counts must return the same object, so that nothing is prepared twice. The
+        default is the field itself."""
         del count
         return self
 
@@ -253,8 +265,8 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
 
     def gradient_change_bound(self, p: Vec3, radius: Real) -> Real:
         """A proved bound of |grad f(y) - grad f(p)| for all y with |y - p| <= radius. It is
-        infinite, which is the default, if none is known. Proofs that a mesh has the topology of the
-        surface use it."""
+        infinite, which is the default, if none is known. With it, meshing proves that a mesh has
+        the topology of the surface."""
         return 0 * p.x + radius + dr.inf
 
     def validate_levels(self, levels: tuple[float, ...]) -> None:
@@ -263,7 +275,8 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
         del levels
 
     def parameters(self) -> tuple[Any, ...]:
-        """The Dr.Jit arrays on which the value depends and that may have derivatives enabled.
+        """The Dr.Jit arrays on which f depends and that may have derivatives enabled, for example
+        the vertices of a mesh that is optimized.
 
         A class that does not define this method has no such parameters, and its constructor refuses
         arguments with derivatives enabled.
@@ -277,10 +290,12 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
         return cls.parameters is Field.parameters
 
     def refuse_hidden_parameters(self) -> None:
-        """Raise NotImplementedError if a class without `parameters` holds numbers with derivatives
-        enabled, for example in its formula. These derivatives would be lost."""
+        """Raise NotImplementedError if the field holds numbers with derivatives enabled, for
+        example in its formula, although its class does not define `parameters`. These derivatives
+        would be lost."""
         if self.has_no_parameters():
             kind = type(self)
+            # The `evaluate` of a user's class may refer to such numbers, too.
             is_own = not kind.__module__.startswith("harnack.")
             check_no_derivatives(kind.__name__, vars(self), kind.evaluate if is_own else None)
 
@@ -288,10 +303,11 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
         """f(p) as an expression that Dr.Jit can differentiate with respect to p and to the field's
         parameters.
 
-        With respect to p it can be differentiated once: the derivative of the value is the gradient
-        of the sample. So no derivative passes through `evaluate`, which may run a recorded loop. At
-        ties of f's formula, too, the derivative is the gradient of the sample. A field with
-        parameters overrides this method if `evaluate` cannot be differentiated in both modes.
+        With respect to p it can be differentiated once: its derivative is the gradient of the
+        sample. So no derivative passes through `evaluate`, which may run a recorded loop. This
+        holds at ties of a formula, too (points where the two arguments of a maximum or minimum are
+        equal). A field with parameters overrides this method if `evaluate` cannot be differentiated
+        in both modes.
         """
         if any(dr.grad_enabled(parameter) for parameter in self.parameters()):
             return self.evaluate(p).value
@@ -299,9 +315,8 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
         at = dr.detach(p)
         with dr.suspend_grad():
             sample = self.evaluate(at)
-        gradient = as_kernel_parameters(
-            sample.gradient
-        )  # a literal 0 would have no derivative in Dr.Jit
+        # A literal 0 would have no derivative in Dr.Jit.
+        gradient = as_kernel_parameters(sample.gradient)
         return dr.replace_grad(sample.value, dr.dot(gradient, p - at))
 
     @accepts_dask_arrays("points")
@@ -345,13 +360,16 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
         with dr.suspend_grad():
             p = dr.detach(points)
             gradient, rows = self.evaluate(p).gradient, self.hessian(p)
+        # An expression whose value is the gradient, because `moved` is 0, and whose derivative by
+        # the points is the Hessian.
         moved = points - p
         return gradient + type(points)(*(dr.dot(row, moved) for row in rows))
 
     def _evaluate_points(
         self, points: Any, precision: Precision | None, choose: Callable[[Sample], Any]
     ) -> npt.NDArray[Any]:
-        """Results of samples at points (n, 3) or (3,), as a NumPy array in the order of the points.
+        """What `choose` takes from the samples at points (n, 3) or (3,), as a NumPy array in the
+        order of the points.
 
         precision: "single", "double", or None for that of the points.
         choose: a function that takes the sample of a batch of points and returns the wanted number
@@ -380,28 +398,31 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
         )
 
     def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
-        """Two bounds at the point p of a sample: of the error of the gradient, as a length, and of
-        the error of `hessian`, in the spectral norm. The default is the sample's `gradient_error`,
-        and infinity for the Hessian, whose error is not known."""
+        """Two error bounds at the point p of a sample: of the gradient, as a length, and of
+        `hessian`, in the spectral norm. The default is the sample's `gradient_error`, and infinity
+        for the Hessian, because its error is not known."""
         del p
         return sample.gradient_error, math.inf
 
     def describe(self) -> dict[str, Any]:
         """The choices that the field made by itself, such as a method or an accuracy, as a
-        dictionary from names to values, for users."""
+        dictionary from names to values that is shown to users.
+
+        The default is empty.
+        """
         return {}
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
-        """A sample at parameter t of a ray, with enclosures (proofs of bounds of f along the ray)
-        ahead and behind.
+        """The sample at the point of a ray with parameter t, and enclosures: intervals that are
+        proved to hold the change of f along the ray, in front of that point and behind it.
 
         path: the ray.
-        ahead, back: the lengths up to which enclosures are of use. An enclosure that is sharper on
-            a shorter length need not hold on all of it.
+        ahead, back: the lengths of ray in front of and behind the point up to which enclosures are
+            useful. An enclosure that is sharper on a shorter length need not hold on all of it.
 
-        The default evaluates the field at that point and applies its promises (proved bounds of f
-        near the point) to the slope along the ray. A field that knows more about f along a ray than
-        in all directions overrides this.
+        The default evaluates the field at that point. The enclosures follow from the promises of
+        the sample (proved bounds of f near the point) and from the slope of f along the ray. A
+        field that knows more about f along a ray than in all directions overrides this.
         """
         del ahead, back
         return path.enclose(self.evaluate(path.point(t)))
@@ -409,7 +430,7 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
 
 class EvaluateOnly(Field):
     """A field that consists of its method `evaluate` only, such as the result of
-    `Field.at_accuracy`."""
+    `Field.at_accuracy`. Its constructor takes the function that returns the sample at a point."""
 
     def __init__(self, evaluate: Callable[[Vec3], Sample]) -> None:
         self._evaluate = evaluate
@@ -423,6 +444,8 @@ def validate_levels_in_range(
 ) -> None:
     """Raise ValueError if a level lies outside the range that is proved to contain all values of f.
 
+    levels: the levels.
+    value_range: the ends (lower, upper) of the range.
     name: the name of the function, for the message.
     """
     lower, upper = value_range
@@ -434,7 +457,9 @@ def validate_levels_in_range(
 
 
 def _prepared(value: Any, backend: Backend) -> Any:
-    """An attribute of a field with the fields in it prepared; the same object if there are none."""
+    """The value of a field's attribute, where each field in it is prepared for the backend. Fields
+    are found if they are the value itself or entries of a list or tuple. If there are none, the
+    same object is returned."""
     if isinstance(value, Field):
         return value.prepare(backend)
     if type(value) in (list, tuple) and any(isinstance(entry, Field) for entry in value):
@@ -452,9 +477,11 @@ def check_is_field(value: Any) -> None:
 
 
 def suggest_field(value: Any) -> str:
-    """The text of an error message: the kind of an object that is not a field, and how to make a
-    field of it."""
+    """The end of an error message about an object that is not a field: what kind of object it is,
+    and how to make a field of it."""
     kind, name = type(value).__name__, getattr(value, "__name__", "")
+    # An object that holds a field, a list of fields, a class, a mesh, a text, points, or a
+    # function.
     if isinstance(getattr(value, "field", None), Field):
         return f"a {kind}: take its .field, and what else this takes of it, such as its level"
     parts: list[Any] = [*value] if type(value) in (list, tuple) else []

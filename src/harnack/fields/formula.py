@@ -1,9 +1,9 @@
-"""Fields that are defined by a formula of the coordinates. Value, gradient and proofs follow from
-the formula.
-
-A formula is evaluated in two ways. For jets of the coordinates at a point it returns value and
-gradient, with bounds of their rounding. For jets along a piece of a path it returns ranges of its
-derivatives there, from which steps are proved.
+"""Fields that are defined by a formula f(x, y, z), a Python function of the coordinates. Value,
+gradient, error bounds and proofs follow from the formula, because it is evaluated with jets in
+place of numbers. A jet holds the ranges (intervals) of a number and of its derivatives. Jets of the
+coordinates at a point give the value and gradient of f, with bounds of their rounding. Jets of the
+coordinates along a piece of a ray give the ranges of the derivatives of f there, from which steps
+along the ray are proved.
 
 The operations of a formula are counted before its kernel is compiled. LLVM's time grows faster than
 the number of operations, so a formula that would take minutes first gives a warning, with a remedy.
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from harnack.enclosures import Promise
 
 
-# Radii of the balls on which a Lipschitz constant is promised, in multiples of |f|/|grad f|; and
+# Radii of the balls on which a Lipschitz constant is computed, in multiples of |f|/|grad f|; and
 # the largest radius.
 _RADII, _MAX_RADIUS = (0.25, 1.0, 4.0), 1e12
 # At a tie of the formula (see `Formula._with_one_sided_gradient`) the gradient is taken at a point
@@ -65,9 +65,10 @@ _WITHOUT_ALTERNATIVES: ContextVar[bool] = ContextVar("without_alternatives", def
 
 @contextmanager
 def without_alternatives() -> Generator[None]:
-    """A context within which samples of formulas carry no alternative promises (further bounds of f
-    that are rarely used). To record these takes several times as long as value and gradient. The
-    context is for callers that use value and gradient only."""
+    """A context within which samples of formulas are computed without their alternative promises,
+    which are further proved bounds of f near the point that are rarely used. To record these takes
+    several times as long as value and gradient. The context is for callers that use value and
+    gradient only."""
     token = _WITHOUT_ALTERNATIVES.set(True)
     try:
         yield
@@ -76,14 +77,16 @@ def without_alternatives() -> Generator[None]:
 
 
 class Formula(Field):
-    """A field that is defined by a formula of the coordinates, its method `formula`.
-
-    Value, gradient, rounding errors and enclosures along rays follow from the formula, by automatic
-    differentiation in interval arithmetic.
+    """A field that is defined by a formula of the coordinates, its method `formula`. The formula is
+    evaluated with jets: ranges of a number and of its derivatives, in interval arithmetic. So one
+    evaluation gives value, gradient and rounding errors at a point; or, along a ray, proved ranges
+    of the derivatives, from which enclosures (bounds of the change of f along the ray) follow. A
+    formula "may jump" if it uses functions that are not continuous, and is "abrupt" if it may
+    change by far more than its slopes allow within the rounding of coordinates.
 
     lipschitz: a proved bound of |grad f| everywhere, for sphere tracing (enclosures="lipschitz");
         None if none is known.
-    is_convex: whether f is a convex function, which stays above its tangents.
+    is_convex: whether f is a convex function, which lies above its tangents.
     """
 
     is_convex: bool = False
@@ -104,15 +107,16 @@ class Formula(Field):
 
     @property
     def tally(self) -> Tally:
-        """The summary of the formula's operations: their number, and whether f may jump or is
-        steep. A prepared formula returns the summary made before it was prepared, when its numbers
-        were still known."""
+        """A summary of the formula's operations: their number, and whether f may jump or is steep.
+        A prepared formula returns the summary that was made before it was prepared, when its
+        numbers were still known to Python."""
         return tally_of(self.formula) if self._prepared_tally is None else self._prepared_tally
 
     @property
     def is_steep(self) -> bool:
-        """Whether the formula uses an operation that may have a vertical tangent or a pole, or f is
-        so steep that it acts like a pole within the rounding of coordinates (`is_abrupt`)."""
+        """Whether the formula uses an operation that may have a vertical tangent or a pole, or f
+        changes so fast that it acts like a pole within the rounding of coordinates
+        (`is_abrupt`)."""
         return self.tally.is_steep or self.is_abrupt
 
     @property
@@ -120,8 +124,10 @@ class Formula(Field):
         """Whether f may change within the rounding of coordinates by far more than its slopes
         allow, as a steep step between two flat parts does.
 
-        A stated Lipschitz constant means that the values are about distances, as for the library's
-        shapes. Then small numbers in a formula are lengths, and only large numbers make it abrupt.
+        `Tally.turns_within` decides it from the smallest number in the formula, within which f may
+        turn. If a Lipschitz constant is stated, values are about distances, as for the library's
+        shapes. Then small numbers in the formula are mere lengths, and 1 is taken in place of the
+        smallest number, so that only large numbers make f abrupt.
         """
         return self.tally.turns_within(1.0 if self.lipschitz is not None else self.tally.finest)
 
@@ -132,8 +138,8 @@ class Formula(Field):
         return dataclasses.replace(sample, alternative_promises=self._local_lipschitz(p, sample))
 
     def _with_one_sided_gradient(self, p: Vec3, sample: Sample) -> Sample:
-        """The sample at p; on lanes on which p lies on a tie of the formula, with the gradient of
-        one side of the tie.
+        """The sample at p, where the gradient is that of one side if p lies on a tie of the
+        formula.
 
         A tie is a point at which two branches of a formula are equal, such as x = 0 for max(x, 0).
         There the jet gives a range of gradients. The range contains all gradients nearby, and
@@ -142,10 +148,11 @@ class Formula(Field):
         direction mostly leads across the tie. So f is evaluated once more (by `Dual`) at a point a
         few roundings away, in about this direction, and the gradient there is used.
 
-        Proof of the error. The gradient at p lies within `gradient_error` of the middle. The second
-        gradient may be farther from the middle than twice that error. Then it does not come from a
+        Proof of the error. The gradient at p lies within `gradient_error` of the middle. If the
+        second gradient is farther from the middle than twice that error, it does not come from a
         tie at p: the gradient of f changes that much over these few roundings, as that of a sine of
-        a large angle does. In this case the middle is used.
+        a large angle does. In this case the middle is kept. Otherwise the error is `gradient_error`
+        plus the distance of the second gradient from the middle.
         """
         epsilon = float(dr.epsilon(type(p.x)))
         is_bounded = dr.isfinite(sample.gradient_error + dr.sum(sample.gradient))
@@ -154,7 +161,9 @@ class Formula(Field):
         norm = safe_norm(middle)
         direction = dr.select(norm > 0, middle / norm, 0) + type(p)(*_TIE_DIRECTION)
         size = max_norm(p) + dr.abs(sample.value)
+        # At the origin with f = 0 any offset will do.
         size = dr.select(size > 0, size, 1)
+        # Value and gradient at a point a few roundings away.
         coordinates = Dual.at_point(p + direction * (_TIE_OFFSET * epsilon * size))
         try:
             nearby_value = coordinates[0].coerce(self.formula(*coordinates))
@@ -172,14 +181,16 @@ class Formula(Field):
         )
 
     def sample_without_alternatives(self, p: Vec3) -> Sample:
-        """The sample at p with the promises of `promises`, and without alternative promises, which
-        samples on rays do not use."""
+        """The sample at p with the proved bounds of `promises` only. Samples on rays use no
+        others."""
         return self._sample_of(self._jet(Jet.at_point(p), p.x), p)
 
     def _sample_of(self, jet: Jet, p: Vec3) -> Sample:
-        """The sample at p, with value, gradient and their errors from the jet of f at p."""
+        """The sample at p: value, gradient and their errors are the midpoints and half widths of
+        the ranges in `jet`, the jet of f at p."""
         zero = 0 * p.x
         gradient = type(p)(*(zero + derivative.midpoint for derivative in jet.first_derivatives))
+        # The sum of the three half widths is a bound of the error as a length.
         gradient_error = zero
         for derivative in jet.first_derivatives:
             gradient_error = gradient_error + derivative.radius
@@ -191,8 +202,10 @@ class Formula(Field):
         """Lipschitz constants of f on balls around p, as promises. Each constant is a bound of
         |grad f| on the box around the ball.
 
-        sample: the sample of f at p. The radii are the multiples `_RADII` of |f|/|grad f|, Newton's
-            estimate of the distance to the level 0.
+        sample: the sample of f at p. The radii are the multiples `_RADII` of |f|/|grad f|, which
+            estimates the distance to the level 0 (one step of Newton's method).
+
+        Where no bound is known, the promise has the radius 0.
         """
         newton_length = dr.abs(sample.value) / safe_norm(sample.gradient)
         promises: list[Lipschitz] = []
@@ -200,6 +213,7 @@ class Formula(Field):
             radius = fmin(multiple * newton_length, _MAX_RADIUS)
             jet = self._jet(Jet.over_ball(p, radius), p.x)
             slopes = (0 * p.x + derivative.max_abs for derivative in jet.first_derivatives)
+            # A bound of the length of the gradient, from bounds of its components.
             constant = safe_norm(type(p)(*slopes)) * (1 + 1e-5)
             is_known = dr.isfinite(constant) & (radius > 0)
             promises.append(
@@ -208,7 +222,8 @@ class Formula(Field):
         return tuple(promises)
 
     def promises(self, p: Vec3) -> tuple[Promise, ...]:
-        """Promises that hold in every direction from p: the Lipschitz constant, if it is known."""
+        """Proved bounds of f that hold in every direction from p: the Lipschitz constant, if it is
+        known."""
         return () if self.lipschitz is None else (Lipschitz(0 * p.x + self.lipschitz),)
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
@@ -218,31 +233,37 @@ class Formula(Field):
         return vector(xx, xy, xz), vector(xy, yy, yz), vector(xz, yz, zz)
 
     def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
-        """The error of the gradient is that of the sample. The error of the Hessian follows from
-        its ranges, which include rounding and ties of the formula."""
+        """Two error bounds at p: of the gradient, as stated in the sample, and of the Hessian. The
+        latter follows from the ranges of the second derivatives, which include rounding and ties of
+        the formula."""
         return sample.gradient_error, hessian_error(self._jet(Jet.at_point(p, order=2), p.x), p.x)
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
-        """The ray sample, with the enclosures ahead that the ranges of the formula prove, and with
-        no enclosures behind. If there are no such enclosures, those of the sample's promises are
-        used.
+        """The sample at the point of a ray with parameter t, with enclosures (proved bounds of the
+        change of f along the ray) in front of the point, up to the length `ahead`. They follow from
+        the ranges of the formula's derivatives along the ray. If the ranges give none, the
+        enclosures of `Ray.enclose` are returned, which follow from the sample alone. There are no
+        enclosures behind the point.
 
-        Proof that no jump of f is passed. If a piece of the path holds a jump, the range of f' on
-        it is all numbers. A march steps from t to t + s, rounded. This point may lie beyond the s
-        that was proved, and the march goes on from a point that is rounded again. A jump between
-        these two points would be missed from both. So if f may jump, the piece begins before t, by
-        more than the rounding of t, and covers all paths that lead through the point up to its
-        rounding (`FormulaOnRay.rounded`). Then the exact path up to t + s lies in such pieces
-        altogether, and they have no jump.
+        path: the ray.
+        ahead, back: the lengths in front of and behind the point; `back` is not used.
+
+        Proof that no jump of f is passed. If a piece of the ray holds a jump, the range of f' on it
+        is all numbers. A march steps from t to t + s, rounded. This point may lie beyond the s that
+        was proved, and the march goes on from a point that is rounded again. A jump between these
+        two points would be missed from both. So if f may jump, the piece begins before t, by more
+        than the rounding of t, and covers all lines that lead through the point up to its rounding
+        (`FormulaOnRay.rounded`). Then the exact ray up to t + s lies in such pieces altogether, and
+        they have no jump.
 
         Proof that no level is passed if f is abrupt (`is_abrupt`), as max(-1, min(1, 1e9 y)) is. At
-        a rounded point f may be -1 with slope 0, although it is 1 at the point of the exact path.
-        So the slopes at the start, too, are those of all points that round to this point, and they
-        hold for the exact path. The values on the exact path differ from f at the rounded point by
-        no more than `tracer.steep.SteepPlace.error`. Together they prove the claim for the exact
-        path. (Enclosures without such pieces prove the claim for the path through the rounded
-        point. The error covers the difference, except where a path passes the end of a surface that
-        is thinner than rounding.)
+        a rounded point f may be -1 with slope 0, although it is 1 at the point of the exact ray. So
+        the slopes at the start, too, are those of all points that round to this point, and they
+        hold for the exact ray. The values on the exact ray differ from f at the rounded point by no
+        more than `tracer.steep.SteepPlace.error`. Together they prove the claim for the exact ray.
+        (Enclosures without such pieces prove the claim for the ray through the rounded point. The
+        error covers the difference, except where a ray passes the end of a surface that is thinner
+        than rounding.)
         """
         del back
         p = path.point(t)
@@ -251,6 +272,8 @@ class Formula(Field):
         slope, slope_error = self._slope(p, path.direction)
         slopes = SlopeRange.around(slope, slope_error)
         function = self.restrict(p, path.direction)
+        # The two proofs of the docstring: slopes of all points that round to p, and pieces that
+        # begin before p.
         if self.is_abrupt:
             slopes = SlopeRange.around(*self._slope(p, path.direction, is_rounded=True))
         if self.is_abrupt or self.may_jump:
@@ -258,6 +281,9 @@ class Formula(Field):
         enclosures = path.proofs.from_restriction(function, slopes, ahead)
         if not enclosures:
             return path.enclose(sample)
+        # A `PiecewiseTaylorEnclosure` proves nothing on a piece whose slopes are unbounded. The
+        # other kinds assume that f is continuous, so they are made only for a length on which that
+        # is proved.
         if self.may_jump and not all(
             isinstance(entry, PiecewiseTaylorEnclosure) for entry in enclosures
         ):
@@ -271,18 +297,18 @@ class Formula(Field):
 
     def _slope(self, p: Vec3, direction: Vec3, *, is_rounded: bool = False) -> tuple[Real, Real]:
         """The derivative of f at p along a direction, and a bound of its error. On a crease the
-        gradient is a range; for directions along the crease the derivative is a single number all
+        gradient is a range; for a direction along the crease the derivative is a single number all
         the same.
 
-        is_rounded: whether the error covers all points that round to p.
+        is_rounded: whether the error also covers all points that round to p.
 
-        The jet that it computes is the one from which the pieces of the path start, so that the
-        kernel does no more work.
+        The jet that is computed here is the one at the start of the pieces of the ray
+        (`FormulaOnRay`), so that the kernel does no additional work.
         """
         zero = 0 * p.x
 
         def coordinate(k: int) -> Jet:
-            """The jet of coordinate k along the path."""
+            """The jet of coordinate number k along the direction, at p."""
             at = Interval.point(p[k])
             at = at.widened(machine_epsilon(p[k])) if is_rounded else at
             return Jet(at, (Interval.point(direction[k]),), (), piece_length=zero)
@@ -293,12 +319,13 @@ class Formula(Field):
 
     @property
     def may_jump(self) -> bool:
-        """Whether the formula has functions that are not continuous everywhere, or cannot be
-        evaluated with the numbers that count its operations."""
+        """Whether the formula uses functions that are not continuous everywhere. Also True if it
+        cannot be evaluated with the numbers that count its operations, so that nothing is known."""
         return self.tally.may_jump
 
     def restrict(self, p: Vec3, direction: Vec3) -> FormulaOnRay:
-        """The formula along the path p + s direction, for enclosures."""
+        """The formula restricted to the line p + s direction, as a function of the length s, from
+        which enclosures are made."""
         return FormulaOnRay(self, p, direction)
 
     def prepare(self, backend: Backend) -> Field:
@@ -309,10 +336,10 @@ class Formula(Field):
         return other
 
     def _jet(self, coordinates: tuple[Jet, Jet, Jet], like: Real) -> Jet:
-        """The jet of f at jets of the coordinates.
+        """The jet of f (ranges of its value and derivatives) from the jets of the three
+        coordinates.
 
-        coordinates: the three jets.
-        like: a number of the backend.
+        like: a number of the backend; not used.
         """
         return as_jet(self.formula(*coordinates), coordinates[0], type(self).__name__)
 
@@ -323,20 +350,21 @@ def probe_jets() -> tuple[Jet, Jet, Jet]:
 
 
 def hessian_error(jet: Jet, like: Real) -> Real:
-    """A bound of the error of a Hessian whose entries are the midpoints of their ranges, in the
-    spectral norm.
+    """A bound of the error of a Hessian, in the spectral norm. Its entries are the midpoints of the
+    ranges of the second derivatives.
 
-    jet: of f at a point, with all second derivatives.
-    like: a number of the backend.
+    jet: the jet of f at a point, with the ranges of all six second derivatives.
+    like: any number of the backend, which decides the type of the result.
 
-    Proof. The spectral norm of a matrix is at most the sum of the absolute values of its entries.
+    Proof. The error of an entry is at most half the width of its range. The spectral norm of a
+    matrix is at most the sum of the absolute values of its entries.
     """
     xx, xy, xz, yy, yz, zz = (entry.radius for entry in jet.second_derivatives)
     return 0 * like + xx + yy + zz + 2 * (xy + xz + yz)
 
 
 def warn_if_slow_to_compile(field: Formula) -> None:
-    """Warn if compiling a formula will take long.
+    """Warn if the kernel of a formula will take more than about ten seconds to compile.
 
     On an idle core LLVM took 0.9 s for 11,000 operations, 2.7 s for 32,000, 7.4 s for 53,000 and 30
     s for 100,000. So the time grows about as the number of operations to the power 2.2.
@@ -354,12 +382,13 @@ def warn_if_slow_to_compile(field: Formula) -> None:
 
 
 def is_jet(x: Any, name: str) -> bool:
-    """Whether a coordinate x is a jet; it is False for a plain number.
+    """Whether a coordinate x is a jet (ranges of a number and its derivatives); False for a plain
+    number.
 
-    name: of the field, for the message.
+    name: the name of the field, for the message.
 
     Raises:
-        TypeError: x is a number of another arithmetic, which the formula does not accept.
+        TypeError: x is a number of another arithmetic of bounds, which the formula does not accept.
     """
     if isinstance(x, FormulaNumber) and not isinstance(x, Jet):
         raise TypeError(
@@ -371,10 +400,11 @@ def is_jet(x: Any, name: str) -> bool:
 
 
 def as_jet(value: Any, like: Jet, name: str) -> Jet:
-    """The result of a formula as a jet. A constant becomes a constant jet.
+    """The result of a formula as a jet (ranges of a number and its derivatives). A constant becomes
+    a constant jet.
 
-    like: any jet of the same variables and piece.
-    name: of the field, for the message.
+    like: any jet of the same variables on the same piece.
+    name: the name of the field, for the message.
 
     Raises:
         TypeError: the result is neither a jet nor a constant.
@@ -391,14 +421,17 @@ def as_jet(value: Any, like: Jet, name: str) -> Jet:
 
 @dataclass(frozen=True)
 class FormulaOnRay:
-    """A formula along the path p + s d, as an `EvaluableRestriction`.
+    """A formula f along a line, as the function F(s) = f(p + s d) of the length s. The line is cut
+    into pieces at given lengths, the knots. For each piece, jets give proved ranges of F' and F''.
+    It is an `EvaluableRestriction`, from which enclosures (bounds of the change of f along a ray)
+    are made.
 
     field: the field with the formula.
     p, direction: (3,) p and d.
     before: the distance before p at which the first piece begins. If it is not 0.0, the pieces
-        cover all paths that lead through p up to rounding.
-    piece_count: the number of pieces into which the path is cut. The ranges of a formula cost as
-        much as its value: one piece takes the least time; four pieces take two thirds of the
+        cover all lines along d that lead through p up to rounding.
+    piece_count: the number of pieces into which the ray is cut. The ranges of a formula take as
+        much time as its value: one piece takes the least time; four pieces take two thirds of the
         samples, but twice the time.
     """
 
@@ -409,34 +442,38 @@ class FormulaOnRay:
     piece_count: int = 1
 
     def rounded(self, t: Real) -> FormulaOnRay:
-        """The formula along all paths that lead through p up to its rounding, where p is the point
-        at parameter t. Its first piece begins before p, by more than the rounding of t."""
+        """The formula along all lines that lead through p up to its rounding, where p is the point
+        of a ray at the parameter t. The first piece begins before p, by more than the rounding of
+        t."""
         before = _ROUNDINGS_BEFORE * float(dr.epsilon(type(t))) * dr.abs(t)
         return dataclasses.replace(self, before=before)
 
     def is_continuous(self, length: Real) -> Mask:
-        """Whether f is proved to be continuous for 0 <= s <= length. It is if the range of its
-        slopes is bounded."""
+        """Whether f is proved to be continuous for 0 <= s <= length. It is if the range of F' is
+        bounded."""
         slopes = self._jet(0.0, length).first_derivatives[0]
         return dr.isfinite(0 * length + slopes.lower) & dr.isfinite(0 * length + slopes.upper)
 
     def derivative_ranges(self, knots: Sequence[Real]) -> tuple[PathPiece, ...]:
-        """Ranges of the derivatives of F(s) = f(p + s d), as `PathPiece`s, one between each knot
-        and the next.
+        """The ranges of the derivatives of F(s), as `PathPiece`s, one between each knot and the
+        next.
 
         knots: increasing lengths s, the first of them 0.
         """
         return tuple(self._piece(start, end) for start, end in itertools.pairwise(knots))
 
     def evaluate_with(self, coordinates: Callable[[Vec3, Vec3], tuple[Any, Any, Any]]) -> Any:
-        """The value of the formula at (x, y, z) = coordinates(p, d), in the arithmetic of these
-        three numbers."""
+        """The value of the formula in another arithmetic: at the three numbers (x, y, z) =
+        coordinates(p, d).
+
+        coordinates: a function that makes three numbers of that arithmetic from p and d.
+        """
         x, y, z = coordinates(self.p, self.direction)
         value = self.field.formula(x, y, z)
         return x.constant(float(value)) if isinstance(value, int | float) else value
 
     def _piece(self, start: Real, end: Real) -> PathPiece:
-        """The ranges of the first two derivatives of f(p + s d) by s, for start <= s <= end."""
+        """The proved ranges of F' and F'' for start <= s <= end."""
         jet = self._jet(start, end)
         (slopes,), (curvatures,) = jet.first_derivatives, jet.second_derivatives
         zero = 0 * self.p.x
@@ -448,28 +485,32 @@ class FormulaOnRay:
         )
 
     def _jet(self, start: Real, end: Real) -> Jet:
-        """The jet of f(p + s d) as a function of s, for start <= s <= end."""
+        """The jet of F (ranges of its value and derivatives) for start <= s <= end."""
         is_exact = isinstance(self.before, float) and self.before == 0.0
         if not is_exact and isinstance(start, float):  # the first piece starts at 0.0
             start = -self.before
+        # If the first piece begins before p, the line is known only up to rounding.
         coordinates = Jet.along_ray(self.p, self.direction, start, end, is_rounded=not is_exact)
         return as_jet(self.field.formula(*coordinates), coordinates[0], type(self.field).__name__)
 
 
 def with_device_numbers(field: Any, backend: Backend) -> Any:
-    """A copy of a dataclass in which its numbers are kernel parameters of the backend, and fields
-    among its attributes are prepared."""
+    """A copy of a field that is a dataclass, in which its numbers are kernel parameters of the
+    backend, and its attributes that are fields are prepared. (A kernel parameter can change without
+    compiling the kernel again.)"""
     other = copy.copy(field)
     for entry in dataclasses.fields(cast("Any", field)) if dataclasses.is_dataclass(field) else ():
         value = getattr(field, entry.name)
         if (prepared := prepare_value(value, backend)) is not value:
+            # The dataclass may be frozen.
             object.__setattr__(other, entry.name, prepared)
     return other
 
 
 def prepare_value(value: Any, backend: Backend) -> Any:
-    """A float, or the floats in a tuple, as kernel parameters of the backend. A field is prepared.
-    All else, integers included, is returned unchanged."""
+    """The value of a field's attribute, ready for the backend. A float, or each float in a tuple,
+    becomes a kernel parameter. A field is prepared. All else, integers included, is returned
+    unchanged."""
     if isinstance(value, float):
         return dr.opaque(backend.Float, value)
     if isinstance(value, tuple):

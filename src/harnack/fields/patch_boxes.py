@@ -1,5 +1,6 @@
-"""Fields whose surfaces are unions of patches (level sets of functions of their own, each inside a
-box), and these boxes on a backend."""
+"""Fields whose surface is a union of patches, and the boxes of the patches on a backend (a Dr.Jit
+device and precision). A patch is a level set of a function of its own, and each patch lies inside a
+box of its own. A ray is traced only along the patches whose boxes it enters."""
 
 from __future__ import annotations
 
@@ -30,8 +31,9 @@ __all__ = ["PatchBoxes", "PatchField"]
 
 @dataclass(frozen=True)
 class PatchBoxes(UnitFrame):
-    """A tree of boxes, one for each patch, in unit coordinates (`UnitFrame`), in which all boxes
-    together have a size of about 1.
+    """A tree of boxes, one for each patch of a surface, on a backend. Boxes are stored in unit
+    coordinates (`UnitFrame`), in which all of them together have a size of about 1. Rays are o + t
+    d.
 
     tree: the tree of the boxes.
     """
@@ -40,10 +42,11 @@ class PatchBoxes(UnitFrame):
 
     @classmethod
     def upload(cls, backend: Backend, lower: FloatArray, upper: FloatArray) -> PatchBoxes:
-        """The boxes with these lowest and highest corners, each (n, 3).
+        """Make the tree of the boxes with these lowest and highest corners, each (n, 3), on a
+        backend.
 
-        The size of the unit coordinates is a power of two. So positions along rays are scaled
-        without rounding, and keep their order.
+        The size of the unit coordinates is a power of two. So ray parameters are scaled without
+        rounding, and keep their order.
         """
         min_corner, max_corner = lower.min(axis=0), upper.max(axis=0)
         center = round_to_single(0.5 * (min_corner + max_corner))
@@ -56,8 +59,9 @@ class PatchBoxes(UnitFrame):
     def next(
         self, o: Vec3, d: Vec3, after: PatchEntry, start: Real, end: Real, active: Mask
     ) -> PatchEntry:
-        """The first entry of a ray into a box after the entry `after`, with start <= t <= end, as a
-        `PatchEntry`; see `PatchUnion.next_patch`."""
+        """The first box that a ray o + t d enters after the entry `after`, with start <= t <= end,
+        as the `PatchEntry` of the patch in the box. See `PatchUnion.next_patch` for the order of
+        entries."""
         behind = after.enter / self.size, after.patch
         enter, leave, box = self.tree.next_box(
             self.to_unit(o), d, behind, start / self.size, end / self.size, active
@@ -66,7 +70,8 @@ class PatchBoxes(UnitFrame):
 
 
 class HasPatchBoxes(Protocol):
-    """Data of a union of patches on a backend: the boxes of the patches, and further data."""
+    """The data of a union of patches on a backend: the boxes of the patches, and further data that
+    a field chooses."""
 
     @property
     def boxes(self) -> PatchBoxes: ...
@@ -76,9 +81,11 @@ _Buffers = TypeVar("_Buffers", bound=HasPatchBoxes)
 
 
 class PatchField(Field, Generic[_Buffers]):
-    """A union of patches, each in a box. The boxes depend on the levels.
+    """A field whose surface is a union of patches. Each patch is a level set of a function of its
+    own, and lies in a box of its own. The boxes depend on the levels. A prepared field has its data
+    (boxes and functions) on a backend.
 
-    levels: the boxes of the prepared field contain the patches of these levels.
+    levels: the levels whose patches lie in the boxes of the prepared field.
     """
 
     has_patches: bool = True
@@ -90,19 +97,19 @@ class PatchField(Field, Generic[_Buffers]):
 
     @abc.abstractmethod
     def boxes(self, levels: tuple[float, ...] | None = None) -> tuple[FloatArray, FloatArray]:
-        """The lowest and the highest corners of boxes, two arrays (m, 3). Each box is proved to
-        contain its patch.
+        """The lowest and the highest corners of the boxes of all patches, two arrays (m, 3). Each
+        box is proved to contain its patch.
 
         levels: the levels whose patches are meant; None for the attribute `levels`.
         """
 
     @abc.abstractmethod
     def _upload(self, backend: Backend) -> _Buffers:
-        """The boxes and the data of the patches on a backend."""
+        """Upload the boxes and the data of the patches to a backend."""
 
     def with_levels(self, levels: tuple[float, ...]) -> Self:
-        """This field with boxes that contain the patches of these levels, not yet prepared. It is
-        made once for equal levels."""
+        """This field with boxes that contain the patches of these levels, not yet prepared. Equal
+        levels give the same object."""
         if levels == self.levels:
             return self
         if levels not in self._for_levels:
@@ -120,7 +127,7 @@ class PatchField(Field, Generic[_Buffers]):
         return prepared
 
     def _require_data(self) -> _Buffers:
-        """The boxes and the data of the patches, on the backend for which the field is prepared.
+        """The boxes and the data of the patches, which `prepare` uploaded.
 
         Raises:
             RuntimeError: `prepare` was not called.
@@ -135,6 +142,7 @@ class PatchField(Field, Generic[_Buffers]):
         return self._require_data().boxes.next(o, d, after, start, end, active)
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
-        """The box around the boxes of all patches."""
+        """A box that contains the patches of these levels: the box around the boxes of all
+        patches."""
         lower, upper = self.boxes(levels)
         return Box(lower.min(axis=0), upper.max(axis=0))

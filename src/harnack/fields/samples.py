@@ -1,11 +1,13 @@
-"""The records that fields return: `Sample`, at a point, and `RaySample`, at a point of a ray with
-enclosures of f ahead and behind.
+"""What a field returns about its function f: a `Sample` at a point, and a `RaySample` at a point of
+a ray. A sample holds value and gradient with error bounds, and promises: proved bounds of f near
+the point, such as a Lipschitz constant on a ball. A ray sample adds enclosures: intervals that are
+proved to hold the change of f along the ray, in front of the point (forward) and behind it
+(backward).
 
-Rounding is part of the proof. The enclosure (a bound of f along the ray) ahead of a point and the
-enclosure behind the next point may be exact to first order. Then they meet right at a surface, and
-with rounded arithmetic one ray in ten slipped through at tight tolerances. So the difference of f
-to every level is reduced by the rounding error of f, and a tolerance below that error is raised to
-it.
+Rounding is part of the proof. The enclosure in front of a point and the enclosure behind the next
+point may be exact to first order. Then they meet right at a surface, and with rounded arithmetic
+one ray in ten slipped through at tight tolerances. So the difference of f to every level is reduced
+by the rounding error of f, and a tolerance below that error is raised to it.
 """
 
 from __future__ import annotations
@@ -30,26 +32,27 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Sample:
-    """Value, gradient and promises of a field f at a point p.
+    """Value and gradient of a field's function f at a point p, with bounds of their errors, and
+    with promises: proved bounds of f near p (`harnack.enclosures.promises`). All numbers may differ
+    from lane to lane, one point in each.
 
     value: f(p).
     gradient: (3,) the gradient of f at p.
-    promises: what f guarantees near p.
-    value_error: a bound of the error of `value`. It includes the truncation error. It includes
-        rounding errors only as far as they exceed eight units in the last place, or eight times the
-        smallest normal number; and it does not include |gradient| times the rounding of the point
-        itself. The tracer adds these. Steps are shortened by the error.
+    promises: the proved bounds of f near p, such as a `Lipschitz` constant on a ball about p.
+    value_error: a bound of the error of `value`. The whole truncation error is included. Of the
+        rounding error only the part is included that exceeds eight units in the last place, or
+        eight times the smallest normal number. The tracer adds that part, and |gradient| times the
+        rounding error of p. Steps are shortened by the error.
     gradient_error: a bound of the truncation and rounding error of `gradient`, as a length; 0 if
         the error is only the rounding of a few operations.
-    shading_normal: (3,) unit normal to shade with, for points near a singular point of the surface,
-        where the gradient is of no use; None for the direction of the gradient. Steps do not depend
-        on it.
-    truncation_error: the part of `value_error` that a sample of higher accuracy reduces
-        (`Field.at_accuracy`).
-    alternative_promises: promises that are also valid, but gave shorter steps than `promises` in
-        every measurement. They are used only if the
-        caller names the enclosures to use.
-    ray_promises: further promises, which hold only for points of the ray of a `Field.sample_ray`.
+    shading_normal: (3,) the unit normal to shade with near a singular point of the surface, where
+        the gradient is of no use; None for the direction of the gradient. Steps do not depend on
+        it.
+    truncation_error: the part of `value_error` that becomes smaller if f is sampled with higher
+        accuracy (`Field.at_accuracy`).
+    alternative_promises: proved bounds that are also valid, but gave shorter steps than `promises`
+        in every measurement. They are used only if the caller names the enclosures to use.
+    ray_promises: Lipschitz constants of f on a ray through p, in a sample of `Field.sample_ray`.
     branch_unknown: the lanes on which f is known only modulo 1 (`JumpSurface.has_unknown_branch`);
         None if there are none.
     """
@@ -67,14 +70,15 @@ class Sample:
 
     @property
     def all_promises(self) -> tuple[Promise, ...]:
-        """All promises, the alternative ones last."""
+        """The proved bounds of both kinds as one tuple: `promises`, then `alternative_promises`."""
         return self.promises + self.alternative_promises
 
     def map_promises(self, change: Callable[[Promise], Promise], **numbers: Any) -> Sample:
-        """This sample with each promise replaced by change(promise), the alternative promises
-        included. `ray_promises` stay as they are.
+        """This sample with each of its promises, the alternative ones included, replaced by
+        change(promise). `ray_promises` stay as they are.
 
-        numbers: new values of further attributes, by their names.
+        change: a function from a promise to a promise.
+        numbers: new values of other attributes of the sample, as keywords such as value=...
         """
         promises, alternatives = (
             tuple(map(change, group)) for group in (self.promises, self.alternative_promises)
@@ -84,12 +88,14 @@ class Sample:
         )
 
     def shifted(self, offset: Real) -> Sample:
-        """The sample of f + offset at the same point. The rounding of the sum is not counted."""
+        """The sample of the function f + offset at the same point. The rounding error of the sum is
+        not counted."""
         return self.map_promises(lambda promise: promise.shifted(offset), value=self.value + offset)
 
     def select(self, mask: Mask, other: Sample) -> Sample:
-        """The sample `other` on the lanes of the mask, this sample on all other lanes. Both samples
-        must have promises of the same kinds in the same order. The result has no shading normal."""
+        """The sample `other` on the lanes of the mask, and this sample on all other lanes. Both
+        samples must have promises of the same kinds in the same order. The result has no shading
+        normal."""
         names = "value", "gradient", "value_error", "gradient_error", "truncation_error"
         numbers = {k: dr.select(mask, getattr(other, k), getattr(self, k)) for k in names}
         groups: dict[str, Any] = {}
@@ -109,22 +115,21 @@ _SAMPLE_HELP = (
 def validate_samples(
     evaluate: Callable[[Any, Vec3], Sample],
 ) -> Callable[[Any, Vec3], Sample]:
-    """Wrap the method `evaluate` of a field so that its result is checked.
-
-    The wrapped method raises TypeError if `evaluate` returns anything but a valid `Sample`, and
-    NotImplementedError if the value has derivatives that the field would drop. It also turns NumPy
-    scalars in the sample into Python numbers, as Dr.Jit takes no NumPy scalars.
-    """
+    """Decorator of a field's method `evaluate`: the decorated method checks what `evaluate`
+    returns. It raises TypeError for anything but a valid `Sample`, and NotImplementedError if the
+    value has derivatives enabled that the field would drop. It also turns NumPy scalars in the
+    sample into Python numbers, because Dr.Jit takes no NumPy scalars."""
 
     @functools.wraps(evaluate)
     def checked(self: Any, p: Vec3) -> Sample:
-        """The sample at p that `evaluate` returns, after all checks."""
+        """The sample at p that `evaluate` returns, after the checks of `validate_samples`."""
         sample: Any = evaluate(self, p)
         name = f"{type(self).__name__}.evaluate"
         if not isinstance(sample, Sample):
             raise TypeError(
                 f"{name} returned {_describe_type(sample)}, not a Sample: {_SAMPLE_HELP}"
             )
+        # Both attributes must be tuples of promises.
         group: Any
         for place, group in (
             ("promises", sample.promises),
@@ -145,6 +150,7 @@ def validate_samples(
                 f"{name}: Sample.gradient is {_describe_type(gradient)}, no 3-vector: "
                 f"{_SAMPLE_HELP}"
             )
+        # Derivatives of the value that do not come from p would be lost.
         if self.has_no_parameters() and not dr.grad_enabled(p):
             check_no_derivatives(type(self).__name__, sample.value)
         return _unbox_numpy(sample).map_promises(_unbox_numpy)
@@ -153,8 +159,8 @@ def validate_samples(
 
 
 def _unbox_numpy(record: _R) -> _R:
-    """The record, with attributes that are NumPy scalars turned into Python numbers, as Dr.Jit
-    takes no NumPy scalars."""
+    """The same sample or promise, with attributes that are NumPy scalars turned into Python
+    numbers, because Dr.Jit takes no NumPy scalars."""
     scalars: dict[str, Any] = {
         key: value.item() for key, value in vars(record).items() if isinstance(value, np.generic)
     }
@@ -162,15 +168,17 @@ def _unbox_numpy(record: _R) -> _R:
 
 
 def _describe_type(value: Any) -> str:
-    """The type of a value in words, for messages."""
+    """The type of a value in words, for error messages: "nothing" for None."""
     return "nothing" if value is None else f"an object of type {type(value).__name__}"
 
 
 def space_scaled(sample: Sample, size: Real) -> Sample:
-    """The sample of the function x -> f(x / size) at the point size * p, from the sample of f at p.
+    """The sample of the scaled function g(x) = f(x / size) at the point size * p, from the sample
+    of f at p.
 
-    Values stay the same. Radii are multiplied by the size. Gradients and Lipschitz constants are
-    divided by it. Bounds of second derivatives and of Laplacians are divided by its square.
+    The value stays the same. Radii of balls are multiplied by the size. Gradients and Lipschitz
+    constants are divided by it. Bounds of second derivatives and of Laplacians are divided by its
+    square.
     """
     return sample.map_promises(
         lambda promise: promise.space_scaled(size),
@@ -181,37 +189,40 @@ def space_scaled(sample: Sample, size: Real) -> Sample:
 
 
 def value_error_bound(sample: Sample, gradient_norm: Real, size: Real) -> Real:
-    """A bound of the error of a sample's value: truncation, rounding, and the effect of the
-    rounding of the point.
+    """A bound of the whole error of a sample's value: truncation, rounding, and the change of f by
+    the rounding of the point p.
 
-    gradient_norm: |gradient| of the sample.
-    size: a bound of the absolute values of the point's coordinates.
+    gradient_norm: the length of the sample's gradient.
+    size: a bound of the absolute values of the coordinates of p.
     """
     kind = cast("Any", type(sample.value))
     epsilon = 2 * float(dr.epsilon(kind))
-    # Numbers below the smallest normal one may underflow to 0.
+    # The rounding of eight units in the last place, which `Sample.value_error` leaves out. Numbers
+    # below the smallest normal one may underflow to 0.
     smallest = kind(float(dr.smallest(kind)))
     value = 8 * fmax(epsilon * dr.abs(sample.value), smallest)
+    # The rounding of p moves it by at most 4 epsilon times size.
     return dr.fma(gradient_norm, 4 * epsilon * size, value + sample.value_error)
 
 
 @dataclass(frozen=True)
 class RaySample:
-    """A sample on a ray, with enclosures of f in both directions.
-
-    Below, x(t) = o + t d is the ray and s >= 0 a length along it.
+    """A sample of f at the point x(t) = o + t d of a ray, with enclosures in both directions:
+    functions of a length s >= 0 along the ray, whose values are intervals that are proved to hold
+    the change of f.
 
     sample: the sample at x(t).
-    forward: enclosures of f(x(t + s)) - f(x(t)), as functions of s.
-    backward: enclosures of f(x(t - s)) - f(x(t)), from the same evaluation.
+    forward: enclosures of f(x(t + s)) - f(x(t)), the change in front of the point.
+    backward: enclosures of f(x(t - s)) - f(x(t)), the change behind the point, from the same
+        evaluation.
     slope: the derivative of f along the ray at x(t), with an error of at most `slope_error_bound`.
-    reach_growth: up to which length the enclosures of the next sample should be computed, as a
+    reach_growth: the length up to which the next sample should compute its enclosures, as a
         multiple of the step that this sample proves.
     slope_error: a bound of the error of `slope` that is smaller than `Sample.gradient_error`; None
-        if no such bound is known. (On a crease the gradient is a range, but the derivative along a
-        ray that runs in the crease may be a number.)
+        if no such bound is known. (On a crease of f the gradient is a range, but the derivative
+        along a ray that runs in the crease may be a single number.)
     min_gradient_norm: a lower bound of |grad f| that may be larger than |gradient| minus
-        `Sample.gradient_error`, as on a crease; None if no such bound is known.
+        `Sample.gradient_error`, for example on a crease; None if no such bound is known.
     """
 
     sample: Sample
@@ -225,16 +236,17 @@ class RaySample:
     @property
     def slope_error_bound(self) -> Real:
         """A bound of the error of `slope`: `slope_error` or, if that is None, the error of the
-        gradient."""
+        whole gradient."""
         return self.sample.gradient_error if self.slope_error is None else self.slope_error
 
 
 @dataclass(frozen=True)
 class Ray:
-    """Rays o + t d with |d| = 1, and the classes of enclosures (proofs of bounds of f along a ray)
-    by which steps on them are proved.
+    """Rays o + t d with |d| = 1, one in each lane, and the kinds of enclosures by which steps on
+    them are proved. An enclosure is an interval, as a function of the length along the ray, that is
+    proved to hold the change of f.
 
-    origin, direction: (3,) o and d, one ray per lane.
+    origin, direction: (3,) o and d.
     proofs: the classes of enclosures to use.
     """
 
@@ -243,15 +255,15 @@ class Ray:
     proofs: EnclosureKinds
 
     def point(self, t: Real) -> Vec3:
-        """The points at parameters t."""
+        """The points o + t d of the rays."""
         return dr.fma(type(self.origin)(t), self.direction, self.origin)
 
     def enclose(self, sample: Sample) -> RaySample:
-        """The sample with enclosures: intervals, as functions of the length s along the ray, that
-        provably contain the change of f from the sample's point, ahead and behind.
+        """The ray sample that follows from a sample at a point of the ray: its enclosures, in front
+        of the point and behind it, are proved by the sample's promises (proved bounds of f near the
+        point) and by the slope of f along the ray.
 
-        They follow from the sample's promises (proved bounds of f near the point) and the slope of
-        f along the ray. The gradient has an error, so the slope enters the proofs as an interval.
+        The gradient has an error. So the slope enters the proofs as an interval.
         """
         slope = dr.dot(sample.gradient, self.direction)
         slopes = SlopeRange.around(slope, sample.gradient_error)

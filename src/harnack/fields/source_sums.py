@@ -1,8 +1,10 @@
-"""Sums over sources (edges, dipoles and far nodes of trees) at a point, and bounds of f near the
-point.
+"""Sums over sources at a point x, and the bounds of f near x that follow from these sums. f is a
+field's function; its sources are edges, dipoles (small triangles), and far nodes of a tree, each of
+which stands for many dipoles. `SourceSums` holds the sums. From them it makes values with error
+bounds, or a `Sample`: value and gradient of f at x with "promises", which are proved bounds of f
+near x.
 
-All fields that are such sums accumulate the same record, `SourceSums`. It gives values with error
-bounds, or a sample with promises (proved bounds of f near the point).
+Two symbols occur throughout: a is the area of a dipole, and rho is its distance from x.
 """
 
 from __future__ import annotations
@@ -22,10 +24,10 @@ from harnack.fields.field import Sample
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
 
-# Radii of the `TaylorRemainder` promises, as fractions of the distance to the nearest singular
-# point: a smaller radius has a smaller constant.
+# Radii of the balls about x on which a sum bounds Taylor's remainder (`TaylorRemainder`), as
+# fractions of the distance to the nearest singular point. A smaller ball has a smaller bound.
 _TAYLOR_RADII = (0.2, 0.4, 0.6)
-# The largest radius of a promise, as a fraction of the distance to the dipoles of far nodes.
+# The largest radius of such a ball, as a fraction of the distance to the dipoles of far nodes.
 _MAX_STEP_FRACTION = 0.65
 # Bounds are enlarged, and distances reduced, by this fraction, for the rounding of sums.
 SUM_MARGIN = 2e-5
@@ -38,47 +40,51 @@ SLOPE_ROUNDINGS, SECOND_ROUNDINGS = 16.0, 320.0
 
 
 def max_step_fraction(coarse_ratio: float) -> float:
-    """The longest step for which the promises of a sum hold, as a fraction of the distance to the
-    center of the nearest far node.
+    """The longest step from x for which the bounds of f hold that `SourceSums.sample` proves, as a
+    fraction of the distance from x to the center of the nearest far node.
 
-    coarse_ratio: far nodes are farther away than this many times their radius.
+    coarse_ratio: a node is far if its center is farther from x than this many times its radius.
     """
     return _MAX_STEP_FRACTION * (1 - 1 / coarse_ratio)
 
 
 def free_radius_fraction(coarse_ratio: float) -> float:
-    """The radius of a ball around x that is free of the sources of a far node, as a fraction of the
+    """The radius of a ball around x that contains no dipole of a far node, as a fraction of the
     distance from x to the center of the node.
 
-    coarse_ratio: far nodes are farther away than this many times their radius.
+    coarse_ratio: a node is far if its center is farther from x than this many times its radius.
     """
     return max_step_fraction(coarse_ratio) / _TAYLOR_RADII[-1]
 
 
 def remainder_factor(q: float) -> float:
-    """The function phi(q) = (3 - 2 q)/(1 - q)^2 for 0 <= q < 1. It is convex, and 3 at 0. At the
-    distance t from a point, Taylor's remainder of a dipole of area a at the distance rho is at most
-    a t^2 rho^-4 phi(t/rho)."""
+    """The function phi(q) = (3 - 2 q)/(1 - q)^2 for 0 <= q < 1. It is convex, and phi(0) = 3. It
+    bounds the change of a dipole's value beyond its linear part: at the distance t from x, Taylor's
+    remainder is at most a t^2 rho^-4 phi(t/rho), where a is the area of the dipole and rho its
+    distance from x."""
     return (3 - 2 * q) / (1 - q) ** 2
 
 
 def final_rounding(backend: Backend, size: float = 1.0) -> Real:
-    """A bound of the rounding after the last term of a sum, as a kernel parameter: 16 roundings of
-    numbers of the given size. (The rounding of terms and of additions is counted by
-    `SourceSums.add_term`.)"""
+    """A bound of the rounding errors that arise after the last term was added to a sum: 16 machine
+    epsilons times `size`. It is returned as a kernel parameter. (`SourceSums.add_term` counts the
+    rounding errors before.)
+
+    size: a bound of the absolute value of the numbers that are rounded.
+    """
     return dr.opaque(backend.Float, backend.machine_epsilon * 16 * size)
 
 
 def dipole_rounding(area: Real, inverse: Real, unit: Real) -> Real:
-    """A bound of the rounding of the value of a dipole at the distance rho.
+    """A bound of the rounding error of the value of one dipole at the distance rho from x.
 
     area: the area of the dipole.
     inverse: 1/rho.
-    unit: the rounding of a coordinate, at least the machine epsilon.
+    unit: a bound of the rounding error of a coordinate, at least the machine epsilon.
 
-    The rounding of coordinates changes the value by at most 2 unit area/rho^3. It enters twice,
-    through the two coordinates of a difference. The four roundings of the term itself change it by
-    4 epsilon area/rho^2.
+    The rounding of one coordinate changes the value by at most 2 unit area/rho^3. A difference of
+    two coordinates has this error twice. The four rounded operations of the term itself change it
+    by at most 4 epsilon area/rho^2.
     """
     square = inverse * inverse
     return (unit * area) * dr.fma(4 * inverse, square, 4 * square)
@@ -86,11 +92,12 @@ def dipole_rounding(area: Real, inverse: Real, unit: Real) -> Real:
 
 @dataclass(frozen=True)
 class SourceTerm:
-    """The term of a single source (a dipole, an edge or a far node) in the sums of f and of its
+    """The contribution of a single source (a dipole, an edge or a far node) to f and to its
     derivatives.
 
-    Derivatives that were not requested are None. The value of an edge is None too, as its angle is
-    added later.
+    value: its part of f; None for an edge, whose angle is added later.
+    gradient: (3,) its part of the gradient; None if gradients were not requested.
+    hessian: its part of the second derivatives; None if they were not requested.
     """
 
     value: Real | None
@@ -100,21 +107,25 @@ class SourceTerm:
 
 @dataclass(frozen=True)
 class SourceSums:
-    """Sums over all sources at points x: f and its derivatives, error bounds, and bounds of higher
-    derivatives near x.
+    """The sums over all sources (dipoles, edges and far nodes of a tree) at points x, one point in
+    each lane: f, its derivatives, error bounds, and the numbers from which bounds of f near x
+    follow.
 
     total: the plain sum of the values. The property `value` adds `compensation` to it.
-    gradient, hessian: of f. They are None if they were not requested.
-    truncation, gradient_truncation, hessian_truncation: bounds of the truncation errors of the
-        value, the gradient and the second derivatives along lines. The last is None without a
-        Hessian.
+    gradient: (3,) of f; None if it was not requested.
+    hessian: of f; None if it was not requested.
+    truncation, gradient_truncation: bounds of the truncation errors of the value and of the
+        gradient.
+    hessian_truncation: a bound of the truncation error of the second derivative along any line;
+        None without a Hessian.
     rounding: a bound of the rounding error of the value.
-    singularity_distance: the distance to the nearest singular point, a dipole or an edge; or
-        `free_radius_fraction` of the distance to the nearest far node's center, if that is smaller.
-    s4, s5: the sums of a/rho^4 and of a/rho^5. A dipole at the distance rho adds its area as a. A
-        far node whose center is at the distance r adds A + K/r^2 of `multipole.remainder_constants`
-        as a, with rho = r. For edges see `LiftedEdge.bounds`.
-    compensation: the sum of the rounding errors of the additions to `total`: see `add_term`.
+    singularity_distance: the distance from x to the nearest singular point, which is a dipole or a
+        point of an edge; or `free_radius_fraction` times the distance to the nearest far node's
+        center, if that is smaller.
+    s4, s5: the sums of a/rho^4 and of a/rho^5 over all sources. For a dipole at the distance rho, a
+        is its area. For a far node, rho is the distance of its center, and a is A + K/rho^2 with
+        the numbers A and K of `multipole.remainder_constants`. For edges see `LiftedEdge.bounds`.
+    compensation: the sum of the rounding errors of the additions to `total`; see `add_term`.
     """
 
     total: Real
@@ -131,65 +142,68 @@ class SourceSums:
 
     @property
     def value(self) -> Real:
-        """f: the plain sum plus the rounding errors of its additions."""
+        """f at x: the plain sum plus the rounding errors of its additions."""
         return self.total + self.compensation
 
     @classmethod
     def zero(cls, backend: Backend, free_distance: Real, derivatives: int) -> SourceSums:
-        """Sums without terms.
+        """The sums before any source is added.
 
-        free_distance: the `singularity_distance` if no terms are added.
+        free_distance: the initial `singularity_distance`, which stays if there are no sources.
         derivatives: 0 for values only, 1 for gradients too, 2 for Hessians too.
         """
         real, zero = backend.Float, backend.Float(0)
         gradient = backend.Array3f(0) if derivatives >= 1 else None
         hessian = SymmetricMatrix.zero(real) if derivatives == 2 else None
-        second = None if hessian is None else zero
-        bounds = zero, zero, second, zero, real(free_distance), zero, zero, zero
+        hessian_truncation = None if hessian is None else zero
+        # The further attributes in the order of the constructor; all sums are 0.
+        bounds = zero, zero, hessian_truncation, zero, real(free_distance), zero, zero, zero
         return cls(zero, gradient, hessian, *bounds)
 
     @classmethod
     def from_state(cls, parts: tuple[Any, ...]) -> SourceSums:
         """The sums that `to_state` turned into this tuple.
 
-        parts: the attributes in the order of the constructor, the Hessian as a tuple of its
-            entries.
+        parts: the attributes in the order of the constructor; the Hessian is a tuple of its six
+            entries, or None.
         """
         total, gradient, hessian, *bounds = parts
         return cls(total, gradient, None if hessian is None else SymmetricMatrix(*hessian), *bounds)
 
     def to_state(self) -> tuple[Any, ...]:
         """The attributes in the order of the constructor, as a tuple for the state of a recorded
-        loop. The Hessian becomes a tuple of its six entries. Sums that were not requested are None:
-        Dr.Jit would record the loop twice if they were numbers that never change."""
+        loop. The Hessian becomes a tuple of its six entries. Sums that were not requested are None,
+        because Dr.Jit would record the loop a second time for numbers that never change."""
         hessian = None if self.hessian is None else self.hessian.components()
         bounds = self.truncation, self.gradient_truncation, self.hessian_truncation, self.rounding
         ends = self.singularity_distance, self.s4, self.s5, self.compensation
         return self.total, self.gradient, hessian, *bounds, *ends
 
     def select(self, mask: Mask, other: SourceSums) -> SourceSums:
-        """The sums `other` on the lanes where the mask holds, these sums on all other lanes. Both
-        must be without Hessians."""
+        """The sums `other` on the lanes where the mask holds, and these sums on all other lanes.
+        Neither may have a Hessian."""
         pairs = zip(other.to_state(), self.to_state(), strict=True)
+        # None stands for a sum that was not requested, in both.
         return SourceSums(*(None if b is None else dr.select(mask, a, b) for a, b in pairs))
 
     @property
     def derivatives(self) -> int:
-        """The order of the derivatives that are summed: 0, 1 or 2."""
+        """The order up to which derivatives are summed: 0, 1 or 2."""
         return 0 if self.gradient is None else 1 if self.hessian is None else 2
 
     def add_term(self, terms: SourceTerm, active: Mask) -> SourceSums:
-        """The sums with the terms of another source added, on active lanes. Derivatives that are
-        None in the terms count as 0.
+        """These sums plus the contribution of one more source, on the active lanes. A derivative
+        that is None in `terms` counts as 0.
 
-        Rounding of the value. If the errors of n additions all have the same sign, they add up like
-        n; this happens where small terms are lost in a large sum. But the error of a rounded sum s
-        = fl(a + b) is a number of the same precision, and can be computed exactly (Knuth's TwoSum;
-        Higham 2002, Section 4.3). With c = s - a it is (a - (s - c)) + (b - c). Its size is at most
-        u |s|, with u half the distance from 1 to the next number. These numbers are summed in turn.
-        The error of that second sum is at most n u times the sum of their absolute values, hence at
-        most n u^2 times the sum of all |s|. Up to n = 2^20 terms n u is at most 1/16, and twice
-        that covers the rounding of the bound itself.
+        Proof of the rounding error of the value. If the errors of n additions all have the same
+        sign, they add up to n times one error; this happens where small terms are lost in a large
+        sum. But the error of a single rounded sum s = fl(a + b) is a number of the same precision,
+        and can be computed exactly (Knuth's TwoSum; Higham 2002, Section 4.3). With c = s - a it is
+        (a - (s - c)) + (b - c). Its size is at most u |s|, where u is half the distance from 1 to
+        the next number. These errors are added up in `compensation`. The error of that second sum
+        is at most n u times the sum of the sizes of its terms, hence at most n u^2 times the sum of
+        all |s|. For n <= 2^20 terms in single precision, n u is at most 1/16. `rounding` therefore
+        grows by u |s|/8, twice that bound, which also covers its own rounding.
         """
         gradient, hessian = self.gradient, self.hessian
         if gradient is not None and terms.gradient is not None:
@@ -201,8 +215,11 @@ class SourceSums:
         if terms.value is not None:
             term = dr.select(active, terms.value, 0)
             total = self.total + term
+            # In the docstring's words: total is s, added is c, and the next line adds the error of
+            # s.
             added = total - self.total
             compensation = compensation + ((self.total - (total - added)) + (term - added))
+            # Dr.Jit's epsilon is u.
             rounding = dr.fma(float(dr.epsilon(total)) / 8, dr.abs(total), rounding)
         new = {"total": total, "compensation": compensation, "rounding": rounding}
         return dataclasses.replace(self, gradient=gradient, hessian=hessian, **new)
@@ -217,18 +234,19 @@ class SourceSums:
         free: Real,
         unit: Real,
     ) -> SourceSums:
-        """The sums with a tree node added, on the lanes where it is far.
+        """These sums plus the contribution of a tree node, on the lanes where it is far.
 
-        terms: the node's terms in the sums.
+        terms: the node's parts of f and of its derivatives.
         far: the lanes on which the node is far.
-        inverse: 1 / the distance of the node's center.
-        size: A + K/r^2 of `multipole.remainder_constants`.
-        left_out: bounds of the truncation errors of value, gradient and second derivatives.
-        free: the distance within which there is none of the node's dipoles.
-        unit: the rounding of a coordinate.
-
-        left_out and inverse must be 0 on the other lanes.
+        inverse: 1 / the distance from x to the node's center; 0 on the other lanes.
+        size: the node's number a, which is A + K/r^2 (`multipole.remainder_constants`, with r the
+            distance of the center).
+        left_out: bounds of the truncation errors of value, gradient and second derivatives; 0 on
+            the other lanes.
+        free: a distance from x within which none of the node's dipoles lies.
+        unit: a bound of the rounding error of a coordinate.
         """
+        # With a = `size` and rho = 1/`inverse`: s4 grows by a/rho^4, s5 by a/rho^5.
         s4_term, second_truncation = size * dr.square(inverse * inverse), self.hessian_truncation
         second_truncation = None if second_truncation is None else second_truncation + left_out[2]
         sums = self.add_term(terms, far)
@@ -246,18 +264,24 @@ class SourceSums:
         )
 
     def values(self, share: float, unit: Real, rounding: Real, outside: float = 0.0) -> PointValues:
-        """`share` times f and its derivatives, as far as they were summed, with error bounds.
+        """The value of `share` times f at x and its derivatives, as far as they were summed, with
+        error bounds.
 
-        unit: the rounding of a coordinate, at least epsilon.
-        rounding: a bound of the rounding of the value that these sums do not count.
-        outside: the number of further roundings of gradients far from all terms, where distances
-            are as long as coordinates: roundings of powers of the distance and of sums of moments.
+        share: the factor.
+        unit: a bound of the rounding error of a coordinate, at least epsilon.
+        rounding: a bound of the part of the value's rounding error that these sums do not count.
+        outside: a number of further roundings of the gradient, for points far from all sources.
+            There, distances are as long as coordinates, and powers of distances and sums of moments
+            are rounded too.
         """
+        # `rounding` is a bound in units of the result, so it is not multiplied.
         value, error = share * self.value, dr.fma(share, self.truncation + self.rounding, rounding)
         if self.gradient is None:
             return PointValues(value, error)
         roundings = SLOPE_ROUNDINGS * unit
         if outside:
+            # `unit` is more than 2 epsilon only where coordinates are large, i.e. far from the
+            # sources.
             roundings = roundings + outside * fmax(unit - 2 * float(dr.epsilon(self.value)), 0)
         gradient_error = share * dr.fma(roundings, self.s4, self.gradient_truncation)
         if self.hessian is None:
@@ -276,35 +300,44 @@ class SourceSums:
         normal: Vec3 | None = None,
         along: tuple[Lipschitz, ...] = (),
     ) -> Sample:
-        """`share` times f as a sample with promises.
+        """The sample of `share` times f at x: value and gradient with error bounds, and proved
+        bounds of f near x (the promises).
 
-        unit: the rounding of a coordinate.
-        rounding: a bound of the rounding of the value that these sums do not count.
-        normal: unit normal to shade with; None for the direction of the gradient.
-        along: further promises, for f along a line.
+        share: the factor.
+        unit: a bound of the rounding error of a coordinate.
+        rounding: a bound of the part of the value's rounding error that these sums do not count.
+        normal: (3,) the unit normal to shade with; None for the direction of the gradient.
+        along: Lipschitz constants of f on parts of a line through x, for a sample on a ray.
+
+        At and near a singular point, where rounding leaves nothing of the gradient, the sample has
+        the value 0, a very large error, and a very steep gradient: a level is then always close,
+        and no step is proved.
 
         Proof of the promises. Consider a dipole of area a at the distance rho. The k-th derivative
         of its value along a line is at most (k+1)! a/rho^(k+2): it is a mixed derivative of a/rho,
-        whose tensor is symmetric and takes its largest value on equal vectors. So at the distance
-        t < rho, Taylor's remainder after the linear term is at most
+        whose tensor is symmetric and takes its largest value on equal vectors. So at the distance t
+        < rho from x, Taylor's remainder after the linear term is at most
 
             a ((rho-t)^-2 - rho^-2 - 2t rho^-3) = a t^2 rho^-4 phi(t/rho), phi(q) = (3-2q)/(1-q)^2.
 
         The remainder of a far node whose center is at the distance r is at most that of a dipole of
         area A + K/r^2 at its center, for t/r <= `max_step_fraction`
-        (`multipole.remainder_constants`). phi is convex: on [0, b] it lies below its chord 3 + rise
-        q, with rise = (phi(b)-3)/b = (4-3b)/(1-b)^2. Now let R be b times `singularity_distance`,
-        and g the gradient of f at x. For t = |y - x| <= R,
+        (`multipole.remainder_constants`). phi is convex. So on [0, b] it lies below its chord 3 +
+        rise q, with rise = (phi(b)-3)/b = (4-3b)/(1-b)^2. Now let R be b times
+        `singularity_distance`, and g the gradient of f at x. Summed over all sources, for t = |y -
+        x| <= R,
 
             |f(y) - f(x) - g.(y-x)| <= t^2 (3 s4 + rise R s5).
 
-        On the ball of radius R, f changes by at most |g| R more than this bound for t = R. There f
-        is harmonic: the dipoles of far nodes are farther away than 1 - 1/coarse_ratio times the
-        distance of the center, and `max_step_fraction` is less than that.
+        This is the `TaylorRemainder` for each b in `_TAYLOR_RADII`. On the ball of the largest
+        radius R, f changes by at most |g| R plus this bound for t = R, which gives the range of the
+        `HarmonicBall`. f is harmonic there: the dipoles of far nodes are farther away than 1 -
+        1/coarse_ratio times the distance of the center, and `max_step_fraction` is less than that.
         """
         g = share * self.gradient
         slope_error = share * dr.fma(SLOPE_ROUNDINGS * unit, self.s4, self.gradient_truncation)
         distance = self.singularity_distance * (1 - SUM_MARGIN) - 4 * unit
+        # A TaylorRemainder bounds the second derivative, so its constant is twice that of t^2.
         scale, radii = (2 + 2 * SUM_MARGIN) * share, [(b, b * distance) for b in _TAYLOR_RADII]
         taylor = [TaylorRemainder(scale * self.remainder(b, r), r) for b, r in radii]
         slope, largest = dr.norm(g) + slope_error, taylor[-1]
@@ -312,9 +345,9 @@ class SourceSums:
         variation = (1 + SUM_MARGIN) * r * dr.fma(0.5 * r, largest.constant, slope)
         value = share * self.value
         ball = HarmonicBall(r, value - variation, value + variation)
-        # At a singular point f has all values: the sample has a gradient so steep that every level
-        # is close to first order, and an error as large as the distance to such a level. Likewise
-        # near a singular point, where rounding leaves nothing of the gradient.
+        # At a singular point f has all values. There, and nearby where rounding leaves nothing of
+        # the gradient, the sample gets a gradient so steep that every level is close to first
+        # order, and an error as large as the distance to such a level.
         near, max_error = 16 * unit, share * 1.6e5 * math.pi
         is_regular = (
             (self.singularity_distance > near)
@@ -343,23 +376,26 @@ class SourceSums:
     def add_line_rates(
         self, v: Vec3, unit: Real, lengths: tuple[Real, ...], rates: tuple[Real, ...], active: Mask
     ) -> tuple[Real, ...]:
-        """Rates K with |f(x + s v) - f(x)| <= K |s| for lengths |s| up to each of `lengths`: the
-        given rates for some edges, plus those for the sources of these sums. They are infinite on
-        lanes that are not active.
+        """For each of several lengths, a rate K with |f(x + s v) - f(x)| <= K |s| for |s| up to
+        that length. These sums contribute to K what their sources change; the given rates
+        contribute what some edges change, which are not in these sums. A rate is infinite on lanes
+        that are not active, and for lengths above the radius R of the proof.
 
-        v: (3,) directions of the lines.
-        unit: the rounding of a coordinate of their points.
-        lengths: the lengths, one for each rate.
+        v: (3,) unit directions of the lines through x.
+        unit: a bound of the rounding error of a coordinate of x.
+        lengths: the lengths.
         rates: the rates of the edges, one for each length (`trail_sums.line_rates`).
 
-        Proof. By these sources f changes by at most |s| |g . v| + s^2 (3 s4 + rise R s5) for |s| <=
-        R, with the symbols and the proof of `sample`. |g . v| is raised by the truncation and
-        rounding errors of the gradient g. For lengths above R the rate is infinite.
+        Proof. The sources of these sums change f by at most |s| |g . v| + s^2 (3 s4 + rise R s5)
+        for |s| <= R, with the symbols and the proof of `sample`. |g . v| is raised by the
+        truncation and rounding errors of the gradient g. Dividing by |s| gives a rate that grows
+        with |s|.
         """
         slope = dr.abs(dr.dot(self.gradient, v)) + self.gradient_truncation
         slope = dr.fma(SLOPE_ROUNDINGS * unit, self.s4, slope)
         fraction = _TAYLOR_RADII[-1]
         radius = fraction * (self.singularity_distance * (1 - SUM_MARGIN) - 4 * unit)
+        # Without sources R may be infinite; then R s5 would be NaN.
         remainder = self.remainder(fraction, dr.select(self.s5 > 0, radius, 0))
         pairs = zip(lengths, rates, strict=True)
         sums = (
@@ -369,8 +405,8 @@ class SourceSums:
         return tuple(sums)
 
     def remainder(self, b: float, r: Real) -> Real:
-        """The number K for which f changes, at a distance t <= r, by at most K t^2 more than its
-        linear part: K = 3 s4 + rise r s5, with the symbols of `sample`.
+        """The number K such that f differs from its linear part by at most K t^2 at any distance t
+        <= r from x: K = 3 s4 + rise r s5, with the symbols of `sample`.
 
         b: the largest ratio of t to the distance rho of a source.
         r: b times the distance to the nearest singular point, or less.
@@ -379,6 +415,6 @@ class SourceSums:
 
 
 def _chord_slope(b: float) -> float:
-    """The slope (phi(b) - 3)/b of the chord over [0, b] of the function phi(q) = (3 - 2q)/(1 -
-    q)^2: with it, phi(q) <= 3 + slope q."""
+    """The slope (phi(b) - 3)/b of the chord over [0, b] of the convex function phi(q) = (3 - 2q)/(1
+    - q)^2. So phi(q) <= 3 + slope q for 0 <= q <= b."""
     return (4 - 3 * b) / (1 - b) ** 2

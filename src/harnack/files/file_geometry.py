@@ -1,5 +1,6 @@
-"""The parts that all readers and writers of files share: errors and locations, limits, the geometry
-of a file, and atomic writing."""
+"""What all readers and writers of files share: errors and locations in files, limits, the geometry
+that a file holds, and atomic writing (a file appears complete or not at all).
+"""
 
 from __future__ import annotations
 
@@ -26,8 +27,8 @@ MAX_ELEMENTS = 10_000_000
 
 
 class FileFormatError(ValueError):
-    """A file cannot be read; the message names the file, the location of the fault and what to
-    do."""
+    """The error for a file that cannot be read. The message names the file, the location of the
+    fault and what to do."""
 
 
 @dataclass(frozen=True)
@@ -49,8 +50,10 @@ class FileLocation:
 
 @dataclass(frozen=True, eq=False)
 class FileLocations:
-    """The locations in a file of all members of a list, such as of all vertices.
+    """The locations in a file of all members of a list, such as of all vertices. Index k gives the
+    `FileLocation` of member k.
 
+    noun: what the members are called in messages, such as "line".
     numbers: for each member, the number of its line, or its position in the file."""
 
     path: Path
@@ -67,8 +70,7 @@ class PolygonList:
 
     corners: the vertex indices of all polygons, one polygon after the other.
     sizes: (m,) the number of corners of each polygon.
-    locations: (m,) the location of each polygon in the file.
-    """
+    locations: (m,) the location of each polygon in the file."""
 
     corners: IntArray
     sizes: IntArray
@@ -82,7 +84,7 @@ class PolygonList:
         return self.locations[int(np.searchsorted(np.cumsum(self.sizes), k, side="right"))]
 
     def __iter__(self) -> Iterator[tuple[IntArray, FileLocation]]:
-        """The corners and the location of each polygon."""
+        """Yield the corners (k,) and the location of each polygon."""
         ends = np.cumsum(self.sizes)
         for k, (begin, end) in enumerate(zip(ends - self.sizes, ends, strict=True)):
             yield self.corners[begin:end], self.locations[k]
@@ -94,7 +96,7 @@ NO_POLYGONS = PolygonList(_NO_INDICES, _NO_INDICES, FileLocations(Path(), "", ()
 
 @dataclass(frozen=True, eq=False)
 class FileGeometry:
-    """The geometry in a file.
+    """The geometry that a file holds.
 
     path: of the file.
     vertices: (n, 3), finite.
@@ -102,8 +104,7 @@ class FileGeometry:
     faces: closed polygons; the last corner is joined to the first.
     polylines: closed only if the last index equals the first.
 
-    All indices lie in [0, n).
-    """
+    All indices lie in [0, n)."""
 
     path: Path
     vertices: FloatArray
@@ -114,21 +115,21 @@ class FileGeometry:
 
 def ranks_in_lists(sizes: IntArray) -> IntArray:
     """For lists that are stored one after the other in one array, the position of each entry within
-    its own list: 0 to size - 1 for each list. sizes: (m,) the lengths of the lists."""
+    its own list: 0, 1, ..., size - 1 for each list. sizes: (m,) the lengths of the lists."""
     ranks = np.arange(int(sizes.sum()), dtype=np.int64)
     ranks -= np.repeat(np.cumsum(sizes) - sizes, sizes)
     return ranks
 
 
 def triangles_as_polygons(path: Path, corners: IntArray) -> PolygonList:
-    """The triangles with the vertex indices `corners` (m, 3), read from the file `path`, as a
-    `PolygonList`."""
+    """Triangles as a `PolygonList`. corners: (m, 3) their vertex indices, which were read from the
+    file `path`."""
     sizes = np.full(len(corners), 3, dtype=np.int64)
     return PolygonList(corners.ravel(), sizes, FileLocations(path, "triangle", range(len(corners))))
 
 
 def check_finite(coordinates: FloatArray, places: FileLocations) -> None:
-    """Raise a FileFormatError if a number in the rows (n, k) of `coordinates` is not finite. The
+    """Raise a FileFormatError if some number in the rows of `coordinates` (n, k) is not finite. The
     message names the location of the first such row. places: the locations of the rows."""
     wrong = np.flatnonzero(~np.isfinite(coordinates).all(axis=1))
     if wrong.size:
@@ -140,8 +141,7 @@ def check_indices(polygons: PolygonList, count: int, *, first: int = 0) -> None:
     message names the first such index and its location.
 
     count: the number of vertices.
-    first: the index that the file's format gives to the first vertex (0 or 1), for the message.
-    """
+    first: the index that the file's format gives to the first vertex (0 or 1), for the message."""
     corners = polygons.corners
     wrong = np.flatnonzero((corners < 0) | (corners >= count))
     if wrong.size:
@@ -181,8 +181,9 @@ def read_bytes(path: Path) -> bytes:
 
 
 def check_element_count(place: FileLocation, count: int) -> None:
-    """Raise a FileFormatError if `count`, the number of vertices, faces and lines that a file
-    declares, is larger than MAX_ELEMENTS. place: the location that the message names."""
+    """Raise a FileFormatError if a file has more than MAX_ELEMENTS elements, which would be read
+    one by one. place: the location that the message names. count: the number of vertices, faces and
+    lines that the file declares."""
     if count > MAX_ELEMENTS:
         raise place.error(
             f"{count:,} elements are too many in a file whose faces differ in size: at most "
@@ -191,7 +192,8 @@ def check_element_count(place: FileLocation, count: int) -> None:
 
 
 def have_mixed_sizes(polygons: PolygonList) -> bool:
-    """Whether polygons have different numbers of corners, or fewer than three."""
+    """Whether polygons have different numbers of corners, or fewer than three. Such polygons are
+    read one by one, which takes long."""
     sizes = polygons.sizes
     return bool(len(sizes)) and bool((sizes != max(3, int(sizes[0]))).any())
 
@@ -201,8 +203,8 @@ def have_mixed_sizes(polygons: PolygonList) -> bool:
 
 @contextlib.contextmanager
 def write_atomically(path: str | os.PathLike[str]) -> Generator[Path, None, None]:
-    """Context manager that yields a name to write to, in the folder of `path`; the file is renamed
-    to `path` at the end of the block.
+    """Context manager that yields a temporary name to write to, in the folder of `path`. At the end
+    of the block, the file is renamed to `path`.
 
     If the block raises, nothing is left and an existing file stays as it was. The name has the
     extension of `path`, from which many writers derive the format.
@@ -231,8 +233,8 @@ def write_atomically(path: str | os.PathLike[str]) -> Generator[Path, None, None
 
 
 def check_writable(path: str | os.PathLike[str]) -> None:
-    """Raise the errors that `write_atomically` would raise before the block runs, and try to create
-    a file there."""
+    """Check that `write_atomically` can write to `path`: raise the errors that it would raise
+    before its block runs, and try to create a file there."""
     target = _writable_target(path)
     try:
         # Where the system can, this file has no name that an interrupt could leave behind.
@@ -265,14 +267,14 @@ def _writable_target(path: str | os.PathLike[str]) -> Path:
 
 
 def _remove(partial: Path) -> None:
-    """Remove the file if it exists."""
+    """Remove the file `partial` if it exists."""
     if os.path.lexists(partial):
         partial.unlink()
 
 
 def _partial_name(target: Path) -> Path:
     """A random name, in the folder of `target`, for the file that is written first and then renamed
-    to `target`. If the target's name is long, this name is no longer, so that the file system
+    to `target`. If the target's name is long, this name is not longer, so that the file system
     accepts it as well."""
     token = f".{secrets.token_hex(4)}.partial"
     stem = os.fsencode(target.stem)
@@ -297,7 +299,7 @@ def _printable_path(path: str | os.PathLike[str]) -> str:
 
 
 def _write_error(path: str | os.PathLike[str], error: OSError) -> OSError:
-    """An OSError of the kind of `error`, whose message says that the file `path` could not be
+    """An error of the same type as `error`, whose message says that the file `path` could not be
     written, why, and what to do."""
     number = error.errno
     reason = _WRITE_ADVICE.get(number or 0) or f"{error.strerror or error}; name a file elsewhere"

@@ -1,5 +1,8 @@
 """Readers of files with meshes, point clouds, closed curves, blobs or molecules. The extension of
-the file's name decides how it is read. Results contain a summary of the file's contents."""
+the file's name decides its format; its contents decide what it is read as, unless the caller says
+so (`read_as`). `contents` is the geometry that was found in a file: vertices, faces, polylines.
+Results contain a summary: a text about the contents of the file, and why they are read like that.
+"""
 
 from __future__ import annotations
 
@@ -73,8 +76,9 @@ def read_loops(path: str | os.PathLike[str], *, boundary: bool = False) -> list[
     file with vertices only is one loop in their order. .loops: a loop on each line, x y z repeated.
     Where edges are joined, equal positions count as the same vertex.
 
-    boundary: not the faces, but the boundary of the surface they form: the edges that do not cancel
-        between neighboring faces, where equal positions count as the same vertex.
+    boundary: whether to return, in place of the faces, the boundary of the surface they form: the
+        edges that do not cancel between neighboring faces, where equal positions count as the same
+        vertex.
 
     Raises:
         FileFormatError: unreadable, malformed or hostile; open polylines; a loop that
@@ -103,8 +107,8 @@ def closed_curves_of(contents: FileGeometry, *, boundary: bool = False) -> list[
 
 
 def _validated(loop: FloatArray, place: FileLocation) -> FloatArray:
-    """The loop (n, 3), after a check that it is a valid closed curve. Raises a FileFormatError that
-    names its place in the file if it is not."""
+    """Check that a loop (n, 3) is a valid closed curve, and return it. Raises a FileFormatError
+    that names its place in the file if it is not."""
     try:
         return validate_loops(loop)[0]
     except CurveError as error:
@@ -112,8 +116,9 @@ def _validated(loop: FloatArray, place: FileLocation) -> FloatArray:
 
 
 def _all_loops(contents: FileGeometry) -> list[LocatedLoop]:
-    """The closed curves of a file, each with its place in the file. These are its faces and its
-    polylines, joined end to end. If a .ply file has neither, its vertices are a single curve.
+    """The closed curves (n, 3) in the contents of a file, each with its place in the file. These
+    are its faces and its polylines, joined end to end. If a .ply file has neither, its vertices are
+    a single curve.
 
     Raises:
         FileFormatError: there are none, or polylines are open.
@@ -130,8 +135,8 @@ def _all_loops(contents: FileGeometry) -> list[LocatedLoop]:
 
 
 def _joined_polylines(contents: FileGeometry) -> list[LocatedLoop]:
-    """The closed curves that the polylines of a file form, each with its place in the file. A
-    polyline that is closed is a curve; the edges of all other polylines are joined to curves.
+    """The closed curves (n, 3) that the polylines of a file form, each with its place in the file.
+    A polyline that is closed is a curve; the edges of all other polylines are joined to curves.
 
     Raises:
         FileFormatError: an edge of length zero, or edges that do not form closed curves.
@@ -141,6 +146,7 @@ def _joined_polylines(contents: FileGeometry) -> list[LocatedLoop]:
     open_edges: list[Edge] = []
     places: dict[int, FileLocation] = {}
     for corners, place in contents.polylines:
+        # A vertex is known by the number that all vertices at the same position have.
         ids: list[int] = welded[corners].tolist()
         if ids[0] == ids[-1] and len(ids) > 3:
             loops.append((x[ids[:-1]], place))
@@ -159,7 +165,7 @@ def _joined_polylines(contents: FileGeometry) -> list[LocatedLoop]:
 
 def _open_message(error: OpenChainError, position: FloatArray) -> str:
     """The message of an error about edges that cannot be joined to closed curves, because at the
-    vertex at `position` (3,) they end, or more than two meet."""
+    vertex at `position` (3,) an edge ends, or more than two meet."""
     point = position.tolist()
     if error.count == 1:
         return (
@@ -173,8 +179,8 @@ def _open_message(error: OpenChainError, position: FloatArray) -> str:
 
 
 def _boundary_loops(contents: FileGeometry) -> list[LocatedLoop]:
-    """The closed curves that form the boundary of the surface of a file's faces, each with its
-    place in the file.
+    """The closed curves (n, 3) that form the boundary of the surface of a file's faces, each with
+    its place in the file.
 
     Raises:
         FileFormatError: there are no faces, or their surface is closed.
@@ -246,10 +252,10 @@ class LoadedCurves:
 
 @dataclass(frozen=True, eq=False)
 class LoadedPolygons:
-    """Polygons from a file, not triangulated: vertices (n, 3), and for each face its corners (k,).
+    """Polygons from a file, not triangulated: vertices (n, 3), and for each face the indices (k,)
+    of its corners.
 
-    summary: the contents of the file.
-    """
+    summary: the contents of the file."""
 
     vertices: FloatArray
     faces: list[IntArray]
@@ -271,10 +277,10 @@ def read_geometry(path: str | os.PathLike[str], read_as: ReadAs | None = None) -
     or from columns 4 to 6 (.xyz). Polygons are triangulated, the nodes of a scene are transformed
     to their positions, and faces of zero area are left out.
 
-    read_as: "winding": the faces, as a mesh. "dipole": the points; of a mesh the centers of its
-        triangles, with their normals and areas. "loops": the result of `read_loops`; of a mesh its
-        boundary, the singular edges joined. "polygons": the faces, not triangulated. None decides
-        as above.
+    read_as: what to make of the contents. "winding": the faces, as a mesh. "dipole": the points; of
+        a mesh the centers of its triangles, with their normals and areas. "loops": the result of
+        `read_loops`; of a mesh its boundary, the singular edges joined. "polygons": the faces, not
+        triangulated. None decides as above.
 
     Raises:
         FileFormatError: unreadable, malformed, truncated or hostile; of another format; it contains
@@ -297,8 +303,12 @@ def read_geometry(path: str | os.PathLike[str], read_as: ReadAs | None = None) -
 
 
 def _read_geometry(path: Path, kind: str, read_as: ReadAs | None) -> LoadedGeometry:
-    """Read a file of the format `kind` (an extension such as ".obj") in the way `read_as`: the work
-    of `read_geometry` after both have been checked."""
+    """Read a file of the format `kind` (an extension such as ".obj") in the way `read_as`. This is
+    the work of `read_geometry` after both have been checked.
+
+    Raises:
+        FileFormatError: the file cannot be read, or not in this way.
+    """
     if kind == ".blobs":
         _check_convertible(path, read_as, (), "blobs")
         return read_metaballs(path, read_bytes(path))
@@ -310,6 +320,7 @@ def _read_geometry(path: Path, kind: str, read_as: ReadAs | None) -> LoadedGeome
         return _as_curves(read_loops(path), "curves, since the file lists nothing else")
     contents = _READERS[kind](path, read_bytes(path))
     try:
+        # Faces come first, then polylines, then points.
         if (contents.faces.sizes >= 3).any():
             return _interpret_faces(contents, read_as)
         if len(contents.polylines):
@@ -327,8 +338,8 @@ def _read_geometry(path: Path, kind: str, read_as: ReadAs | None) -> LoadedGeome
 def _check_convertible(
     path: Path, read_as: ReadAs | None, choices: tuple[str, ...], noun: str
 ) -> None:
-    """Raise a FileFormatError if the contents of a file cannot be read in the way `read_as`, that
-    is, unless it is None or one of `choices`. noun: what the contents are, for the message."""
+    """Raise a FileFormatError unless the contents of a file can be read in the way `read_as`: it
+    must be None or one of `choices`. noun: what the contents are, for the message."""
     needs = {
         "winding": "faces", "dipole": "points or faces", "loops": "polylines or faces",
         "polygons": "faces",
@@ -342,11 +353,12 @@ def _check_convertible(
 def _interpret_faces(
     contents: FileGeometry, read_as: ReadAs | None
 ) -> LoadedMesh | LoadedCloud | LoadedCurves | LoadedPolygons:
-    """The faces in the contents of a file, in the form that `read_as` asks for: a mesh, a cloud of
-    points, closed curves or polygons. None means a mesh or curves, whichever the faces look like
-    (`_looks_like_curves`)."""
+    """Convert the faces in the contents of a file to the form that `read_as` asks for: a mesh, a
+    cloud of points, closed curves or polygons. None means a mesh or curves, whichever the faces
+    look like (`_looks_like_curves`)."""
     if read_as == "polygons":
         return _polygons(contents)
+    # Only some formats are read as curves.
     can_be_loops = contents.path.suffix.lower() in _LOOP_FILES
     if read_as == "loops" and len(contents.polylines) and can_be_loops:
         return _as_curves(
@@ -386,16 +398,18 @@ def _looks_like_curves(contents: FileGeometry) -> bool:
     welded = weld_vertices(contents.vertices)
     begin = welded[faces.corners]
     ends = np.cumsum(faces.sizes)
-    following = np.arange(1, len(begin) + 1, dtype=np.int64)
-    following[ends[faces.sizes > 0] - 1] = (ends - faces.sizes)[faces.sizes > 0]
-    end = begin[following]
+    # The corner after each corner; after the last one of a polygon comes its first.
+    next_corner = np.arange(1, len(begin) + 1, dtype=np.int64)
+    next_corner[ends[faces.sizes > 0] - 1] = (ends - faces.sizes)[faces.sizes > 0]
+    end = begin[next_corner]
+    # A number for each edge, the same in both directions.
     keys = np.minimum(begin, end) * len(welded) + np.maximum(begin, end)
     keys = keys[np.repeat(faces.sizes, faces.sizes) >= 3]
     return len(np.unique(keys)) == len(keys)
 
 
 def _mesh(contents: FileGeometry) -> LoadedMesh:
-    """The triangle mesh of a file's faces, with a summary of what was read.
+    """Make a triangle mesh of a file's faces, with a summary of what was read.
 
     Raises:
         MeshError: the faces cancel each other.
@@ -404,38 +418,42 @@ def _mesh(contents: FileGeometry) -> LoadedMesh:
     vertices, faces = without_zero_area_faces(contents.vertices, triangles)
     zero_area = triangles[zero_area_faces(vertices, triangles)]
     welded = Welded.of(vertices, faces)
-    net, edges = welded.net, welded.edges
-    if not len(net.faces):
+    net_faces, singular = welded.net, welded.edges
+    if not len(net_faces.faces):
         raise MeshError(f"its {len(faces):,} faces cancel each other: there is no surface")
     count = f"{len(faces):,} triangles"
-    if len(edges) == 0:
+    if len(singular) == 0:
         summary = f"{count} without singular edges: a closed mesh"
         center = vertices.mean(axis=0)
+        # Six times the enclosed volume; negative if faces look inward.
         if np.linalg.det(vertices[faces] - center).sum() < 0.0:
             summary += ", whose faces look inward (the winding number inside is negative)"
-    elif len(edges) >= len(faces):
-        summary = f"{count}, {len(edges):,} singular edges: a triangle soup"
+    elif len(singular) >= len(faces):
+        summary = f"{count}, {len(singular):,} singular edges: a triangle soup"
     else:
-        summary = f"{count}, {len(edges):,} singular edges: a mesh with holes or faces turned round"
+        summary = (
+            f"{count}, {len(singular):,} singular edges: a mesh with holes or faces turned round"
+        )
     if welded.rounded:
         vertices = vertices[welded.index]
         summary += f"; {welded.rounded:,} corners joined with others that were apart by rounding"
     if len(triangles) > len(faces):
         summary += f"; {len(triangles) - len(faces):,} of zero area left out"
-    if len(faces) > len(net.faces):
-        summary += f"; {len(faces) - len(net.faces):,} are added to or canceled by others"
+    if len(faces) > len(net_faces.faces):
+        summary += f"; {len(faces) - len(net_faces.faces):,} are added to or canceled by others"
     if len(contents.polylines):
         summary += "; polylines not used"
     return LoadedMesh(vertices, faces, summary, zero_area, welded.rounded)
 
 
 def _mesh_to_cloud(mesh: LoadedMesh) -> LoadedCloud:
-    """The triangles of a mesh as a cloud of points, with their normals and areas."""
+    """A cloud of points that stands for the triangles of a mesh: their centers, with their normals
+    and areas."""
     corners = mesh.vertices[mesh.faces]
-    normal = 0.5 * np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    area = np.linalg.norm(normal, axis=1)
+    area_normal = 0.5 * np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = np.linalg.norm(area_normal, axis=1)
     summary = f"{len(area):,} triangles, each taken as a point with its normal and area, as asked"
-    return LoadedCloud(corners.mean(axis=1), normal / area[:, None], area, summary)
+    return LoadedCloud(corners.mean(axis=1), area_normal / area[:, None], area, summary)
 
 
 def _mesh_to_boundary(path: Path, mesh: LoadedMesh) -> LoadedCurves:
@@ -462,7 +480,8 @@ def _mesh_to_boundary(path: Path, mesh: LoadedMesh) -> LoadedCurves:
 
 
 def _cloud(contents: FileGeometry) -> LoadedCloud:
-    """The point cloud of a file without faces."""
+    """Make a point cloud of the vertices of a file without faces, with their normals if it has
+    them."""
     points = as_cloud_points(contents.vertices)
     count = f"{len(points):,} points"
     if contents.normals is None:
@@ -473,8 +492,8 @@ def _cloud(contents: FileGeometry) -> LoadedCloud:
 
 
 def _as_curves(loops: list[FloatArray], reason: str) -> LoadedCurves:
-    """Closed curves (n, 3) as a `LoadedCurves`, with a summary that gives their number and the
-    reason why the file is read as curves."""
+    """Collect closed curves `loops`, arrays (n, 3), in a `LoadedCurves`, with a summary that gives
+    their number and the reason why the file is read as curves."""
     noun = "loop" if len(loops) == 1 else "loops"
     return LoadedCurves(
         tuple(loops), f"{len(loops):,} {noun} of {sum(map(len, loops)):,} vertices: {reason}"

@@ -1,4 +1,7 @@
-"""Reading .glb and .gltf scenes through trimesh, after their headers were checked.
+"""Reading .glb and .gltf scenes through trimesh, after their headers were checked. A "scene" is a
+tree of nodes; each has a transform, and may draw a mesh. A "buffer" is a block of bytes, an
+"accessor" describes an array in it (type and length), and a "primitive" is a part of a mesh that
+draws triangles, points or lines.
 
 A glTF file is a JSON header and buffers of bytes. The header says which bytes to read, and a
 hostile header can ask for more memory than there is; so it is compared with the sizes of the
@@ -42,8 +45,8 @@ _IGNORED_EXTENSIONS = ("KHR_materials", "KHR_texture", "KHR_lights", "EXT_textur
 
 
 def read_gltf(path: Path, data: bytes) -> FileGeometry:
-    """All triangles of the scene in a .glb or .gltf file, moved to the positions that its nodes
-    give them. If it has no triangles, all its points.
+    """Read all triangles of the scene in a .glb or .gltf file, moved to the positions that its
+    nodes give them. If it has no triangles, read all its points.
 
     data: the bytes of the file.
 
@@ -77,7 +80,7 @@ def read_gltf(path: Path, data: bytes) -> FileGeometry:
 
 
 def _header(place: FileLocation, data: bytes) -> dict[str, Any]:
-    """The JSON header of a .gltf file, or of a .glb file.
+    """Parse the JSON header of a .gltf file, or of a .glb file.
 
     Raises:
         FileFormatError: another format or version, a truncated file, or no JSON object.
@@ -86,6 +89,8 @@ def _header(place: FileLocation, data: bytes) -> dict[str, Any]:
     if place.path.suffix.lower() == ".glb":
         if len(data) < 20 or data[:4] != b"glTF":
             raise place.error("this is no .glb file: it does not begin with 'glTF'")
+        # A .glb file begins with "glTF", the version and the file's length; then come the length of
+        # the header and its type.
         version, length, size = (int.from_bytes(data[k : k + 4], "little") for k in (4, 8, 12))
         if version != 2:
             raise place.error(f"version {version} of glTF is not read, only 2")
@@ -105,14 +110,20 @@ def _header(place: FileLocation, data: bytes) -> dict[str, Any]:
 
 
 def _buffer_files(path: Path, header: dict[str, Any]) -> dict[str, bytes]:
-    """The contents of the separate files in which a scene stores its buffers, by the names that the
-    header gives them. path: of the scene's file."""
+    """Read the separate files in which a scene stores its buffers. Returns their contents by the
+    names that the header gives them. path: of the scene's file.
+
+    Raises:
+        FileFormatError: a buffer is not a file in the scene's folder or below, or they are too
+            large.
+    """
     files: dict[str, bytes] = {}
     for buffer in header.get("buffers", []):
         uri: Any = buffer.get("uri")
         if uri is None or uri.startswith("data:") or uri in files:
             continue
         name = Path(unquote(uri))
+        # A hostile file could name any file of this machine.
         if name.is_absolute() or ".." in name.parts or ":" in uri:
             raise FileLocation(path).error(f"its buffer {uri[:80]!r} is not a file beside it")
         files[uri] = read_bytes(path.parent / name)
@@ -136,6 +147,7 @@ def _check_header(place: FileLocation, header: dict[str, Any], size: int) -> Non
             raise place.error(f"it uses the extension {name}, which is not read: save it without")
     _check_supported(place, header)
     views, accessors = header.get("bufferViews", []), header.get("accessors", [])
+    # The bytes of all arrays. Several arrays may share bytes of the file, but not without limit.
     total = 0
     for view in views:
         if _count(view, "byteLength") + _count(view, "byteOffset", 0) > size:
@@ -159,13 +171,13 @@ def _check_supported(place: FileLocation, header: dict[str, Any]) -> None:
     meshes: list[Any] = header.get("meshes", [])
     if any("skin" in node for node in nodes):
         raise place.error("its vertices are moved by a skin: apply it, and save the mesh as it is")
-    primitives = [entry for mesh in meshes for entry in mesh["primitives"]]
-    weights = [w for entry in (*nodes, *meshes) for w in entry.get("weights", [])]
-    if any(weights) and any("targets" in entry for entry in primitives):
+    primitives = [item for mesh in meshes for item in mesh["primitives"]]
+    weights = [weight for item in (*nodes, *meshes) for weight in item.get("weights", [])]
+    if any(weights) and any("targets" in item for item in primitives):
         raise place.error(
             "its vertices are moved by morph targets: apply them, and save the mesh as it is"
         )
-    modes = {entry.get("mode", _TRIANGLES[0]) for entry in primitives}
+    modes = {item.get("mode", _TRIANGLES[0]) for item in primitives}
     if _FAN in modes:
         raise place.error("triangles in fans are not read: save them one by one")
     if modes & {*_TRIANGLES} and modes - {*_TRIANGLES}:
@@ -174,7 +186,11 @@ def _check_supported(place: FileLocation, header: dict[str, Any]) -> None:
 
 def _corner_counts(place: FileLocation, header: dict[str, Any], accessors: list[Any]) -> list[int]:
     """For each mesh in the header of a scene, the number of triangle corners that it lists.
-    accessors: the header's descriptions of arrays, which contain their lengths."""
+    accessors: the header's descriptions of arrays, which contain their lengths.
+
+    Raises:
+        FileFormatError: vertices or indices are compressed or sparse.
+    """
     corner_counts: list[int] = []
     for mesh in header.get("meshes", []):
         total = 0
@@ -185,6 +201,7 @@ def _corner_counts(place: FileLocation, header: dict[str, Any], accessors: list[
                 accessor = accessors[accessor_id]
                 if "bufferView" not in accessor or "sparse" in accessor:
                     raise place.error("compressed or sparse vertices are not read: save it plainly")
+            # The indices list the corners; without indices, the vertices do.
             total += accessors[accessor_ids[-1]]["count"]
         corner_counts.append(total)
     return corner_counts
@@ -201,6 +218,7 @@ def _check_nodes(place: FileLocation, header: dict[str, Any], corner_counts: lis
     roots = [root for scene in header.get("scenes", []) for root in set(scene.get("nodes", []))]
     if len(descendants) != len(set(descendants)) or set(descendants) & set(roots):
         raise place.error("a node of its scene hangs below two others")
+    # Go down the trees level by level.
     generation, depth = set(roots), 0
     while generation:
         generation, depth = {child for node in generation for child in children[node]}, depth + 1
@@ -213,7 +231,8 @@ def _check_nodes(place: FileLocation, header: dict[str, Any], corner_counts: lis
 
 
 def _count(entry: dict[str, Any], key: str, default: int | None = None) -> int:
-    """A nonnegative integer in the header: entry[key]. Raises a ValueError if it is none."""
+    """The nonnegative integer entry[key] of a header, or `default` if the key is missing. Raises a
+    ValueError if it is not a nonnegative integer."""
     value = entry.get(key, default)
     if not isinstance(value, int) or isinstance(value, bool) or value < 0:
         raise ValueError(f"{key} is {value!r}")
@@ -221,7 +240,7 @@ def _count(entry: dict[str, Any], key: str, default: int | None = None) -> int:
 
 
 def _contents(place: FileLocation, scene: Any) -> FileGeometry:
-    """The triangles of the scene in world coordinates; if there are none, its points.
+    """The triangles of a trimesh scene in world coordinates; if there are none, its points.
 
     Raises:
         FileFormatError: an index out of range; neither triangles nor points.
@@ -229,7 +248,7 @@ def _contents(place: FileLocation, scene: Any) -> FileGeometry:
     vertices: list[FloatArray] = []
     faces: list[IntArray] = []
     points: list[FloatArray] = []
-    count = 0
+    vertex_count = 0
     for node in scene.graph.nodes_geometry:
         world_from_node, name = scene.graph[node]
         geometry = scene.geometry[name]
@@ -247,8 +266,8 @@ def _contents(place: FileLocation, scene: Any) -> FileGeometry:
         if np.linalg.det(world_from_node[:3, :3]) < 0.0:  # a mirror image, inside out
             corners = corners[:, ::-1]
         vertices.append(positions)
-        faces.append(corners + count)
-        count += len(positions)
+        faces.append(corners + vertex_count)
+        vertex_count += len(positions)
     if sum(map(len, faces)):
         triangles = triangles_as_polygons(place.path, np.concatenate(faces))
         return FileGeometry(place.path, np.concatenate(vertices), None, triangles)
@@ -260,7 +279,7 @@ def _contents(place: FileLocation, scene: Any) -> FileGeometry:
 def _transformed(
     place: FileLocation, vertices: FloatArray, world_from_node: FloatArray
 ) -> FloatArray:
-    """The vertices (n, 3) under the transform `world_from_node` (4, 4). Raises a FileFormatError
+    """The vertices (n, 3) moved by the transform `world_from_node` (4, 4). Raises a FileFormatError
     for coordinates that are not finite."""
     x = vertices.astype(np.float64) @ world_from_node[:3, :3].T + world_from_node[:3, 3]
     if not math.isfinite(float(np.abs(x).max(initial=0.0))):

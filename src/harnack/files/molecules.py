@@ -1,4 +1,7 @@
-"""Reading molecules: the atoms of .pdb and mmCIF files, by the library gemmi."""
+"""Reading molecules: the atoms of .pdb and mmCIF files, by the library gemmi. A file may hold
+several "models" of a molecule; a molecule consists of chains of "residues" (groups of atoms).
+"Alternatives" are several positions of the same atom, or several residues at the same place.
+"""
 
 from __future__ import annotations
 
@@ -23,10 +26,10 @@ _MAX_LISTED_ELEMENTS = 6
 
 @dataclass(frozen=True, eq=False)
 class Atoms:
-    """Atoms from a file: positions (n, 3) and van der Waals radii (n,) in angstrom, elements (n,).
+    """Atoms of a molecule from a file: positions (n, 3) and van der Waals radii (n,) in angstrom,
+    and the names of the elements (n,).
 
-    summary: the contents of the file, and which of its atoms were left out.
-    """
+    summary: the contents of the file, and which of its atoms were left out."""
 
     positions: FloatArray
     radii: FloatArray
@@ -54,9 +57,14 @@ def read_molecule(path: str | os.PathLike[str]) -> Atoms:
 
 
 def parse_molecule(path: Path, data: bytes) -> Atoms:
-    """The atoms in the bytes `data` of a molecule's file: those of the first model, without
+    """Parse the bytes `data` of a molecule's file: the atoms of the first model, without
     alternatives, water and hydrogen (`read_molecule`). path: of the file, whose extension gives the
-    format."""
+    format.
+
+    Raises:
+        FileFormatError: malformed data, no atoms of known elements, or coordinates that are not
+            finite.
+    """
     place = FileLocation(path)
     if b"\0" in data:
         raise place.error("this is binary data, not the text that its extension announces")
@@ -74,6 +82,7 @@ def parse_molecule(path: Path, data: bytes) -> Atoms:
         first = " ".join(str(error).split())
         raise place.error(f"the molecule cannot be read ({first})") from None
     sizes = [model.count_atom_sites() for model in structure]
+    # Only the first model counts.
     atoms = _drop_alternate_locations(structure[0]) if sizes else []
     known_atoms = [atom for atom in atoms if atom.element.atomic_number > 0]
     if not known_atoms:
@@ -98,9 +107,9 @@ def parse_molecule(path: Path, data: bytes) -> Atoms:
 
 
 def _text(data: bytes, *, is_cif: bool) -> str:
-    """The text of a molecule's file, without byte order mark, and with "\\n" as line end. In the
-    text of a .pdb file, each non-ASCII letter is replaced by a single byte: the format is given by
-    columns, which gemmi counts in bytes."""
+    r"""Decode the bytes of a molecule's file to text, without byte order mark, and in a .pdb file
+    with "\n" as line end. There each non-ASCII letter is replaced by a single byte: the format is
+    given by columns, which gemmi counts in bytes."""
     data = data.removeprefix(b"\xef\xbb\xbf")
     if is_cif:
         return data.decode("utf-8", "replace")
@@ -116,8 +125,9 @@ def _drop_alternate_locations(model: Any) -> list[Any]:
     """The atoms of a model of a molecule, without alternatives. Of several residues at the same
     position only the first is kept; in a residue, of several atoms with the same name that are
     marked by different letters as alternatives, only the first. A line TER in the file ends a
-    chain; the same residue number after it stands for another position.
-    """
+    chain; the same residue number after it stands for another position."""
+    # The first marked residue at each position (its name and its letter); and the first letter of
+    # each marked atom.
     residues: dict[tuple[int, str], tuple[str, str]] = {}
     first_altlocs: dict[tuple[int, str, str, str], str] = {}
     atoms: list[Any] = []
@@ -137,13 +147,14 @@ def _drop_alternate_locations(model: Any) -> list[Any]:
 
 
 def _count_atom_lines(text: str) -> int:
-    """The number of lines of a .pdb file that are atoms."""
+    """The number of lines of a .pdb file that describe an atom."""
     return sum(line[:4].upper() in _ATOM_LINES for line in text.split("\n"))
 
 
 def _check_coordinates(path: Path, text: str) -> None:
     """Check that columns 31 to 54 of each line of a .pdb file that describes an atom are three
-    numbers. gemmi does not check this: it reads a word as 0, and "12x" as 12.
+    numbers, of eight columns each. gemmi does not check this: it reads a word as 0, and "12x" as
+    12.
 
     As in gemmi, a line describes an atom if its first four letters, in upper or lower case, say so,
     since a serial number above 99,999 may follow directly.
@@ -158,6 +169,7 @@ def _check_coordinates(path: Path, text: str) -> None:
                     "ATOM and HETATM begin in column 1"
                 )
             continue
+        # The decimal points of the three numbers must be in the same column of each.
         dot_columns = {line[k : k + 8].find(".") for k in (30, 38, 46)}
         if len(dot_columns) > 1 and not any(c.isspace() for c in line[30:54]):
             raise FileLocation(path, f"line {number}").error(
@@ -174,8 +186,11 @@ def _check_coordinates(path: Path, text: str) -> None:
 
 
 def _summarize(elements: tuple[str, ...], left_out: dict[str, int], model_count: int) -> str:
-    """The summary of a molecule: the number of atoms, the commonest elements, and how many atoms
-    were left out, by reason."""
+    """The summary of a molecule as a text: the number of atoms, the commonest elements, and how
+    many atoms were left out.
+
+    elements: the name of each atom's element. left_out: the number of atoms that were left out, by
+        reason. model_count: the number of models in the file."""
     common = Counter(elements).most_common(_MAX_LISTED_ELEMENTS)
     names = ", ".join(f"{count:,} {name}" for name, count in common)
     summary = (

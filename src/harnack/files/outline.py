@@ -1,5 +1,7 @@
 """Outlines for `harnack.Extrusion` and `harnack.SolidOfRevolution`: of text, of SVG files, and
-regular polygons.
+regular polygons. An outline is a list of closed polygons ("loops", arrays (n, 2)) that do not cross
+and have the region on their left, as `harnack.geometry.make_outline` returns them. Curves of
+letters and SVG paths are replaced by polylines within a stated tolerance.
 
 Curves are flattened to a stated tolerance. The results are loops that do not cross, with the region
 on their left, as `harnack.geometry.make_outline` returns them.
@@ -50,8 +52,8 @@ def regular_polygon(sides: int, radius: float) -> Outline:
 
 
 def _import_optional(module: str) -> Any:
-    """Import a module of an optional package: matplotlib, for text, or svgpathtools, for SVG paths.
-    Raises a ModuleNotFoundError that says how to install it."""
+    """Import a module of an optional package (matplotlib, for text, or svgpathtools, for SVG
+    paths). Raises a ModuleNotFoundError that says how to install it."""
     try:
         return importlib.import_module(module)
     except ModuleNotFoundError:
@@ -72,16 +74,16 @@ def text(
     align: Literal["left", "center", "right"] = "left",
     tolerance: float | None = None,
 ) -> Outline:
-    """The outline of text, which starts at the origin and runs along x, y upwards.
+    """The outline of text. Its first line starts at the origin and runs along x, with y upwards.
 
     words: one or more lines, set by matplotlib (`pip install harnack[outlines]`).
     size: of the font, in units of length: about the height from the lowest to the highest point of
-        a line.
+        a line. Lines are 1.2 sizes apart.
     font: a file (.ttf, .otf), or the name of a family that is installed; None for DejaVu Sans,
         which matplotlib brings.
-    align: the alignment of lines to each other, and to the y axis.
-    tolerance: the largest distance between the polygons and the letters' curves; by default a
-        thousandth of the size.
+    align: how lines are aligned to the y axis: whether they begin, have their middle or end there.
+    tolerance: the largest distance between the polygons and the letters' curves, a length; by
+        default a thousandth of the size.
 
     Raises:
         ValueError: text without a visible letter, or with letters that the font lacks; an unknown
@@ -144,6 +146,7 @@ def _text_line_loops(line: str, font: Any, size: float, max_error: float) -> lis
             )
     text_to_path = _import_optional("matplotlib.textpath").TextToPath()
     points, codes = text_to_path.get_text_path(properties, line, ismath=False)
+    # matplotlib makes letters of its own font size.
     scale = size / text_to_path.FONT_SCALE
     positions = np.asarray(points, dtype=np.float64).reshape(-1, 2) * scale
     return _path_to_loops(positions, [int(code) for code in codes], max_error)
@@ -155,29 +158,33 @@ _POINTS_OF_CODE = {2: 1, 3: 2, 4: 3}
 
 
 def _path_to_loops(points: FloatArray, codes: list[int], max_error: float) -> list[FloatArray]:
-    """The closed polygons (n, 2) of a path of matplotlib, with its curves replaced by polylines
-    within the distance `max_error`.
+    """The closed polygons (n, 2) of a path of matplotlib, with its curves replaced by polylines.
 
-    points, codes: (k, 2), (k,) the path's points, and the code of matplotlib for what each is."""
-    loops: list[list[FloatArray]] = []
+    points, codes: (k, 2), (k,) the path's points, and matplotlib's code for the role of each: the
+        start of a polygon, its end, or a point of a line or of a curve.
+    max_error: the largest distance of a polyline from its curve, a length."""
+    loop_pieces: list[list[FloatArray]] = []
     k = 0
     while k < len(codes):
         code = codes[k]
         if code == _MOVE_CODE:
-            loops.append([points[k : k + 1]])
+            loop_pieces.append([points[k : k + 1]])
         if code in (_MOVE_CODE, _CLOSE_CODE):
             k += 1
             continue
         count = _POINTS_OF_CODE[code]
-        controls = np.concatenate([loops[-1][-1][-1:], points[k : k + count]])
-        loops[-1].append(flatten_bezier(controls, max_error)[0] if count > 1 else controls[1:])
+        # A line or a curve begins at the last point so far.
+        controls = np.concatenate([loop_pieces[-1][-1][-1:], points[k : k + count]])
+        loop_pieces[-1].append(
+            flatten_bezier(controls, max_error)[0] if count > 1 else controls[1:]
+        )
         k += count
-    return _drop_degenerate_loops([np.concatenate(pieces) for pieces in loops])
+    return _drop_degenerate_loops([np.concatenate(pieces) for pieces in loop_pieces])
 
 
 def _drop_degenerate_loops(loops: list[FloatArray]) -> list[FloatArray]:
-    """Those of the loops (n, 2) that have at least three different points. Loops with fewer points
-    enclose no area."""
+    """The loops (n, 2) that have at least three different points. Loops with fewer points enclose
+    no area."""
     return [loop for loop in loops if len(np.unique(loop, axis=0)) > 2]
 
 
@@ -199,8 +206,8 @@ _FILL_CHANGING_RULES = re.compile(r"none|evenodd|transform|hidden|@import|clip|m
 def svg(
     path: str | os.PathLike[str], *, scale: float = 1.0, tolerance: float | None = None
 ) -> Outline:
-    """The outline of the filled shapes of an SVG file, y upwards, by svgpathtools (`pip install
-    harnack[outlines]`).
+    """The outline of the filled shapes of an SVG file, with y upwards. It is read by svgpathtools
+    (`pip install harnack[outlines]`).
 
     path: of a file with paths, rectangles, circles, ellipses and polygons, in groups and with
         transforms. The outline is that of the union of all filled shapes. Strokes have no outline
@@ -211,9 +218,9 @@ def svg(
 
     Raises:
         FileFormatError (a ValueError): not an SVG file; a file with contents that are not
-            supported: text (turn it into paths), images, copies of other elements (`use`), clips
-            and masks, style sheets that change fills, entities; or a file that is too large or too
-            deeply nested.
+        supported: text (turn it into paths), images, copies of other elements (`use`), clips and
+        masks, style sheets that change fills, entities; or a file that is too large or too deeply
+        nested.
         ModuleNotFoundError: svgpathtools is not installed.
         OSError: the file cannot be read.
     """
@@ -232,8 +239,8 @@ def svg(
 
 
 def _parse_svg(data: bytes) -> Element:
-    """The root element of an SVG file. Declarations of entities are refused: a few entities can
-    stand for billions of letters.
+    """Parse the bytes of an SVG file, and return its root element. Declarations of entities are
+    refused: a few entities can stand for billions of letters.
 
     Raises:
         ValueError: too many elements, too deep nesting, an entity, or another root than <svg>.
@@ -244,7 +251,8 @@ def _parse_svg(data: bytes) -> Element:
 
     def start_element(name: str, attributes: dict[str, str]) -> None:
         """Add an element of the XML file to the tree, with its name without the prefix of the
-        namespace. Raises a ValueError if there are too many elements."""
+        namespace. Raises a ValueError if there are too many elements, or if they are nested too
+        deeply."""
         nonlocal count, depth
         count, depth = count + 1, depth + 1
         if count > _MAX_SVG_ELEMENTS or depth > _MAX_SVG_DEPTH:
@@ -254,12 +262,14 @@ def _parse_svg(data: bytes) -> Element:
         builder.start(name.rpartition(":")[2], attributes)
 
     def end_element(name: str) -> None:
-        """End the current element."""
+        """End the current element of the tree."""
         nonlocal depth
         depth -= 1
         builder.end(name.rpartition(":")[2])
 
     def refuse_entity(*declaration: Any) -> None:
+        """Raise a ValueError for the declaration of an entity. declaration: its name comes
+        first."""
         raise ValueError(f"it declares the entity {declaration[0]!r}, and entities are not read")
 
     parser.StartElementHandler, parser.EndElementHandler = start_element, end_element
@@ -276,10 +286,10 @@ def _filled_shapes(
     element: Element, transform: FloatArray, inherited: dict[str, str]
 ) -> Iterator[tuple[str, FloatArray, FillingRule]]:
     """Yield the filled shapes of an SVG element and of all elements in it. A shape is given by its
-    path data, its transform (3, 3) to the picture's coordinates, and its fill rule.
+    path data (a text), its transform (3, 3) to the picture's coordinates, and its fill rule.
 
-    transform: (3, 3) the transform of the element's parent.
-    inherited: the style properties that the parent passes on.
+    transform: (3, 3) the transform of the element's parent to the picture's coordinates.
+    inherited: the style properties that the parent passes on, by name.
 
     Raises:
         ValueError: contents that are not supported.
@@ -304,6 +314,7 @@ def _filled_shapes(
         parse_transform = _import_optional("svgpathtools.parser").parse_transform
         local_transform: FloatArray = parse_transform(element.attrib["transform"], strict=True)
         transform = transform @ local_transform
+    # Shapes that cannot be seen are left out, but the elements in them are looked at.
     is_filled = styles.get("fill") not in ("none", "transparent")
     is_filled &= not _NO_OPACITY.fullmatch(styles.get("fill-opacity", "1"))
     if tag in _SHAPES and is_filled and styles.get("visibility") != "hidden":
@@ -326,9 +337,9 @@ _CUTTING = ("clip-path", "mask")
 
 
 def _styles(element: Element) -> dict[str, str]:
-    """The style properties of an SVG element, by name. They are given by its attributes and by its
-    attribute `style`, which overrides the others. A transform is included only if it is in
-    `style`."""
+    """The style properties of an SVG element, by name, as far as they matter for what is filled.
+    They are given by its attributes and by its attribute `style`, which overrides the others. A
+    transform is included only if it is in `style`."""
     names = (*_INHERITED, *_CUTTING, "transform-origin")
     styles = {name: element.attrib[name].strip() for name in names if name in element.attrib}
     names = (*names, "transform")
@@ -343,7 +354,7 @@ _LENGTHS = {"x", "y", "cx", "cy", "width", "height", "r", "rx", "ry"}
 
 
 def _path_data(element: Element) -> str:
-    """The path data (SVG's attribute d) of a shape.
+    """The path data (the text of SVG's attribute d) of a shape.
 
     Raises:
         ValueError: a length with a unit, or a size that is negative or not finite.
@@ -377,7 +388,7 @@ def _path_data(element: Element) -> str:
 def _outline_of(
     shapes: list[tuple[str, FloatArray, FillingRule]], scale: float, tolerance: float | None
 ) -> Outline:
-    """The outline of the union of filled shapes, y upwards.
+    """The outline of the union of filled shapes, with y upwards.
 
     shapes: for each shape its path data, its transform (3, 3), and its fill rule.
     scale: the length of the file's unit.
@@ -391,6 +402,7 @@ def _outline_of(
         (_segments(data), matrix, rule) for data, matrix, rule in shapes
     ]
     if tolerance is None:
+        # The picture's size is that of the box around the ends of all segments.
         ends = [
             matrix[:2, :2] @ _xy(end) + matrix[:2, 2]
             for segments, matrix, _ in paths for part in segments for end in (part.start, part.end)
@@ -400,6 +412,7 @@ def _outline_of(
             raise ValueError("it fills nothing")
         tolerance = _RELATIVE_TOLERANCE * size
     loops: list[FloatArray] = []
+    # In SVG, y points downwards.
     flip = np.array([scale, -scale])
     for segments, matrix, rule in paths:
         shape_loops = [part * flip for part in _loops(segments, matrix, tolerance)]
@@ -434,34 +447,40 @@ def _segments(data: str) -> list[Any]:
 
 
 def _loops(segments: list[Any], matrix: FloatArray, tolerance: float) -> list[FloatArray]:
-    """The closed polygons (n, 2) that the segments of an SVG path form, under the transform
-    `matrix` (3, 3). A polygon is made of consecutive segments, each of which begins where the one
+    """The closed polygons (n, 2) that the segments of an SVG path form, moved by the transform
+    `matrix` (3, 3). A polygon is made of successive segments, each of which begins where the one
     before ends. Curves are replaced by polylines within the distance `tolerance`."""
-    loops: list[list[FloatArray]] = []
+    loop_pieces: list[list[FloatArray]] = []
     end_point: complex | None = None
     for segment in segments:
+        # A segment that does not begin where the last one ends begins a new polygon.
         if end_point is None or segment.start != end_point:
-            loops.append([_transform_points(matrix, [segment.start])])
+            loop_pieces.append([_transform_points(matrix, [segment.start])])
         end_point = segment.end
         kind = type(segment).__name__
         if kind == "Arc":
-            loops[-1].append(_arc(segment, matrix, tolerance))
+            loop_pieces[-1].append(_arc(segment, matrix, tolerance))
             continue
         controls = _transform_points(matrix, [*segment.bpoints()])
         if not np.isfinite(controls).all():
             raise ValueError("a number in it is not finite")
-        loops[-1].append(
+        loop_pieces[-1].append(
             flatten_bezier(controls, tolerance)[0] if len(controls) > 2 else controls[1:]
         )
-    return _drop_degenerate_loops([np.concatenate(segment) for segment in loops])
+    return _drop_degenerate_loops([np.concatenate(segment) for segment in loop_pieces])
 
 
 def _arc(arc: Any, matrix: FloatArray, tolerance: float) -> FloatArray:
-    """A polyline within `tolerance` of an elliptic arc, under the transform `matrix` (3, 3).
+    """A polyline within `tolerance` of an elliptic arc, moved by the transform `matrix` (3, 3).
     Returns its points (n, 2) without the first one.
 
-    The number of chords follows from a bound of their error: if an arc of the angle a and the
-    larger radius r is divided into n chords, they are within r (a/n)^2/8 of it."""
+    The number of chords, at least 2, follows from a bound of their error: if an arc of the angle a
+    and the larger radius r is divided into n chords, they are within r (a/n)^2/8 of it. The
+    transform stretches r at most by its matrix norm.
+
+    Raises:
+        ValueError: the arc has more than 100,000 chords.
+    """
     angle = math.radians(abs(float(arc.delta)))
     max_radius = max(abs(arc.radius.real), abs(arc.radius.imag))
     max_radius *= float(np.linalg.norm(matrix[:2, :2], 2))
@@ -474,10 +493,10 @@ def _arc(arc: Any, matrix: FloatArray, tolerance: float) -> FloatArray:
 
 
 def _transform_points(matrix: FloatArray, points: list[complex]) -> FloatArray:
-    """(n, 2) points, given as complex numbers x + i y, under the transform `matrix` (3, 3)."""
+    """(n, 2) points, given as complex numbers x + i y, moved by the transform `matrix` (3, 3)."""
     return np.array([_xy(point) for point in points]) @ matrix[:2, :2].T + matrix[:2, 2]
 
 
 def _xy(z: complex) -> FloatArray:
-    """The vector (x, y) of x + i y."""
+    """The vector (x, y) of the complex number z = x + i y."""
     return np.array([z.real, z.imag])

@@ -1,5 +1,10 @@
-"""Reading Stanford .ply files, ascii and binary: vertices, faces and edges. Other elements are
-ignored.
+"""Reading Stanford .ply files, text and binary: vertices, faces and edges. Other elements are
+ignored. A .ply file is a header and rows. An "element" is a kind of row, such as "vertex", with the
+number of its rows; its "properties" are the numbers, or lists of numbers, in each row.
+
+Each property is read in all rows of an element at once. A "position" says where a number is in the
+file: in bytes for a binary file, in words (entries between blanks) for a text file. The position of
+a property in a row follows from the properties before it, and the lengths of the lists among these.
 
 A file is a header and rows of elements, such as one row for each vertex. Properties of a row are
 numbers or lists. Each property is read in all rows of an element at once; its position in a row
@@ -71,8 +76,8 @@ class Property:
 
 @dataclass(frozen=True)
 class PlyElement:
-    """An element of the header: its name, the number of rows that follow, and the properties of a
-    row."""
+    """An element that the header of a .ply file declares: its name, the number of rows that follow,
+    and the properties of a row."""
 
     name: str
     count: int
@@ -83,7 +88,7 @@ class PlyElement:
 class PlyHeader:
     """The header of a .ply file.
 
-    byte_order: "<" or ">" for a binary file, "" for ascii.
+    byte_order: "<" or ">" for a binary file, "" for text.
     size, lines: the number of bytes and the number of lines before the first row."""
 
     byte_order: str
@@ -92,13 +97,14 @@ class PlyHeader:
     lines: int
 
     def declared_rows(self, size: int) -> int:
-        """The number of rows that the header declares for all elements. The number for a single
-        element counts as at most `size`, the file's size in bytes, as a file cannot hold more."""
+        """The number of rows that the header declares for all elements together. The number for a
+        single element counts as at most `size`, the file's size in bytes, as a file cannot hold
+        more."""
         return sum(min(section.count, size) for section in self.elements)
 
 
 class BinaryValues:
-    """The bytes of a binary file, from which numbers are read at byte positions."""
+    """The bytes of a binary .ply file, from which numbers are read at byte positions."""
 
     def __init__(self, data: bytes, byte_order: str) -> None:
         self.size = len(data)
@@ -113,6 +119,8 @@ class BinaryValues:
         since the rows that contain them end after the file's end."""
         kind = np.dtype(self.byte_order + code)
         last_position = self.size - kind.itemsize  # the header alone is longer than a number
+        # A view of the data as the numbers that begin at each byte, so that one index reads them
+        # all.
         all_numbers = np.ndarray((last_position + 1,), kind, self.data, strides=(1,))
         return all_numbers[np.clip(where, 0, last_position)].astype(kind.newbyteorder("="))
 
@@ -122,8 +130,9 @@ class BinaryValues:
 
 
 class TextValues:
-    """The numbers of all rows of an element in a text file, read at positions counted in words from
-    the first row. counts: (n,) the number of words of each row."""
+    """The numbers of all rows of an element in a text file, read at positions. A position is
+    counted in words (entries between blanks) from the first row. counts: (n,) the number of words
+    of each row."""
 
     def __init__(self, rows: TextLines) -> None:
         numbers, self.counts = read_floats(rows, convert=_any_number)
@@ -137,11 +146,13 @@ class TextValues:
         values = self._numbers[np.clip(where, 0, self.size)]
         if code in "fd" or (values != np.rint(values)).any():
             return values
+        # Larger numbers would overflow; as indices or lengths they are out of range anyway.
         return np.clip(values, -(2.0**53), 2.0**53).astype(np.int64)
 
     def width(self, code: str) -> int:
-        """The number of positions that a number of the type `code` takes. Positions in a text file
-        are counted in words, and a number of any type is one word, so it is 1."""
+        """How many positions a number takes: always 1, as positions in a text file are counted in
+        words. (The same method of `BinaryValues` returns the number of bytes of the type `code`.)
+        """
         return 1
 
 
@@ -149,8 +160,8 @@ Values: TypeAlias = BinaryValues | TextValues
 
 
 def _any_number(word: bytes, place: FileLocation) -> float:
-    """The number that a word is, also NaN or infinite. Raises a FileFormatError for another
-    word."""
+    """The number that a word stands for, also NaN or infinite. Raises a FileFormatError that names
+    its `place` if it stands for none."""
     try:
         return float(word)
     except ValueError as error:
@@ -163,8 +174,7 @@ class PropertyColumn:
 
     code: the type of the numbers, as a format character of the module `struct`.
     positions: (n,) in bytes for a binary file, in words for a text file.
-    list_lengths: (n,) the lengths of the lists; None for a property that is a single number.
-    """
+    list_lengths: (n,) the lengths of the lists; None for a property that is a single number."""
 
     code: str
     positions: IntArray
@@ -174,31 +184,35 @@ class PropertyColumn:
 
 @dataclass(frozen=True, eq=False)
 class ElementTable:
-    """All rows of an element: its columns by name, and the location of each row in the file."""
+    """All rows of an element of a .ply file: its properties as columns by name, and the location of
+    each row in the file."""
 
     values: Values
     columns: dict[str, PropertyColumn]
     places: FileLocations
 
     def has_scalars(self, *names: str) -> bool:
-        """Whether there are columns with these names that hold single numbers."""
+        """Whether there are columns with all of these names that hold single numbers, not lists."""
         return all(
             name in self.columns and self.columns[name].list_lengths is None for name in names
         )
 
     def scalar_column(self, name: str) -> npt.NDArray[Any]:
-        """A column of single numbers."""
+        """The numbers (n,) of a column of single numbers. Raises a FileFormatError if there is no
+        such column, or if it holds lists."""
         column = self._column(name)
         if column.list_lengths is not None:
             raise self._wrong_kind_error()
         return self.values.read(column.positions + column.offset, column.code)
 
     def list_column(self, name: str) -> tuple[npt.NDArray[Any], IntArray]:
-        """A column of lists: the numbers of all lists, one list after the other, and the length of
-        each list."""
+        """The numbers of a column of lists: all lists in one array, one list after the other; and
+        the length (n,) of each list. Raises a FileFormatError if there is no such column, or if it
+        holds single numbers."""
         column = self._column(name)
         if column.list_lengths is None:
             raise self._wrong_kind_error()
+        # The position of each number: that of its list plus its rank in the list.
         where = np.repeat(column.positions + column.offset, column.list_lengths)
         where += ranks_in_lists(column.list_lengths) * self.values.width(column.code)
         return self.values.read(where, column.code), column.list_lengths
@@ -210,7 +224,8 @@ class ElementTable:
         return self.columns[name]
 
     def _wrong_kind_error(self) -> FileFormatError:
-        """The error for a list in place of a single number, or the reverse."""
+        """The error for a column that holds lists where single numbers are expected, or the
+        reverse."""
         return self.places[0].error("a list where one number is expected, or the reverse")
 
 
@@ -243,6 +258,7 @@ def read_ply(path: Path, data: bytes) -> FileGeometry:
     if table and (table.has_scalars("vertex1", "vertex2") or not tables.get("face")):
         ends = np.stack([table.scalar_column("vertex1"), table.scalar_column("vertex2")], axis=1)
         edges = _polygons(table, ends.ravel(), np.full(len(ends), 2), len(vertices))
+    # Such faces are handled one by one, which takes long.
     if have_mixed_sizes(faces):
         check_element_count(FileLocation(path), header.declared_rows(len(data)))
     return FileGeometry(path, vertices, normals, faces, edges)
@@ -273,11 +289,13 @@ def _check_end(path: Path, remainder: bytes) -> None:
 def _polygons(
     table: ElementTable, corners: npt.NDArray[Any], sizes: IntArray, count: int
 ) -> PolygonList:
-    """The polygons with the vertex indices `corners`, one polygon after the other, and `sizes` (m,)
-    corners each. Raises a FileFormatError if an index is not in [0, count).
+    """The polygons (or edges) that the rows of an element list. Raises a FileFormatError if an
+    index is not an integer in [0, count).
 
-    table: the rows of the element, for their locations in the file. count: the number of
-        vertices."""
+    table: the rows of the element, for their locations in the file.
+    corners: the vertex indices, one polygon after the other. sizes: (m,) the number of corners of
+        each polygon.
+    count: the number of vertices."""
     polygons = PolygonList(corners.astype(np.int64), sizes, table.places)
     if corners.dtype.kind == "f" and corners.size:
         k = int(np.argmax(corners != np.rint(corners)))
@@ -291,11 +309,13 @@ def _polygons(
 def _columns(
     section: PlyElement, values: Values, begins: IntArray, places: FileLocations
 ) -> tuple[dict[str, PropertyColumn], IntArray]:
-    """The properties of an element in all its rows, as columns by name; and the position (n,) at
-    which each row ends.
+    """The properties of the element `section` in all its rows, as columns by name; and the position
+    (n,) at which each row ends.
 
     values: the numbers of the file. begins: (n,) the position at which each row begins.
-    places: the locations of the rows, for errors."""
+    places: the locations of the rows, for errors.
+
+    A row whose list has an invalid length ends after the end of the file; callers test for that."""
     columns: dict[str, PropertyColumn] = {}
     positions, offset = begins, 0
     for prop in section.properties:
@@ -303,6 +323,7 @@ def _columns(
             columns[prop.name] = PropertyColumn(prop.code, positions, offset, None)
             offset += values.width(prop.code)
             continue
+        # What follows a list begins at another place in each row: positions are counted from there.
         lengths = values.read(positions + offset, prop.length_code)
         if lengths.dtype.kind == "f":
             k = int(np.argmax(lengths != np.rint(lengths)))
@@ -317,7 +338,8 @@ def _columns(
 
 
 def _text_tables(path: Path, data: bytes, header: PlyHeader) -> dict[str, ElementTable]:
-    """The tables of the elements of a text file, by name.
+    """The rows of each element of a text file, as a table by the element's name. Elements without
+    rows are left out.
 
     Raises:
         FileFormatError: fewer or more rows than the header declares, or a row of wrong length.
@@ -334,6 +356,7 @@ def _text_tables(path: Path, data: bytes, header: PlyHeader) -> dict[str, Elemen
         values = TextValues(rows)
         counts = values.counts
         columns, ends = _columns(section, values, np.cumsum(counts) - counts, places)
+        # Each row must end where the next line begins.
         wrong = np.flatnonzero(ends != np.cumsum(counts))
         if wrong.size:
             how = "few" if ends[wrong[0]] > np.cumsum(counts)[wrong[0]] else "many"
@@ -344,7 +367,11 @@ def _text_tables(path: Path, data: bytes, header: PlyHeader) -> dict[str, Elemen
 
 
 def _binary_tables(path: Path, data: bytes, header: PlyHeader) -> dict[str, ElementTable]:
-    """The tables of the elements of a binary file, by name.
+    """The rows of each element of a binary file, as a table by the element's name. Elements without
+    rows are left out.
+
+    Rows are first read as if all were as long as the first row, which is fast. If their ends show
+    that they are not, the end of each row is found one by one.
 
     Raises:
         FileFormatError: fewer or more data than the header declares.
@@ -380,11 +407,14 @@ def _binary_tables(path: Path, data: bytes, header: PlyHeader) -> dict[str, Elem
 
 
 def _row_ends(section: PlyElement, values: BinaryValues, begin: int) -> Iterator[int]:
-    """Yield the position at which each row of an element ends, one row after the other, for
-    elements whose rows have different lengths because they contain lists.
+    """Yield the position at which each row of the element `section` ends, one row after the other.
+    This is for elements whose rows have different lengths because they contain lists.
 
-    begin: the position at which the first row begins.
-    Raises struct.error if a row ends after the end of the file."""
+    values: the bytes of the file. begin: the position at which the first row begins.
+
+    Raises struct.error if a row ends after the end of the file, or a list has a negative length."""
+    # For each list: the bytes since the list before, how its length is stored, and the bytes of
+    # each of its numbers. At the end `fixed_bytes` is what follows the last list.
     fixed_bytes = 0
     lists: list[tuple[int, struct.Struct, int]] = []
     for prop in section.properties:
@@ -408,7 +438,7 @@ def _row_ends(section: PlyElement, values: BinaryValues, begin: int) -> Iterator
 
 
 def _too_short(path: Path, section: PlyElement) -> FileFormatError:
-    """The error for a file that ends before all rows of an element."""
+    """The error for a file that ends before all rows of the element `section`."""
     return FileLocation(path).error(
         f"the file ends before the {section.count:,} rows of element {section.name!r} that its "
         "header declares"
@@ -416,7 +446,8 @@ def _too_short(path: Path, section: PlyElement) -> FileFormatError:
 
 
 def _header(path: Path, data: bytes) -> PlyHeader:
-    """The elements and properties that the header of a .ply file declares.
+    """Parse the header of a .ply file: its format, and the elements and properties that it
+    declares.
 
     Raises:
         FileFormatError: it is malformed, or not the header of a .ply file.
@@ -440,6 +471,7 @@ def _header(path: Path, data: bytes) -> PlyHeader:
         elif words[0] == b"element" and len(words) == 3 and words[2].isdigit():
             name = words[1].decode("ascii", "backslashreplace")
             sections.append(PlyElement(name, _parse_count(words[2], place), ()))
+        # A property belongs to the element before it.
         elif words[0] == b"property" and sections:
             last = sections[-1]
             columns = (*last.properties, _parse_property(words, last, place))
@@ -455,14 +487,16 @@ def _header(path: Path, data: bytes) -> PlyHeader:
 
 
 def _parse_count(word: bytes, place: FileLocation) -> int:
-    """The number of rows of an element, from the digits of a header."""
+    """The number of rows of an element, from its digits in the header. Raises a FileFormatError if
+    it has more than 18."""
     if len(word) > 18:
         raise place.error(f"{excerpt(word)} is too large a count")
     return int(word)
 
 
 def _parse_property(words: list[bytes], section: PlyElement, place: FileLocation) -> Property:
-    """The property that a line of the header declares for the element `section`.
+    """The property that a line of the header declares for the element `section`. words: the words
+    of the line.
 
     Raises:
         FileFormatError: a malformed line, a name that occurs twice, or a list whose length is no

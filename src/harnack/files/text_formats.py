@@ -1,5 +1,8 @@
 """Reading geometry files in text formats: .xyz, .loops, .blobs, .obj, .off and .stl (.stl may also
-be binary)."""
+be binary). Each reader takes the path of a file, for messages, and its bytes `data`. A "statement"
+is a line of an .obj file, whose first word says what it defines. Errors are FileFormatErrors that
+name the line.
+"""
 
 from __future__ import annotations
 
@@ -50,6 +53,7 @@ def read_xyz(path: Path, data: bytes) -> FileGeometry:
         raise FileLocation(path).error("it holds no points: write one a line, x y z")
     numbers, counts = read_floats(lines)
     columns = int(counts[0])
+    # All lines must have as many columns as the first.
     ragged = np.flatnonzero(counts != columns)
     if ragged.size:
         raise lines.locations[ragged[0]].error(
@@ -101,10 +105,9 @@ _COLUMNS = "x y z radius [weight [group]]"
 @dataclass(frozen=True, eq=False)
 class Metaballs:
     """The n blobs (metaballs) of a file: their centers (n, 3), radii (n,) and weights (n,); and the
-    number of the group of each (n,), or None if the file names no groups.
+    number of the group of each blob (n,), or None if the file names no groups.
 
-    summary: a text about the contents of the file.
-    """
+    summary: a text about the contents of the file."""
 
     centers: FloatArray
     radii: FloatArray
@@ -140,6 +143,7 @@ def read_metaballs(path: Path, data: bytes) -> Metaballs:
         raise lines.locations[invalid[0]].error(
             f"a blob has four to six numbers, {_COLUMNS}, not {counts[invalid[0]]}"
         )
+    # Columns that a line lacks (weight and group) are 1.
     table = np.ones((len(counts), 6))
     table[np.arange(6) < counts[:, None]] = numbers
     radii, groups = table[:, 3], table[:, 5]
@@ -177,9 +181,9 @@ def read_obj(path: Path, data: bytes) -> FileGeometry:
     """Read the bytes `data` of a Wavefront .obj file: its vertices, faces (`f`) and polylines
     (`l`); and for a point cloud the normals, if there are as many normals as vertices.
 
-    If there are statements `p`, the result has only the vertices that they name, with their
-    normals. Groups, materials and textures are ignored. Statements that define other surfaces, such
-    as splines, are an error.
+    If there are statements `p` and neither faces nor polylines, the result has only the vertices
+    that they name, with their normals. Groups, materials and textures are ignored. Statements that
+    define other surfaces, such as splines, are an error.
 
     An index may be negative; then it counts back from the last vertex before the statement. It may
     be followed by slashes and the indices of a texture vertex and a normal, which are ignored in
@@ -191,6 +195,7 @@ def read_obj(path: Path, data: bytes) -> FileGeometry:
     lines = split_content_lines(path, data)
     if b"\\" in data:
         lines = _join_continued_lines(lines)
+    # For each keyword the texts of its statements, without the keyword, and their line numbers.
     statements: dict[bytes, tuple[list[bytes], list[int]]]
     statements = {keyword: ([], []) for keyword in (b"v", b"vn", b"f", b"l", b"p")}
     for number, line in zip(lines.locations.numbers, lines.text, strict=True):
@@ -213,6 +218,7 @@ def read_obj(path: Path, data: bytes) -> FileGeometry:
     vertices = read_table(rows[b"v"], 3, too_few_message="a vertex needs three coordinates, not {}")
     faces = _parse_obj_polygons(rows[b"f"], "'f' needs at least 3 vertices", 3, rows[b"v"])
     polylines = _parse_obj_polygons(rows[b"l"], "'l' needs at least 2 vertices", 2, rows[b"v"])
+    # Such faces are handled one by one, which takes long.
     if have_mixed_sizes(faces):
         check_element_count(FileLocation(path), len(lines))
     if len(faces) or len(polylines):
@@ -228,8 +234,8 @@ def read_obj(path: Path, data: bytes) -> FileGeometry:
 def _parse_obj_points(
     path: Path, vertices: FloatArray, normals: FloatArray | None, rows: dict[bytes, TextLines]
 ) -> FileGeometry:
-    """The vertices that the statements `p` of an .obj file name, with their normals if all of these
-    statements name one.
+    """The vertices that the statements `p` of an .obj file name, as a point cloud, with their
+    normals if all of these statements name one.
 
     vertices: (n, 3) all vertices of the file. normals: (k, 3) all its normals, or None.
     rows: the lines of the statements, by their keyword.
@@ -238,6 +244,7 @@ def _parse_obj_points(
         FileFormatError: an index out of range, or normals for only some of the points.
     """
     points = _parse_obj_polygons(rows[b"p"], "'p' needs a vertex", 1, rows[b"v"])
+    # A word is vertex/texture/normal; the last two may be missing.
     words = [word.split(b"/") for line in rows[b"p"].text for word in line.split()]
     normal_words = [word[2] for word in words if len(word) == 3 and word[2]]
     if normals is None or not normal_words:
@@ -254,7 +261,7 @@ def _parse_obj_points(
 
 def _join_continued_lines(lines: TextLines) -> TextLines:
     """The same lines, except that a line that ends with a backslash is joined with the next one to
-    a single line."""
+    a single line, which has the number of its first line."""
     pieces: list[list[bytes]] = []
     numbers: list[int] = []
     continued = 0  # the number of the line that continues the last
@@ -274,9 +281,10 @@ def _join_continued_lines(lines: TextLines) -> TextLines:
 def _parse_obj_polygons(
     lines: TextLines, too_few: str, min_corners: int, vertices: TextLines
 ) -> PolygonList:
-    """The faces or polylines that statements of an .obj file define, with vertex indices from 0.
+    """The faces, polylines or points that statements of an .obj file define, with vertex indices
+    from 0.
 
-    lines: the lines of the statements, `f` or `l`.
+    lines: the lines of the statements `f`, `l` or `p`, without the keyword.
     too_few: the error message for a statement with fewer corners than `min_corners`.
     vertices: the lines of all vertices. A negative index counts back from the last of these before
         the statement.
@@ -294,7 +302,8 @@ def _parse_obj_polygons(
         raise statements.location_of_corner(zero[0]).error(
             "vertices are counted from 1, there is no vertex 0"
         )
-    # Negative indices are counted back from the statement.
+    # For each corner, the number of vertices before its statement: negative indices count back from
+    # there.
     preceding = np.repeat(
         np.searchsorted(vertices.locations.numbers, lines.locations.numbers), sizes
     )
@@ -335,15 +344,18 @@ def read_off(path: Path, data: bytes) -> FileGeometry:
     vertices = read_table(lines[:count], 3)
     rows = lines[count : count + faces_count]
     # Colors may follow the corners; these need not be integers, and not even numbers.
-    numbers, counts = read_floats(rows, convert=_number_or_nan)
-    begins = np.cumsum(counts) - counts
+    numbers, word_counts = read_floats(rows, convert=_number_or_nan)
+    begins = np.cumsum(word_counts) - word_counts
+    # The first word of a face's line is the number of its corners.
     sizes = _integers(rows, numbers[begins], np.arange(len(rows)), np.zeros_like(begins))
-    if (wrong := np.flatnonzero((sizes < 1) | (sizes >= counts))).size:
+    if (wrong := np.flatnonzero((sizes < 1) | (sizes >= word_counts))).size:
         k = wrong[0]
         raise rows.locations[k].error(f"a face of '{sizes[k]}' vertices does not fit on this line")
-    owners = np.repeat(np.arange(len(rows)), sizes)
-    within = 1 + ranks_in_lists(sizes)
-    corners = _integers(rows, numbers[begins[owners] + within], owners, within)
+    row_of_corner = np.repeat(np.arange(len(rows)), sizes)
+    word_of_corner = 1 + ranks_in_lists(sizes)
+    corners = _integers(
+        rows, numbers[begins[row_of_corner] + word_of_corner], row_of_corner, word_of_corner
+    )
     faces = PolygonList(corners, sizes, rows.locations)
     check_indices(faces, count)
     return FileGeometry(path, vertices, None, faces)
@@ -360,7 +372,7 @@ def _number_or_nan(word: bytes, _: FileLocation) -> float:
 def _integers(
     rows: TextLines, numbers: FloatArray, row_of: IntArray, word_of: IntArray
 ) -> IntArray:
-    """The numbers (k,), which were read from words of lines, as integers.
+    """Convert numbers (k,), which were read from words of lines, to integers.
 
     rows: the lines. row_of, word_of: (k,) for each number, the index of its line, and its position
         among the words of that line, for messages.
@@ -370,6 +382,7 @@ def _integers(
     """
     wrong = np.flatnonzero(~((numbers == np.rint(numbers)) & (np.abs(numbers) < 2.0**53)))
     if wrong.size:
+        # Parsing the first wrong word alone raises the error that names it.
         k = int(row_of[wrong[0]])
         parse_vertex_index(rows.text[k].split()[int(word_of[wrong[0]])], rows.locations[k])
     return numbers.astype(np.int64)
@@ -394,6 +407,7 @@ def _parse_off_header(path: Path, lines: TextLines) -> tuple[int, int, TextLines
         raise FileLocation(path).error(
             "binary .off files are not read: save it as text, or as .ply"
         )
+    # The numbers stand behind the word OFF or on the next line.
     line_index = 0 if rest else 1
     if line_index == len(lines):
         raise FileLocation(path).error("the file ends before the numbers of vertices and faces")
@@ -434,9 +448,9 @@ def read_stl(path: Path, data: bytes) -> FileGeometry:
 
 
 def _is_binary(data: bytes) -> bool:
-    """Whether an .stl file with the bytes `data` is binary. The word "solid" at the beginning is no
-    proof of a text file, since many binary files begin with it as well. So the length is tested
-    first, which a binary file gives in its header."""
+    """Whether an .stl file with the bytes `data` is binary. Many binary files begin with the word
+    "solid" like text files. So the length is tested first: a binary file has the length that
+    follows from the number of triangles in its header."""
     if (
         len(data) >= _STL_HEADER_BYTES
         and len(data) == _STL_HEADER_BYTES + _stl_facet_count(data) * _FACET.itemsize
@@ -452,7 +466,7 @@ def _stl_facet_count(data: bytes) -> int:
 
 def _parse_binary_stl(path: Path, data: bytes) -> FloatArray:
     """The corners (3 m, 3) of the m triangles of a binary .stl file. Raises a FileFormatError if
-    its length is not that of its triangles."""
+    the file's length does not follow from the number of triangles in its header."""
     if len(data) < _STL_HEADER_BYTES:
         raise FileLocation(path).error(
             f"{len(data)} bytes are too few for an .stl file: it begins with 'solid' or with a "
@@ -480,23 +494,26 @@ def _parse_text_stl(path: Path, data: bytes) -> FloatArray:
         FileFormatError: an unknown statement, a truncated file, or a facet without three vertices.
     """
     lines = split_content_lines(path, data)
-    words = [line.split(None, 1)[0].lower() for line in lines.text]
-    for k, word in enumerate(words):
+    keywords = [line.split(None, 1)[0].lower() for line in lines.text]
+    for k, word in enumerate(keywords):
         if word not in _KEYWORDS:
             raise lines.locations[k].error(f"{excerpt(word)} is no .stl statement")
-    if words[-1] != b"endsolid":
-        raise lines.locations[len(words) - 1].error(
+    if keywords[-1] != b"endsolid":
+        raise lines.locations[len(keywords) - 1].error(
             "the file ends before 'endsolid': it is truncated"
         )
-    vertex_lines = [k for k, word in enumerate(words) if word == b"vertex"]
-    facets = words.count(b"facet")
-    begins = [k for k, word in enumerate(words) if word == b"facet"]
+    vertex_lines = [k for k, word in enumerate(keywords) if word == b"vertex"]
+    facet_count = keywords.count(b"facet")
+    facet_lines = [k for k, word in enumerate(keywords) if word == b"facet"]
+    # The number of vertex lines between each facet line and the next.
     vertices_per_facet = (
-        np.histogram(vertex_lines, [*begins, len(words)])[0] if begins else np.zeros(0, int)
+        np.histogram(vertex_lines, [*facet_lines, len(keywords)])[0]
+        if facet_lines
+        else np.zeros(0, int)
     )
-    if len(vertex_lines) != 3 * facets or (vertices_per_facet != 3).any():
+    if len(vertex_lines) != 3 * facet_count or (vertices_per_facet != 3).any():
         raise FileLocation(path).error(
-            f"{len(vertex_lines):,} vertices in {facets:,} facets: each needs three"
+            f"{len(vertex_lines):,} vertices in {facet_count:,} facets: each needs three"
         )
     rows = [lines.text[k][len("vertex") :] for k in vertex_lines]
     return read_table(

@@ -1,5 +1,7 @@
-"""Numbers in text files. All numbers of a file are parsed at once, which is fast; if that fails,
-they are parsed word by word, to find the wrong word for the error message."""
+"""Reading numbers from text files. A "word" is an entry of a line, between blanks. All numbers of a
+file are parsed at once by NumPy, which is fast. If that fails, they are parsed word by word, to
+find the wrong word for the error message, and for lines with different numbers of words.
+"""
 
 from __future__ import annotations
 
@@ -56,6 +58,7 @@ def split_content_lines(
 ) -> TextLines:
     """The lines of a text file that are not blank, without comments and byte order mark.
 
+    data: the bytes of the file. comment: what begins a comment; None if there are no comments.
     first: number of the first line, for messages.
 
     Raises:
@@ -75,6 +78,7 @@ def split_content_lines(
     if comment is not None and comment in data:
         lines = [line.split(comment, 1)[0] if comment in line else line for line in lines]
     lines = [line.strip() for line in lines]
+    # The numbers of the lines in the file, which stay when blank lines are left out.
     numbers: Sequence[int] = range(first, first + len(lines))
     if not all(lines):
         numbers = [number for number, line in zip(numbers, lines, strict=True) if line]
@@ -83,7 +87,8 @@ def split_content_lines(
 
 
 def parse_finite(word: bytes, place: FileLocation) -> float:
-    """The finite number that a word of a text file stands for. place: its location, for the error.
+    """The finite number that a word of a text file stands for. place: the word's location, for the
+    error.
 
     Raises:
         FileFormatError: the word is not a finite number.
@@ -99,7 +104,7 @@ def parse_finite(word: bytes, place: FileLocation) -> float:
 
 def parse_vertex_index(word: bytes, place: FileLocation) -> int:
     """The integer that a word of a text file stands for, small enough for the index of a vertex.
-    place: its location, for the error.
+    place: the word's location, for the error.
 
     Raises:
         FileFormatError: the word is not such an integer.
@@ -149,6 +154,7 @@ def read_table(
     table = _parse_with_numpy(lines, range(columns))
     if table is not None and np.isfinite(table).all():
         return table
+    # Word by word, to find the first wrong word, or for lines with too few.
     numbers: list[float] = []
     for k, line in enumerate(lines.text):
         words, place = line.split()[:columns], lines.locations[k]
@@ -161,7 +167,8 @@ def read_table(
 def read_floats(
     lines: TextLines, *, convert: Callable[[bytes, FileLocation], float] = parse_finite
 ) -> tuple[FloatArray, IntArray]:
-    """The numbers in all words of n lines, as one array; and the number (n,) of words of each line.
+    """The numbers in all words of n lines, as one array, line after line; and the number (n,) of
+    words of each line.
 
     convert: a function that converts a word to a number or raises an error. It is called only if
         not all words are finite numbers.
@@ -176,12 +183,13 @@ def read_floats(
 
 
 def read_integers(lines: TextLines) -> tuple[IntArray, IntArray]:
-    """The integers in all words of n lines, as one array; and the number (n,) of words of each
-    line.
+    """The integers in all words of n lines, as one array, line after line; and the number (n,) of
+    words of each line.
 
     Raises:
         FileFormatError: some word is not an integer; the message names the line of the first one.
     """
+    # NumPy reads floating-point numbers; if they are whole and below 2^53, they are exact.
     table = _parse_with_numpy(lines)
     if table is not None and (np.abs(table) < 2.0**53).all() and (table == np.rint(table)).all():
         return table.astype(np.int64).ravel(), _row_lengths(table)
@@ -189,11 +197,12 @@ def read_integers(lines: TextLines) -> tuple[IntArray, IntArray]:
 
 
 def _parse_with_numpy(lines: TextLines, columns: Sequence[int] | None = None) -> FloatArray | None:
-    """The numbers of n lines as a table (n, k), parsed by NumPy, which is fast. None if that fails,
-    because some word is not a number, or because lines have different numbers of words.
+    """The numbers of n lines with k words each as a table (n, k), parsed by NumPy, which is fast.
+    None if that fails, because some word is not a number, or because lines have different numbers
+    of words.
 
-    columns: the columns to read; None for all.
-    """
+    columns: the columns to read; None for all."""
+    # NumPy would read 1_0 as 10.
     if not len(lines) or b"_" in b"\n".join(lines.text):
         return None
     try:
@@ -208,26 +217,25 @@ def _parse_with_numpy(lines: TextLines, columns: Sequence[int] | None = None) ->
 
 
 def _row_lengths(table: FloatArray) -> IntArray:
-    """The number of words of each of the n lines of a table (n, k): an array (n,) filled with k.
-
-    All rows have the same length. `read_integers` returns such an array for lines of any lengths.
-    """
+    """How many words each line has, for lines that were read as a rectangular table (n, k): an
+    array (n,) filled with k. `read_floats` and `read_integers` return such an array for lines of
+    any lengths."""
     return np.full(len(table), table.shape[1], dtype=np.int64)
 
 
 def _parse_words(
     lines: TextLines, kind: type[_Number], convert: Callable[[bytes, FileLocation], _Number]
 ) -> tuple[npt.NDArray[Any], IntArray]:
-    """Parse n lines word by word. Returns the numbers of all lines as one array; and the number
-    (n,) of words of each line. It serves lines with different numbers of words, and words that are
-    not plain numbers.
+    """Parse n lines word by word, also if they have different numbers of words. Returns the numbers
+    of all lines as one array; and the number (n,) of words of each line.
 
     kind: float or int, by which all words are converted, if that succeeds.
     convert: a function that converts a word, or raises an error for an invalid one. It is slower,
-        and is called for every word if `kind` fails for one.
+        and is called for every word if `kind` fails for one, or gives a number that is not finite.
     """
 
     def slow_numbers() -> Iterator[_Number]:
+        """Yield the number of each word, converted by `convert`."""
         for k, line in enumerate(lines.text):
             place = lines.locations[k]
             for word in line.split():
@@ -235,6 +243,7 @@ def _parse_words(
 
     counts = np.fromiter((len(line.split()) for line in lines.text), np.int64)
     try:
+        # First the fast way: Python's own conversion of all words.
         words = chain.from_iterable(map(bytes.split, lines.text))
         numbers = np.fromiter(map(kind, words), np.dtype(kind))
         if np.isfinite(numbers).all():

@@ -1,4 +1,5 @@
-"""Reading .3mf files, which slicers write, through trimesh: triangles in millimeters."""
+"""Reading .3mf files, which slicers write, through trimesh. The result is triangles in
+millimeters."""
 
 from __future__ import annotations
 
@@ -36,9 +37,9 @@ _UNITS = {
 
 
 def read_3mf(path: Path, data: bytes) -> FileGeometry:
-    """Read all triangles in the bytes `data` of a .3mf file: those of the parts in its build (what
-    is to be printed), at their positions there, in millimeters. Colors and settings are ignored,
-    including the setting that a part is not to be printed.
+    """Read all triangles in the bytes `data` of a .3mf file: the triangles of the parts in its
+    build (the list of what is to be printed), at their positions there, in millimeters. Colors and
+    settings are ignored, including the setting that a part is not to be printed.
 
     Raises:
         FileFormatError: the file is not an archive, is too large when unpacked, is malformed, or
@@ -79,7 +80,7 @@ def _contents(place: FileLocation, scene: Any) -> FileGeometry:
     unit = str(scene.units or "millimeter").lower().removesuffix("s")
     if unit not in _UNITS:
         raise place.error(f"its unit, {unit[:40]!r}, is none of {', '.join(_UNITS)}")
-    vertices, faces, count = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)], 0
+    vertices, faces, vertex_count = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)], 0
     for node in scene.graph.nodes_geometry:
         matrix, name = scene.graph[node]
         geometry = scene.geometry[name]
@@ -87,11 +88,11 @@ def _contents(place: FileLocation, scene: Any) -> FileGeometry:
         polygons = triangles_as_polygons(place.path, corners)
         check_indices(polygons, len(geometry.vertices))
         x = np.asarray(geometry.vertices, np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
-        if np.linalg.det(matrix[:3, :3]) < 0:  # a mirror image
+        if np.linalg.det(matrix[:3, :3]) < 0:  # a mirror image: faces must be reversed
             corners = corners[:, ::-1]
         vertices.append(_UNITS[unit] * x)
-        faces.append(corners + count)
-        count += len(x)
+        faces.append(corners + vertex_count)
+        vertex_count += len(x)
     x, triangles = np.concatenate(vertices), np.concatenate(faces)
     check_finite(x, FileLocations(place.path, "vertex", range(len(x))))
     if not len(triangles):

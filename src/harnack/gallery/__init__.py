@@ -1,4 +1,5 @@
-"""The gallery: named scenes that the command line, the docs and the tests share.
+"""The gallery: named scenes that the command line, the docs and the tests share. Each module has
+functions that make the surfaces of scenes, and tuples of `Scene` objects.
 
 A scene is data (fields, levels, materials and a camera); `Scene.render` passes it to the renderer.
 Nothing is computed in this package.

@@ -1,4 +1,6 @@
-"""Scenes of curves, harmonic polynomials, periodic surfaces, and functions of the plane.
+"""Scenes of the gallery: curves, harmonic polynomials, periodic surfaces, and functions of the
+plane. Each function here makes the surfaces of a scene (a list of `Surface`). The solid angle of a
+closed curve, a function of space, has level sets that span the curve.
 
 A function of the plane gives a Riemann surface (Fig. 19 of Gillespie et al. 2024), level curves or
 a height field.
@@ -30,8 +32,9 @@ from harnack.tracer import Surface
 
 
 def _curve(loops: Any, level: Any = None, **settings: Any) -> list[Surface]:
-    """The level set of the solid angle of closed curves. loops: vertices (n, 3), or a list of them.
-    settings: keywords of `Surface`."""
+    """A surface that spans closed curves: a level set of their solid angle. loops: the vertices (n,
+    3) of a curve, or a list of such arrays. level: the level; None for the default. settings:
+    keywords of `Surface`."""
     return [Surface(SolidAngle(loops), level, **settings)]
 
 
@@ -47,6 +50,7 @@ def _holes() -> list[Surface]:
     so that no plane contains them."""
     edge, *holes = example_curves.square_with_holes(24)
     s = np.linspace(0, 1, 10, endpoint=False)[:, None]
+    # Ten points on each side of the square, so that it can be bent.
     fine = [(1 - s) * a + s * b for a, b in zip(edge, np.roll(edge, -1, axis=0), strict=True)]
     return _curve([_on_wave(loop) for loop in (np.concatenate(fine), *holes)])
 
@@ -58,10 +62,9 @@ def _on_wave(loop: FloatArray) -> FloatArray:
 
 
 def _periodic(kind: Any, half_wall: float, *, box: bool = False) -> list[Surface]:
-    """The solid between the levels -half_wall and half_wall of a periodic function.
+    """A wall: the solid between the levels -half_wall and half_wall of a periodic function.
 
-    kind: the class of the function. box: whether it is cut to a box; otherwise to a ball.
-    """
+    kind: the class of the function. box: whether it is cut to a box; otherwise to a ball."""
     domain = Box((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0)) if box else Ball(radius=1.0)
     return [Surface(kind(1.0, domain=domain), (-half_wall, half_wall), side="between")]
 
@@ -84,7 +87,7 @@ def _eigenfunctions() -> list[Surface]:
 
 
 def _harmonic(field: Field) -> list[Surface]:
-    """The field's default level set."""
+    """A scene of one surface: the field's default level set."""
     return [Surface(field)]
 
 
@@ -109,15 +112,16 @@ def _quartic() -> list[Surface]:
 
 
 def _fitted_knot() -> list[Surface]:
-    """A solid around a trefoil knot: a sum of Gaussians along the knot, approximated by a series of
-    16 x 16 x 9 cosines."""
+    """A solid around a trefoil knot. Its field is a sum of Gaussians along the knot, approximated
+    by a series of 16 x 16 x 9 cosines."""
     curve = example_curves.torus_knot(2, 3, 150)
     step = np.linalg.norm(np.roll(curve, -1, axis=0) - curve, axis=1)
+    # The Gaussians' width, and the lengths of the curve's edges as weights of the sum.
     width = 0.15 * float(np.ptp(curve, axis=0).max()) / 2
 
     def density(x: FloatArray) -> FloatArray:
-        """The sum of Gaussians at points x (n, 3): the integral along the curve, divided by its
-        value for a straight line."""
+        """(n,) the sum of Gaussians at points x (n, 3): the integral along the curve, divided by
+        its value for a straight line."""
         sums = [
             np.exp(-((batch[:, None] - curve) ** 2).sum(axis=2) / width**2) @ step
             for batch in np.array_split(x, len(x) // 4000 + 1)
@@ -269,14 +273,14 @@ SOLIDS = (
 
 
 def _surface(function: Any, part: str = "imag", **settings: Any) -> list[Surface]:
-    """The Riemann surface of a function. part: "real" or "imag", the part of the function that is
-    the height. settings: options of `RiemannSurface`."""
+    """The Riemann surface of a function. function: its name, such as "log". part: "real" or "imag",
+    the part of the function that is the height. settings: options of `RiemannSurface`."""
     return [Surface(RiemannSurface(function, part, **settings))]
 
 
 def _elliptic(domain: Volume) -> list[Surface]:
-    """The Riemann surface of sqrt(z^3 - z), a torus without its points at infinity, cut to
-    `domain`."""
+    """The Riemann surface of sqrt(z^3 - z), cut to `domain`: a torus without its points at
+    infinity."""
     return _surface("sqrt", argument={0: 1, 1: 1, -1: 1}, height=0.6, domain=domain)
 
 
@@ -295,7 +299,7 @@ def _field_lines() -> list[Surface]:
 
 
 def _ripples() -> list[Surface]:
-    """The graph of a function of x and y that looks like ripples."""
+    """The graph of a function of x and y that looks like ripples on water."""
     field = HeightField(
         lambda x, y: exp(-(x**2 + y**2) * 1.5) * sin(x * 5 + cos(y * 4)) * 0.6,
         domain=Box((-1.5, -1.5, -1.0), (1.5, 1.5, 1.0)),

@@ -1,4 +1,6 @@
-"""Scenes of damaged meshes and of point clouds."""
+"""Scenes of the gallery: damaged meshes, closed by the level set of their winding number, and point
+clouds, through which a level set passes. Each function here makes the surfaces of a scene.
+"""
 
 from __future__ import annotations
 
@@ -21,10 +23,11 @@ _GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
 def _cut_mesh() -> list[Surface]:
     """A bumpy sphere with 14 round holes, closed by the level set of its winding number."""
     vertices, faces = example_meshes.bumpy_sphere(6)
-    middles = vertices[faces].mean(axis=1)
-    middles /= np.linalg.norm(middles, axis=1, keepdims=True)
-    full = (middles @ _spiral_directions(14).T < math.cos(0.27)).all(axis=1)
-    return [Surface(WindingNumber(vertices, faces[full]))]
+    directions = vertices[faces].mean(axis=1)
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    # Faces within 0.27 radians of one of 14 directions are left out.
+    is_kept = (directions @ _spiral_directions(14).T < math.cos(0.27)).all(axis=1)
+    return [Surface(WindingNumber(vertices, faces[is_kept]))]
 
 
 def _spiral_directions(n: int) -> FloatArray:
@@ -49,26 +52,26 @@ def _soup() -> list[Surface]:
 
 def _cloud() -> list[Surface]:
     """A surface through random points of a quartic with five handles; the normals are the quartic's
-    gradients. Newton's steps move random points onto it."""
+    gradients. Newton's steps move random points onto the quartic."""
     points = np.random.default_rng(2).uniform(-2.5, 2.5, (12000, 3))
     for _ in range(40):
         value, gradient = _tangle(points)
         points = points - 0.7 * (value / (gradient**2).sum(axis=1))[:, None] * gradient
     value, gradient = _tangle(points)
-    converged = (np.abs(value) < 1e-9) & (np.abs(points) < 2.6).all(axis=1)
-    return [Surface(DipolePotential(points[converged], gradient[converged]))]
+    is_on_quartic = (np.abs(value) < 1e-9) & (np.abs(points) < 2.6).all(axis=1)
+    return [Surface(DipolePotential(points[is_on_quartic], gradient[is_on_quartic]))]
 
 
 def _tangle(points: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """f = x^4 - 5 x^2 + y^4 - 5 y^2 + z^4 - 5 z^2 + 11.8 at points (n, 3), shape (n,), and its
-    gradients (n, 3)."""
+    """The function f = x^4 - 5 x^2 + y^4 - 5 y^2 + z^4 - 5 z^2 + 11.8 at points (n, 3): its values
+    (n,) and its gradients (n, 3). Its zero set is a surface with five handles."""
     value = (points**4 - 5.0 * points**2).sum(axis=1) + 11.8
     return value, 4.0 * points**3 - 10.0 * points
 
 
 def _knot_cloud() -> list[Surface]:
-    """A surface through points on a tube around a trefoil, arranged like the seeds of a
-    sunflower."""
+    """A surface through points on a tube around a trefoil knot. The points are arranged like the
+    seeds of a sunflower."""
     n, count = 1200, 8000
     curve = example_curves.torus_knot(2, 3, n)
     tangents = np.roll(curve, -1, axis=0) - np.roll(curve, 1, axis=0)
@@ -76,6 +79,7 @@ def _knot_cloud() -> list[Surface]:
     k = np.arange(count)
     index = k * n // count
     angle = (2 * math.pi * _GOLDEN * k)[:, None]
+    # Two vectors across the knot at each point, and the normal at an angle between them.
     u = np.cross(tangents[index], (0.0, 0.0, 1.0))
     u /= np.linalg.norm(u, axis=1, keepdims=True)
     normals = np.cos(angle) * u + np.sin(angle) * np.cross(tangents[index], u)

@@ -1,4 +1,7 @@
-"""Scenes of extruded outlines: a plate with a name on it, and a bolt with its nut."""
+"""Scenes of the gallery: solids that are extruded from outlines (closed polygons in the plane). One
+is a plate with a name on it, the other a bolt with its nut. Each function here makes the surfaces
+of a scene.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""Scenes of meshes whose faces are large nonplanar polygons, and of grid shells."""
+"""Scenes of the gallery: meshes whose faces are large nonplanar polygons, and grid shells (curved
+roofs of crossing beams). Each function that returns a list of `Surface` makes the surfaces of a
+scene. A "line" is a polyline, an array (k, 3) of points; the "ground" is the plane z = 0. Lines of
+curvature are curves along a direction of largest or smallest curvature.
+"""
 
 from __future__ import annotations
 
@@ -27,6 +31,8 @@ def _exoskeleton() -> list[Surface]:
     """A wavy torus of some 150 nonplanar polygons, and tubes around their edges."""
     vertices, faces = example_meshes.torus_mesh(1.0, 0.45, 240, 108)
     angle = np.arctan2(vertices[:, 1], vertices[:, 0])
+    # The center line of the torus goes up and down three times, and its tube is thicker and
+    # thinner.
     ring = np.column_stack([np.cos(angle), np.sin(angle), 0.25 * np.sin(3 * angle)])
     across = vertices - np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
     wavy = ring + across * (1 + 0.25 * np.cos(3 * angle))[:, None]
@@ -77,15 +83,14 @@ class GridShell:
 
     After Fig. 17 of Gillespie et al. (2024), whose data are not public: outlines and holes are
     reconstructed. The level -2 pi + a leaves the ground at the angle a/2 everywhere. So the outline
-    and the holes are lines of curvature themselves (Joachimsthal), and the lines of the other
-    family meet them at right angles.
+    and the holes are lines of curvature themselves (Joachimsthal), and the lines of curvature of
+    the other family (largest or smallest curvature) meet them at right angles.
 
     outline: (n, 2), counter-clockwise.
     holes: (x, y, radius) of each hole.
     angle: a in radians, twice the angle at which the shell leaves the ground.
-    spacing: the distance of the beams along the outline and the holes.
-    thickness: the radius of the beams.
-    """
+    spacing: the distance of the beams along the outline and the holes, a length.
+    thickness: the radius of the beams, a length."""
 
     outline: FloatArray
     holes: tuple[tuple[float, float, float], ...]
@@ -94,31 +99,32 @@ class GridShell:
     thickness: float
 
     def field(self) -> SolidAngle:
-        """The solid angle of the outline and the holes; the shell is its level set `level`."""
+        """The solid angle of the outline and the holes, a function of space. The shell is its level
+        set at `level`."""
         corners = np.column_stack([self.outline, np.zeros(len(self.outline))])
         return SolidAngle([corners, *(Circle(r, (x, y, 0), (0, 0, -1)) for x, y, r in self.holes)])
 
     @property
     def level(self) -> float:
-        """The level of the solid angle whose level set is the shell."""
+        """The value of the solid angle on the shell, -2 pi + `angle`."""
         return -2 * math.pi + self.angle
 
     def beams(self, field: SolidAngle) -> list[FloatArray]:
-        """The center lines of all beams, each (k, 3): lines of curvature from the outline and the
-        holes across the shell, lines of the other family that cross them, and the outline and the
-        holes themselves.
+        """The center lines of all beams, each (k, 3): "ribs", lines of curvature from the outline
+        and the holes across the shell; lines of the other family, which cross them; and the outline
+        and the holes themselves.
 
-        field: the solid angle.
-        """
+        field: the solid angle."""
         above_ground = HalfSpace((0, 0, -1), 0.0)
         points, inward = self._boundary_points_and_normals()
         slope = 0.5 * self.angle
-        rise = np.column_stack([math.cos(slope) * inward, np.full(len(points), math.sin(slope))])
-        ground = np.column_stack([points, np.zeros(len(points))])
+        upward = np.column_stack([math.cos(slope) * inward, np.full(len(points), math.sin(slope))])
+        boundary_points = np.column_stack([points, np.zeros(len(points))])
 
         def lines(seeds: FloatArray) -> tuple[list[FloatArray], list[FloatArray]]:
-            """The lines of curvature through seeds (n, 3), of both families (largest and smallest
-            curvature): two lists, each with a line for each seed."""
+            """The lines of curvature through the points `seeds` (n, 3). Returns two lists with a
+            line for each seed: the lines along the largest curvature, and the lines along the
+            smallest."""
             step = 0.25 * self.spacing
             maximum_lines, minimum_lines = (
                 curvature_lines(field, seeds, step=step, length=100 * step, family=family,
@@ -128,17 +134,24 @@ class GridShell:
             return maximum_lines, minimum_lines
 
         offset = 0.3 * self.spacing
+        # Of the two lines of curvature through each seed near the boundary, the one that rises from
+        # it; the other runs along it.
         candidates = [
-            max(pair, key=lambda line: _relative_height(line, offset))
-            for pair in zip(*lines(ground + offset * rise), strict=True)
+            max(both_families, key=lambda line: _relative_height(line, offset))
+            for both_families in zip(*lines(boundary_points + offset * upward), strict=True)
         ]
         ribs = _drop_parallel_lines(candidates, 0.55 * self.spacing)
         # Seeds of the other family lie along a subset of these lines.
         spines = ribs[:: max(1, len(ribs) // 6)]
         seeds = np.concatenate([spine[2:-2:2] for spine in spines])
+        # Of the two lines through each seed, the one that crosses the ribs more nearly at a right
+        # angle.
         crossing_lines = [
-            min(pair, key=lambda line: min(_crossing_cosine(line, spine) for spine in spines))
-            for pair in zip(*lines(seeds), strict=True)
+            min(
+                both_families,
+                key=lambda line: min(_crossing_cosine(line, spine) for spine in spines),
+            )
+            for both_families in zip(*lines(seeds), strict=True)
         ]
         return [*ribs, *_drop_parallel_lines(crossing_lines, 0.55 * self.spacing), *self._edges()]
 
@@ -152,13 +165,15 @@ class GridShell:
             count = max(1, round(length / self.spacing))
             fraction = (np.arange(count)[:, None] + 0.5) / count
             points.append(a + fraction * (b - a))
+            # The outline is counter-clockwise, so the region is on the left of its edges.
             inward.append(np.tile(np.array([a[1] - b[1], b[0] - a[0]]) / length, (count, 1)))
         for x, y, r in self.holes:
             count = max(8, round(2 * math.pi * r / self.spacing))
             angle = 2 * math.pi * (np.arange(count) + 0.5) / count
-            out = np.column_stack([np.cos(angle), np.sin(angle)])
-            points.append(np.array([x, y]) + r * out)
-            inward.append(out)
+            # The region is outside of the holes.
+            outward = np.column_stack([np.cos(angle), np.sin(angle)])
+            points.append(np.array([x, y]) + r * outward)
+            inward.append(outward)
         return np.concatenate(points), np.concatenate(inward)
 
     def _edges(self) -> list[FloatArray]:
@@ -178,8 +193,8 @@ def _relative_height(line: FloatArray, reach: float) -> float:
 
 
 def _crossing_cosine(line: FloatArray, other: FloatArray) -> float:
-    """|cos| of the angle between two lines (k, 3) where they come closest; 2 for a line that is too
-    short."""
+    """cos| of the angle between two lines (k, 3) at their points that are nearest to each
+    other; 2 if `line` has fewer than three points."""
     if len(line) < 3:
         return 2.0
     distance = np.linalg.norm(line[:, None] - other[None], axis=2)
@@ -190,8 +205,9 @@ def _crossing_cosine(line: FloatArray, other: FloatArray) -> float:
 
 
 def _drop_parallel_lines(lines: Sequence[FloatArray], gap: float) -> list[FloatArray]:
-    """The lines, longest first, without each line that lies within the distance `gap` of longer
-    lines for most of its length. Of each line every second point is returned."""
+    """The lines (k, 3), longest first, without each line that lies within the distance `gap` of
+    longer lines for more than 60 % of its points. Of each line every second point is returned, and
+    its last."""
     kept: list[FloatArray] = []
     for line in sorted(lines, key=len, reverse=True):
         if len(line) < 3:

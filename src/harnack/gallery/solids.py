@@ -1,4 +1,9 @@
-"""Scenes of blobs and of solids.
+"""Scenes of the gallery: blobs and solids. Each function here makes the surfaces of a scene.
+"Blobs" are fields that are sums of bumps; the scenes are metaballs, a surface through points with
+normals, and a molecule.
+
+Solids are distance surfaces (level sets of distances), Boolean combinations of them, noise, and
+transparent blobs.
 
 Blobs are metaballs, a surface through points with normals, and molecules. Solids are distance
 surfaces (level sets of distances), Boolean combinations of them, noise, and transparent blobs.
@@ -34,7 +39,8 @@ _VAN_DER_WAALS = {"H": 1.2, "C": 1.7, "N": 1.55, "O": 1.52}
 
 
 def _solid(field: Field, level: float) -> list[Surface]:
-    """The solid of the points at which the field is at least `level`."""
+    """The solid of the points at which the field is at least `level`, as the only surface of a
+    scene."""
     return [Surface(field, level, side="above")]
 
 
@@ -134,7 +140,7 @@ BLOBS = (
 
 
 def _drawn(*solids: Solid) -> list[Surface]:
-    """Each solid as a surface."""
+    """Each of the solids as a surface of a scene."""
     return [Surface(solid) for solid in solids]
 
 
@@ -145,8 +151,8 @@ def _carved() -> list[Surface]:
 
 
 def _tori() -> list[Surface]:
-    """Three pairs of linked tori of radii 1 and 0.1, blended by superellipses with (power, radius)
-    = (2, 0.5), (8, 0.5) and (8, 0.2)."""
+    """Three pairs of linked tori of radii 1 and 0.1, blended by superellipses of different power p
+    and blend radius r: (p, r) = (2, 0.5), (8, 0.5) and (8, 0.2)."""
     link = Torus(1.0, 0.1).rotated(90, "x")
     pairs = [Torus(1.0, 0.1).blended(link, r, power=p) for p, r in ((2, 0.5), (8, 0.5), (8, 0.2))]
     return _drawn(*(pair.translated((0.0, 2.4 * k, 0.0)) for k, pair in enumerate(pairs)))

@@ -1,5 +1,8 @@
 """Clip volumes, the convex sets to which rays are cut: ball, box, half-space and their
-intersections, and polytopes in general."""
+intersections, and polytopes in general. A ray is o + t d, with origin o, direction d and ray
+parameter t. A plane n.x = h has the unit normal n, which points out of the volume, and the offset
+h; the volume lies in n.x <= h. Host means NumPy, in double precision; a kernel is a program that
+Dr.Jit compiles for the device, for many rays at once (lanes)."""
 
 from __future__ import annotations
 
@@ -50,16 +53,18 @@ Prepared = TypeVar("Prepared", bound="Polytope")
 
 @dataclass(frozen=True, eq=False)
 class PlaneTable:
-    """Planes n.x <= h (n a unit normal, h an offset) as rows (n, h) of four numbers, for a kernel.
+    """Planes of a polytope for a kernel: a plane n.x <= h (n a unit normal, h an offset) is a row
+    (n, h) of four numbers. The kernel either contains these numbers as literals, or reads them from
+    a buffer on the device.
 
     backend: the backend on which the kernel runs.
-    rows: (m, 4) on the host. Without a buffer, kernels contain these numbers as literals.
-    buffer: the rows on the backend; None for volumes that were not prepared.
+    rows: (m, 4) on the host.
+    buffer: the rows on the backend; None if they are literals.
     plane_count: the number of rows in the buffer as a kernel parameter.
     max_offset: the largest |h|; a kernel parameter if there is a buffer.
 
-    Cost per plane and ray: 0.4 ns if the loop over planes is unrolled, where reading a number from
-    the buffer at a literal index costs no more than a literal; 1.1 ns in a loop with four planes
+    Time per plane and ray: 0.4 ns if the loop over planes is unrolled, where reading a number from
+    the buffer at a literal index takes no longer than a literal; 1.1 ns in a loop with four planes
     per iteration.
     """
 
@@ -71,13 +76,14 @@ class PlaneTable:
 
     @classmethod
     def literal(cls, backend: Backend, rows: FloatArray) -> PlaneTable:
-        """The planes (m, 4) as literals of the kernel."""
+        """A table whose rows (m, 4) are literals of the kernel."""
         return cls(backend, rows, None, None, backend.Float(_max_offset(rows)))
 
     @classmethod
     def upload(cls, backend: Backend, rows: FloatArray) -> PlaneTable:
-        """The planes (m, 4) in a buffer. If there are more than eight, planes without effect fill
-        it up to a multiple of eight, so that volumes with about as many planes share a kernel."""
+        """A table whose rows (m, 4) are in a buffer. If there are more than eight, planes without
+        effect fill it up to a multiple of eight, so that volumes with about as many planes share a
+        kernel."""
         count = len(rows) if len(rows) <= 8 else -(-len(rows) // 8) * 8
         padded = np.concatenate([rows, np.tile(_UNBOUNDED_PLANE, (count - len(rows), 1))])
         plane_count = dr.opaque(backend.UInt32, count)
@@ -107,7 +113,7 @@ class PlaneTable:
             return state
 
         def body(k: Any, *values: Any) -> tuple[Any, ...]:
-            """Apply four planes, from row k on."""
+            """Apply four planes, from row k on. Returns the next row, and the state."""
             folded: Any = values
             for i in range(_PLANES_PER_ITERATION):
                 row: Any = dr.gather(self.backend.Array4f, self.buffer, k + i)
@@ -128,7 +134,7 @@ class PlaneTable:
         return result[1:]
 
     def _entry(self, k: int, i: int) -> Real:
-        """Entry i of row k, as a literal or read from the buffer."""
+        """Entry i of row k: a literal, or read from the buffer."""
         if self.buffer is None:
             return self.backend.Float(float(self.rows[k, i]))
         return dr.gather(self.backend.Float, self.buffer, self.backend.UInt32(4 * k + i))
@@ -138,13 +144,15 @@ RoundingSlacks: TypeAlias = tuple[Real, Real]
 
 
 def _max_offset(rows: FloatArray) -> float:
-    """The largest |h| of the rows (n, h)."""
+    """The largest |h| of the rows (n, h), (m, 4)."""
     return float(np.abs(rows[:, 3]).max(initial=0.0))
 
 
 @dataclass(frozen=True, eq=False)
 class Polytope(Volume):
-    """The intersection of the half-spaces n.x <= h, with unit normals n.
+    """The intersection of half-spaces n.x <= h, each on the inner side of a plane with the unit
+    normal n and the offset h. Subclasses say which planes they have (`planes`); all other methods
+    follow.
 
     Rounding. A point o + t d of a ray lies in a half-space if N - t D >= 0, with N = h - n.o and D
     = n.d. With u the unit roundoff, the computed N and D are off by at most a few u times |n|.|o| +
@@ -158,15 +166,16 @@ class Polytope(Volume):
 
     @abc.abstractmethod
     def planes(self) -> FloatArray:
-        """The planes n.x <= h as rows (nx, ny, nz, h), shape (m, 4), float64, all finite."""
+        """The planes as rows (nx, ny, nz, h), shape (m, 4), float64, all finite."""
 
     def prepare(self: Prepared, backend: Backend) -> Prepared:
+        """An equal polytope whose planes are in a buffer on the backend."""
         return replace(self, _device_planes=PlaneTable.upload(backend, self.planes()))
 
     def _plane_table(self, backend: Backend) -> PlaneTable:
-        """The prepared table of planes if there is one, otherwise a new one. A new table consists
-        of literals if there are few planes, or while a loop is recorded, when nothing can be
-        uploaded."""
+        """The prepared table of planes if there is one for this backend, otherwise a new one. A new
+        table consists of literals if there are few planes, or while a loop is recorded, when
+        nothing can be uploaded."""
         if self._device_planes is not None and self._device_planes.backend == backend:
             return self._device_planes
         rows = self.planes()
@@ -178,7 +187,7 @@ class Polytope(Volume):
     def _slacks(
         self, table: PlaneTable, o: Vec3, d: Vec3
     ) -> Callable[[Vec3, Real], RoundingSlacks]:
-        """A function of the normal n and the offset h of a plane that returns bounds of the
+        """Returns a function of the normal n and the offset h of a plane. It returns bounds of the
         rounding errors of h - n.o and of n.d, for rays o + t d."""
         del table
         eps = clip_rounding(backend_of(o))
@@ -192,19 +201,23 @@ class Polytope(Volume):
         return slacks
 
     def clip(self, o: Vec3, d: Vec3, t_min: Real, t_max: Real) -> tuple[Real, Real]:
+        """The interval [t0, t1] of each ray o + t d within the polytope (see `Volume.clip`). It is
+        cut by one plane after the other."""
         backend = backend_of(o)
         table = self._plane_table(backend)
         slacks = self._slacks(table, o, d)
 
         def step(state: tuple[Real, Real], n: Vec3, h: Real) -> tuple[Real, Real]:
-            """Cut the interval [t0, t1] to the half-space n.x <= h. `room` is h - n.o and `speed`
-            is n.d, with their bounds of rounding errors."""
+            """Cut the interval [t0, t1] to the half-space n.x <= h. In the terms of the class,
+            `room` is N and `speed` is D, both with their bounds of rounding errors."""
             t0, t1 = state
             room_slack, speed_slack = slacks(n, h)
             room = h - dr.dot(n, o) + room_slack
             speed = dr.dot(n, d) - speed_slack
             t = room / speed
             is_leaving = speed > 0
+            # The ray leaves the half-space at t if speed > 0; else it enters at |t|, if it is
+            # outside at first.
             t1 = dr.select(is_leaving, fmin(t, t1), t1)
             t0 = dr.select(is_leaving | (room >= 0), t0, fmax(dr.abs(t), t0))
             return t0, t1
@@ -220,6 +233,7 @@ class Polytope(Volume):
         )
 
     def contains(self, p: Vec3) -> Mask:
+        """Whether points p lie in the polytope, up to rounding."""
         backend = backend_of(p)
         eps = clip_rounding(backend)
         abs_p = dr.abs(p)
@@ -233,13 +247,15 @@ class Polytope(Volume):
         return self._plane_table(backend).fold((all_lanes,), step)[0]
 
     def signed_distance(self, p: Vec3) -> Real:
+        """The largest of the signed distances of p from the planes."""
         return self._nearest_plane(p)[0]
 
     def outward_normal(self, p: Vec3) -> Vec3:
+        """The normal of the plane with the largest signed distance from p."""
         return self._nearest_plane(p)[1]
 
     def _nearest_plane(self, p: Vec3) -> tuple[Real, Vec3]:
-        """The largest of the signed distances of p from the planes (n.p - h), and the normal n of
+        """The largest of the signed distances n.p - h of p from the planes, and the normal n of
         that plane."""
         backend = backend_of(p)
 
@@ -257,6 +273,7 @@ class Polytope(Volume):
         return self._plane_table(backend).fold(start, step)
 
     def contains_points(self, points: npt.ArrayLike) -> BoolArray:
+        """Whether points (n, 3) lie in the polytope, up to rounding: (n,)."""
         x = as_points(points)
         rows = self.planes()
         is_inside = np.ones(len(x), dtype=np.bool_)
@@ -269,13 +286,19 @@ class Polytope(Volume):
 
 @dataclass(frozen=True)
 class Ball(Volume):
-    """The points within `radius` (> 0) of `center`."""
+    """The ball of the points within `radius` of `center`.
+
+    center: (3,).
+    radius: a positive length.
+    """
 
     center: Point = (0.0, 0.0, 0.0)
     radius: float = 1.0
     _device_numbers: Any = field(default=None, repr=False, compare=False)
 
     def __post_init__(self) -> None:
+        """Validate and convert the attributes. Raises ValueError for a center that is not three
+        finite numbers, or a radius that is not positive."""
         if isinstance(self.center, int | float):
             raise ValueError(
                 f"the center of a ball must be three numbers, not {self.center!r}: for one about "
@@ -295,11 +318,12 @@ class Ball(Volume):
         return backend.Array3f(*self.center), backend.Float(self.radius)
 
     def prepare(self, backend: Backend) -> Ball:
+        """An equal ball whose center and radius are kernel parameters."""
         center = backend.Array3f(*(dr.opaque(backend.Float, c) for c in self.center))
         return replace(self, _device_numbers=(center, dr.opaque(backend.Float, self.radius)))
 
     def clip(self, o: Vec3, d: Vec3, t_min: Real, t_max: Real) -> tuple[Real, Real]:
-        """The interval [t0, t1] of the rays o + t d within the ball (see `Volume.clip`).
+        """The interval [t0, t1] of each ray o + t d within the ball (see `Volume.clip`).
 
         The line's half-length in the ball follows from r^2 - |perp|^2, where r is the radius, c the
         center, and perp the vector from c to the nearest point of the line. The usual formula
@@ -316,6 +340,7 @@ class Ball(Volume):
         line_distance = dr.norm(dr.fma(d, t_nearest, from_center))
         slack = clip_rounding(backend) * (dr.norm(from_center) + dr.norm(center) + radius)
         radius_bound = radius + slack
+        # r^2 - |perp|^2 as a product, which loses no digits.
         half_length = dr.sqrt(
             fmax((radius_bound - line_distance) * (radius_bound + line_distance), 0.0)
         )
@@ -325,6 +350,7 @@ class Ball(Volume):
         return normalize_empty_interval(t0, dr.select(line_distance <= radius_bound, t1, -dr.inf))
 
     def contains(self, p: Vec3) -> Mask:
+        """Whether points p lie in the ball, up to rounding."""
         backend = backend_of(p)
         c, r = self._center_and_radius(backend)
         distance = dr.norm(p - c)
@@ -335,6 +361,7 @@ class Ball(Volume):
         return dr.norm(p - c) - r
 
     def outward_normal(self, p: Vec3) -> Vec3:
+        """The unit vector from the center to p; the z axis at the center."""
         backend = backend_of(p)
         from_center = p - self._center_and_radius(backend)[0]
         length = dr.norm(from_center)
@@ -356,13 +383,17 @@ class Ball(Volume):
 
 @dataclass(frozen=True)
 class Box(Polytope):
-    """The points x with lower <= x <= upper in each coordinate. Coordinates of the corners may be
-    infinite."""
+    """The points x with lower <= x <= upper in each coordinate.
+
+    lower, upper: (3,) the corners; coordinates may be infinite.
+    """
 
     lower: Point
     upper: Point
 
     def __post_init__(self) -> None:
+        """Validate and convert the corners. Raises ValueError unless lower <= upper in each
+        coordinate."""
         lower = as_point(self.lower, "the lower corner of a box", finite=False)
         upper = as_point(self.upper, "the upper corner of a box", finite=False)
         if any(a > b or a == np.inf or b == -np.inf for a, b in zip(lower, upper, strict=True)):
@@ -390,9 +421,10 @@ class Box(Polytope):
 
 @dataclass(frozen=True)
 class HalfSpace(Polytope):
-    """The points x with n.x <= offset, where n is the unit vector along `normal`; n points out of
-    the half-space.
+    """The half-space of the points x with n.x <= offset, where n is the unit vector along `normal`;
+    n points out of the half-space.
 
+    normal: (3,), not zero; it is scaled to length one.
     offset: the distance of the plane from the origin, negative if the origin is outside of the
         half-space.
     """
@@ -401,6 +433,8 @@ class HalfSpace(Polytope):
     offset: float
 
     def __post_init__(self) -> None:
+        """Validate the attributes, and scale the normal to length one. Raises ValueError for a
+        normal of length zero, or numbers that are not finite."""
         normal = np.array(as_point(self.normal, "the normal of a half-space"))
         largest = float(np.abs(normal).max())
         if largest == 0.0:
@@ -417,6 +451,8 @@ class HalfSpace(Polytope):
         return np.array([[*self.normal, self.offset]])
 
     def bounds(self) -> tuple[FloatArray, FloatArray]:
+        """Lower and upper corner (3,) of a box around the half-space: infinite, but for a plane at
+        right angles to an axis."""
         lower, upper = np.full(3, -np.inf), np.full(3, np.inf)
         for k, n in enumerate(self.normal):
             if n and not any(
@@ -431,11 +467,16 @@ class HalfSpace(Polytope):
 
 @dataclass(frozen=True)
 class VolumeIntersection(Volume):
-    """The intersection of one or more volumes."""
+    """The intersection of one or more volumes, whose methods combine the results of these volumes.
+
+    volumes: the volumes; any iterable is accepted.
+    """
 
     volumes: tuple[Volume, ...]
 
     def __init__(self, volumes: Iterable[Volume]) -> None:
+        """Validate and store the volumes. Raises TypeError for anything else, and ValueError if
+        there is none."""
         if not isinstance(cast("Any", volumes), Iterable):
             raise TypeError(f"an intersection is of several volumes, not of {volumes!r:.60}")
         members = tuple(volumes)
@@ -449,6 +490,7 @@ class VolumeIntersection(Volume):
         return VolumeIntersection(v.prepare(backend) for v in self.volumes)
 
     def clip(self, o: Vec3, d: Vec3, t_min: Real, t_max: Real) -> tuple[Real, Real]:
+        """The interval [t0, t1] of each ray o + t d within all volumes (see `Volume.clip`)."""
         t0, t1 = t_min, t_max
         for volume in self.volumes:
             t0, t1 = volume.clip(o, d, t0, t1)
@@ -461,12 +503,14 @@ class VolumeIntersection(Volume):
         return is_inside
 
     def signed_distance(self, p: Vec3) -> Real:
+        """The largest of the signed distances of p from the volumes."""
         distance = self.volumes[0].signed_distance(p)
         for volume in self.volumes[1:]:
             distance = fmax(volume.signed_distance(p), distance)
         return distance
 
     def outward_normal(self, p: Vec3) -> Vec3:
+        """The normal at p of the volume with the largest signed distance."""
         distance, normal = self.volumes[0].signed_distance(p), self.volumes[0].outward_normal(p)
         for volume in self.volumes[1:]:
             other_distance = volume.signed_distance(p)

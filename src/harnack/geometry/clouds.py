@@ -1,10 +1,9 @@
 """Point clouds with normals: validation, the area of the surface that each point represents, and
-estimated normals.
-
-A cloud is a sample of a surface: points (n, 3), unit normals (n, 3) that point to the positive
-(outer) side, and areas (n,) whose sum is about the area of the surface. Points at the same position
-are allowed; sums over the points count each of them.
-"""
+estimated normals. A cloud is a sample of a surface: points (n, 3), unit normals (n, 3) that point
+to the positive (outer) side, and areas (n,) whose sum is about the area of the surface. A neighbor
+of a point is one of the points nearest to it. The plane of a point is the plane that best fits its
+neighbors, an estimate of the surface's tangent plane. Points at the same position are allowed; sums
+over the points count each of them."""
 
 from __future__ import annotations
 
@@ -37,7 +36,8 @@ __all__ = ["CloudError", "estimate_areas", "estimate_normals", "validate_cloud"]
 MAX_POINTS = 100_000_000
 # Points per step: the temporary arrays of one step then stay in the cache of one core.
 _CHUNK = 4096
-# The largest ratio of a cell's radius to the median radius of its neighbors' cells.
+# The radius at which a point's Voronoi cell is cut off is at most this multiple of the median of
+# its neighbors' radii.
 _MAX_RADIUS_RATIO = 3.0
 # Number of points whose cells are computed at once.
 _POINTS_PER_BATCH = 1 << 18
@@ -52,12 +52,12 @@ def validate_cloud(
     points: npt.ArrayLike, normals: npt.ArrayLike | None, areas: npt.ArrayLike
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Validate a cloud. Returns points (n, 3), unit normals (n, 3) and areas (n,): float64 copies
-    that cannot be written to.
+    that cannot be written to. `estimate_areas` and `estimate_normals` compute missing areas and
+    normals.
 
-    normals: of any length but zero.
-    areas: positive, in the square of the points' unit; a single number stands for all.
-
-    `estimate_areas` and `estimate_normals` compute missing areas and normals.
+    points: (n, 3).
+    normals: (n, 3), of any length but zero.
+    areas: (n,), positive, in the square of the points' unit; a single number stands for all.
 
     Raises:
         CloudError: not numbers of these shapes, or no points; a value that is not finite; a normal
@@ -83,7 +83,7 @@ def validate_cloud(
 
 
 def as_cloud_points(points: Any) -> FloatArray:
-    """Points as a new float64 array (n, 3) of finite numbers, n >= 1.
+    """Convert points to a new float64 array (n, 3) of finite numbers, n >= 1.
 
     Raises:
         CloudError: points are not numbers of that shape, or have coordinates above 1e100.
@@ -98,7 +98,7 @@ def as_cloud_points(points: Any) -> FloatArray:
 
 
 def as_unit_normals(normals: Any, count: int) -> FloatArray:
-    """Normals as a new array (count, 3), scaled to unit length.
+    """Convert normals to a new array (count, 3), scaled to unit length.
 
     Raises:
         CloudError: normals are missing or not of that shape, or a normal is zero or not finite.
@@ -158,9 +158,11 @@ def estimate_areas(
     n = as_unit_normals(normals, len(x))
     check_neighbors(neighbors)
     welded = weld_vertices(x)
+    # The distinct positions, and for each point the index of its position.
     positions, position_of = np.unique(welded, return_inverse=True)
     sharing_count = np.bincount(position_of)[position_of]
     tree = build_point_tree(x[positions])
+    # The place of each position in the order of the tree.
     rank = np.empty(len(positions), np.int64)
     rank[tree.indices] = np.arange(len(positions))
     # In the order of the tree neighbors follow each other, which halves the time.
@@ -179,6 +181,7 @@ def estimate_areas(
     areas = np.empty(len(x))
     cells = TangentVoronoi.of(tree.data)
     for start in range(0, len(x), _POINTS_PER_BATCH):
+        # The cut-off radius of each cell: half of R, but at most three times the neighbors' median.
         batch = order[start : start + _POINTS_PER_BATCH]
         max_radius = _MAX_RADIUS_RATIO * np.median(radii[nearest[batch]], axis=1)
         cell_radii = np.minimum(radii[position_of[batch]], max_radius)
@@ -187,8 +190,13 @@ def estimate_areas(
 
 
 def _as_numbers(values: Any, name: str) -> FloatArray:
-    """The values as a new float64 array. name: what they are, for messages. Raises `CloudError` if
-    they are not real numbers, or too many."""
+    """Convert values to a new float64 array.
+
+    name: what they are, for messages.
+
+    Raises:
+        CloudError: they are not real numbers, or too many.
+    """
     ragged = "are ragged: every row needs as many numbers"
     array = as_real_array(values, name, CloudError, ragged=ragged, other="must be real numbers")
     if array.size > 3 * MAX_POINTS:
@@ -197,17 +205,14 @@ def _as_numbers(values: Any, name: str) -> FloatArray:
 
 
 def check_neighbors(neighbors: int) -> None:
-    """Check that the number of neighbors is large enough to fit a plane.
-
-    Raises:
-        CloudError: it is less than 3.
-    """
+    """Raise CloudError if the number of neighbors is less than 3: too few to fit a plane."""
     if neighbors < 3:
         raise CloudError(f"at least 3 neighbors are needed, not {neighbors}")
 
 
 def build_point_tree(points: FloatArray) -> Any:
-    """A search tree (SciPy's cKDTree) of points (n, 3), all different, for `nearest_neighbors`.
+    """Build a search tree (SciPy's cKDTree) of points (n, 3), all different, for
+    `nearest_neighbors`.
 
     Raises:
         CloudError: there is only a single point.
@@ -221,15 +226,12 @@ def build_point_tree(points: FloatArray) -> Any:
 
 
 def nearest_neighbors(tree: Any, points: FloatArray, count: int) -> tuple[IntArray, FloatArray]:
-    """For each of m points of a tree, its k nearest neighbors among the points of the tree: their
-    indices (m, k) and distances (m, k), nearest first.
+    """Find the k nearest other points of a tree for each of m of its points. Returns their indices
+    (m, k) and distances (m, k), nearest first.
 
     tree: a search tree (`build_point_tree`) of points that are all different.
     points: (m, 3), all of which must be points of the tree.
     count: the number of neighbors, k; k is less if the tree has fewer other points.
-
-    As all points are different, the nearest one that the tree finds is the point itself. It is left
-    out.
 
     Raises:
         CloudError: a point and all its neighbors lie within 1e-100.
@@ -237,11 +239,13 @@ def nearest_neighbors(tree: Any, points: FloatArray, count: int) -> tuple[IntArr
     distance, index = tree.query(points, k=min(count + 1, tree.n))
     if distance[:, -1].min() < 1e-100:
         raise CloudError(f"a point and its {count} neighbors all lie within 1e-100: remove some")
+    # All points of the tree are different, so the nearest one found is the point itself.
     return index[:, 1:], distance[:, 1:]
 
 
 def parallel_over_slices(work: Callable[[slice], None], count: int) -> None:
-    """Call `work` for slices that make up range(count), on all cores."""
+    """Call `work` for slices that make up range(count), on all cores. An error in a call is raised
+    here."""
     slices = [slice(k, min(k + _CHUNK, count)) for k in range(0, count, _CHUNK)]
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         for _ in pool.map(work, slices):
@@ -254,12 +258,13 @@ Indices = npt.NDArray[np.int64] | npt.NDArray[np.int32]
 
 # A neighborhood lies on a line if its second variance over its first is below this.
 _COLLINEAR_RATIO = 1e-9
-# Choice of the number of neighbors if none is prescribed. Flatness is the median, over at most
-# _PROBES points, of the ratio of the smallest to the middle standard deviation of a neighborhood.
-# The first of _NEIGHBOR_COUNTS whose flatness is below _MAX_FLATNESS is taken. If there is none,
-# the largest count is tried among random halves, quarters, ... of the points, until they are fewer
-# than _MIN_SUBSET. If none qualifies, the flattest choice is taken; a choice counts as flatter than
-# the best before it if it improves its flatness by the factor _FLATNESS_GAIN.
+# The choice of the number of neighbors if none is given. The flatness is a ratio of two standard
+# deviations of the positions of a point's neighbors: the smallest, along the normal, over the
+# middle one; its median over at most _PROBES points counts. The first of _NEIGHBOR_COUNTS whose
+# flatness is below _MAX_FLATNESS is taken. If there is none, the largest count is tried among
+# random halves, quarters, ... of the points, until they are fewer than _MIN_SUBSET. If none
+# qualifies, the choice of smallest flatness is taken; a choice replaces the best one before it if
+# its flatness is below _FLATNESS_GAIN times that of the best.
 _NEIGHBOR_COUNTS, _MAX_FLATNESS, _PROBES, _MIN_SUBSET, _FLATNESS_GAIN = (
     (16, 32, 64),
     0.45,
@@ -292,17 +297,19 @@ def estimate_normals(points: npt.ArrayLike, neighbors: int | None = None) -> Flo
 
     As each component faces outward by itself, the inner wall of a hollow body does not face its
     cavity. The side that an open surface faces is a convention; for a flat surface it is the
-    positive side of the axis nearest to its normal. If details are smaller than neighborhoods,
-    normals may have the wrong sign: look at the result. Points at the same position get the same
-    normal.
+    positive side of the axis nearest to its normal. If details are smaller than the distance of the
+    neighbors, normals may have the wrong sign: look at the result. Points at the same position get
+    the same normal.
 
     Raises:
         CloudError: points are no finite numbers (n, 3) or have coordinates above 1e100; fewer than
-            4 positions; neighborhoods on a line, which have no plane; fewer than 3 neighbors.
+            4 positions; neighbors of a point that lie on a line and have no plane; fewer than 3
+            neighbors.
     """
     x = as_cloud_points(points)
     if neighbors is not None:
         check_neighbors(neighbors)
+    # The distinct positions, and for each point the index of its position.
     positions, position_of = np.unique(weld_vertices(x), return_inverse=True)
     x = x[positions]
     if len(x) < 4:
@@ -316,36 +323,40 @@ def estimate_normals(points: npt.ArrayLike, neighbors: int | None = None) -> Flo
     sign = _propagate_signs(planes, parent)
     normals = planes.normals * sign[:, None]
     normals *= _outward_signs(x[subset], normals, piece)[piece, None]
+    # Planes were fitted to a subset only; the other points get their normals from it.
     if len(subset) < len(x):
         normals = _transfer_normals(x, tree, normals, neighbors)
     return normals[position_of]
 
 
 def _choose_neighborhood(x: FloatArray) -> tuple[int, IntArray]:
-    """Choose how tangent planes are fitted to the points x (n, 3), by their noise. Returns the
-    number of neighbors, and the indices (k,) of the points among which neighbors are searched."""
+    """Choose how planes are fitted to the points x (n, 3), by their noise. Returns the number of
+    neighbors, and the indices (k,) of the points among which neighbors are searched: all points, or
+    a random subset if the noise is large."""
     rng = np.random.default_rng(0)
     probes = x[rng.choice(len(x), min(len(x), _PROBES), replace=False)]
     subset = np.arange(len(x))
-    min_flatness, choice = np.inf, (_NEIGHBOR_COUNTS[0], subset)
-    counts = _NEIGHBOR_COUNTS
+    best_flatness, best_choice = np.inf, (_NEIGHBOR_COUNTS[0], subset)
+    counts_to_try = _NEIGHBOR_COUNTS
     while True:
         tree = build_point_tree(x[subset])
-        for count in counts:
+        for count in counts_to_try:
             neighbors_of, _ = nearest_neighbors(tree, probes, count)
             offsets = tree.data[neighbors_of]
             offsets = offsets - offsets.mean(axis=1, keepdims=True)
+            # In increasing order: along the normal, then in the tangent plane.
             variances = np.linalg.eigvalsh(np.einsum("mki,mkj->mij", offsets, offsets))
             flatness = np.median(
                 np.sqrt(np.abs(variances[:, 0]) / np.maximum(variances[:, 1], 1e-300))
             )
-            if flatness < _FLATNESS_GAIN * min_flatness:
-                min_flatness, choice = float(flatness), (count, subset)
-            if min_flatness < _MAX_FLATNESS:
-                return choice
+            if flatness < _FLATNESS_GAIN * best_flatness:
+                best_flatness, best_choice = float(flatness), (count, subset)
+            if best_flatness < _MAX_FLATNESS:
+                return best_choice
         if len(subset) < _MIN_SUBSET:
-            return choice
-        subset, counts = (
+            return best_choice
+        # Too noisy: try half of the points, with the largest number of neighbors.
+        subset, counts_to_try = (
             np.sort(rng.choice(subset, len(subset) // 2, replace=False)),
             _NEIGHBOR_COUNTS[-1:],
         )
@@ -354,14 +365,14 @@ def _choose_neighborhood(x: FloatArray) -> tuple[int, IntArray]:
 def _transfer_normals(
     x: FloatArray, tree: Any, known_normals: FloatArray, neighbors: int
 ) -> FloatArray:
-    """Unit normals (n, 3) of the points x (n, 3), from k points with known normals.
+    """Compute unit normals (n, 3) of the points x (n, 3) from the known normals of k of them. For
+    each point, a plane is fitted to the nearest points with known normals; the point's normal is
+    the normal of this plane. Of its two signs, the one is taken for which the inner products with
+    the known normals of the nearest eight of these points have a sum >= 0.
 
-    A plane is fitted to the known points nearest to each point of x. The normal of x is the normal
-    of this plane, with the sign for which the inner products with the known normals of the nearest
-    of these points have a sum >= 0.
-
-    tree: the search tree of the k points with known normals, a subset of x.
-    known_normals: (k, 3) the unit normals of the points of the tree.
+    x: (n, 3) all points.
+    tree: the search tree of the k points with known normals.
+    known_normals: (k, 3) their unit normals.
     neighbors: the number of known points to which a plane is fitted.
     """
     normals = np.empty_like(x)
@@ -370,10 +381,13 @@ def _transfer_normals(
         """Compute the normals of a slice of the points."""
         _, index = tree.query(x[rows], k=min(neighbors, tree.n))
         offsets = tree.data[index] - tree.data[index].mean(axis=1, keepdims=True)
-        _, axes = np.linalg.eigh(np.einsum("mki,mkj->mij", offsets, offsets))
-        axis = axes[:, :, 0]
-        projections = np.einsum("mki,mi->mk", known_normals[index[:, :_VOTING_NEIGHBORS]], axis)
-        normals[rows] = axis * np.where(projections.sum(axis=1) < 0, -1.0, 1.0)[:, None]
+        _, eigenvectors = np.linalg.eigh(np.einsum("mki,mkj->mij", offsets, offsets))
+        # The direction of the smallest variance.
+        plane_normals = eigenvectors[:, :, 0]
+        projections = np.einsum(
+            "mki,mi->mk", known_normals[index[:, :_VOTING_NEIGHBORS]], plane_normals
+        )
+        normals[rows] = plane_normals * np.where(projections.sum(axis=1) < 0, -1.0, 1.0)[:, None]
 
     parallel_over_slices(fit_slice, len(x))
     return normals
@@ -381,10 +395,10 @@ def _transfer_normals(
 
 @dataclass(frozen=True)
 class _TangentPlanes:
-    """Tangent planes of a cloud.
+    """For each point of a cloud the plane that best fits it and its neighbors.
 
-    points: (n, 3) the points, moved onto the planes that fit their neighbors.
-    normals: (n, 3) unit normals of these planes, of either sign.
+    points: (n, 3) the points, each moved onto its plane.
+    normals: (n, 3) unit normals of the planes, of either sign.
     neighbors: (n, k) the indices of the neighbors.
     """
 
@@ -396,7 +410,9 @@ class _TangentPlanes:
 def _fit_tangent_planes(x: FloatArray, tree: Any, neighbors: int) -> _TangentPlanes:
     """Fit a plane to each point of a cloud and its nearest neighbors.
 
-    tree: the tree of the points x.
+    x: (n, 3) the points.
+    tree: the search tree of these points.
+    neighbors: the number of neighbors.
 
     Raises:
         CloudError: the neighbors of a point lie on a line.
@@ -411,13 +427,15 @@ def _fit_tangent_planes(x: FloatArray, tree: Any, neighbors: int) -> _TangentPla
         index, distance = nearest_neighbors(tree, x[rows], neighbors)
         nearest[rows] = index
         offsets = (x[index] - x[rows, None]) / distance[:, -1, None, None]
+        # The point itself, with the offset 0, counts as well.
         offsets = np.concatenate([offsets, np.zeros_like(offsets[:, :1])], axis=1)
         center = offsets.mean(axis=1, keepdims=True)
         offsets -= center
-        variances, axes = np.linalg.eigh(np.einsum("mki,mkj->mij", offsets, offsets))
-        normals[rows] = axes[:, :, 0]
-        height = np.einsum("mi,mi->m", center[:, 0], axes[:, :, 0]) * distance[:, -1]
-        points[rows] = x[rows] + height[:, None] * axes[:, :, 0]
+        variances, eigenvectors = np.linalg.eigh(np.einsum("mki,mkj->mij", offsets, offsets))
+        normals[rows] = eigenvectors[:, :, 0]
+        # The plane passes through the center; its height above the point, along the normal.
+        height = np.einsum("mi,mi->m", center[:, 0], eigenvectors[:, :, 0]) * distance[:, -1]
+        points[rows] = x[rows] + height[:, None] * eigenvectors[:, :, 0]
         on_line[rows] = variances[:, 1] <= _COLLINEAR_RATIO * variances[:, 2]
 
     parallel_over_slices(fit_slice, len(x))
@@ -432,24 +450,28 @@ def _fit_tangent_planes(x: FloatArray, tree: Any, neighbors: int) -> _TangentPla
 
 
 def _agreement(planes: _TangentPlanes, i: Indices, j: Indices) -> FloatArray:
-    """How well the normals of points i[k] and j[k] agree, for each k: the inner product (m,) of
-    normal i with normal j mirrored in the plane that bisects the two points.
+    """How well the normals of points i[k] and j[k] agree, for each of m pairs: the inner product
+    (m,) of normal i with the mirror image of normal j in the plane that bisects the two points. On
+    a circle, across an edge between two planes and across a thin wall it is 1 if both normals face
+    outward (Xie et al. 2003).
 
-    i, j: indices (m,) of points. On a circle, across an edge between two planes and across a thin
-        wall the result is 1 if both normals face outward (Xie et al. 2003).
+    i, j: (m,) indices of points.
     """
     x, normals = planes.points, planes.normals
     edge = x[j] - x[i]
     length = np.linalg.norm(edge, axis=1, keepdims=True)
+    # Points at the same position have no such plane; nothing is mirrored then.
     edge /= np.where(length > 0.0, length, 1.0)
     a, b = normals[i], normals[j]
     product_along_edge = np.einsum("ij,ij->i", edge, a) * np.einsum("ij,ij->i", edge, b)
+    # Mirroring b in the plane at right angles to e gives b - 2 (b.e) e.
     return np.einsum("ij,ij->i", a, b) - 2.0 * product_along_edge
 
 
 def _spanning_forest(planes: _TangentPlanes) -> tuple[IntArray, IntArray]:
-    """The spanning forest of the graph of neighbors in which normals agree best: a tree in each
-    connected component, with the smallest sum of weights 1 - |agreement| of its edges.
+    """Find the spanning forest of the graph of neighbors in which normals agree best: a tree in
+    each connected component, with the smallest sum of weights 1 - |agreement| of its edges
+    (`_agreement`).
 
     Returns, for each point, its connected component (n,), counted from 0, and its parent (n,) in
     the forest; a root is its own parent.
@@ -462,13 +484,15 @@ def _spanning_forest(planes: _TangentPlanes) -> tuple[IntArray, IntArray]:
     weight = np.empty((n, k))
 
     def weigh_edges(rows: slice) -> None:
-        """Weights of the edges from a slice of the points: small where normals agree."""
+        """Compute the weights of the edges from a slice of the points: small where normals
+        agree."""
         start = np.repeat(np.arange(rows.start, rows.stop, dtype=np.int64), k)
         agreement = np.abs(_agreement(planes, start, nearest[rows].ravel()))
         # SciPy takes a weight of 0 for a missing edge.
         weight[rows] = np.maximum(1.0 - agreement, 0.0).reshape(-1, k) + 1e-9
 
     parallel_over_slices(weigh_edges, n)
+    # The matrix of the graph in compressed rows: k entries for each point.
     row_starts = np.arange(0, n * k + 1, k, dtype=np.int64)
     graph = sparse.csr_array((weight.ravel(), nearest.ravel(), row_starts), shape=(n, n))
     forest = sparse.csgraph.minimum_spanning_tree(graph).tocoo()
@@ -485,11 +509,11 @@ def _spanning_forest(planes: _TangentPlanes) -> tuple[IntArray, IntArray]:
 
 
 def _propagate_signs(planes: _TangentPlanes, parent: IntArray) -> FloatArray:
-    """The sign (n,) for each normal such that neighbors in the forest agree, on the path from each
-    point to the root of its tree.
+    """Find the sign (n,) for each normal such that neighbors in the forest agree. It is the product
+    of the signs on the path from the point to the root of its tree.
 
-    planes: the planes with their normals. parent: (n,) the parent of each point in the forest; a
-        root is its own parent.
+    planes: the planes with their normals.
+    parent: (n,) the parent of each point in the forest; a root is its own parent.
 
     The signs are multiplied along the paths by pointer doubling: after step i, `parent` is the
     ancestor 2^i generations up, or the root.
@@ -505,20 +529,22 @@ def _propagate_signs(planes: _TangentPlanes, parent: IntArray) -> FloatArray:
 
 
 def _outward_signs(x: FloatArray, normals: FloatArray, component: IntArray) -> FloatArray:
-    """The sign (p,) for each connected component of the cloud such that the normals of its extreme
-    points in 26 directions, on the whole, face outward. For a flat component, whose extreme points
-    do not decide, it is the sign for which the normals point to the positive side of the axis
-    nearest to them.
+    """Find the sign (p,) for each connected component of a cloud such that the normals of its
+    extreme points in 26 directions, on the whole, face outward. For a flat component, whose extreme
+    points do not decide, it is the sign for which the normals point to the positive side of the
+    axis nearest to them.
 
-    x, normals: (n, 3) points and normals that agree within each component.
+    x, normals: (n, 3) points, and normals that agree within each component.
     component: (n,) the component of each point.
     """
+    # Sorted by component, so that each component is a range of rows.
     order = np.argsort(component, kind="stable")
     x, normals, component = x[order], normals[order], component[order]
     starts = np.flatnonzero(np.append(True, component[1:] != component[:-1]))
     outwardness = np.zeros(len(starts))
     for direction in _DIRECTIONS / np.linalg.norm(_DIRECTIONS, axis=1, keepdims=True):
         height = x @ direction
+        # The farthest point of each component in this direction (the first of several).
         highest = np.flatnonzero(height == np.maximum.reduceat(height, starts)[component])
         _, first = np.unique(component[highest], return_index=True)
         outwardness += normals[highest[first]] @ direction

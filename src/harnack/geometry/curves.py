@@ -1,9 +1,7 @@
-"""Closed curves in space, polygonal loops and circles: validation and simple measures.
-
-A loop is an array (n, 3) of vertices; its last vertex is joined to its first. A curve is a tuple of
-loops, which may be knotted, linked, nested or cross each other. A circle is a closed curve, too,
-given by its center, radius and normal.
-"""
+"""Closed curves in space, polygonal loops and circles: validation and simple measures. A loop is an
+array (n, 3) of vertices; its last vertex is joined to its first. A curve is a tuple of loops, which
+may be knotted, linked, nested or cross each other. A circle is a closed curve, too, given by its
+center, radius and normal."""
 
 from __future__ import annotations
 
@@ -54,7 +52,8 @@ _MIN_RADIUS = 1 / MAX_COORDINATE
 
 @dataclass(frozen=True)
 class Circle:
-    """A circle, run counter-clockwise as seen from the side that its normal points to.
+    """A circle as a closed curve, run counter-clockwise as seen from the side that its normal
+    points to.
 
     radius: a positive length.
     center: (3,).
@@ -70,6 +69,7 @@ class Circle:
     normal: tuple[float, float, float] = (0.0, 0.0, 1.0)
 
     def __post_init__(self) -> None:
+        """Validate and convert the attributes, and scale the normal to length one."""
         radius = _numbers(self.radius, "radius", ())
         if not _MIN_RADIUS <= radius <= MAX_COORDINATE:
             raise ValueError(
@@ -85,7 +85,9 @@ class Circle:
         largest = float(np.abs(normal).max())
         if largest == 0.0:
             raise ValueError("normal of a circle is zero: give the direction of its axis")
-        if abs(float(normal @ normal) - 1) > 1e-15:  # else it has unit length, to rounding
+        # A normal of unit length, to rounding, is kept as it is.
+        if abs(float(normal @ normal) - 1) > 1e-15:
+            # Divided by the largest component first, so that squares neither overflow nor vanish.
             normal = normal / largest
             normal = normal / np.linalg.norm(normal)
         object.__setattr__(self, "radius", float(radius))
@@ -104,17 +106,26 @@ class Circle:
         return Circle(self.radius, self.center, (-x, -y, -z))
 
     def bounds(self) -> tuple[FloatArray, FloatArray]:
-        """Lower and upper corner, (3,) each, of the box around the circle."""
+        """Lower and upper corner (3,) of the box around the circle."""
+        # The circle's extent along an axis is r times the sine of the angle between axis and
+        # normal.
         half_size = self.radius * np.sqrt(np.maximum(1 - np.square(self.normal), 0))
         return np.array(self.center) - half_size, np.array(self.center) + half_size
 
     def polygon(self, sides: int, *, circumscribed: bool = False) -> FloatArray:
-        """The corners (sides, 3) of a regular polygon with this many sides that is inscribed in the
-        circle or, if `circumscribed`, drawn about it."""
+        """The corners (sides, 3) of a regular polygon that is inscribed in the circle or, if
+        `circumscribed`, drawn about it.
+
+        sides: the number of sides, at least 3.
+
+        Raises:
+            ValueError: there are fewer sides.
+        """
         if sides < 3:
             raise ValueError(f"a polygon needs at least three sides, not {sides}")
         radius = self.radius / math.cos(math.pi / sides) if circumscribed else self.radius
         axis = np.array(self.normal)
+        # Two axes at right angles to the normal and to each other.
         first_axis = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
         first_axis /= np.linalg.norm(first_axis)
         angle = 2 * math.pi * np.arange(sides)[:, None] / sides
@@ -123,7 +134,7 @@ class Circle:
 
 
 def _numbers(values: Any, name: str, shape: tuple[int, ...]) -> FloatArray:
-    """The value of a circle's attribute `name` as a float64 array of this shape.
+    """Convert the value of a circle's attribute `name` to a float64 array of this shape.
 
     Raises:
         ValueError: another shape, or a number that is not finite.
@@ -139,10 +150,9 @@ def _numbers(values: Any, name: str, shape: tuple[int, ...]) -> FloatArray:
 
 
 def cancel_opposite_circles(circles: Iterable[Circle]) -> tuple[Circle, ...]:
-    """The circles without pairs of opposite circles, whose contributions to a solid angle cancel.
-
-    Only circles with exactly the same center and radius and exactly opposite normals cancel.
-    """
+    """Remove pairs of opposite circles, whose contributions to a solid angle cancel; returns the
+    other circles. Only circles with exactly the same center and radius and exactly opposite normals
+    cancel."""
     surplus: Counter[Circle] = Counter()
     for circle in circles:
         reverse = circle.reversed()
@@ -162,7 +172,7 @@ LoopsLike: TypeAlias = npt.ArrayLike | Sequence[npt.ArrayLike]
 
 
 class CurveError(ValueError):
-    """A curve that cannot be used; the message says why and what to do."""
+    """A curve cannot be used; the message says why and what to do."""
 
 
 class CurveShapeError(CurveError):
@@ -170,19 +180,19 @@ class CurveShapeError(CurveError):
 
 
 class NonFiniteVertexError(CurveError):
-    """A vertex with a NaN or infinite coordinate."""
+    """A vertex has a coordinate that is NaN or infinite."""
 
 
 class TooFewVerticesError(CurveError):
-    """Fewer than three different vertices."""
+    """A curve has fewer than three different vertices."""
 
 
 class TooManyVerticesError(CurveError):
-    """More than MAX_VERTICES vertices."""
+    """A curve has more than MAX_VERTICES vertices."""
 
 
 class RepeatedVertexError(CurveError):
-    """Two equal vertices in a row."""
+    """Two consecutive vertices of a curve are equal."""
 
 
 class CurveScaleError(CurveError):
@@ -190,11 +200,11 @@ class CurveScaleError(CurveError):
 
 
 def validate_loops(loops: LoopsLike, *, closed: bool = True) -> Loops:
-    """Validate an array-like (n, 3), or a list of them. Returns a tuple of new float64 arrays.
+    """Validate loops. Returns a tuple of new float64 arrays (n, 3). A loop closes by itself. If its
+    last vertex repeats its first, the last is dropped; any other vertex equal to the one before it
+    is an error. Edges that fold back on themselves are allowed.
 
-    A loop closes by itself. If its last vertex repeats its first, the last is dropped; any other
-    vertex equal to the one before it is an error. Edges that fold back on themselves are allowed.
-
+    loops: an array (n, 3) of vertices, or a list of such arrays.
     closed: False for curves that end at their first and last vertex, which then may be equal.
 
     Raises:
@@ -215,8 +225,10 @@ def validate_loops(loops: LoopsLike, *, closed: bool = True) -> Loops:
 
 
 def validate_curves(curves: Any) -> tuple[Loops, tuple[Circle, ...]]:
-    """Validate closed curves. curves: a `Circle`; a loop (n, 3) of vertices; or a list in which
-    each entry is a loop or a circle. Returns the loops, float64 arrays (n, 3), and the circles.
+    """Validate closed curves. Returns the loops, float64 arrays (n, 3), and the circles.
+
+    curves: a `Circle`; a loop (n, 3) of vertices; or a list in which each entry is a loop or a
+        circle.
 
     Raises:
         CurveError: a loop is malformed; the subclass names the fault.
@@ -246,16 +258,22 @@ def _as_parts(curves: Any) -> list[Any]:
 def _as_list(loops: Any) -> list[tuple[int, Any]]:
     """The loops in the argument of `validate_loops`, as pairs of a number, counted from 0, and a
     loop. The argument is several loops if its entries are lists of points; otherwise it is a single
-    loop."""
+    loop. Numbers and shapes of the loops are not checked here.
+
+    Raises:
+        CurveShapeError: the points of a single loop have different numbers of coordinates.
+    """
     try:
         array = np.asarray(loops)
     except ValueError:  # loops of different lengths, or points of different lengths
         if any(_is_point(part) for part in loops):
             raise CurveShapeError("every vertex needs three coordinates: some differ") from None
+        # Loops of different lengths.
         return _numbered(loops)
     if array.ndim == 3:
         return _numbered(array)
-    if array.dtype == object and array.ndim == 1 and len(array):  # so does older NumPy
+    # Older NumPy makes an array of objects of loops of different lengths.
+    if array.dtype == object and array.ndim == 1 and len(array):
         return _numbered(array)
     if array.ndim == 1 and array.size == 0:
         return []
@@ -271,16 +289,16 @@ def _is_point(part: Any) -> bool:
 
 
 def _numbered(loops: Any) -> list[tuple[int, Any]]:
-    """The loops with their numbers, counted from 0."""
+    """The loops, each in a pair with its number, counted from 0."""
     return [(k, loop) for k, loop in enumerate(loops)]
 
 
 def _validate_loop(loop: Any, name: str, closed: bool = True) -> FloatArray:
-    """The vertices (n, 3) of a loop, validated; a last vertex that repeats the first one is
+    """Validate a loop. Returns its vertices (n, 3); a last vertex that repeats the first one is
     dropped.
 
-    name: what the loop is, for messages. closed: False for a curve that ends at its first and last
-        vertex.
+    name: what the loop is, for messages.
+    closed: False for a curve that ends at its first and last vertex.
 
     Raises:
         CurveError: the subclass that names the fault.
@@ -300,8 +318,14 @@ def _validate_loop(loop: Any, name: str, closed: bool = True) -> FloatArray:
 
 
 def _as_vertices(loop: Any, name: str) -> FloatArray:
-    """A new float64 array (n, 3) of the vertices of a loop. Raises CurveShapeError or
-    TooManyVerticesError."""
+    """Convert the vertices of a loop to a new float64 array (n, 3).
+
+    name: what the loop is, for messages.
+
+    Raises:
+        CurveShapeError: they are not numbers of that shape.
+        TooManyVerticesError: there are too many.
+    """
     ragged = "is ragged: every vertex needs three coordinates"
     array = as_real_array(loop, name, CurveShapeError, ragged=ragged)
     planar = "; append a column of zeros to a planar curve"
@@ -312,18 +336,24 @@ def _as_vertices(loop: Any, name: str) -> FloatArray:
 
 
 def _count_distinct(vertices: FloatArray) -> int:
-    """The number of different vertices, at most 3."""
+    """Count the different vertices among vertices (n, 3), up to 3."""
     remaining = vertices
     for count in range(3):
         if len(remaining) == 0:
             return count
+        # Drop all copies of the first one.
         remaining = remaining[(remaining != remaining[0]).any(axis=1)]
     return 3
 
 
 def _check_edges(vertices: FloatArray, name: str, closed: bool) -> None:
     """Raise RepeatedVertexError for an edge of length zero, and CurveScaleError for lengths that
-    overflow or underflow."""
+    overflow or underflow.
+
+    vertices: (n, 3).
+    name: what the loop is, for messages.
+    closed: whether an edge joins the last vertex to the first.
+    """
     ends = np.roll(vertices, -1, axis=0)
     edges = ends - vertices
     if not closed:
@@ -345,23 +375,23 @@ def _check_edges(vertices: FloatArray, name: str, closed: bool) -> None:
 
 
 def _too_many(name: str, count: int) -> str:
-    """The message for a curve with too many vertices."""
+    """The message of an error about a curve `name` with too many vertices."""
     return f"{name} has {count:,} vertices: at most {MAX_VERTICES:,} are accepted; resample it"
 
 
 def edge_endpoints(loops: Loops) -> tuple[FloatArray, FloatArray]:
-    """The start points and the end points of all edges of closed loops, (m, 3) each, loop by
+    """The start points and the end points of all edges of closed loops, (m, 3) each, loop after
     loop."""
     return np.concatenate(loops), np.concatenate([np.roll(v, -1, axis=0) for v in loops])
 
 
 def total_length(loops: Loops) -> float:
-    """The sum of the lengths of all edges of loops."""
+    """The sum of the lengths of all edges of closed loops."""
     start, end = edge_endpoints(loops)
     return float(np.linalg.norm(end - start, axis=1).sum())
 
 
 def bounding_box(loops: Loops) -> tuple[FloatArray, FloatArray]:
-    """Lower and upper corner, (3,) each, of the box around loops."""
+    """Lower and upper corner (3,) of the box around the vertices of loops."""
     vertices = np.concatenate(loops)
     return vertices.min(axis=0), vertices.max(axis=0)

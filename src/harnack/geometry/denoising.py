@@ -1,27 +1,25 @@
-"""Clouds with noise: an estimate of the noise, and points moved onto the surface.
+"""Point clouds with noise: an estimate of the noise, and points moved onto the surface that they
+sample. A cloud has points (n, 3) and unit normals (n, 3). A point with noise lies off the surface
+by some distance, whose standard deviation is the noise; the spacing is the distance of neighboring
+points. The neighbors of a point are the points nearest to it. `CloudDenoiser` moves points along
+their normals to the height of the surface that their neighbors predict, so that sums over them need
+less smoothing, and edges stay sharper.
 
-A point of a cloud with noise lies off the surface by some distance, with a standard deviation that
-`estimate_noise` estimates. `CloudDenoiser` moves points along their normals to the height of the
-surface that their neighbors predict, so that sums over them need less smoothing, and edges stay
-sharper.
-
-A neighbor j, at p_j with the normal n_j, predicts that the surface near x is
+A neighbor j, at p_j with the normal n_j, predicts that the surface near x is at the height
 
     t_j = (n + n_j)/2 . (p_j - x)
 
-away from x, along the normal n of x. If x is on the surface, t_j is 0 on a sphere, and to second
-order on every surface, however far the neighbor is: at x, the tangent plane of j is as far outside
-of the surface as p_j is inside of the tangent plane of x. So the mean of t_j does not shrink curved
+above x, along the normal n of x. If x is on the surface, t_j is 0 on a sphere, and to second order
+on every surface, however far the neighbor is: at x, the tangent plane of j is as far outside of the
+surface as p_j is inside of the tangent plane of x. So the mean of t_j does not shrink curved
 surfaces, as the mean of the positions would. Neighbors are weighted by distance and by the angle
 between n and n_j, so that neighbors around an edge or on the other side of a wall do not count.
 
 The noise is removed from the points, not from the field. A kernel wide enough for the noise rounds
-all edges and shrinks curved parts. Points moved along their normals, by planes of their own and of
-their neighbors together, need to be smoothed over a spacing only: the mean error of surfaces was a
-tenth to a third less than by smoothing over 1.4 sqrt(noise * spacing) alone, and areas were right,
-which had been twice as large. Correcting a smoothed surface by the distance by which a second
-smoothing moves it was no better than a single smoothing. The field stays a sum of dipoles, with all
-its bounds: only its data change (`denoised_cloud`).
+all edges and shrinks curved parts. Points moved along their normals need to be smoothed over a
+spacing only: the mean error of surfaces was a tenth to a third less than by smoothing over 1.4
+sqrt(noise * spacing) alone, and areas were right, which had been twice as large. The field stays a
+sum of dipoles, with all its bounds: only its data change (`denoised_cloud`).
 """
 
 from __future__ import annotations
@@ -43,10 +41,11 @@ from harnack.geometry.clouds import (
 __all__ = ["CloudDenoiser", "NoiseEstimate", "estimate_noise", "outlier_indices"]
 
 # A point is an outlier if the distance of its fourth neighbor is more than _OUTLIER_RATIO times the
-# median of the same distance of its neighbors.
+# typical distance of fourth neighbors.
 _OUTLIER_RATIO, _OUTLIER_NEIGHBORS = 6.0, 4
-# Noise is measured at _PROBES points, among the first of _COUNTS neighbors that reach _MIN_REACH
-# standard deviations far; neighbors whose normals turn by more than 60 degrees do not count.
+# Noise is measured at _PROBES points. The number of neighbors is the first of _COUNTS for which the
+# farthest neighbor is at least _MIN_REACH standard deviations away. Neighbors do not count if the
+# cosine between the normals is at most _MIN_NORMAL_COSINE, 60 degrees.
 _PROBES, _COUNTS, _MIN_REACH, _MIN_NORMAL_COSINE = 1000, (16, 64, 256, 1024), 4.5, 0.5
 # _NEIGHBORS_PER_NOISE * noise / spacing neighbors are used, within the two limits: half of them lie
 # within 3.1 sqrt(noise * spacing), by experiment a compromise of noise and detail.
@@ -62,18 +61,19 @@ _DISTANCE_DECAY, _NORMAL_SCALE, _ESTIMATED_NORMAL_SCALE = 3.0, 0.8, 0.4
 # _PLANE_NEIGHBORS points. Where only a fraction of the points is moved, these are first moved by
 # _INITIAL_NEIGHBORS of each other.
 _NORMAL_ITERATIONS, _PLANE_NEIGHBORS, _INITIAL_NEIGHBORS = 2, 32, 32
-# A point is not moved if its neighbors face the other way: then the derivative of the mean of t_j
-# along n is below this.
+# A point is not moved if its neighbors face the other way: then the rate at which the mean of t_j
+# falls, as the point moves along n, is below this.
 _MIN_SLOPE = 0.25
 # A point is dropped if less than this fraction of its neighbors, by weight, has a normal similar to
-# its estimated one: such points lie in the middle of thin parts. At edges and corners the fraction
-# is larger.
+# its own estimated one: such points lie in the middle of thin parts. At edges and corners the
+# fraction is larger.
 _MIN_AGREEING_WEIGHT = 0.1
 
 
 @dataclass(frozen=True)
 class NoiseEstimate:
-    """The noise of a cloud, in the units of its points.
+    """The noise of a cloud: how far its points lie off the surface. Both lengths are in the unit of
+    the points.
 
     deviation: the standard deviation of the points from the surface, along its normal.
     spacing: the square root of the area that a point stands for (median).
@@ -84,20 +84,26 @@ class NoiseEstimate:
 
     @property
     def neighbor_count(self) -> int:
-        """The number of neighbors from which the height of the surface is averaged."""
+        """The number of neighbors whose predicted heights of the surface are averaged; more noise
+        needs more."""
         count = round(_NEIGHBORS_PER_NOISE * self.deviation / self.spacing)
         return min(max(count, _MIN_NEIGHBORS), _MAX_NEIGHBORS)
 
     def kept_fraction(self) -> float:
-        """The fraction of the points that are worth moving, at most 1."""
+        """The fraction of the points to be selected and moved, at most 1: with large noise, fewer
+        points show the surface just as well."""
         fraction = _MAX_NOISE_PER_SPACING * self.spacing / max(self.deviation, 1e-300)
         return min(max(fraction, _MIN_KEPT_FRACTION), 1.0)
 
 
 def outlier_indices(points: FloatArray, tree: Any) -> IntArray:
-    """The indices of outliers among points (n, 3): points whose fourth neighbor is more than six
-    times as far away as the fourth neighbor of a typical point. Typical are both the median of the
-    point's own neighbors and the median of all points. tree: the search tree of these points."""
+    """Find the outliers among points (n, 3): points whose fourth neighbor is more than six times as
+    far away as the fourth neighbor of a typical point. The typical distance is the median over the
+    point's own neighbors, or the median over all points, whichever is larger. Returns the indices
+    (k,).
+
+    tree: the search tree of these points.
+    """
     count = min(_OUTLIER_NEIGHBORS, len(points) - 1)
     nearest = np.empty((len(points), count), np.int64)
     distances = np.empty(len(points))
@@ -108,22 +114,26 @@ def outlier_indices(points: FloatArray, tree: Any) -> IntArray:
         nearest[rows], distances[rows] = index[:, 1:], distance[:, -1]
 
     parallel_over_slices(find_neighbors, len(points))
+    # The larger one of the two typical distances.
     expected = np.maximum(np.median(distances[nearest], axis=1), np.median(distances))
     return np.flatnonzero(distances > _OUTLIER_RATIO * expected)
 
 
 def estimate_noise(points: FloatArray, normals: FloatArray | None, tree: Any) -> NoiseEstimate:
-    """Estimate the noise and the spacing of a cloud of points (n, 3). tree: the search tree of
-    these points.
+    """Estimate the noise and the spacing of a cloud.
 
     Each of up to 1000 probe points has neighbors. A neighbor j at p_j with the normal n_j predicts
     that the surface is at the height t_j = (n + n_j)/2 . (p_j - x) above a probe x with the normal
     n. The noise is the median, over the probes, of the standard deviation of t_j. If `normals` is
-    None, deviations from the plane that best fits the neighbors are used instead, so that curvature
+    None, distances from the plane that best fits the neighbors are used instead, so that curvature
     counts as noise.
 
     The number of neighbors grows from 16 to 1024, until the farthest is (in the median) 4.5
     standard deviations away: fewer neighbors reach no farther than the noise, and show no surface.
+
+    points: (n, 3).
+    normals: (n, 3) unit normals, or None.
+    tree: the search tree of the points.
     """
     rng = np.random.default_rng(0)
     probes = np.sort(rng.choice(len(points), min(len(points), _PROBES), replace=False))
@@ -137,7 +147,9 @@ def estimate_noise(points: FloatArray, normals: FloatArray | None, tree: Any) ->
             deviations = _deviations_by_normals(offsets, normals[probes], normals[index])
             deviation = float(np.median(deviations))
         radius = float(np.median(distance[:, -1]))
+        # count neighbors in a disc of this radius: each stands for radius^2 pi / count.
         noise = NoiseEstimate(deviation, radius * math.sqrt(math.pi / index.shape[1]))
+        # Also stop if the cloud has no more points.
         if radius >= _MIN_REACH * deviation or index.shape[1] < count:
             break
     return noise
@@ -145,16 +157,24 @@ def estimate_noise(points: FloatArray, normals: FloatArray | None, tree: Any) ->
 
 def _deviations_from_planes(offsets: FloatArray) -> FloatArray:
     """For each of m points, the standard deviation (m,) of its neighbors from the plane that fits
-    them best. offsets: (m, k, 3) of the neighbors."""
+    them best.
+
+    offsets: (m, k, 3) from the point to its neighbors.
+    """
     centered = offsets - offsets.mean(axis=1, keepdims=True)
     variances = np.linalg.eigvalsh(np.matmul(centered.transpose(0, 2, 1), centered))
+    # A plane has three parameters.
     degrees_of_freedom = max(offsets.shape[1] - 3, 1)
     return np.sqrt(np.maximum(variances[:, 0], 0.0) / degrees_of_freedom)
 
 
 def _min_variance_axes(offsets: FloatArray, weights: FloatArray | None) -> FloatArray:
-    """For each of m points, the unit vector (m, 3) along which the offsets (m, k, 3) of its
-    neighbors vary least. weights: (m, k) of the offsets; None for equal weights."""
+    """For each of m points, the unit vector (m, 3) along which the offsets of its neighbors vary
+    least: the one with the smallest weighted sum of squared components.
+
+    offsets: (m, k, 3).
+    weights: (m, k) of the offsets; None for equal weights.
+    """
     weighted = offsets if weights is None else offsets * weights[:, :, None]
     _, axes = np.linalg.eigh(np.matmul(weighted.transpose(0, 2, 1), offsets))
     return axes[:, :, 0]
@@ -168,7 +188,8 @@ def _deviations_by_normals(
     surface at the height t_j = (n + n_j)/2 . d_j above a point with the normal n.
 
     offsets: (m, k, 3) from each point to its neighbors.
-    normals: (m, 3) of the points. neighbor_normals: (m, k, 3).
+    normals: (m, 3) the unit normals of the points.
+    neighbor_normals: (m, k, 3) the unit normals of the neighbors.
     """
     is_similar = np.einsum("mi,mki->mk", normals, neighbor_normals) > _MIN_NORMAL_COSINE
     heights = np.einsum("mki,mki->mk", 0.5 * (normals[:, None] + neighbor_normals), offsets)
@@ -178,14 +199,18 @@ def _deviations_by_normals(
 
 
 class CloudDenoiser:
-    """Moves points of a noisy cloud onto the surface that the cloud samples.
+    """Moves points of a noisy cloud along their normals onto the surface that the cloud samples.
+    The selected points are moved: all points, unless the noise is so large that a random part of
+    them shows the surface just as well. All points count as neighbors.
 
-    points: (n, 3). noise: the noise of the cloud. tree: the search tree of the points.
-    selected: (m,) indices of the points to be moved: all of them, unless the noise is so large that
-        a random part of them shows the surface just as well.
+    points: (n, 3).
+    noise: the noise of the cloud.
+    tree: the search tree of the points.
+    selected: (m,) indices of the selected points.
     """
 
     def __init__(self, points: FloatArray, noise: NoiseEstimate, tree: Any | None = None) -> None:
+        """Select the points to be moved. The search tree is built if it is not given."""
         self.points, self.noise = points, noise
         self.tree = build_point_tree(points) if tree is None else tree
         self.selected = np.arange(len(points))
@@ -204,8 +229,12 @@ class CloudDenoiser:
         return self.noise.spacing * math.sqrt(len(self.points) / len(self.selected))
 
     def denoise_points(self, normals: FloatArray) -> FloatArray:
-        """The selected points (m, 3), moved along their normals onto the surface. normals: (n, 3),
-        the known normals of all points."""
+        """Move the selected points along their known normals onto the surface; returns the points
+        (m, 3). If only a part of the points is selected, they are first moved by their nearest
+        neighbors among themselves, so that the search for neighbors starts near the surface.
+
+        normals: (n, 3) the unit normals of all points.
+        """
         points, own_normals = self.points[self.selected], normals[self.selected]
         if len(points) < len(self.points):
             points = _move_along_normals(
@@ -223,13 +252,15 @@ class CloudDenoiser:
 
     def denoise_points_and_normals(self, normals: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Move the selected points and improve their normals, in alternation. Returns points and
-        unit normals, (k, 3) each. k <= m: a point is dropped if hardly any of its neighbors has a
-        normal similar to its own.
+        unit normals, (k, 3) each. k may be less than m: a point is dropped if hardly any of its
+        neighbors has a normal similar to its own.
 
-        normals: (m, 3), estimates for the selected points.
+        normals: (m, 3) estimated unit normals of the selected points.
         """
         start, normal_scale = self.points[self.selected], _ESTIMATED_NORMAL_SCALE
         if len(start) == len(self.points):
+            # `nearest`: for each point of the cloud, the selected point whose normal it gets.
+            # `adjacent`: for each selected point, its neighbors among the selected points.
             nearest = self.selected
             adjacent = _neighbors(self.tree, start, _PLANE_NEIGHBORS)
         else:
@@ -257,9 +288,9 @@ class CloudDenoiser:
 
 
 def _neighbors(tree: Any, points: FloatArray, count: int) -> Indices:
-    """The indices (m, k) of the points of a tree that are nearest to points (m, 3). A point that
-    belongs to the tree is its own first neighbor. k = count, or less if the tree has fewer
-    points."""
+    """Find the points of a tree that are nearest to points (m, 3); returns their indices (m, k). A
+    point that belongs to the tree is its own first neighbor. k = `count`, or less if the tree has
+    fewer points."""
     count = min(count, tree.n)
     index = np.empty((len(points), count), np.int32)
 
@@ -279,12 +310,13 @@ def _move_along_normals(
     normals: FloatArray,
     normal_scale: float,
 ) -> FloatArray:
-    """The points `start` (m, 3), each moved along its normal n onto the surface that its neighbors
-    predict. A neighbor j at p_j with the normal n_j predicts that the surface is at the height t_j
-    = (n + n_j)/2 . (p_j - x) above a point x; each point moves to where the weighted mean of t_j is
-    0.
+    """Move points along their normals onto the surface that their neighbors predict; returns the
+    moved points (m, 3). A neighbor j at p_j with the normal n_j predicts that the surface is at the
+    height t_j = (n + n_j)/2 . (p_j - x) above a point x with the normal n. Each point moves along n
+    to where the weighted mean of t_j is 0. A point whose normal no neighbor supports stays.
 
-    own_normals: (m, 3) of the points `start`.
+    start: (m, 3) the points.
+    own_normals: (m, 3) their unit normals.
     neighbors: (m, k) indices of their neighbors among `points`.
     points, normals: (n, 3) each, the points of the cloud and their unit normals.
     normal_scale: the difference |n - n_j| at which the weight of a neighbor falls to 1/e.
@@ -295,8 +327,7 @@ def _move_along_normals(
     moved = np.empty_like(start)
 
     def move_slice(rows: slice) -> None:
-        """Move the points of a slice: `slope` is the derivative, in absolute value, of the mean of
-        t_j along n."""
+        """Move the points of a slice."""
         n, index = own_normals[rows], neighbors[rows]
         neighbor_normals, offsets = normals[index], points[index] - start[rows, None]
         height = np.einsum("mi,mki->mk", n, offsets)
@@ -304,8 +335,9 @@ def _move_along_normals(
         weight = _weights(_squared_tangential(offsets, height), cosine, normal_scale)
         # The mean of n_j . (p_j - x) and n . (p_j - x); both are linear where x moves along n.
         heights = 0.5 * (np.einsum("mki,mki->mk", neighbor_normals, offsets) + height)
+        # The rate at which the mean of t_j falls as x moves along n.
         slope = 0.5 * (weight * (cosine + 1)).sum(axis=1)
-        # A point whose normal no neighbor supports stays.
+        # A point with a smaller slope stays.
         mean = np.where(slope > _MIN_SLOPE, (weight * heights).sum(axis=1), 0.0)
         moved[rows] = start[rows] + (mean / np.maximum(slope, _MIN_SLOPE))[:, None] * n
 
@@ -323,7 +355,8 @@ def _agreeing_weight(
     normal_scale: float,
 ) -> FloatArray:
     """For each of m points, the fraction (m,) of its neighbors, by weight, that have a normal
-    similar to its own.
+    similar to its own. Neighbors have weights that fall with the distance; a normal counts as
+    similar by a number that falls from 1 with the angle.
 
     start, own_normals: (m, 3) the points and their unit normals.
     neighbors: (m, k) indices of their neighbors among `points`.
@@ -354,12 +387,13 @@ def _agreeing_weight(
 def _refit_normals(
     points: FloatArray, normals: FloatArray, neighbors: Indices, normal_scale: float
 ) -> FloatArray:
-    """New unit normals (m, 3) of points (m, 3). A normal is that of the plane that best fits the
-    point's neighbors, where neighbors with a similar normal have the largest weight. Its sign is
-    that of the point's old normal.
+    """Fit new unit normals (m, 3) to points. A normal is that of the plane that best fits the
+    point's neighbors, where neighbors with a similar normal have the largest weight. Of its two
+    signs, the one nearer to the old normal is taken.
 
+    points: (m, 3).
     normals: (m, 3) the old normals.
-    neighbors: (m, k) indices of the neighbors.
+    neighbors: (m, k) indices of the neighbors among the points.
     normal_scale: the difference |n - n'| of two unit normals at which the weight of a neighbor
         falls to 1/e.
     """
@@ -371,6 +405,7 @@ def _refit_normals(
         offsets = points[index] - points[rows, None]
         cosine = np.einsum("mi,mki->mk", normals[rows], normals[index])
         weight = _weights(_squared_lengths(offsets), cosine, normal_scale)
+        # Relative to the weighted mean of the neighbors.
         offsets -= np.einsum("mk,mki->mi", weight, offsets)[:, None]
         axis = _min_variance_axes(offsets, weight)
         is_reversed = np.einsum("mi,mi->m", axis, normals[rows]) < 0
@@ -387,25 +422,36 @@ def _squared_lengths(offsets: FloatArray) -> FloatArray:
 
 def _squared_tangential(offsets: FloatArray, height: FloatArray) -> FloatArray:
     """The squared lengths (m, k) of the parts of offsets (m, k, 3) that are parallel to the tangent
-    planes. height: (m, k) the parts normal to them."""
+    planes.
+
+    height: (m, k) the components of the offsets along the normals.
+    """
     return np.maximum(_squared_lengths(offsets) - height * height, 0.0)
 
 
 def _relative_to_largest(square: FloatArray) -> FloatArray:
-    """The squared distances (m, k), divided by the largest one in each row."""
+    """Squared distances (m, k), divided by the largest one in each row."""
     return square / np.maximum(square.max(axis=1, keepdims=True), 1e-300)
 
 
 def _normal_weight(cosine: FloatArray, normal_scale: float) -> FloatArray:
-    """Weights (m, k) of neighbors by the cosine between normals: 1 for equal normals, 1/e for
-    normals whose difference has the length `normal_scale`."""
+    """Weights (m, k) of neighbors by the angle between normals: 1 for equal normals, 1/e for
+    normals whose difference has the length `normal_scale`.
+
+    cosine: (m, k) the cosines of the angles.
+    """
+    # |n - n'|^2 = 2 - 2 cos.
     return np.exp(-(2 - 2 * cosine) / normal_scale**2)
 
 
 def _weights(square: FloatArray, cosine: FloatArray, normal_scale: float) -> FloatArray:
     """Weights (m, k) of the neighbors of m points, with sum 1 in each row. They fall with the
-    squared distance `square` (m, k) and with the angle between normals. cosine: (m, k) of these
-    angles. normal_scale: the difference of two unit normals at which the weight falls to 1/e."""
+    distance and with the angle between normals.
+
+    square: (m, k) the squared distances.
+    cosine: (m, k) the cosines of the angles between the normals.
+    normal_scale: the difference of two unit normals at which the weight falls to 1/e.
+    """
     weight = np.exp(-_DISTANCE_DECAY * _relative_to_largest(square)) * _normal_weight(
         cosine, normal_scale
     )

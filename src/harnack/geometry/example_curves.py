@@ -1,8 +1,6 @@
-"""Closed curves for pictures, tests and examples. Arrays are (n, 3) float64.
-
-Loops are not closed by a repeated vertex. All are counter-clockwise seen from +z where that has a
-meaning.
-"""
+"""Closed curves for pictures, tests and examples. A curve is an array (n, 3) of vertices, float64,
+whose last vertex is joined to the first (which is not repeated); a list of such arrays is a curve
+of several loops. All are counter-clockwise seen from +z where that has a meaning."""
 
 from __future__ import annotations
 
@@ -23,7 +21,7 @@ def _check_whole(name: str, number: Any) -> None:
 
 
 def _angles(n: int, minimum: int) -> FloatArray:
-    """n angles that divide the full turn, in radians.
+    """Angles (n,) that divide the full turn into n equal parts, in radians, from 0.
 
     Raises:
         ValueError: n is less than `minimum`.
@@ -36,13 +34,17 @@ def _angles(n: int, minimum: int) -> FloatArray:
 
 
 def regular_polygon(n: int, radius: float = 1.0) -> FloatArray:
-    """The regular n-gon in the plane z = 0, with a vertex on the x axis."""
+    """The regular n-gon (n, 3) in the plane z = 0, with a vertex on the x axis.
+
+    radius: the distance of the vertices from the origin.
+    """
     t = _angles(n, 3)
     return radius * np.column_stack([np.cos(t), np.sin(t), np.zeros(n)])
 
 
 def wavy_polygon(n: int, amplitude: float = 0.45, waves: int = 3) -> FloatArray:
-    """n vertices of (cos t, sin t, amplitude cos(waves t)): a nonplanar polygon on a cylinder."""
+    """A polygon (n, 3) on a cylinder that is not planar: its vertices are (cos t, sin t, amplitude
+    cos(waves t)) for n equally spaced angles t."""
     t = _angles(n, 3)
     return np.column_stack([np.cos(t), np.sin(t), amplitude * np.cos(waves * t)])
 
@@ -50,7 +52,10 @@ def wavy_polygon(n: int, amplitude: float = 0.45, waves: int = 3) -> FloatArray:
 def torus_knot(
     p: int, q: int, n: int, *, major_radius: float = 1.0, minor_radius: float = 0.4
 ) -> FloatArray:
-    """A (p, q) torus knot: p turns about the z axis, q through the hole. (2, 3) is a trefoil.
+    """A (p, q) torus knot with n vertices, (n, 3): p turns about the z axis, q through the hole.
+    (2, 3) is a trefoil.
+
+    major_radius, minor_radius: of the torus on which it lies.
 
     Raises:
         ValueError: p and q have a common divisor, which would be a link.
@@ -68,7 +73,7 @@ def torus_knot(
 
 
 def figure_eight_knot(n: int) -> FloatArray:
-    """The figure-eight knot 4_1, about 1 in size."""
+    """The figure-eight knot 4_1 with n vertices, (n, 3), about 1 in size."""
     t = _angles(n, 3)
     distance = (2.0 + np.cos(2.0 * t)) / 3.0
     return np.column_stack(
@@ -84,13 +89,17 @@ def coil(
     height: float = 1.0,
     return_path: ReturnPath = "outside",
 ) -> FloatArray:
-    """A closed coil of n vertices: a helix about the z axis and a way back to its start.
-
-    turns: full turns of the helix. height: from its lowest to its highest vertex.
-    return_path: "outside" returns at 1.5 radii, parallel to the axis; "axis" along the axis.
-
+    """A closed coil with n vertices, (n, 3): a helix about the z axis and a way back to its start.
     The solid angle of such a curve spans `turns` times 4 pi, which breaks bounds that hold for
     curves on convex bodies.
+
+    turns: the number of full turns of the helix.
+    radius: of the helix.
+    height: from its lowest to its highest vertex.
+    return_path: "outside" returns at 1.5 radii, parallel to the axis; "axis" along the axis.
+
+    Raises:
+        ValueError: there are too few turns or vertices, or another path is given.
     """
     if turns < 1:
         raise ValueError(f"a coil needs at least one turn, not {turns}")
@@ -107,7 +116,7 @@ def coil(
 
 
 def hopf_link(n: int) -> list[FloatArray]:
-    """Two unit circles of n vertices, each through the other's center."""
+    """Two circles of radius 1 with n vertices each, each through the other's center."""
     circle = regular_polygon(n)
     upright = circle[:, [0, 2, 1]] * (-1.0, 1.0, 1.0)
     shift = np.array([0.5, 0.0, 0.0])
@@ -115,7 +124,8 @@ def hopf_link(n: int) -> list[FloatArray]:
 
 
 def borromean_rings(n: int) -> list[FloatArray]:
-    """Three ellipses of n vertices in the coordinate planes: linked, but no two of them are."""
+    """Three ellipses with n vertices each in the coordinate planes: the three are linked, but no
+    two of them are."""
     circle = regular_polygon(n)
     ellipse = circle * (1.0, 0.5, 1.0)
     return [np.roll(ellipse, shift, axis=1) for shift in range(3)]
@@ -131,9 +141,11 @@ def square_with_holes(
         (0.1, 0.5, 0.3),
     ),
 ) -> list[FloatArray]:
-    """A square in the plane z = 0 with round holes of n vertices, which are oriented the opposite
-    way.
+    """A square in the plane z = 0 with round holes, which are oriented the opposite way. Returns
+    the square, then the holes.
 
+    n: the number of vertices of each hole.
+    side: the length of the square's sides.
     holes: x, y and radius of each hole. They are not checked to be disjoint and within the square.
     """
     corners = np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
@@ -147,9 +159,12 @@ def square_with_holes(
 def random_closed_curve(
     rng: np.random.Generator, n: int, *, harmonics: int = 4, decay: float = 1.0
 ) -> FloatArray:
-    """n vertices of a random trigonometric polynomial, about 1 in size: often a knot.
+    """A random closed curve with n vertices, (n, 3), about 1 in size, and often a knot: its
+    coordinates are random trigonometric polynomials.
 
-    harmonics: the number of frequencies. decay: amplitudes fall like frequency^-decay.
+    rng: the source of random numbers.
+    harmonics: the number of frequencies.
+    decay: amplitudes fall like frequency^-decay.
     """
     t = _angles(n, 3)
     if harmonics < 1:
@@ -164,9 +179,10 @@ def random_closed_curve(
 def spiky_polygon(
     rng: np.random.Generator, n: int, *, inner: float = 0.2, height: float = 0.5
 ) -> FloatArray:
-    """A star of n vertices with random radii in [inner, 1] and heights in [-height, height].
+    """A star with n vertices, (n, 3), with random radii in [inner, 1] and heights in [-height,
+    height]. Even vertices are spikes, odd ones lie near the inner radius.
 
-    Even vertices are spikes, odd ones lie near the inner radius.
+    rng: the source of random numbers.
     """
     t = _angles(n, 3) + rng.uniform(-0.3, 0.3, size=n) * (2.0 * np.pi / n)
     radii = rng.uniform(0.6, 1.0, size=n)

@@ -1,8 +1,7 @@
-"""Meshes for pictures, tests and examples, and functions that damage meshes.
-
-Shapes are (vertices (n, 3) float64, faces (m, 3) int64), closed, counter-clockwise from outside.
-Functions that damage take faces and return faces; `seed` makes them repeatable.
-"""
+"""Meshes for pictures, tests and examples, and functions that damage meshes. A mesh is a pair of
+vertices (n, 3), float64, and faces (m, 3), int64, which hold the indices of the corners of
+triangles. It is closed, and faces run counter-clockwise as seen from outside. Functions that damage
+a mesh take its faces and return other faces; `seed` makes their random choice repeatable."""
 
 from __future__ import annotations
 
@@ -25,9 +24,8 @@ MeshArrays: TypeAlias = tuple[FloatArray, IntArray]
 
 
 def icosphere(subdivisions: int) -> MeshArrays:
-    """The icosahedron in the unit sphere, each face cut in four `subdivisions` times.
-
-    20 * 4^subdivisions faces, all vertices on the unit sphere.
+    """The icosahedron in the unit sphere, with each face cut in four `subdivisions` times. It has
+    20 * 4^subdivisions faces, and all vertices are on the unit sphere.
 
     Raises:
         ValueError: negative, or above 10 (21 million faces).
@@ -42,14 +40,15 @@ def icosphere(subdivisions: int) -> MeshArrays:
 
 
 def bumpy_sphere(subdivisions: int) -> MeshArrays:
-    """The icosphere with radii r = 1 + 0.15 sin 5x sin 5y sin 5z, (x, y, z) on the unit sphere."""
+    """The icosphere with each vertex (x, y, z) moved from the unit sphere to the radius r = 1 +
+    0.15 sin 5x sin 5y sin 5z."""
     vertices, faces = icosphere(subdivisions)
     radii = 1.0 + 0.15 * np.sin(5.0 * vertices).prod(axis=1, keepdims=True)
     return vertices * radii, faces
 
 
 def torus_mesh(major_radius: float, minor_radius: float, n: int, m: int) -> MeshArrays:
-    """A torus about the z axis: n segments the long way round, m the short way, 2 n m faces.
+    """A torus about the z axis with 2 n m faces: n segments the long way round, m the short way.
 
     Raises:
         ValueError: fewer than 3 segments, or not 0 < minor_radius < major_radius.
@@ -66,6 +65,7 @@ def torus_mesh(major_radius: float, minor_radius: float, n: int, m: int) -> Mesh
     vertices = np.column_stack(
         [distance * np.cos(s), distance * np.sin(s), minor_radius * np.sin(t)]
     )
+    # The four corners of each quadrilateral (i, j), counter-clockwise.
     a, b = i * m + j, (i + 1) % n * m + j
     c, d = (i + 1) % n * m + (j + 1) % m, i * m + (j + 1) % m
     faces = np.concatenate([np.column_stack([a, b, c]), np.column_stack([a, c, d])])
@@ -100,7 +100,8 @@ def duplicate_faces(
 
 
 def _random_faces(faces: IntArray, fraction: float, seed: int) -> IntArray:
-    """Distinct indices of a random fraction (rounded to a whole number) of the faces.
+    """Choose a random fraction (rounded to a whole number) of the faces; returns their indices, all
+    different.
 
     Raises:
         ValueError: fraction outside [0, 1].
@@ -114,6 +115,7 @@ def _random_faces(faces: IntArray, fraction: float, seed: int) -> IntArray:
 def _icosahedron() -> MeshArrays:
     """The icosahedron in the unit sphere."""
     golden = 0.5 * (1.0 + np.sqrt(5.0))
+    # The four corners of a rectangle in each of the coordinate planes.
     corners = [(0.0, y, z) for y in (-1.0, 1.0) for z in (-golden, golden)]
     vertices = np.concatenate([np.roll(corners, shift, axis=1) for shift in range(3)])
     # The faces are the triples of vertices 2 apart from each other, turned to face outward.
@@ -133,9 +135,10 @@ def _icosahedron() -> MeshArrays:
 
 def _subdivided(vertices: FloatArray, faces: IntArray) -> MeshArrays:
     """The mesh with each face divided in four at the midpoints of its edges, which become new
-    vertices."""
+    vertices. Returns vertices and faces."""
     ends = np.roll(faces, -1, axis=1)
     n = len(vertices)
+    # One integer for each edge, the same for both directions.
     keys = np.minimum(faces, ends) * n + np.maximum(faces, ends)
     edges, midpoint_index = np.unique(keys.ravel(), return_inverse=True)
     midpoints = 0.5 * (vertices[edges // n] + vertices[edges % n])

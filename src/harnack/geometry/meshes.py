@@ -1,9 +1,7 @@
-"""Triangle meshes: validation, faces of zero area, and solid angles of triangles.
-
-A mesh is an array (n, 3) of vertices and an array (m, 3) of faces, indices of vertices counted from
-0. The positive side of a face is the one from which its vertices run counter-clockwise. A mesh may
-have holes, cross itself, repeat faces or reverse them; no face need be joined to another.
-"""
+"""Triangle meshes: validation, faces of zero area, and solid angles of triangles. A mesh is an
+array (n, 3) of vertices and an array (m, 3) of faces, indices of vertices counted from 0. The
+positive side of a face is the one from which its vertices run counter-clockwise. A mesh may have
+holes, cross itself, repeat faces or reverse them; no face need be joined to another."""
 
 from __future__ import annotations
 
@@ -35,21 +33,20 @@ __all__ = [
 MAX_VERTICES = 100_000_000
 MAX_FACES = 100_000_000
 
-# Twice the area, over the square of the longest edge, up to which a face counts as flat.
+# Twice the area of a face, divided by the square of its longest edge, up to which the face counts
+# as flat.
 ZERO_AREA_RATIO = 8.0 * float(np.finfo(np.float64).eps)
 
 
 class MeshError(ValueError):
-    """A mesh that cannot be used; the message says why and what to do."""
+    """A mesh cannot be used; the message says why and what to do."""
 
 
 def validate_mesh(
     vertices: npt.ArrayLike, faces: npt.ArrayLike, *, allow_zero_area: bool = False
 ) -> tuple[FloatArray, IntArray]:
     """Validate a mesh. Returns vertices (n, 3) float64 and faces (m, 3) int64: copies that cannot
-    be written to.
-
-    Vertices that no face uses are kept, and checked like all others.
+    be written to. Vertices that no face uses are kept, and checked like all others.
 
     allow_zero_area: whether faces may have zero area, as faces of closed meshes that only join
         others.
@@ -70,12 +67,11 @@ def validate_mesh(
 
 
 def zero_area_faces(vertices: npt.ArrayLike, faces: npt.ArrayLike) -> IntArray:
-    """The indices (k,) of the faces that count as faces of zero area.
-
-    Twice the area of such a face is at most 8 units in the last place (2^-49) of the square of its
-    longest edge: up to the rounding of a cross product, its vertices lie on a line or two of them
-    are equal. This depends neither on the scale nor on the position of the mesh. Such a face has no
-    reliable normal.
+    """Find the faces that count as faces of zero area; returns their indices (k,). Twice the area
+    of such a face is at most 8 units in the last place (2^-49) of the square of its longest edge:
+    up to the rounding of a cross product, its vertices lie on a line or two of them are equal. This
+    depends neither on the scale nor on the position of the mesh. Such a face has no reliable
+    normal.
 
     Raises:
         MeshError: the mesh is not valid, apart from faces of zero area (see `validate_mesh`).
@@ -87,12 +83,13 @@ def without_zero_area_faces(
     vertices: npt.ArrayLike, faces: npt.ArrayLike
 ) -> tuple[FloatArray, IntArray]:
     """The mesh without its faces of zero area (see `zero_area_faces`): vertices (n, 3) float64 and
-    faces (k, 3) int64, copies that cannot be written to.
+    faces (k, 3) int64, copies that cannot be written to. All vertices stay, so indices keep their
+    meaning.
 
-    All vertices stay, so indices keep their meaning. A face of zero area adds nothing to a winding
-    number. If it filled a gap of zero width (a vertex in the middle of its neighbor's edge), the
-    edges at that gap become boundary edges on top of each other: they still cancel in every sum,
-    and only make distances to boundary edges smaller than need be.
+    A face of zero area adds nothing to a winding number. If it filled a gap of zero width (a vertex
+    in the middle of its neighbor's edge), the edges at that gap become boundary edges on top of
+    each other: they still cancel in every sum, and only make distances to boundary edges smaller
+    than need be.
 
     Raises:
         MeshError: the mesh is not valid, apart from faces of zero area (see `validate_mesh`); or no
@@ -113,10 +110,12 @@ def without_zero_area_faces(
 
 
 def solid_angles(corners: FloatArray, point: FloatArray) -> FloatArray:
-    """The solid angles (m,) of triangles (m, 3, 3) as seen from a point (3,), between -2 pi and 2
-    pi (Van Oosterom and Strackee 1983). They are positive if the point is on the negative side of
-    the triangle. Their sum over a mesh, divided by 4 pi, is the winding number of the mesh."""
+    """The solid angles (m,) of triangles with corners (m, 3, 3) as seen from a point (3,), between
+    -2 pi and 2 pi (Van Oosterom and Strackee 1983). They are positive if the point is on the
+    negative side of the triangle. Their sum over a mesh, divided by 4 pi, is the winding number of
+    the mesh."""
     a, b, c = (corners[:, k] - point for k in range(3))
+    # The vectors a, b, c from the point to the corners, their lengths, and their dot products.
     x, y, z = (np.sqrt(np.einsum("ij,ij->i", offset, offset)) for offset in (a, b, c))
     ab, bc, ca = (np.einsum("ij,ij->i", p, q) for p, q in ((a, b), (b, c), (c, a)))
     denominator = x * y * z + ab * z + bc * x + ca * y
@@ -124,15 +123,16 @@ def solid_angles(corners: FloatArray, point: FloatArray) -> FloatArray:
 
 
 def _checked_arrays(vertices: Any, faces: Any) -> tuple[FloatArray, IntArray]:
-    """Vertices as a new float64 array (n, 3) of finite numbers, and faces as a new int64 array (m,
-    3) of valid indices. Raises `MeshError`."""
+    """Convert vertices to a new float64 array (n, 3) of finite numbers, and faces to a new int64
+    array (m, 3) of valid indices. Raises `MeshError` if that is not possible."""
     x = _as_vertices(vertices)
     triangles = _as_faces(faces, len(x))
     return x, triangles
 
 
 def _as_vertices(vertices: Any) -> FloatArray:
-    """Vertices as a new float64 array (n, 3) of finite numbers. Raises `MeshError`."""
+    """Convert vertices to a new float64 array (n, 3) of finite numbers. Raises `MeshError` if that
+    is not possible."""
     array = _as_array(vertices, "the vertices", "every vertex needs three coordinates")
     if array.size == 0:
         raise MeshError("there are no vertices: give an array (n, 3)")
@@ -149,8 +149,8 @@ def _as_vertices(vertices: Any) -> FloatArray:
 
 
 def _as_faces(faces: Any, count: int) -> IntArray:
-    """Faces as a new int64 array (m, 3) of indices below `count`, the number of vertices. Raises
-    `MeshError`."""
+    """Convert faces to a new int64 array (m, 3) of indices below `count`, the number of vertices.
+    Raises `MeshError` if that is not possible."""
     array = _as_array(faces, "the faces", "every face needs three indices; triangulate polygons")
     if array.size == 0:
         raise MeshError("there are no faces: give an array (m, 3) of vertex indices")
@@ -189,8 +189,14 @@ def _check_range(faces: npt.NDArray[Any], count: int) -> None:
 
 
 def _as_array(values: Any, name: str, ragged: str) -> npt.NDArray[Any]:
-    """The values as a NumPy array, which is no array of objects. name: what they are, for messages.
-    ragged: the end of the message for rows of different lengths. Raises `MeshError`."""
+    """Convert values to a NumPy array of numbers.
+
+    name: what they are, for messages.
+    ragged: the end of the message for rows of different lengths.
+
+    Raises:
+        MeshError: they are no array of numbers.
+    """
     try:
         array = np.asarray(values)
     except (ValueError, OverflowError):
@@ -201,10 +207,12 @@ def _as_array(values: Any, name: str, ragged: str) -> npt.NDArray[Any]:
 
 
 def _measure_faces(x: FloatArray, faces: IntArray) -> tuple[BoolArray, FloatArray]:
-    """For each face (m, 3) of vertices x (n, 3): whether it counts as a face of zero area, (m,),
-    and the largest difference of two of its vertices in any coordinate, (m,).
+    """For each face: whether it counts as a face of zero area, (m,); and the largest difference of
+    two of its vertices in any coordinate, (m,). Edges are scaled before they are multiplied, so
+    that nothing overflows or underflows.
 
-    Edges are scaled before they are multiplied, so that nothing overflows or underflows.
+    x: (n, 3) the vertices.
+    faces: (m, 3).
     """
     a, b, c = (np.ascontiguousarray(x[corner].T) for corner in faces.T)
     u, v, w = b - a, c - a, c - b  # (3, m) each: rows are x, y, z
@@ -218,8 +226,11 @@ def _measure_faces(x: FloatArray, faces: IntArray) -> tuple[BoolArray, FloatArra
 
 
 def _check_size(longest: FloatArray) -> None:
-    """Raise a MeshError for a face so small that squares of its edges underflow. longest: (m,) the
-    longest edge of each face, 0 for some faces of zero area, which are not reported here."""
+    """Raise a MeshError for a face so small that squares of its edges underflow.
+
+    longest: (m,) the largest difference of two vertices of each face in any coordinate. It is 0 for
+        faces whose vertices are equal, which are not reported here.
+    """
     small = np.flatnonzero((longest > 0.0) & (longest < 1e-100))
     if small.size:
         raise MeshError(
@@ -229,7 +240,11 @@ def _check_size(longest: FloatArray) -> None:
 
 
 def _zero_area_message(x: FloatArray, faces: IntArray, flat: IntArray) -> str:
-    """The text of an error message about faces of zero area. flat: the indices of these faces."""
+    """The text of an error message about faces of zero area.
+
+    x, faces: (n, 3), (m, 3) the mesh.
+    flat: the indices of these faces.
+    """
     a, b, c = (x[k] for k in faces[flat[0]])
     corners = ", ".join(format_vector(corner) for corner in (a, b, c))
     repeated = bool((a == b).all() or (b == c).all() or (c == a).all())

@@ -1,5 +1,6 @@
 """Orientability of triangle meshes: whether a mesh has two sides, or only one, like a Moebius
-strip."""
+strip. Faces (m, 3) hold indices of vertices. Two faces are neighbors if they have an edge in common
+that no third face has; they agree in orientation if they run it in opposite directions."""
 
 from __future__ import annotations
 
@@ -13,11 +14,12 @@ __all__ = ["is_nonorientable", "orientation_components"]
 
 
 def is_nonorientable(faces: IntArray) -> bool:
-    """Whether the mesh has a boundary and all of its components are non-orientable, like a Moebius
-    strip. Components are connected across edges with exactly two faces."""
+    """Whether a mesh has a boundary and all of its components are non-orientable, like a Moebius
+    strip. A component is a largest set of faces connected through neighbors."""
     if not (_face_edges(faces)[2] == 1).any():
         return False
     labels = orientation_components(faces)
+    # A face and its reverse have the same label in a component that is non-orientable.
     return bool((labels[: len(faces)] == labels[len(faces) :]).all())
 
 
@@ -25,10 +27,10 @@ def orientation_components(faces: IntArray) -> IntArray:
     """Labels (2m,) that show whether the faces (m, 3) of a mesh can be oriented consistently. Entry
     k belongs to face k as given, entry m + k to face k reversed.
 
-    Two such oriented faces have the same label if they are connected through neighbors (faces with
-    a common edge that no third face has) whose orientations agree. So face k and its reverse have
-    the same label if and only if the connected component of face k is non-orientable. (The labels
-    are the components of the orientation double cover.)
+    Two such oriented faces have the same label if they are connected through neighbors whose
+    orientations agree. So face k and its reverse have the same label if and only if the connected
+    component of face k is non-orientable. (The labels are the components of the orientation double
+    cover.)
     """
     import scipy.sparse  # imported here, as it takes half a second and few programs need it
     import scipy.sparse.csgraph as csgraph_module
@@ -37,7 +39,9 @@ def orientation_components(faces: IntArray) -> IntArray:
     face_count = len(faces)
     pairs, edge_of, use_count = _face_edges(faces)
     order = np.argsort(edge_of, kind="stable")
+    # The two half-edges of each edge with exactly two faces.
     first, second = order[(use_count == 2)[edge_of[order]]].reshape(-1, 2).T
+    # Both faces run the edge in the same direction: they disagree.
     is_reversed = ((pairs[first] == pairs[second]).all(axis=1)).astype(np.int64)
     first, second = first % face_count, second % face_count
     # Node k is face k as given, node face_count + k the face reversed; neighbors that agree are
@@ -53,9 +57,9 @@ def orientation_components(faces: IntArray) -> IntArray:
 
 
 def _face_edges(faces: IntArray) -> tuple[IntArray, IntArray, IntArray]:
-    """The edges of all faces (m, 3): the directed edges (3m, 2), the first edge of every face
-    first; for each of them its index (3m,) among the undirected edges; and for each undirected edge
-    the number of faces that contain it."""
+    """The edges of all faces (m, 3). Returns the directed edges (3m, 2), the first edges of all
+    faces first; for each of them its index (3m,) among the undirected edges; and for each
+    undirected edge the number of faces that contain it."""
     pairs = np.concatenate([faces[:, [k, (k + 1) % 3]] for k in range(3)]).astype(np.int64)
     keys = pairs.min(axis=1) * (int(pairs.max(initial=0)) + 1) + pairs.max(axis=1)
     _, edge_of, use_count = np.unique(keys, return_inverse=True, return_counts=True)

@@ -1,8 +1,8 @@
-"""Outlines of regions of the plane: closed loops of points, cleaned so that they bound a region.
-
-`make_outline` accepts any loops, and determines the region inside by the even-odd rule or by
-winding numbers. The loops that it returns do not cross, and have the region on their left.
-"""
+"""Outlines of regions of the plane: closed loops of points, cleaned so that they bound a region. A
+loop is an array (n, 2) of points; its last point is joined to its first. `make_outline` accepts any
+loops, and determines the region inside by a rule: points around which an odd number of loops runs
+(even-odd), or points with a winding number other than 0. The loops that it returns do not cross,
+and have the region on their left."""
 
 from __future__ import annotations
 
@@ -34,15 +34,16 @@ _CLIPPER_SIZE = 2.0**17
 def make_outline(loops: Any, rule: FillingRule = "even-odd") -> Outline:
     """The outline of the region inside of loops: the loops that bound it.
 
-    loops: an array (n, 2) of the vertices of a closed loop, the last joined to the first, or
-        several such arrays of different lengths. Loops may be nested to any depth, and may have
-        either orientation.
+    loops: an array (n, 2) of the points of a closed loop, the last joined to the first, or several
+        such arrays of different lengths. Loops may be nested to any depth, and may have either
+        orientation.
     rule: which points are inside. "even-odd": points around which an odd number of loops runs, so
         that a loop in another loop is a hole, whatever its orientation. "nonzero": points whose
         winding number is not 0; the letters of fonts use this rule.
 
-    Loops that neither touch nor cross keep their vertices exactly. Others are cut where they cross
-    (by Clipper2, through manifold3d), with vertices rounded to about 1e-13 of the outline's size.
+    With "even-odd", loops that neither touch nor cross keep their points exactly. Others are cut
+    where they cross (by the library Clipper2, through manifold3d), with points rounded to about
+    1e-13 of the outline's size.
 
     Raises:
         ValueError: a loop is malformed or too large; there is no area inside.
@@ -63,11 +64,11 @@ def make_outline(loops: Any, rule: FillingRule = "even-odd") -> Outline:
 
 
 def _validated_loops(loops: Any) -> list[FloatArray]:
-    """The loops as arrays (n, 2), without repeated points.
+    """Convert loops to a list of arrays (n, 2), without points that repeat the point before.
 
     Raises:
         ValueError: no loops, a wrong shape, numbers that are not finite or too large, too many
-            points, or fewer than three different points.
+            points, or fewer than three points that are left.
     """
     entries: list[Any] = [loops] if _is_one_loop(loops) else list(loops)
     if not entries:
@@ -93,7 +94,7 @@ def _validated_loops(loops: Any) -> list[FloatArray]:
 
 
 def _is_one_loop(loops: Any) -> bool:
-    """Whether the argument of `make_outline` is a single loop (n, 2), not a list of loops.
+    """Whether the argument of `make_outline` is a single loop (n, 2), and not a list of loops.
 
     Raises:
         TypeError: it is neither.
@@ -112,28 +113,32 @@ def _is_one_loop(loops: Any) -> bool:
 
 
 def _edges_and_successors(loops: list[FloatArray]) -> tuple[FloatArray, FloatArray, IntArray]:
-    """The edges of closed loops (n, 2): the starts (m, 2) and the ends (m, 2) of all edges, and for
-    each edge the index (m,) of the next edge of the same loop."""
+    """The edges of closed loops (n, 2). Returns the starts (m, 2) and the ends (m, 2) of all edges,
+    and for each edge the index (m,) of the next edge of the same loop."""
     start = np.concatenate(loops)
     end = np.concatenate([np.roll(loop, -1, axis=0) for loop in loops])
     successor: IntArray = np.arange(1, len(start) + 1, dtype=np.int64)
     last = np.array([len(loop) for loop in loops], dtype=np.int64).cumsum() - 1
+    # The last edge of each loop is followed by its first.
     successor[last] = np.concatenate([[0], last[:-1] + 1])
     return start, end, successor
 
 
 def _self_intersects(loops: list[FloatArray], tolerance: float) -> bool:
-    """Whether two edges that are not neighbors come within `tolerance` of each other, or an edge
-    folds back on its neighbor. True also if there are too many pairs to compare."""
+    """Whether two edges that are not neighbors come within `tolerance` (a length) of each other, or
+    an edge folds back on its neighbor. True also if there are too many pairs to compare."""
     start, end, successor = _edges_and_successors(loops)
     next_edge = end[successor] - start[successor]
     edge = end - start
     turn = edge[:, 0] * next_edge[:, 1] - edge[:, 1] * next_edge[:, 0]
     dot = (edge * next_edge).sum(axis=1)
     size = np.linalg.norm(edge, axis=1) * np.linalg.norm(next_edge, axis=1)
+    # The next edge runs back: parallel and opposite.
     if ((np.abs(turn) <= 1e-9 * size) & (dot < 0)).any():
         return True
     lower, upper = np.minimum(start, end) - tolerance, np.maximum(start, end) + tolerance
+    # Edges in the order of their lowest x. Each edge is compared with the following ones up to its
+    # highest x; `counts` is their number.
     order = np.argsort(lower[:, 0], kind="stable")
     last = cast("IntArray", lower[order, 0].searchsorted(upper[order, 0], side="right"))
     counts: IntArray = last - np.arange(1, len(order) + 1)
@@ -143,6 +148,7 @@ def _self_intersects(loops: list[FloatArray], tolerance: float) -> bool:
     while begin < len(order):
         stop = begin + max(1, int(counts[begin:].cumsum().searchsorted(_PAIRS_PER_BATCH)))
         batch = counts[begin:stop]
+        # All pairs of the batch: edge order[rows] and the edge offset + 1 places later.
         rows = np.arange(begin, stop).repeat(batch)
         offset = np.arange(len(rows)) - (batch.cumsum() - batch).repeat(batch)
         i, j = order[rows], order[rows + 1 + offset]
@@ -158,13 +164,14 @@ def _self_intersects(loops: list[FloatArray], tolerance: float) -> bool:
 def _segments_touch(
     a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, tolerance: float
 ) -> BoolArray:
-    """(k,) whether the segments from a to b and from c to d, (k, 2) each, cross or come within
-    `tolerance` of each other."""
+    """Whether two segments, from a to b and from c to d, cross or come within `tolerance` (a
+    length) of each other: (k,) for k pairs. a, b, c and d are (k, 2)."""
 
     def orientation(p: FloatArray, q: FloatArray, r: FloatArray) -> FloatArray:
         """Twice the signed area of the triangles p q r: positive if r is to the left of p -> q."""
         return (q[:, 0] - p[:, 0]) * (r[:, 1] - p[:, 1]) - (q[:, 1] - p[:, 1]) * (r[:, 0] - p[:, 0])
 
+    # The ends of each segment are on different sides of the other one's line.
     is_crossing = (orientation(a, b, c) * orientation(a, b, d) < 0) & (
         orientation(c, d, a) * orientation(c, d, b) < 0
     )
@@ -175,7 +182,7 @@ def _segments_touch(
 
 
 def _distances(p: FloatArray, a: FloatArray, b: FloatArray) -> FloatArray:
-    """The distances (k,) of points p from the segments from a to b; p, a and b are (k, 2)."""
+    """The distances (k,) of points p from the segments from a to b; all are (k, 2)."""
     edge = b - a
     t = ((p - a) * edge).sum(axis=1) / (edge * edge).sum(axis=1)
     return np.linalg.norm(p - a - np.clip(t, 0, 1)[:, None] * edge, axis=1)
@@ -190,17 +197,21 @@ def _orient_loops(loops: list[FloatArray]) -> Outline:
     oriented: list[FloatArray] = []
     for k, loop in enumerate(loops):
         x, y = loop[0]
+        # A ray from the loop's first point in the direction of x crosses a loop around it an odd
+        # number of times.
         spans_y = (start[:, 1] > y) != (end[:, 1] > y)
         spans_y &= loop_index != k
         a, b = start[spans_y], end[spans_y]
         crossing = a[:, 0] + (y - a[:, 1]) / (b[:, 1] - a[:, 1]) * (b[:, 0] - a[:, 0])
         is_hole = np.count_nonzero(crossing > x) % 2 == 1
+        # Counter-clockwise for the outside of a region, clockwise for a hole.
         oriented.append(loop[::-1].copy() if (_area(loop) > 0) == is_hole else loop)
     return _make_read_only(oriented)
 
 
 def _area(loop: FloatArray) -> float:
     """The signed area of a loop (n, 2), positive if it runs counter-clockwise."""
+    # Relative to the first point, to avoid rounding errors far from the origin.
     offsets = loop - loop[0]
     next_offsets = np.roll(offsets, -1, axis=0)
     return 0.5 * float(
@@ -209,8 +220,12 @@ def _area(loop: FloatArray) -> float:
 
 
 def _resolve_crossings(loops: list[FloatArray], rule: FillingRule) -> Outline:
-    """The outline of the region inside of loops that cross or touch, computed by Clipper2. rule:
-    which points are inside, as for `make_outline`: "even-odd" or "nonzero" winding number."""
+    """The outline of the region inside of loops that cross or touch, computed by the library
+    Clipper2.
+
+    rule: which points are inside, as for `make_outline`: "even-odd", or "nonzero" for a winding
+        number other than 0.
+    """
     from manifold3d import CrossSection, FillRule
 
     fill = FillRule.EvenOdd if rule == "even-odd" else FillRule.NonZero
@@ -238,8 +253,8 @@ def _make_read_only(loops: list[FloatArray]) -> Outline:
 
 
 def scale_for_clipper(outline: Sequence[FloatArray]) -> tuple[list[FloatArray], float]:
-    """The loops multiplied by a power of two, and this factor. It is so large that Clipper2's
-    rounding to 1e-8 hardly matters."""
+    """Multiply loops by a power of two that is so large that Clipper2's rounding to 1e-8 hardly
+    matters. Returns the scaled loops, and the factor."""
     largest = max(float(np.abs(loop).max()) for loop in outline)
     scale = 2.0 ** (math.frexp(_CLIPPER_SIZE)[1] - math.frexp(largest)[1])
     return [np.ascontiguousarray(loop * scale) for loop in outline], scale

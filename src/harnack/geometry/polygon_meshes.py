@@ -1,9 +1,8 @@
-"""Meshes of polygons that need not be planar: validation, measures, and a generator of examples.
-
-A face is a closed curve through vertices, or several, such as an outline and holes: a list of loops
-of vertex indices, counted from 0. Its positive side is the one from which the outline runs
-counter-clockwise and holes clockwise. Faces need not be joined, and may cross each other.
-"""
+"""Meshes of polygons that need not be planar: validation, measures, and a generator of examples. A
+face is a closed curve through vertices, or several, such as an outline and holes. Each closed curve
+is a loop, a list of vertex indices counted from 0; a corner is one entry of a loop. The positive
+side of a face is the one from which the outline runs counter-clockwise and holes clockwise. Faces
+need not be joined, and may cross each other."""
 
 from __future__ import annotations
 
@@ -32,19 +31,22 @@ from harnack.geometry.meshes import MAX_FACES, MAX_VERTICES, MeshError
 
 __all__ = ["PolygonFaces", "cluster_into_polygons", "validate_polygons"]
 
-# A face whose corners are closer to a line than this fraction of its size counts as collinear.
+# A face counts as collinear if its corners are nearer to a line than this fraction of its size.
 _COLLINEAR_TOLERANCE = 1e-9
-# The turn between two edges counts if its sine is at least this.
+# A turn from one edge to the next counts as a turn to the left only if its sine is at least this.
 _MIN_TURN_SINE = 1e-6
 # The turns of a convex polygon add up to 2 pi, within this tolerance in radians.
 _REVOLUTION_TOLERANCE = 1e-6
-# Faces with a non-convex projection are examined further, 0.5 ms each, up to this number.
+# Faces without a convex projection are examined further, which takes 0.5 ms each, up to this
+# number.
 _MAX_EXAMINED_FACES = 20_000
 
 
 @dataclass(frozen=True, eq=False)
 class PolygonFaces:
-    """Polygonal faces with any number of corners and loops, in flat arrays.
+    """Polygonal faces with any number of corners and loops, in flat arrays. A loop is a closed
+    curve through vertices, a corner is one entry of a loop, and a face consists of one or more
+    loops (an outline and holes). There are n vertices, k corners, l loops and m faces.
 
     vertices: (n, 3).
     corners: (k,) the vertex index of each corner, loop after loop.
@@ -59,7 +61,7 @@ class PolygonFaces:
 
     @property
     def face_count(self) -> int:
-        """The number of faces."""
+        """The number of faces, m."""
         return int(self.face_of_loop[-1]) + 1
 
     @property
@@ -86,7 +88,7 @@ class PolygonFaces:
         return np.unique(np.sort(ends, axis=1), axis=0)
 
     def loops(self, face: int) -> list[FloatArray]:
-        """The closed curves of a face, (n, 3) each."""
+        """The loops of the face with index `face`, each an array (j, 3) of points."""
         loop_ids = np.flatnonzero(self.face_of_loop == face)
         slices = (
             slice(self.loop_starts[k], self.loop_starts[k] + self.loop_sizes[k]) for k in loop_ids
@@ -94,7 +96,7 @@ class PolygonFaces:
         return [self.vertices[self.corners[corners]] for corners in slices]
 
     def face_boxes(self) -> tuple[FloatArray, FloatArray]:
-        """Lower and upper corners (m, 3) of the boxes around the vertices of each face."""
+        """Lower and upper corners (m, 3) of the bounding boxes of the faces' vertices."""
         x, first = self.vertices[self.corners], self.first_corners
         return np.minimum.reduceat(x, first), np.maximum.reduceat(x, first)
 
@@ -107,7 +109,8 @@ class PolygonFaces:
     @functools.cached_property
     def in_convex_position(self) -> BoolArray:
         """(m,) whether each face is a single loop without self-intersections that is proved to lie
-        on the boundary of a convex set; False where there is no proof."""
+        on the boundary of a convex set; False where there is no proof. Faces whose projection is
+        not convex are examined by `is_convex_position`, but no more than 20,000 of them."""
         is_convex = self._projects_to_convex_polygon()
         is_single = np.bincount(self.face_of_loop, minlength=self.face_count) == 1
         unproved = np.flatnonzero(is_single & ~is_convex)[:_MAX_EXAMINED_FACES]
@@ -116,8 +119,8 @@ class PolygonFaces:
         return is_convex
 
     def _projects_to_convex_polygon(self) -> BoolArray:
-        """For each face, whether it is a single loop whose projection along its mean normal is a
-        convex polygon that is run around once, as an array (m,).
+        """(m,) for each face, whether it is a single loop whose projection along its mean normal is
+        a convex polygon that is run around once.
 
         Such a loop has no self-intersection, for its projection has none. It lies on the boundary
         of a convex set, the cylinder over the projection. A turn counts only if its sine is more
@@ -127,12 +130,16 @@ class PolygonFaces:
         face, first = self.face_of_corner, self.first_corners
         center = np.add.reduceat(x, first) / np.diff(np.append(first, len(x)))[:, None]
         offsets = x - center[face]
+        # The sum of the cross products of successive offsets: the vector area, twice.
         normal = np.add.reduceat(np.cross(offsets, offsets[self.next_corner]), first)
         length = np.linalg.norm(normal, axis=1)
         normal /= np.where(length > 0, length, 1)[:, None]
         edge = x[self.next_corner] - x
+        # A millionth of the product of the lengths of both edges, to be compared with their cross
+        # product.
         min_sine = np.linalg.norm(edge, axis=1)
         min_sine *= _MIN_TURN_SINE * min_sine[self.next_corner]
+        # The projection of the edges; all turns must be to the left, and add up to one revolution.
         edge -= (edge * normal[face]).sum(axis=1)[:, None] * normal[face]
         next_edge = edge[self.next_corner]
         sine = (np.cross(edge, next_edge) * normal[face]).sum(axis=1)
@@ -151,8 +158,11 @@ class PolygonFaces:
 
 
 def validate_polygons(vertices: Any, faces: Any) -> PolygonFaces:
-    """Validate polygons. vertices: (n, 3). faces: a sequence of faces of any lengths, each a
-    sequence of at least three indices or a sequence of such loops; or an integer array (m, k).
+    """Validate polygonal faces; returns them as arrays that cannot be written to.
+
+    vertices: (n, 3).
+    faces: a sequence of faces of any lengths, each a sequence of at least three indices or a
+        sequence of such loops; or an integer array (m, k).
 
     Raises:
         MeshError: not numbers of these shapes, an empty mesh; a coordinate that is not finite; an
@@ -183,7 +193,8 @@ def validate_polygons(vertices: Any, faces: Any) -> PolygonFaces:
 
 
 def _checked_vertices(vertices: Any) -> FloatArray:
-    """A new float64 array (n, 3) of finite vertices. Raises MeshError."""
+    """Convert vertices to a new float64 array (n, 3) of finite numbers. Raises MeshError if that is
+    not possible."""
     array = as_real_array(vertices, "the vertices", MeshError, ragged="must all have 3 coordinates")
     if array.size == 0:
         raise MeshError("there are no vertices: give an array (n, 3)")
@@ -198,8 +209,9 @@ def _checked_vertices(vertices: Any) -> FloatArray:
 
 
 def _flatten_faces(faces: Any) -> tuple[IntArray, IntArray, IntArray]:
-    """The corners (k,) of all loops, one loop after the other; and the number of corners (l,) and
-    the face (l,) of each loop. Raises MeshError."""
+    """Convert a list of faces to flat arrays: the corners (k,) of all loops, one loop after the
+    other; and for each loop the number of its corners (l,) and its face (l,). Raises MeshError if
+    that is not possible."""
     if not _is_list(faces):
         raise MeshError(f"the faces must be a list of lists of vertex indices, not {faces!r}")
     if len(faces) == 0:
@@ -223,7 +235,8 @@ def _flatten_faces(faces: Any) -> tuple[IntArray, IntArray, IntArray]:
 
 
 def _loops_of(face: Any, k: int) -> list[Any]:
-    """The loops of face number k, as integer arrays (n,). Raises MeshError."""
+    """The loops of the face with index k, as integer arrays (n,). Raises MeshError if it is no
+    face."""
     if not _is_list(face):
         raise MeshError(
             f"face {k} is {face!r}: it must be a list of vertex indices, or a list of such loops"
@@ -260,6 +273,7 @@ def _check_edges(mesh: PolygonFaces) -> None:
     n = len(mesh.vertices)
     loop = np.repeat(np.arange(len(mesh.loop_sizes)), mesh.loop_sizes)
     face = mesh.face_of_corner
+    # A number for each pair of a loop and a vertex.
     first = _first_repeated_key(loop * n + mesh.corners)
     if first is not None:
         raise MeshError(
@@ -274,6 +288,7 @@ def _check_edges(mesh: PolygonFaces) -> None:
             f"face {face[k]} has an edge without a length, from vertex {begin[k]} to "
             f"{end[k]}{others_suffix(degenerate.size)}: join vertices at the same place"
         )
+    # A number for each edge, the same for both directions.
     _, edge = np.unique(np.minimum(begin, end) * n + np.maximum(begin, end), return_inverse=True)
     if (first := _first_repeated_key(face * len(edge) + edge.reshape(-1))) is not None:
         raise MeshError(
@@ -292,23 +307,22 @@ def _first_repeated_key(keys: IntArray) -> int | None:
 
 
 def _check_not_collinear(mesh: PolygonFaces) -> None:
-    """Raise a MeshError for a face whose corners are collinear.
-
-    Let a be the corner that is farthest from the center of the face's box, and b the corner that is
-    farthest from a. The corners are collinear if all are within 1e-9 of the face's size from the
-    line through a and b.
-    """
+    """Raise a MeshError for a face whose corners are collinear. Let a be the corner that is
+    farthest from the center of the face's box, and b the corner that is farthest from a. The
+    corners are collinear if all are within 1e-9 of the face's size from the line through a and
+    b."""
     x, face = mesh.vertices[mesh.corners], mesh.face_of_corner
     lower, upper = mesh.face_boxes()
     relative = x - (0.5 * (lower + upper))[face]
     relative /= np.abs(upper - lower).max(axis=1)[face][:, None]
-    # The pole of each face is its corner farthest from the center; offsets are relative to it.
+    # The pole of each face is its corner a; it is the last of the face in the order by face and
+    # radius.
     squared_radius = (relative * relative).sum(axis=1)
     order = np.lexsort((squared_radius, face))
     last = np.append(np.flatnonzero(np.diff(face[order])), len(order) - 1)
     pole = relative[order[last]]
     offset = relative - pole[face]
-    # From the pole to the corner that is farthest from it.
+    # The direction from a to b.
     square_distance = (offset * offset).sum(axis=1)
     order = np.lexsort((square_distance, face))
     direction = offset[order[last]]
@@ -324,7 +338,7 @@ def _check_not_collinear(mesh: PolygonFaces) -> None:
         )
 
 
-# The weight of normals relative to positions, in units of the mesh.
+# The weight of normals relative to positions, a length in the unit of the mesh.
 _NORMAL_WEIGHT = 0.25
 
 
@@ -337,9 +351,10 @@ def cluster_into_polygons(
     smoothing: int = 0,
     seed: int = 0,
 ) -> tuple[FloatArray, list[list[list[int]]]]:
-    """Cut a triangle mesh into about `count` clusters of triangles. Returns the vertices (k, 3) and
-    the boundary of each cluster as a polygon face, a list of loops of vertex indices. The polygons
-    have many corners and are not planar; they serve as examples for pictures and tests.
+    """Cut a triangle mesh into about `count` clusters of triangles, and make a polygonal face of
+    each. Returns the vertices (k, 3); and for each cluster the loops of its boundary, lists of
+    vertex indices. The polygons have many corners and are not planar; they serve as examples for
+    pictures and tests.
 
     Each triangle is a point (centroid, weight * normal) in six dimensions, and Lloyd's algorithm
     finds the clusters, so that they are compact and bend little (Cohen-Steiner, Alliez and Desbrun
@@ -347,9 +362,10 @@ def cluster_into_polygons(
     are left out.
 
     vertices, faces: (n, 3) and (m, 3), the triangle mesh.
-    iterations: the number of steps of Lloyd's algorithm. seed: of its random start.
+    iterations: the number of steps of Lloyd's algorithm.
     smoothing: how often each corner with exactly two edges is moved to the middle between its
         position and the mean of its two neighbors, since boundaries along triangles are zigzags.
+    seed: the seed of the random start.
 
     Raises:
         ValueError: fewer than two clusters, or more than triangles.
@@ -360,6 +376,7 @@ def cluster_into_polygons(
     order = np.argsort(cluster_of, kind="stable")
     parts = np.split(faces[order], np.flatnonzero(np.diff(cluster_of[order])) + 1)
     loops = [join_edges(boundary_edges(part.tolist())) for part in parts]
+    # A cluster that is a closed surface has no boundary.
     loops = [cluster for cluster in loops if cluster]
     used = np.unique([corner for cluster in loops for loop in cluster for corner in loop])
     new_index = np.full(len(vertices), -1)
@@ -382,13 +399,15 @@ def _loop_edges(loop: list[int]) -> list[tuple[int, int]]:
 
 
 def _smoothed(points: FloatArray, edges: IntArray, times: int) -> FloatArray:
-    """The points (n, 3), where each point of exactly two edges is moved to the middle between its
-    position and the mean of its two neighbors, `times` times.
+    """Smooth polygons: each point with exactly two edges is moved to the middle between its
+    position and the mean of its two neighbors, `times` times. Returns the points (n, 3).
 
-    edges: (e, 2), each edge once.
+    points: (n, 3).
+    edges: (e, 2) indices of points, each edge once.
     """
     directed = np.concatenate([edges, edges[:, ::-1]])
     is_inner = np.bincount(directed[:, 0], minlength=len(points)) == 2
+    # By start, so that the two neighbors of a point follow each other.
     directed = directed[np.argsort(directed[:, 0], kind="stable")]
     neighbors = directed[is_inner[directed[:, 0]], 1].reshape(-1, 2)
     for _ in range(times):
@@ -401,11 +420,14 @@ def _smoothed(points: FloatArray, edges: IntArray, times: int) -> FloatArray:
 def _clusters(
     vertices: FloatArray, faces: IntArray, count: int, iterations: int, seed: int
 ) -> IntArray:
-    """The cluster (m,) of each triangle of a mesh. Triangles are points (centroid, weight * unit
-    normal) in six dimensions, weighted by area, and are clustered by Lloyd's algorithm.
+    """Find the cluster (m,) of each triangle of a mesh. Triangles are points (centroid, weight *
+    unit normal) in six dimensions, weighted by area, and are clustered by Lloyd's algorithm: each
+    triangle joins the nearest center, and each center moves to the mean of its triangles.
 
-    count: the number of clusters; some may become empty. iterations: the number of Lloyd's steps.
-        seed: of the random initial centers.
+    vertices, faces: (n, 3), (m, 3) the mesh.
+    count: the number of clusters; some may become empty, and are dropped.
+    iterations: the number of Lloyd's steps.
+    seed: the seed of the random initial centers.
     """
     import scipy.spatial  # imported here: it takes half a second, and few programs need it
 

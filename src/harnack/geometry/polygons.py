@@ -1,7 +1,10 @@
-"""Closed polygons: removal of opposite edges, and triangulation.
+"""Closed polygons: removal of opposite edges, and triangulation. A loop is an array (n, 3) of
+points, the last joined to the first; its edges are directed. Two edges are opposite if they join
+the same two points in the two directions. A polygon is a list of indices of vertices (its corners),
+the last joined to the first.
 
 Pairs of opposite edges are removed by integer index, before a curve is uploaded: in floating point,
-two opposite contributions would leave their rounding errors.
+two opposite contributions to a solid angle would leave their rounding errors.
 """
 
 from __future__ import annotations
@@ -23,7 +26,8 @@ __all__ = ["cancel_opposite_edges", "remaining_edges", "triangulate"]
 
 
 def cancel_opposite_edges(loops: Loops) -> Loops:
-    """Remove pairs of opposite edges from closed loops; the solid angle stays the same modulo 4 pi.
+    """Remove pairs of opposite edges from closed loops; returns the loops that are left. The solid
+    angle of the loops stays the same modulo 4 pi.
 
     Seen from a point, the contribution of an edge is minus that of the reversed edge, so both drop
     out of the sum. If they were kept, they would leave rounding errors, and would count in
@@ -35,14 +39,15 @@ def cancel_opposite_edges(loops: Loops) -> Loops:
     edges that overlap in part and run opposite ways, both stay.
 
     Proof that the remaining loops are closed: in loops the same number of edges begins and ends at
-    a vertex, and this stays true when an edge and its reverse are removed. The gradient of the
-    solid angle is the sum of the edges' fields, which cancel (Biot and Savart), and the integral
-    along closed paths is still a multiple of 4 pi, so that values change by a constant at most; far
-    away both vanish, modulo 4 pi.
+    a vertex, and this stays true when an edge and its reverse are removed. Proof that the solid
+    angle stays the same: its gradient is the sum of the edges' fields, which cancel (Biot and
+    Savart), and the integral along closed paths is still a multiple of 4 pi, so that values change
+    by a constant at most; far away both vanish, modulo 4 pi.
     """
     points = np.concatenate(loops)
     begin, end = _welded_edges(loops, points)
     edges, weights = net_edges(begin, end)
+    # Every edge is left.
     if int(weights.sum()) == len(points):
         return loops
     return tuple(points[np.array(loop)] for loop in singular_loops(edges, weights))
@@ -64,8 +69,11 @@ def remaining_edges(loops: Loops) -> tuple[FloatArray, FloatArray]:
 
 
 def _welded_edges(loops: Loops, points: FloatArray) -> tuple[IntArray, IntArray]:
-    """The first and the last point (m,) of all edges of the loops, as indices of `points` (m, 3),
-    the vertices of all loops. Points at the same position have the same index."""
+    """The edges of loops, by the indices of their first and last points, (m,) each. Points at the
+    same position have the same index.
+
+    points: (m, 3) the points of all loops, to which the indices refer.
+    """
     index = weld_vertices(points)
     parts = np.split(index, np.cumsum([len(loop) for loop in loops])[:-1])
     return index, np.concatenate([np.roll(part, -1) for part in parts])
@@ -73,14 +81,14 @@ def _welded_edges(loops: Loops, points: FloatArray) -> tuple[IntArray, IntArray]
 
 # Triangles of polygons.
 
-# The largest work for ear clipping, which takes about ten seconds: the sum, over the polygons that
-# need it, of the squared number of corners plus _WORK_PER_POLYGON.
+# The largest work for ear clipping, which takes about ten seconds. The work is the sum of the
+# squared number of corners plus _WORK_PER_POLYGON, over the polygons that need it.
 _MAX_EAR_WORK = 1_000_000_000
 _WORK_PER_POLYGON = 1000
 # Twice the area of a triangle, in a polygon of size about 1, up to which it counts as flat.
 _FLAT_AREA = 1e-12
-# Straight edges with corners in their middle are bent inwards: a corner at the distances a and b
-# from the ends moves by this times a b.
+# For ear clipping, corners in the middle of a straight edge are moved inwards: a corner at the
+# distances a and b from the ends of the edge moves by this times a b.
 _INWARD_CURVATURE = 1e-6
 _CORNERS_PER_GROUP = 2_000_000
 
@@ -88,16 +96,17 @@ _CORNERS_PER_GROUP = 2_000_000
 def triangulate(vertices: FloatArray, corners: IntArray, sizes: IntArray) -> IntArray:
     """Triangulate polygons. Returns triangles (k, 3), in the order of the polygons.
 
+    A polygon need not be exactly planar: it is judged by its projection along its mean normal.
+    First the fan around its first corner is tried (all diagonals from that corner), then the fan
+    around its second corner. If neither is a valid triangulation, because the polygon is not
+    convex, ears are cut off it (Meisters 1975). The edges of the triangles always cancel to those
+    of the polygon: polygons that cross themselves get triangles that overlap, and in a winding
+    number these still add up to the polygon.
+
     vertices: (n, 3).
     corners: the vertex indices of all polygons, one polygon after the other.
     sizes: (m,) the number of corners of each polygon; polygons with fewer than three yield no
         triangles.
-
-    A polygon need not be exactly planar: it is judged by its projection along its mean normal. If
-    the fans around its first two corners are not valid triangulations, because the polygon is not
-    convex, ears are cut off it (Meisters 1975). The edges of the triangles always cancel to those
-    of the polygon: polygons that cross themselves get triangles that overlap, and in a winding
-    number these still add up to the polygon.
 
     Raises:
         MeshError: the triangulation would take too long, because of the number of non-convex
@@ -107,34 +116,39 @@ def triangulate(vertices: FloatArray, corners: IntArray, sizes: IntArray) -> Int
         return corners.reshape(-1, 3)
     begins = np.cumsum(sizes) - sizes
     triangles = [np.zeros((0, 3), dtype=np.int64)]
-    owners = [np.zeros(0, dtype=np.int64)]
+    polygon_of_triangles = [np.zeros(0, dtype=np.int64)]
     work = 0
     for group in _group_by_size(sizes):
-        k = int(sizes[group[0]])
-        polygons = corners[begins[group][:, None] + np.arange(k)]
+        corner_count = int(sizes[group[0]])
+        polygons = corners[begins[group][:, None] + np.arange(corner_count)]
         is_concave = np.zeros(len(group), dtype=bool)
-        if k > 3:
+        if corner_count > 3:
             is_concave = _fan_is_invalid(vertices, polygons)
             # The fan around the second corner is the fan around the first corner of the rotated
             # polygon.
             polygons[is_concave] = np.roll(polygons[is_concave], -1, axis=1)
             # A quadrilateral has no other triangulation.
-            is_concave[is_concave] = k > 4 and _fan_is_invalid(vertices, polygons[is_concave])
-        work += int(is_concave.sum()) * (k * k + _WORK_PER_POLYGON)
+            is_concave[is_concave] = corner_count > 4 and _fan_is_invalid(
+                vertices, polygons[is_concave]
+            )
+        work += int(is_concave.sum()) * (corner_count * corner_count + _WORK_PER_POLYGON)
         if work > _MAX_EAR_WORK:
             raise MeshError(
-                f"{is_concave.sum():,} polygons with dents and {k:,} corners each take too long to "
-                "triangulate: let the program that made the file triangulate them"
+                f"{is_concave.sum():,} polygons with dents and {corner_count:,} corners each take "
+                "too long to triangulate: let the program that made the file triangulate them"
             )
         triangles.append(_fans(polygons[~is_concave]))
-        owners.append(np.repeat(group[~is_concave], k - 2))
+        polygon_of_triangles.append(np.repeat(group[~is_concave], corner_count - 2))
         projections = _projections(vertices, polygons[is_concave])
         for owner, polygon, projection in zip(
             group[is_concave], polygons[is_concave], projections, strict=True
         ):
             triangles.append(_clip_ears(polygon, projection))
-            owners.append(np.full(len(triangles[-1]), owner))
-    return np.concatenate(triangles)[np.argsort(np.concatenate(owners), kind="stable")]
+            polygon_of_triangles.append(np.full(len(triangles[-1]), owner))
+    # In the order of the polygons again.
+    return np.concatenate(triangles)[
+        np.argsort(np.concatenate(polygon_of_triangles), kind="stable")
+    ]
 
 
 def _group_by_size(sizes: IntArray) -> list[IntArray]:
@@ -148,38 +162,51 @@ def _group_by_size(sizes: IntArray) -> list[IntArray]:
     """
     order = np.argsort(sizes, kind="stable")
     order = order[sizes[order] >= 3]
+    # The first polygon of each number of corners, in this order.
     distinct, first = np.unique(sizes[order], return_index=True)
     groups: list[IntArray] = []
-    for size, begin, end in zip(distinct, first, [*first[1:], len(order)], strict=True):
-        step = max(1, _CORNERS_PER_GROUP // int(size))
-        groups += [order[k : min(k + step, end)] for k in range(begin, end, step)]
+    for corner_count, begin, end in zip(distinct, first, [*first[1:], len(order)], strict=True):
+        polygons_at_once = max(1, _CORNERS_PER_GROUP // int(corner_count))
+        groups += [
+            order[k : min(k + polygons_at_once, end)] for k in range(begin, end, polygons_at_once)
+        ]
     return groups
 
 
 def _fans(polygons: IntArray) -> IntArray:
-    """The triangles (m (k - 2), 3) of m polygons with k corners each, (m, k): each polygon is
-    divided by the diagonals from its first corner."""
+    """Divide polygons into triangles by the diagonals from their first corners. Returns the
+    triangles (m (k - 2), 3) of m polygons with k corners each, polygon after polygon.
+
+    polygons: (m, k) indices of vertices.
+    """
     first = np.broadcast_to(polygons[:, :1], polygons[:, 2:].shape)
     return np.stack([first, polygons[:, 1:-1], polygons[:, 2:]], axis=2).reshape(-1, 3)
 
 
 def _fan_is_invalid(vertices: FloatArray, polygons: IntArray) -> BoolArray:
-    """For each of m polygons with k corners (indices (m, k) of `vertices`), whether a triangle of
-    the fan around its first corner is reversed or flat, as an array (m,). Polygons of zero area
-    count as convex."""
+    """(m,) for each polygon, whether a triangle of the fan around its first corner (the triangles
+    between the diagonals from there) is reversed or flat. Polygons of zero area count as convex.
+
+    vertices: (n, 3).
+    polygons: (m, k) indices of vertices.
+    """
     points = vertices[polygons]
     diagonals = points[:, 1:] - points[:, :1]
     areas = np.cross(diagonals[:, :-1], diagonals[:, 1:])
     normal = areas.sum(axis=1)
     square = np.einsum("mj,mj->m", normal, normal)
+    # No positive component along the polygon's mean normal.
     is_turned = np.einsum("mkj,mj->mk", areas, normal) <= _FLAT_AREA * square[:, None]
     return is_turned.any(axis=1) & (square > 0.0)
 
 
 def _projections(vertices: FloatArray, polygons: IntArray) -> FloatArray:
-    """Plane coordinates (m, k, 2) of m polygons with k corners (indices (m, k) of `vertices`), each
-    projected along its mean normal. In the plane the polygons run counter-clockwise and have a size
-    of about 1."""
+    """Project polygons to planes, each along its mean normal. Returns plane coordinates (m, k, 2),
+    in which the polygons run counter-clockwise and have a size of about 1.
+
+    vertices: (n, 3).
+    polygons: (m, k) indices of vertices.
+    """
     offsets = vertices[polygons]
     offsets = offsets - offsets[:, :1]
     normal = np.cross(offsets[:, :-1], offsets[:, 1:]).sum(axis=1)
@@ -193,9 +220,12 @@ def _projections(vertices: FloatArray, polygons: IntArray) -> FloatArray:
 
 
 def _clip_ears(polygon: IntArray, projection: FloatArray) -> IntArray:
-    """The triangles (k - 2, 3) of a polygon (k,), by cutting off ears (triangles at convex
-    corners). projection: (k, 2) the polygon in the plane. A polygon that crosses itself may give
-    another number of triangles."""
+    """Triangulate a polygon by cutting off ears (triangles at convex corners). Returns its
+    triangles, k - 2 of them for k corners; a polygon that crosses itself may give another number.
+
+    polygon: (k,) indices of vertices.
+    projection: (k, 2) the polygon in the plane.
+    """
     import mapbox_earcut  # imported here, since most files do not need it
 
     ears = np.zeros((0, 3), dtype=np.int64)
@@ -211,9 +241,12 @@ def _clip_ears(polygon: IntArray, projection: FloatArray) -> IntArray:
 
 
 def _perturb_straight_corners(projection: FloatArray) -> FloatArray:
-    """The polygon (k, 2) with each corner in the middle of a straight edge moved inwards by a tiny
+    """Move each corner of a polygon that is in the middle of a straight edge inwards by a tiny
     amount. Ear clipping then does not cut off such a corner, which would give a triangle of zero
-    area."""
+    area. Returns the polygon (k, 2).
+
+    projection: (k, 2) the polygon in the plane, counter-clockwise and of size about 1.
+    """
     arriving, leaving = (
         projection - np.roll(projection, 1, axis=0),
         np.roll(projection, -1, axis=0) - projection,
@@ -224,12 +257,13 @@ def _perturb_straight_corners(projection: FloatArray) -> FloatArray:
     if len(ends) in (0, len(projection)):
         return projection
     k = np.arange(len(projection))
+    # The ends of the straight edge that each corner is on.
     edge_begin = projection[ends[np.searchsorted(ends, k, side="right") - 1]]
     edge_end = projection[ends[np.searchsorted(ends, k) % len(ends)]]
     edge = edge_end - edge_begin
     length = np.maximum(np.linalg.norm(edge, axis=1), 1e-300)
-    depth = np.linalg.norm(projection - edge_begin, axis=1) * np.linalg.norm(
+    product_of_distances = np.linalg.norm(projection - edge_begin, axis=1) * np.linalg.norm(
         edge_end - projection, axis=1
     )
     inward = np.stack([-edge[:, 1], edge[:, 0]], axis=1) / length[:, None]
-    return projection + _INWARD_CURVATURE * depth[:, None] * inward
+    return projection + _INWARD_CURVATURE * product_of_distances[:, None] * inward

@@ -1,4 +1,4 @@
-"""Smooth curves through points: `smooth_curve`."""
+"""Smooth curves through points, by cubic splines: `smooth_curve`."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def smooth_curve(
 
 
 def _as_sample_count(samples: Any) -> int:
-    """The number of samples per segment as an int.
+    """Convert the number of samples per segment to an int.
 
     Raises:
         TypeError: not an integer.
@@ -89,7 +89,8 @@ def _as_sample_count(samples: Any) -> int:
 
 
 def _is_list(points: Any) -> bool:
-    """Whether the argument is a list of curves (arrays of points), and not a single curve."""
+    """Whether the argument `points` is a list of curves (arrays of points), and not a single
+    curve."""
     try:
         return np.ndim(points) == 3
     except ValueError:  # curves of different lengths
@@ -97,11 +98,16 @@ def _is_list(points: Any) -> bool:
 
 
 def _spline(x: FloatArray, samples: int, closed: bool, power: float) -> FloatArray:
-    """The vertices of the cubic spline through the points x (n, 3) of a curve, `samples` of them
-    from each point to the next.
+    """Compute points of the cubic spline through the points x (n, 3) of a curve. Returns them as an
+    array (k, 3); the points x themselves are among them, bit for bit.
 
+    samples: how many of them there are from each point of x to the next.
     closed: whether the curve returns to its first point.
-    power: from a point to the next, the parameter grows by this power of their distance.
+    power: from a point to the next, the parameter of the spline grows by this power of their
+        distance.
+
+    Raises:
+        CurveScaleError: two consecutive points are so near that their parameters are equal.
     """
     knots = np.concatenate([x, x[:1]]) if closed else x
     chords = np.diff(knots, axis=0)

@@ -1,10 +1,13 @@
-"""The interface of a clip volume: a convex set to which rays are cut.
+"""The interface of a clip volume: a convex set to which rays are cut. A ray is o + t d, with origin
+o, direction d and ray parameter t. The backend is where Dr.Jit runs; a kernel is a program that it
+compiles, and a kernel parameter a number that may change without compiling again.
 
-Extents are clip volumes, too, and are proved to contain the level set. The 2π level of a curve in
-convex position lies in its hull; for other curves, empty cells are removed from an isoperimetric
-box. So rays that miss the extent cost nothing, and for a ray without an end a miss can be proved.
-If a field is expensive to evaluate (`Field.occupied_cells`) and there are many rays, the march also
-jumps across the empty cells of a grid.
+Extents are clip volumes, too: volumes that are proved to contain the level set of a field. The 2π
+level of the solid angle of a curve in convex position lies in the curve's hull; for other curves,
+empty cells are removed from an isoperimetric box. So rays that miss the extent take no time, and
+for a ray without an end a miss can be proved. If a field is expensive to evaluate
+(`Field.occupied_cells`) and there are many rays, the march also jumps across the empty cells of a
+grid.
 """
 
 from __future__ import annotations
@@ -28,7 +31,7 @@ Point: TypeAlias = tuple[float, float, float]
 
 
 class Volume(abc.ABC):
-    """A closed convex set of R^3, not empty.
+    """A closed convex set in space, not empty, to which rays are cut.
 
     In any precision, `clip` and `contains` lose no point of the volume: they exclude a point only
     if it is certainly outside. They may admit points that lie outside by a few rounding errors of
@@ -40,11 +43,12 @@ class Volume(abc.ABC):
     """
 
     def __new__(cls, *given: Any, **named: Any) -> Self:
-        """Make a volume. Raises for numbers with derivatives, which would be lost."""
+        """Make a volume. Raises an error for numbers with derivatives, which would be lost."""
         check_no_derivatives(cls.__name__, given, named)
         return super().__new__(cls)
 
     def __and__(self, other: object) -> Volume:
+        """The intersection of two volumes. Intersections among them are flattened."""
         from harnack.geometry.clip_volumes import VolumeIntersection
 
         if not isinstance(other, Volume):
@@ -53,21 +57,21 @@ class Volume(abc.ABC):
 
     @abc.abstractmethod
     def clip(self, o: Vec3, d: Vec3, t_min: Real, t_max: Real) -> tuple[Real, Real]:
-        """The interval [t0, t1] of t in which the points o + t d of each ray lie inside the volume,
-        within 0 <= t_min <= t <= t_max.
+        """The interval [t0, t1] of the ray parameters t for which the point o + t d of each ray
+        lies inside the volume, within 0 <= t_min <= t <= t_max. If a ray misses the volume, t0 =
+        inf and t1 = -inf; otherwise t0 < t1.
 
-        o, d: origins and directions; d need not have unit length, but must not be zero. If a ray
-            misses the volume, t0 = inf and t1 = -inf; otherwise t0 < t1.
+        o, d: origins and directions; d need not have unit length, but must not be zero.
         """
 
     @abc.abstractmethod
     def contains(self, p: Vec3) -> Mask:
-        """Whether p lies in the volume, boundary included."""
+        """Whether points p lie in the volume, boundary included."""
 
     @abc.abstractmethod
     def signed_distance(self, p: Vec3) -> Real:
-        """The distance of p to the boundary, negative inside. For points outside it may be a lower
-        bound of the distance."""
+        """The distance of p from the boundary, negative inside. For points outside it may be a
+        lower bound of the distance."""
 
     @abc.abstractmethod
     def outward_normal(self, p: Vec3) -> Vec3:
@@ -80,45 +84,44 @@ class Volume(abc.ABC):
 
     @abc.abstractmethod
     def contains_points(self, points: npt.ArrayLike) -> BoolArray:
-        """Whether points (n, 3) lie in the volume, in double precision on the host: (n,)."""
+        """Whether points (n, 3) lie in the volume, computed in double precision by NumPy: (n,)."""
 
     @abc.abstractmethod
     def padded(self, distance: float) -> Volume:
         """A volume that contains every point within `distance` (>= 0, finite) of this volume."""
 
     def prepare(self, backend: Backend) -> Volume:
-        """An equal volume whose numbers are kernel parameters on the backend.
-
-        So another volume of the same kind does not compile another kernel.
-        """
+        """An equal volume whose numbers are kernel parameters on the backend. So another volume of
+        the same kind does not compile another kernel."""
         del backend
         return self
 
 
 def _operands(volume: Volume) -> tuple[Volume, ...]:
-    """The volumes of an intersection; for a volume of another kind, that volume alone."""
+    """The volumes of an intersection, as a tuple; for a volume of another kind, that volume
+    alone."""
     volumes: tuple[Volume, ...] | None = getattr(volume, "volumes", None)
     return (volume,) if volumes is None else volumes
 
 
 def clip_rounding(backend: Backend) -> float:
-    """The relative error that is allowed for one formula of clipping: ten roundings of half a unit
-    in the last place.
-
-    The longest chain of roundings among all volumes (a plane: its normal rounded to the backend,
-    three products, three sums, one division) is nine.
-    """
+    """The relative error that is allowed for one formula of clipping: ten roundings, each of half a
+    unit in the last place. The longest chain of roundings among all volumes (a plane: its normal
+    rounded to the backend, three products, three sums, one division) is nine."""
     return 10.0 * float(dr.epsilon(backend.Float))
 
 
 def normalize_empty_interval(t0: Real, t1: Real) -> tuple[Real, Real]:
-    """The interval [t0, t1], or (inf, -inf) where it is empty or a single point."""
+    """The interval [t0, t1] of each lane; (inf, -inf) where it is empty or a single point."""
     is_nonempty = t0 < t1
     return dr.select(is_nonempty, t0, dr.inf), dr.select(is_nonempty, t1, -dr.inf)
 
 
 def as_point(value: Iterable[float], name: str, *, finite: bool = True) -> Point:
-    """Three numbers as a tuple of floats.
+    """Convert three numbers to a tuple of floats.
+
+    name: what they are, for messages.
+    finite: whether all must be finite.
 
     Raises:
         ValueError: not three numbers, NaN, or infinite where it must not be.
@@ -137,7 +140,10 @@ def as_point(value: Iterable[float], name: str, *, finite: bool = True) -> Point
 
 
 def check_volume(value: object, name: str) -> None:
-    """Raise TypeError for a value that is neither a volume nor None."""
+    """Raise TypeError for a value that is neither a volume nor None.
+
+    name: what it is, for the message.
+    """
     if value is not None and not isinstance(value, Volume):
         raise TypeError(
             f"{name} must be a volume: a harnack.Ball, harnack.Box or harnack.HalfSpace, or an "
@@ -146,7 +152,7 @@ def check_volume(value: object, name: str) -> None:
 
 
 def as_padding(distance: float) -> float:
-    """The padding distance as a float.
+    """Convert the distance by which a volume is enlarged to a float.
 
     Raises:
         ValueError: it is negative, infinite or NaN.
@@ -157,7 +163,7 @@ def as_padding(distance: float) -> float:
 
 
 def as_points(points: npt.ArrayLike) -> FloatArray:
-    """Points as a float64 array (n, 3).
+    """Convert points to a float64 array (n, 3).
 
     Raises:
         ValueError: no real numbers, or another shape.

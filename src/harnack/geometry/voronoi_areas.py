@@ -1,4 +1,8 @@
-"""Areas of the Voronoi cells of points in their tangent planes."""
+"""Areas of the Voronoi cells of points in their tangent planes. The cell of a point x is the set of
+the points y of its tangent plane with |y - x| <= R that are nearer to x than to each of its
+neighbors, which lie anywhere in space. So the cell is the part of a disc of radius R that is
+bounded by lines: for each neighbor the bisector line, on which y is as far from x as from the
+neighbor. Lengths are in units of R inside of kernels; each lane computes one cell."""
 
 from __future__ import annotations
 
@@ -22,18 +26,20 @@ __all__ = ["TangentVoronoi"]
 
 # Number of lines that are intersected with all other lines in one iteration.
 _LINES_PER_ITERATION = 4
-# Lines count as parallel if the sine of their angle is below this, and as equal if they are
-# parallel and their distance is below this.
+# Lines count as parallel if the sine of their angle is below this; parallel lines count as equal if
+# their distance is below this.
 _PARALLEL = 1e-12
 
 
 @dataclass(frozen=True)
 class _BisectorLine:
-    """The bisector line n . y = h that bounds a cell towards a neighbor, in units of the cell's
-    radius.
+    """The bisector line of a neighbor, on which points of the tangent plane are as far from the
+    cell's point as from the neighbor: n . y = h, with y relative to the point, in units of the
+    cell's radius.
 
     x, y: the components of n, of length 1; both are 0, and h is 1, if the line misses the unit
         disc.
+    h: the distance of the line from the point.
     neighbor: the vector from the point to the neighbor, projected to the tangent plane.
     """
 
@@ -45,9 +51,10 @@ class _BisectorLine:
 
 @dataclass(frozen=True)
 class TangentVoronoi:
-    """Computes Voronoi areas of points in their tangent planes.
+    """Computes the areas of Voronoi cells of points in their tangent planes, on a device. Each cell
+    is bounded by the bisector lines of the point's neighbors, and cut off at a radius R.
 
-    positions: the positions of all n possible neighbors, as three coordinates of width n.
+    positions: the three coordinates of all n possible neighbors, each an array (n,) on the device.
     """
 
     backend: Backend
@@ -63,16 +70,15 @@ class TangentVoronoi:
     def areas(
         self, points: FloatArray, normals: FloatArray, nearest: npt.NDArray[Any], radii: FloatArray
     ) -> FloatArray:
-        """The areas (m,) of the Voronoi cells of points (m, 3) in their tangent planes. The cell of
-        a point x is the set of the points y of the tangent plane with |y - x| <= R that are nearer
-        to x than to each neighbor.
+        """Compute the areas (m,) of the cells of points. The cell of a point x is the set of the
+        points y of its tangent plane with |y - x| <= R that are nearer to x than to each of its
+        neighbors. If all neighbors lie on one side of a line through the point, their mirror images
+        at the point count as neighbors, too.
 
+        points: (m, 3).
         normals: (m, 3) unit normals of the tangent planes.
         nearest: (m, k) the indices of the neighbors among the positions.
         radii: (m,) R of each point.
-
-        If all neighbors lie on one side of a line through the point, their mirror images at the
-        point count as neighbors, too.
         """
         areas, one_sided = self._cell_areas(points, normals, nearest, radii, mirrored=False)
         if one_sided.any():
@@ -89,8 +95,8 @@ class TangentVoronoi:
         self, points: FloatArray, normals: FloatArray, nearest: npt.NDArray[Any],
         radii: FloatArray, *, mirrored: bool,
     ) -> tuple[FloatArray, BoolArray]:  # fmt: skip
-        """The areas (m,) of the cells of m points, in units of their squared radii; and a mask (m,)
-        of the points whose neighbors all lie on one side of a line through the point.
+        """Compute the areas (m,) of the cells of m points, in units of their squared radii; and a
+        mask (m,) of the points whose neighbors all lie on one side of a line through the point.
 
         points, normals: (m, 3) the points, and the unit normals of their tangent planes.
         nearest: (m, k) indices of the neighbors among `positions`.
@@ -107,6 +113,7 @@ class TangentVoronoi:
         u, v = (upload_vectors(backend, axis) for axis in orthonormal_basis_rows(normals))
         center, scale = upload_vectors(backend, points), upload_floats(backend, 1 / radii)
         count = nearest.shape[1]
+        # Neighbor by neighbor: entry i * m + k is neighbor i of point k.
         table = upload_integers(backend, np.ascontiguousarray(nearest.T).ravel())
         lane, width = dr.arange(index, len(points)), dr.opaque(index, len(points))
         line_count = dr.opaque(index, count * (2 if mirrored else 1))
@@ -114,7 +121,7 @@ class TangentVoronoi:
 
         def bisector(i: Any, active: Mask) -> _BisectorLine:
             """The bisector line of neighbor i; beyond `neighbor_count`, of the mirror image of a
-            neighbor."""
+            neighbor. `active` masks the lanes in which it is needed."""
             row = dr.select(i < neighbor_count, i, i - neighbor_count)
             neighbor_id = dr.gather(index, table, row * width + lane, active)
             position = [
@@ -129,7 +136,8 @@ class TangentVoronoi:
 
         def add_lines(j: Any, *state: Any) -> tuple[Any, ...]:
             """Add the triangles at the lines j, j + 1, ... to the area and their angles to the sum
-            of angles; and note whether one of them has no neighbor to its left."""
+            of angles; and note whether one of them has no neighbor to its left. The state is (area,
+            angle, is_one_sided)."""
             numbers = [j + t for t in range(_LINES_PER_ITERATION)]
             own_lines = [bisector(number, number < line_count) for number in numbers]
             area, angle, is_one_sided = state
@@ -142,6 +150,7 @@ class TangentVoronoi:
                 lower, upper, has_left = interval
                 is_cut, is_line = lower < upper, number < line_count
                 lower, upper = dr.select(is_cut, lower, 0), dr.select(is_cut, upper, 0)
+                # The triangle from the center to the edge has the height h.
                 area = area + dr.select(is_line, 0.5 * own_line.h * (upper - lower), 0)
                 turn = dr.atan2(upper, own_line.h) - dr.atan2(lower, own_line.h)
                 angle = angle + dr.select(is_line, turn, 0)
@@ -152,27 +161,31 @@ class TangentVoronoi:
                 )
             return j + _LINES_PER_ITERATION, area, angle, is_one_sided
 
+        # Zeros of the width of the lanes.
         zero = backend.Float(0) + 0 * scale
         initial = index(0) + 0 * lane, zero, zero, zero > 1
         condition = _below(line_count)
         _, area, angle, is_one_sided = dr.while_loop(initial, condition, add_lines, label="lines")
+        # Sectors of the unit disc in the directions without an edge.
         total = area + 0.5 * fmax(2 * math.pi - angle, 0)
         dr.eval(total, is_one_sided)
         return to_numpy(total), to_numpy(is_one_sided)
 
 
 def _below(count: Any) -> Callable[..., Mask]:
-    """The condition of a Dr.Jit loop: whether the first entry of its state is below `count`."""
+    """The condition of a Dr.Jit loop: a function of the loop's state that tells whether its first
+    entry is below `count`."""
 
     def is_active(i: Any, *_: Any) -> Mask:
+        """Whether the first entry i of the state is below `count`."""
         return i < count
 
     return is_active
 
 
 def _line_in_disc(backend: Backend, q: tuple[Real, Real], b: Real) -> _BisectorLine:
-    """The line q.y = b in the plane, with its normal scaled to unit length, as a `_BisectorLine`.
-    If it misses the unit disc, its normal becomes 0."""
+    """The line q . y = b in the plane, with its normal scaled to unit length. If it misses the unit
+    disc, its normal becomes 0. q is also kept as the neighbor's projection."""
     length = dr.sqrt(dr.square(q[0]) + dr.square(q[1]))
     crosses = length > b
     inverse = dr.select(crosses, dr.rcp(length), 0)
@@ -186,9 +199,10 @@ def _clip_bisectors(
     bisector: Any,
     line_count: Any,
 ) -> list[tuple[Real, Real, Mask]]:
-    """For each line of `own_lines`: the interval (lower, upper) of positions along it that lie in
-    the cell, that is in the unit disc and not beyond another line (empty if lower >= upper); and
-    whether some other neighbor lies to the left of the line's neighbor.
+    """Find the edges of a cell on the lines `own_lines`. Returns for each of them: the interval
+    (lower, upper) of positions along it that lie in the cell, that is in the unit disc and not
+    beyond another line (empty if lower >= upper); and whether some other neighbor lies to the left
+    of the line's neighbor.
 
     indices: the index of each of `own_lines` among all lines.
     bisector: bisector(i, mask) returns line i, in lanes of the mask.
@@ -197,22 +211,25 @@ def _clip_bisectors(
     initial: list[Any] = []
     for own_line in own_lines:
         half_chord = dr.sqrt(fmax(1 - dr.square(own_line.h), 0))
+        # The chord of the disc on each line; and False in all lanes.
         initial += [-half_chord, half_chord, half_chord > dr.inf]
 
     def clip_by_line(i: Any, *state: Any) -> tuple[Any, ...]:
         """Clip the intervals of all own lines by line i; and note whether its neighbor is to the
-        left."""
+        left. The state has three entries for each own line: lower, upper, has_left."""
         other, clipped = bisector(i, i < line_count), list[Any]()
         for t, (index, own_line) in enumerate(zip(indices, own_lines, strict=True)):
             lower, upper, has_left = state[3 * t : 3 * t + 3]
             # The rate at which a point that moves along the own line nears the other line.
             slope = other.y * own_line.x - other.x * own_line.y
+            # How far the foot of the own line (position 0) is inside of the other line.
             distance = other.h - own_line.h * (other.x * own_line.x + other.y * own_line.y)
             is_parallel = dr.abs(slope) < _PARALLEL
             bound = distance / dr.select(is_parallel, 1, slope)
             lower = dr.select(slope < -_PARALLEL, fmax(lower, bound), lower)
             upper = dr.select(slope > _PARALLEL, fmin(upper, bound), upper)
-            # If lines are equal, only the first counts.
+            # An own line beyond a parallel one is no edge. If lines are equal, only the first
+            # counts.
             is_hidden = is_parallel & (distance < dr.select(index > i, _PARALLEL, -_PARALLEL))
             upper = dr.select(is_hidden, -dr.inf, upper)
             has_left = has_left | (

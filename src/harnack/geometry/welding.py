@@ -1,10 +1,8 @@
-"""Joins (welds) vertices of meshes that are at the same position up to rounding.
-
-Programs compute a corner once for each face around it, and may get 0 for one face and 2.7e-16 for
-another. As edges are compared by index, such faces would not be neighbors. So corners at boundary
-edges are joined if rounding explains their distance. All other vertices, and closed meshes, stay as
-they are.
-"""
+"""Welds meshes: joins vertices that are at the same position up to rounding. Programs compute a
+corner once for each face around it, and may get 0 for one face and 2.7e-16 for another. As edges
+are compared by the indices of their ends, such faces would not be neighbors. So vertices at edges
+that do not cancel between faces (boundary edges) are joined if rounding explains their distance.
+All other vertices, and closed meshes, stay as they are."""
 
 from __future__ import annotations
 
@@ -21,12 +19,13 @@ __all__ = ["Welded", "connected_groups", "pairs_within", "rounding_of"]
 
 # The distance, in units in the last place of the largest coordinate, that rounding explains.
 _MAX_ULPS = 4
-# Rounding explains no distance that is more than this fraction of the shortest edge there.
+# A distance that is more than this fraction of the shortest edge there is never explained by
+# rounding.
 _MAX_EDGE_FRACTION = 1e-3
 
 
 def rounding_of(vertices: FloatArray) -> float:
-    """The distance by which rounding may separate two corners that should be at the same position:
+    """The distance by which rounding may separate two vertices that should be at the same position:
     four units in the last place of the largest coordinate of the vertices (n, 3). These are units
     of single precision if all coordinates are numbers of single precision."""
     single = vertices.astype(np.float32)
@@ -36,12 +35,15 @@ def rounding_of(vertices: FloatArray) -> float:
 
 @dataclass(frozen=True)
 class Welded:
-    """A mesh after welding.
+    """A mesh after its vertices at the same position, up to rounding, were joined. An edge (a, b)
+    cancels against the same edge run the other way; the edges that are left over are boundary
+    edges.
 
     index: (n,) the vertex that each vertex was joined to: the first at exactly its position, or the
         first of the positions that rounding separates.
     net: the faces between these vertices, duplicates added up (`net_faces`).
-    edges, weights: the edges at which these faces do not cancel (`singular_edges`).
+    edges, weights: the directed edges (k, 2) at which these faces do not cancel, and how often each
+        remains (`singular_edges`).
     rounded: the number of positions that were joined with others from which rounding separates
         them.
     """
@@ -54,16 +56,17 @@ class Welded:
 
     @classmethod
     def of(cls, vertices: FloatArray, faces: IntArray) -> Welded:
-        """Weld vertices (n, 3) of faces (m, 3).
+        """Weld the vertices (n, 3) of faces (m, 3).
 
-        Two corners are joined if both are on edges that do not cancel, and if their distance is at
+        Two vertices are joined if both are on edges that do not cancel, and if their distance is at
         most `rounding_of` and at most a thousandth of the shortest edge there. The result is used
         only if it has fewer edges that do not cancel. If a face would lose its area, or two of its
         corners would become one, the corners of that face are not joined. So the number of faces is
-        the same as before, except for faces that cancel; and wider gaps stay, as two corners are
+        the same as before, except for faces that cancel. Wider gaps stay, as two vertices are
         joined only if they are as near as two results of the same computation.
         """
         welded = cls._from_index(weld_vertices(vertices), vertices, faces, 0)
+        # The mesh is closed.
         if not len(welded.edges):
             return welded
         joined = _joined_by_rounding(vertices, welded.net.faces, np.unique(welded.edges))
@@ -77,37 +80,40 @@ class Welded:
     def _from_index(
         cls, index: IntArray, vertices: FloatArray, faces: IntArray, rounded: int
     ) -> Welded:
-        """The mesh in which vertex k is replaced by vertex index[k]. rounded: the number of
-        positions that were joined although rounding separates them."""
+        """The mesh in which vertex k is replaced by vertex index[k].
+
+        rounded: the number of positions that were joined although rounding separates them.
+        """
         net = net_faces(index[faces])
         return cls(index, net, *singular_edges(net.faces, net.multiplicity), rounded)
 
 
 def _joined_by_rounding(positions: FloatArray, faces: IntArray, candidates: IntArray) -> IntArray:
-    """For each vertex the vertex (n,) to which it is joined, or itself.
+    """For each vertex the vertex (n,) to which it is joined, or itself. Pairs of candidates are
+    joined if rounding explains their distance. If a face would then lose its area or a corner, the
+    vertices of that face are not joined after all, and the rest is tried again.
 
-    positions: (n, 3) of the vertices. faces: (m, 3).
+    positions: (n, 3) of the vertices.
+    faces: (m, 3).
     candidates: (k,) the vertices that may be joined, all at different positions.
-
-    Pairs of candidates are joined if rounding explains their distance. If a face would then lose
-    its area or a corner, the vertices of that face are not joined after all, and the rest is tried
-    again.
     """
     representative = np.arange(len(positions))
     pairs = candidates[pairs_within(positions[candidates], rounding_of(positions[faces]))]
     distance = np.linalg.norm(positions[pairs[:, 0]] - positions[pairs[:, 1]], axis=1)
     corners = positions[faces]
-    min_edge = np.full(len(positions), np.inf)
-    face_min_edge = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).min(axis=1)
+    shortest_edge = np.full(len(positions), np.inf)
+    shortest_of_face = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).min(axis=1)
     for k in range(3):
-        np.minimum.at(min_edge, faces[:, k], face_min_edge)
-    pairs = pairs[distance <= _MAX_EDGE_FRACTION * min_edge[pairs].min(axis=1)]
+        np.minimum.at(shortest_edge, faces[:, k], shortest_of_face)
+    pairs = pairs[distance <= _MAX_EDGE_FRACTION * shortest_edge[pairs].min(axis=1)]
     while len(pairs):
         group = connected_groups(pairs, len(positions))
+        # The first vertex of each group stands for the group.
         representative = np.unique(group, return_index=True)[1][group]
         joined = representative[faces]
         changed_faces = np.flatnonzero((joined != faces).any(axis=1))
         is_degenerate = (joined == np.roll(joined, 1, axis=1)).any(axis=1)
+        # Faces that lose their area by the joining.
         new_flat = changed_faces[zero_area_faces(positions, joined[changed_faces])]
         is_degenerate[np.setdiff1d(new_flat, zero_area_faces(positions, faces))] = True
         if not is_degenerate.any():
@@ -128,8 +134,9 @@ def pairs_within(points: FloatArray, distance: float) -> IntArray:
 
 
 def connected_groups(pairs: IntArray, count: int) -> IntArray:
-    """(count,) the number of the connected component of each index. pairs (k, 2) are the edges of
-    the graph. Components are numbered in the order of their first indices."""
+    """The connected components of a graph with the nodes 0 to count - 1 and the edges `pairs` (k,
+    2). Returns the number (count,) of each node's component. Components are numbered in the order
+    of their first nodes."""
     import scipy.sparse  # imported here: it takes half a second, and few programs need it
     import scipy.sparse.csgraph as csgraph_module
 

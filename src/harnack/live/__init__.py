@@ -1,5 +1,6 @@
 """Draws surfaces interactively in a browser: `page` writes a standalone page, and `view` shows a
-page that Python serves. The same JavaScript module draws both.
+page that Python serves. The same JavaScript module draws both. A live scene is a set of surfaces
+that a person can turn, cut, and change by sliders.
 
 The browser runs the kernel that Dr.Jit recorded. `live_scene` turns the arguments of `render` into
 plain data: shaders, a buffer of 32-bit words for each shader, a camera, and test rays with Dr.Jit's

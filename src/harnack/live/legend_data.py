@@ -1,5 +1,6 @@
-"""Legends of live pictures whose colors stand for numbers, that is of all values of the option
-`show` but "shaded". legend.js draws a legend beside the picture."""
+"""Legends of live pictures whose colors stand for numbers: pictures of normals, depths, numbers of
+evaluations, and status of rays. The option `show` names the kind of picture. legend.js draws a
+legend beside the picture."""
 
 from __future__ import annotations
 
@@ -28,14 +29,14 @@ NEAR_GRAY, FAR_GRAY, HIT_COLOR = 0.95, 0.12, (0.93, 0.93, 0.90)
 
 
 def evaluations_share(evaluations: Any) -> Any:
-    """The positions, on the logarithmic color scale, of numbers of evaluations per ray: 0 for no
-    evaluation, 1 for `EVALUATIONS_TOP` evaluations. evaluations: a number or an array of numbers;
-    the result has its shape."""
+    """Return the positions, on a logarithmic color scale, of numbers of evaluations per ray: 0 for
+    no evaluation, 1 for `EVALUATIONS_TOP` evaluations. evaluations: a number or an array of
+    numbers; the result has its shape."""
     return np.log2(1.0 + np.asarray(evaluations)) / math.log2(1.0 + EVALUATIONS_TOP)
 
 
 def legends() -> dict[str, Any]:
-    """The legends of all kinds of pictures, as JSON data by the value of `show`.
+    """Return the legends of all kinds of pictures, as JSON data by the value of `show`.
 
     Each legend has a "title". A legend of a color scale has "colors", CSS colors at equal steps
     from the low end to the high end of the scale, and "ticks", pairs of a position from 0 to 1 on
@@ -75,5 +76,5 @@ def legends() -> dict[str, Any]:
 
 
 def _css(color: Sequence[float] | Any) -> str:
-    """An sRGB color of three numbers from 0 to 1 as CSS text, such as "#f2f2f2"."""
+    """Return an sRGB color of three numbers from 0 to 1 as CSS text, such as "#f2f2f2"."""
     return "#" + bytes(to_uint8(np.array(color, np.float64))).hex()

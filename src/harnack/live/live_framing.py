@@ -28,7 +28,8 @@ _DIRECTIONS = 200
 
 @dataclass(frozen=True)
 class Framing:
-    """The placement of surfaces on the stage, and a camera that sees them.
+    """The placement of surfaces on the stage (the scene's coordinates, in which the floor is
+    horizontal), and a camera that sees them.
 
     placement: the similarity that maps coordinates of the surfaces to coordinates of the stage.
     camera: a camera that turns about a target, as data for camera.js: "target", "distance" in units
@@ -43,7 +44,7 @@ class Framing:
 
     @classmethod
     def of(cls, camera: Camera, up: Any, points: FloatArray, *, is_whole: bool) -> Framing:
-        """Place points (n, 3) of the surfaces on the stage, and frame them.
+        """Place points (n, 3) of the surfaces on the stage, and frame them. Returns the `Framing`.
 
         camera: the camera option of `render`. If it has a box, this box is framed in place of the
             points.
@@ -58,18 +59,19 @@ class Framing:
             points = corners_of(np.array(box.bounds()))
         elif not is_whole:
             box = Box(*(_three(end) for end in (points.min(axis=0), points.max(axis=0))))
+        # What stands on the ground: the box or, without a box, the points.
         standing = points if box is None else corners_of(np.array(box.bounds()))
         placement = stage_placement(standing, rotation_to_z_up(up))
         return cls(placement, _orbit(camera, placement, points), box)
 
     def with_box(self, camera: Camera) -> Camera:
-        """The camera, with this framing's box if it has no box of its own. `render` with this
-        camera places the surfaces on the stage exactly as this framing does."""
+        """Return the camera, with this framing's box if it has no box of its own. `render` with
+        this camera places the surfaces on the stage exactly as this framing does."""
         return camera if camera.box is not None else replace(camera, box=self.box)
 
 
 def extreme_points(points: FloatArray) -> FloatArray:
-    """The points, of points (n, 3), that are farthest in at least one of 200 fixed random
+    """Return those of the points (n, 3) that are farthest in at least one of 200 fixed random
     directions; all points if there are at most 200. A camera that frames them frames nearly all n
     points."""
     if len(points) <= _DIRECTIONS:
@@ -79,7 +81,7 @@ def extreme_points(points: FloatArray) -> FloatArray:
 
 
 def _orbit(camera: Camera, placement: Placement, points: FloatArray) -> dict[str, Any]:
-    """A camera that turns about a target, as data for camera.js (see `Framing.camera`).
+    """Return a camera that turns about a target, as data for camera.js (see `Framing.camera`).
 
     It stands where `camera` stands when it frames the points (n, 3) after placement, and looks in
     the same direction. The target is the point of the line of sight that is as far from the camera
@@ -92,6 +94,7 @@ def _orbit(camera: Camera, placement: Placement, points: FloatArray) -> dict[str
     middle = 0.5 * (on_stage.min(axis=0) + on_stage.max(axis=0))
     distance = max(float((middle - pose.origin) @ forward), 1e-3)
     elevation = np.degrees(np.arcsin(np.clip(-forward[2], -1, 1)))
+    # A vertical line of sight has no azimuth of its own.
     is_vertical = abs(forward[2]) > 1 - 1e-9
     azimuth = pose.azimuth if is_vertical else np.degrees(np.arctan2(-forward[1], -forward[0]))
     return {
@@ -104,6 +107,6 @@ def _orbit(camera: Camera, placement: Placement, points: FloatArray) -> dict[str
 
 
 def _three(point: FloatArray) -> tuple[float, float, float]:
-    """A point (3,) as a tuple of three floats."""
+    """Return a point (3,) as a tuple of three floats."""
     x, y, z = (float(c) for c in point)
     return x, y, z

@@ -1,7 +1,10 @@
-"""Live scenes: surfaces on the studio's stage as data that `renderer.js` draws.
+"""Live scenes: surfaces on the stage, as data that `renderer.js` draws in a browser. The stage is
+the scaled world in which surfaces stand on a floor. A person changes a scene by its controls:
+sliders, the vertices of a curve, a cut, and settings such as the material. A state is the data of
+all surfaces for given controls.
 
-Each surface has a shader, a kernel translated from Dr.Jit's recording, and the words that the
-shader reads. All data is plain: numbers, lists, text, and arrays of words that `encode_arrays`
+Each surface has a shader, a kernel translated from Dr.Jit's recording, and the 32-bit words that
+the shader reads. All data is plain: numbers, lists, text, and arrays of words that `encode_arrays`
 turns into text.
 """
 
@@ -125,8 +128,10 @@ class ControlState:
 
 @dataclass(frozen=True)
 class LiveScene:
-    """A live scene: its content as a function of sliders, its placement on the stage, and how it is
-    shown.
+    """Surfaces that a person can turn, cut, and change by sliders in a browser: what they are as
+    functions of the sliders, where they stand on the stage (the scaled world, with a floor), and
+    how they are shown. A `ControlState` holds the positions of all sliders and other controls; for
+    each of them `state` returns the surfaces as data.
 
     content: the surfaces and options as functions of the sliders.
     points: visible points (n, 3) of each surface at the start, in the surfaces' coordinates.
@@ -179,12 +184,13 @@ class LiveScene:
         if not isinstance(ground, GroundBackdrop):
             raise ValueError('backdrop: what is drawn live stands on a ground: "light" or "dark"')
         content = SlidingContent.of(surfaces, options)
-        start = content.starts
-        with slider_values_in_errors(start):
-            drawn = _objects_at(content, start)
+        start_values = content.starts
+        # Points of the surfaces at the start: the scene is placed and framed by them.
+        with slider_values_in_errors(start_values):
+            objects = _objects_at(content, start_values)
             backend = choose_backend("single")
-            points = tuple(visible_points(body.surface, backend) for body in drawn)
-        curve = _curve_of(drawn) if edits else None
+            points = tuple(visible_points(body.surface, backend) for body in objects)
+        curve = _curve_of(objects) if edits else None
         up, camera = "z" if up is None else up, check_camera(camera)
         framing = Framing.of(camera, up, np.concatenate(points), is_whole=True)
         return cls(
@@ -192,9 +198,11 @@ class LiveScene:
         )
 
     def framed(self, places: Iterable[Mapping[str, float]]) -> LiveScene:
-        """This scene with a placement and a camera such that the surfaces stay in the picture for
-        all slider values in `places`, each a mapping from slider names to values. A scene without
-        sliders, or whose camera has a box, is returned unchanged.
+        """Return this scene with a placement and a camera such that the surfaces stay in the
+        picture for many slider values. A scene without sliders, or whose camera has a box, is
+        returned unchanged.
+
+        places: the slider values, each a mapping from slider names to values.
 
         Slider values for which nothing can be drawn are left out here: drawing them reports the
         error.
@@ -223,8 +231,8 @@ class LiveScene:
         return tuple(_rays(self.placement.apply(points)) for points in self.points)
 
     def scene(self, title: str) -> JsonDict:
-        """All data that a page needs when it opens, as JSON data for `renderer.js`: placement,
-        camera, sliders, legends and the initial state."""
+        """Return all data that a page needs when it opens, as JSON data for `renderer.js`:
+        placement, camera, sliders, legends and the initial state. title: of the page."""
         place, points = self.placement, np.concatenate(self.points)
         _, settings = self._at(self.initial_controls)
         material = settings.get("material")
@@ -264,12 +272,16 @@ class LiveScene:
     def pose(self) -> JsonDict:
         """The first camera as {"position": (3,), "target": (3,), "fov": degrees}, in the surfaces'
         coordinates."""
-        orbit, place = self.framing.camera, self.placement
+        orbit, placement = self.framing.camera, self.placement
         azimuth, elevation = np.radians([orbit["azimuth"], orbit["elevation"]])
-        back = np.array([np.cos(azimuth), np.sin(azimuth), np.tan(elevation)]) * np.cos(elevation)
+        to_camera = np.array([np.cos(azimuth), np.sin(azimuth), np.tan(elevation)]) * np.cos(
+            elevation
+        )
         target = np.array(orbit["target"])
-        eye, at = place.apply_inverse(np.stack([target + orbit["distance"] * back, target]))
-        return {"position": eye.tolist(), "target": at.tolist(), "fov": orbit["fov"]}
+        eye, target_point = placement.apply_inverse(
+            np.stack([target + orbit["distance"] * to_camera, target])
+        )
+        return {"position": eye.tolist(), "target": target_point.tolist(), "fov": orbit["fov"]}
 
     @property
     def initial_controls(self) -> ControlState:
@@ -277,21 +289,22 @@ class LiveScene:
         return ControlState(self.content.starts)
 
     def state(self, controls: ControlState) -> JsonDict:
-        """The surfaces of a state of the controls as data, {"surfaces": a dictionary for each
-        surface as `_kernel_data` returns it, "curves": a list of points for each loop of the
-        boundary curves}. Its arrays of words are NumPy's; `encode_arrays` turns them into text.
+        """Return the surfaces for a state of the controls as data. "surfaces" holds a dictionary
+        for each surface, as `_kernel_data` returns it. "curves" holds a list of points for each
+        loop of the curves at which the surfaces end. Arrays of words are NumPy's; `encode_arrays`
+        turns them into text.
 
         Raises:
             ValueError: the surfaces and isolines have more colors than the browser's table can
                 hold.
             SliderValueError: nothing can be drawn at these slider values.
         """
-        drawn = self.surfaces_at(controls)
+        objects = self.surfaces_at(controls)
         with slider_values_in_errors(controls.values):
-            placed = [self.place(body) for body in drawn]
+            placed = [self.place(body) for body in objects]
         surfaces = [
             _kernel_data(body, placed_surface, *self.rays[min(k, len(self.rays) - 1)])
-            for k, (body, placed_surface) in enumerate(zip(drawn, placed, strict=True))
+            for k, (body, placed_surface) in enumerate(zip(objects, placed, strict=True))
         ]
         colors = sum(len(surface["paints"]) for surface in surfaces)
         if colors > _MOST_PAINTS:
@@ -299,21 +312,28 @@ class LiveScene:
                 f"the surfaces and their isolines have {colors:,} colors, and what moves is drawn "
                 f"with {_MOST_PAINTS:,} at most: draw fewer surfaces at once"
             )
+        # The curves at which surfaces end, each field's once.
         curves: list[Any] = []
-        for k, body in enumerate(drawn):
-            if all(body.surface.field is not other.surface.field for other in drawn[:k]):
+        for k, body in enumerate(objects):
+            # Surfaces of the same field have the same curves.
+            if all(body.surface.field is not other.surface.field for other in objects[:k]):
                 curves += body.surface.field.boundary_curves
         return {"surfaces": surfaces, "curves": [np.asarray(curve).tolist() for curve in curves]}
 
     def surfaces_at(self, controls: ControlState) -> list[StudioObject]:
-        """The surfaces, for a state of the controls, as objects of the studio (surface, material
-        and isolines). Raises `SliderValueError` if they cannot be made at these slider values."""
+        """Return the surfaces for a state of the controls, as objects of the studio (surface,
+        material and isolines).
+
+        Raises:
+            SliderValueError: they cannot be made at these slider values.
+        """
         with slider_values_in_errors(controls.values):
             return self._drawn(controls)
 
     def _at(self, controls: ControlState) -> tuple[Any, dict[str, Any]]:
-        """The surfaces, and the options of `view` by name, for a state of the controls. Options
-        that a person changed (`controls.settings`) replace those of the scene."""
+        """Return the surfaces, and the options of `view` by name, for a state of the controls.
+        Options that a person changed (`controls.settings`) replace those of the scene. If the tubes
+        around curves were switched off, their material is dropped too."""
         content, settings = self.content.at(controls.values)
         settings |= controls.settings
         if "boundary_radius" in controls.settings and settings["boundary_radius"] is None:
@@ -321,27 +341,30 @@ class LiveScene:
         return content, settings
 
     def _drawn(self, controls: ControlState) -> list[StudioObject]:
-        """The surfaces as objects of the studio, with tolerances, cut by the volume of the
-        controls, and with the edited curve in place of the field's own."""
+        """Return the surfaces for a state of the controls as objects of the studio: with
+        tolerances, cut by the volume of the controls, and with the edited curve in place of the
+        field's own."""
         content, settings = self._at(controls)
-        drawn = _studio_objects(content, settings)
-        curve = _curve_of(drawn) if self.editable else None
+        objects = _studio_objects(content, settings)
+        curve = _curve_of(objects) if self.editable else None
         if (
             curve is not None
             and controls.curves is not None
             and settings.get("boundary_radius") is not None
         ):
-            # The tube around the curve is that of the moved one.
-            drawn = _studio_objects(_with_loops(content, curve, controls.curves), settings)
-            curve = _curve_of(drawn)
-        drawn = [self._fitted(body) for body in drawn]
+            # The tube around the curve has to follow the edited curve.
+            objects = _studio_objects(_with_loops(content, curve, controls.curves), settings)
+            curve = _curve_of(objects)
+        objects = [self._fitted(body) for body in objects]
         if controls.cut_volume is not None:
-            drawn = [
-                replace(body, surface=with_cut(body.surface, controls.cut_volume)) for body in drawn
+            objects = [
+                replace(body, surface=with_cut(body.surface, controls.cut_volume))
+                for body in objects
             ]
         if curve is None:
-            return drawn
-        # As Dr.Jit's arrays: those of NumPy decide which proof is taken.
+            return objects
+        # Vertices are passed as Dr.Jit arrays. From the numbers of NumPy arrays the field
+        # would choose among its proofs, and so among kernels.
         backend = choose_backend("single")
         loops = curve.loops if controls.curves is None else controls.curves
         field = SolidAngle([to_vector3(backend, loop) for loop in loops])
@@ -349,29 +372,31 @@ class LiveScene:
             replace(body, surface=replace(body.surface, field=field).with_call_cache(begins=True))
             if body.surface.field is curve
             else body
-            for body in drawn
+            for body in objects
         ]
 
     def render_still(self, controls: ControlState, **options: Any) -> Picture:
-        """A still picture of a state of the controls, drawn by `render`. options: options of
-        `render` that replace those of the scene."""
+        """Draw a still picture of a state of the controls by `render`. options: options of `render`
+        that replace those of the scene."""
         _, settings = self._at(controls)
-        style = {
+        scene_options = {
             name: settings[name] for name in ("isolines", "section_material") if name in settings
         }
-        drawn = self.surfaces_at(controls)
+        objects = self.surfaces_at(controls)
         if isinstance(options.get("camera"), Camera):
             options["camera"] = self.framing.with_box(options["camera"])
         defaults: dict[str, Any] = {"backdrop": self.backdrop, "up": self.up, "progress": False}
-        materials = [body.material for body in drawn]
+        materials = [body.material for body in objects]
         return render(
-            [body.surface for body in drawn], material=materials, **{**defaults, **style, **options}
+            [body.surface for body in objects],
+            material=materials,
+            **{**defaults, **scene_options, **options},
         )
 
     def to_scene_text(self, controls: ControlState, **options: Any) -> tuple[str, list[str]]:
-        """A state of the controls as the text of a scene file, and the names of the sliders that
-        the text has lost. A slider is lost if a Python function depends on it; the text then
-        holds the result of the function at the slider's value.
+        """Write a state of the controls as the text of a scene file. Returns the text, and the
+        names of the sliders that it has lost. A slider is lost if a Python function depends on it;
+        the text then holds the result of the function at the slider's value.
 
         options: more options of `render` to be written.
 
@@ -384,6 +409,7 @@ class LiveScene:
         content, settings = self._at(controls)
         surfaces: list[Any] = [*content] if isinstance(content, list | tuple) else [content]
         curve = _curve_of(_studio_objects(content, settings)) if controls.curves else None
+        # An edited curve is written in place of the field's own.
         if curve is not None:
             surfaces = _with_loops(content, curve, controls.curves)
         if controls.cut_volume is not None:
@@ -392,38 +418,40 @@ class LiveScene:
         for name, slider in self.content.sliders.items():
             if (
                 self.content.settings.get(name) is slider and name not in controls.settings
-            ):  # in the place of what surfaces have
+            ):  # the slider is itself the value of an option
                 settings[name] = replace(slider, start=controls.values[name])
             else:
                 lost_sliders.append(name)
         return to_scene_text(surfaces, {**settings, **options}, self.sources), lost_sliders
 
     def _fitted(self, body: StudioObject) -> StudioObject:
-        """The object with its own hit tolerance, or, if it has none, with a tolerance of 1e-4 in
-        units of the stage."""
+        """Return the object with its own hit tolerance or, if it has none, with a tolerance of 1e-4
+        in units of the stage."""
         if body.surface.tolerance is not None:
             return body
         tolerance = HitTolerance(_TOLERANCE / self.placement.scale)
         return replace(body, surface=replace(body.surface, tolerance=tolerance))
 
     def place(self, body: StudioObject) -> PlacedSurface:
-        """The object's surface moved to the stage and prepared for tracing in single precision."""
+        """Return the object's surface, moved to the stage and prepared for tracing in single
+        precision."""
         size = float(np.linalg.norm(np.diff(bounding_box(body.surface), axis=0)))
         backend = choose_backend("single")
         return PlacedSurface.of(body.surface, self.placement, backend, body.isolines, size)
 
 
 def live_options(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """The options among `settings` that pages and views take. Options for still pictures alone,
-    such as a size, are left out, and "shaded" replaces a `show` that is not in `LIVE_MODES`."""
+    """Return the options among `settings` that pages and views take. Options for still pictures
+    alone, such as a size, are left out, and "shaded" replaces a `show` that is not in
+    `LIVE_MODES`."""
     options = {name: value for name, value in settings.items() if name not in STILL_OPTIONS}
     return {**options, "show": options["show"] if options.get("show") in LIVE_MODES else "shaded"}
 
 
 def with_cut(surface: TracedSurface, volume: Volume) -> TracedSurface:
-    """The surface, cut by one more volume. A half-space becomes part of the surface's `section`, so
-    that one looks inside; any other volume becomes part of its `clip`, outside of which nothing is
-    drawn."""
+    """Return the surface, cut by one more volume. A half-space becomes part of the surface's
+    `section`, so that one looks inside; any other volume becomes part of its `clip`, outside of
+    which nothing is drawn."""
     name = _cut_option(volume)
     combined = _overlap(getattr(surface, name), volume)
     cut_surface = replace(surface, **cast("Any", {name: combined})).with_call_cache(begins=True)
@@ -433,36 +461,43 @@ def with_cut(surface: TracedSurface, volume: Volume) -> TracedSurface:
 def _with_cut_options(
     surfaces: list[Any], settings: dict[str, Any], volume: Volume
 ) -> tuple[list[Any], dict[str, Any]]:
-    """The surfaces and the options, cut by one more volume. The volume becomes an option if the
-    options have keywords of `Surface`, such as a level (whose values may be sliders); otherwise it
-    becomes part of each surface."""
+    """Return the surfaces and the options, cut by one more volume. The volume becomes an option if
+    the options have keywords of `Surface`, such as a level (whose values may be sliders); otherwise
+    it becomes part of each surface."""
     name = _cut_option(volume)
     if any(option in SURFACE_OPTIONS for option in settings):
         return surfaces, {**settings, name: _overlap(settings.get(name), volume)}
-    whole = [surface if isinstance(surface, Surface) else Surface(surface) for surface in surfaces]
+    as_surfaces = [
+        surface if isinstance(surface, Surface) else Surface(surface) for surface in surfaces
+    ]
     return [
-        surface.replace(**{name: _overlap(getattr(surface, name), volume)}) for surface in whole
+        surface.replace(**{name: _overlap(getattr(surface, name), volume)})
+        for surface in as_surfaces
     ], settings
 
 
 def _cut_option(volume: Volume) -> str:
-    """The name of the keyword of `Surface` that takes the volume: "section" for a half-space,
-    otherwise "clip"."""
+    """Return the name of the keyword of `Surface` that takes the volume: "section" for a
+    half-space, otherwise "clip"."""
     return "section" if isinstance(volume, HalfSpace) else "clip"
 
 
 def _overlap(previous: Volume | None, volume: Volume) -> Volume:
-    """The intersection of two volumes; `previous` = None stands for all of space."""
+    """Return the intersection of two volumes; `previous` = None stands for all of space."""
     return volume if previous is None else VolumeIntersection((previous, volume))
 
 
 def _with_loops(content: Any, curve: SolidAngle, loops: Any) -> list[Any]:
-    """The surfaces of `content` as a list, with the field `curve` replaced by a `SolidAngle` of
-    `loops`, an array of vertices (n, 3) for each loop."""
+    """Return the surfaces of `content` as a list, with the field `curve` replaced by the solid
+    angle of an edited curve.
+
+    content: a field, a `Surface`, or a list of them.
+    loops: the edited curve, an array of vertices (n, 3) for each loop.
+    """
     moved = SolidAngle([*loops])
 
     def edited(surface: Any) -> Any:
-        """The surface or field, with the new curve if its field is the old one."""
+        """Return the surface or field, with the new curve if its field is the old one."""
         if isinstance(surface, Surface) and surface.field is curve:
             return surface.replace(field=moved)
         return moved if surface is curve else surface
@@ -472,13 +507,16 @@ def _with_loops(content: Any, curve: SolidAngle, loops: Any) -> list[Any]:
 
 
 def _objects_at(content: SlidingContent, values: Mapping[str, float]) -> list[StudioObject]:
-    """The content at the given slider values as objects of the studio."""
+    """Return the content at the given slider values as objects of the studio."""
     return _studio_objects(*content.at(values))
 
 
 def _studio_objects(surfaces: Any, options: Mapping[str, Any]) -> list[StudioObject]:
-    """Surfaces, with the options of `view` by name, as objects of the studio. Raises `ValueError`
-    for a transparent material."""
+    """Return surfaces, with the options of `view` by name, as objects of the studio.
+
+    Raises:
+        ValueError: a material is transparent.
+    """
     studio = {name: options[name] for name in _OF_STUDIO if name in options}
     isolines = parse_isolines(options.get("isolines"))
     bodies = studio_objects(
@@ -491,14 +529,18 @@ def _studio_objects(surfaces: Any, options: Mapping[str, Any]) -> list[StudioObj
 
 
 def _surface_and_trace(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Those of the options that are keywords of `Surface` or options of traces. Raises `TypeError`
-    for an option that `view` does not have."""
+    """Return those of the options that are keywords of `Surface` or options of traces.
+
+    Raises:
+        TypeError: an option is none that `view` has.
+    """
     refuse_unknown("view", options)
     return shorthand_among(options)
 
 
 def check_opaque(material: Material) -> None:
-    """Raise ValueError for a material that live pictures cannot show."""
+    """Raise ValueError for a material that live pictures cannot show, because light passes through
+    it."""
     if material.transparent:
         raise ValueError(
             'what moves is not drawn transparent: choose another material, such as material="clay"'
@@ -506,8 +548,8 @@ def check_opaque(material: Material) -> None:
 
 
 def _curve_of(bodies: Sequence[StudioObject]) -> SolidAngle | None:
-    """The `SolidAngle` whose vertices can be edited; None if the objects have no such field, or
-    more than one. Curves with circles cannot be edited."""
+    """Return the `SolidAngle` whose vertices can be edited; None if the objects have no such field,
+    or more than one. Curves with circles cannot be edited."""
     fields = {id(body.surface.field): body.surface.field for body in bodies}
     curves = [f for f in fields.values() if isinstance(f, SolidAngle) and not f.circles]
     return curves[0] if len(curves) == 1 else None
@@ -516,12 +558,16 @@ def _curve_of(bodies: Sequence[StudioObject]) -> SolidAngle | None:
 def _kernel_data(
     body: StudioObject, placed: PlacedSurface, origins: FloatArray, directions: FloatArray
 ) -> JsonDict:
-    """A surface as data for `renderer.js`: its shader and the words that the shader reads, its
-    colors and tolerance, and, under "check", the test rays with the results that Dr.Jit computes
-    for them.
+    """Return a surface as data for `renderer.js`: its shader and the words that the shader reads,
+    its colors and tolerance, and, under "check", the test rays with the results that Dr.Jit
+    computes for them.
 
+    body: the surface with its material.
     placed: the surface on the stage.
     origins, directions: (n, 3) of the test rays, in stage coordinates.
+
+    "lanes" and "results" say in which order the shader reads the entries of a ray (`_LANES`) and
+    writes its results (`_RESULTS`). "key" is a hash of the shader.
     """
     backend = choose_backend("single")
     lanes = {
@@ -531,17 +577,20 @@ def _kernel_data(
     }
 
     def compute(o: Vec3, d: Vec3, far: Real) -> JsonDict:
-        met = placed.intersect(o, d, far, backend.Bool(True))
+        hits = placed.intersect(o, d, far, backend.Bool(True))
         return {
-            "status": status_of(met), "t": met.t, "normal": met.normal,
-            "evaluations": met.evaluations, "paint": color_index(met),
+            "status": status_of(hits), "t": hits.t, "normal": hits.normal,
+            "evaluations": hits.evaluations, "paint": color_index(hits),
         }  # fmt: skip
 
     kernel = record_kernel(compute, lanes, placed)
+    # The test rays and Dr.Jit's results for them, as words in the order of the shader.
     inputs = dict(labeled_leaves("lane", lanes))
     results = {name: kernel.results.get(f"result {name}") for name in _RESULTS}
     if any(results[name] is None for name in _RESULTS[:-1]):
         raise ValueError("what rays meet is the same for all of them: there is nothing to draw")
+    # Results that are the same constant for all rays are 0 here; of these only the color may be
+    # constant.
     answers = [
         np.zeros(len(origins), np.uint32) if x is None else as_words(x) for x in results.values()
     ]
@@ -562,7 +611,7 @@ def _kernel_data(
 
 
 def status_of(met: SurfaceHit) -> Any:
-    """The `RayStatus` of each ray as an array of integers. met: the hits of the rays."""
+    """Return the `RayStatus` of each ray as an array of integers. met: the hits of the rays."""
     hit, out_of_steps, miss = (
         type(met.evaluations)(int(status))
         for status in (RayStatus.HIT, RayStatus.OUT_OF_STEPS, RayStatus.MISS)
@@ -571,9 +620,9 @@ def status_of(met: SurfaceHit) -> Any:
 
 
 def color_index(met: SurfaceHit) -> Any:
-    """For each ray, the index in `surface_colors` of the color of the hit: 0 for the surface
+    """Return for each ray the index in `surface_colors` of the color of its hit: 0 for the surface
     itself, 1 for a filling of a hole, 2 for a cut face on a section, 2 + k for isoline k = 1, 2,
-    ..."""
+    ... . met: the hits of the rays."""
     index = cast("Any", type(met.evaluations))
     plain = dr.select(
         met.is_on_section, index(_CUT), dr.select(met.is_hole_filling, index(_MENDED), index(0))
@@ -582,20 +631,20 @@ def color_index(met: SurfaceHit) -> Any:
 
 
 def placed_tolerance(body: StudioObject, placed: PlacedSurface) -> float:
-    """The hit tolerance of the object's surface as a length in units of the stage."""
+    """Return the hit tolerance of the object's surface as a length in units of the stage."""
     return body.surface.hit_tolerance.distance * float(placed.scale[0])
 
 
 def _place(kernel: RecordedKernel, label: str) -> int:
-    """The index of a result, such as "result t", in the shader's output; `_NO_OUTPUT` if it is 0
-    for all rays, so that the shader does not write it."""
+    """Return the index of a result, such as "result t", in the shader's output; `_NO_OUTPUT` if it
+    is 0 for all rays, so that the shader does not write it."""
     if label in kernel.constants:
         return _NO_OUTPUT
     return kernel.shader.results.index(label)
 
 
 def _rays(points: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """2048 pseudo-random rays towards a surface: origins and unit directions, both (2048, 3).
+    """Return 2048 pseudo-random rays toward a surface: origins and unit directions, both (2048, 3).
     Origins lie on a sphere of radius 5 about the middle of the points' box. Each ray goes to a
     random point of the surface, displaced by about 0.05.
 
@@ -611,26 +660,27 @@ def _rays(points: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def surface_colors(body: StudioObject) -> list[JsonDict]:
-    """The colors of a surface in shaded pictures, a dictionary for each of: the surface itself,
-    fillings of holes, cut faces on a section, and each isoline. "front" and "back" are the linear
-    sRGB colors of the sides of larger and of smaller values of the field; "glossy" is whether the
-    material is glossy."""
+    """Return the colors of a surface in shaded pictures, a dictionary for each of: the surface
+    itself, fillings of holes, cut faces on a section, and each isoline. "front" and "back" are the
+    linear sRGB colors of the sides of larger and of smaller values of the field; "glossy" is
+    whether the material is glossy."""
     surface, mi = body.surface, register()
     is_solid = surface.solid_range is not None
     front, back, glossy = _reflectances(body.material.bsdf(solid=is_solid, traced_light=False))
-    inside = mi.Bool(not is_solid and not isinstance(surface.field, Solid))
-    sides = two_sided_color(front, back, inside), back
+    is_open = mi.Bool(not is_solid and not isinstance(surface.field, Solid))
+    sides = two_sided_color(front, back, is_open), back
     fillings = [hole_filling_tint(side, mi.Bool(True)) for side in sides]
     paints = [_paint(sides[0], sides[1], glossy), _paint(fillings[0], fillings[1], glossy)]
-    section = body.material if body.section_material is None else body.section_material
-    front, back, glossy = _reflectances(section.bsdf(solid=is_solid, traced_light=False))
+    section_material = body.material if body.section_material is None else body.section_material
+    front, back, glossy = _reflectances(section_material.bsdf(solid=is_solid, traced_light=False))
     paints.append(_paint(front, back, glossy))
     lines = [mi.Color3f(*linear_from_srgb(line.srgb)) for line in body.isolines]
     return [*paints, *(_paint(line, line, False) for line in lines)]
 
 
 def _paint(front: Any, back: Any, glossy: bool) -> JsonDict:
-    """One entry of `surface_colors`; front, back: Dr.Jit colors of one lane."""
+    """Return one entry of `surface_colors`. front, back: the colors of the two sides, Dr.Jit colors
+    of one lane."""
     sides = {"front": front, "back": back}
     return {
         "glossy": glossy,
@@ -639,7 +689,7 @@ def _paint(front: Any, back: Any, glossy: bool) -> JsonDict:
 
 
 def _reflectances(bsdf: Mapping[str, Any]) -> tuple[Any, Any, bool]:
-    """The colors of a material's front and back side (Dr.Jit colors of one lane), as shaded
+    """Return the colors of a material's front and back side (Dr.Jit colors of one lane), as shaded
     pictures use them, and whether the material is glossy. bsdf: the material as a Mitsuba
     dictionary."""
     mi = register()
@@ -647,6 +697,7 @@ def _reflectances(bsdf: Mapping[str, Any]) -> tuple[Any, Any, bool]:
     colors: list[Any] = []
     for side in (1, -1):
         si = dr.zeros(mi.SurfaceInteraction3f)
+        # Light along the normal, on either side.
         si.wi, si.t = mi.Vector3f(0, 0, side), mi.Float(1)
         diffuse = mi.Color3f(plugin.eval_diffuse_reflectance(si, True))
         colors.append(reflectance(diffuse, mi.Bool(False)))
@@ -656,9 +707,9 @@ def _reflectances(bsdf: Mapping[str, Any]) -> tuple[Any, Any, bool]:
 
 
 def encode_arrays(value: Any) -> Any:
-    """The same data with each NumPy array replaced by text: its bytes, compressed by gzip, in
-    base64. `decodeWords` in renderer.js reads it. The tables of meshes are repetitive and shrink to
-    a tenth."""
+    """Return the same data with each NumPy array replaced by text: its bytes, compressed by gzip,
+    in base64. `decodeWords` in renderer.js reads it. The tables of meshes are repetitive and shrink
+    to a tenth."""
     if isinstance(value, np.ndarray):
         return base64.b64encode(gzip.compress(value.tobytes(), _LEVEL, mtime=0)).decode()
     if isinstance(value, dict):
@@ -669,11 +720,13 @@ def encode_arrays(value: Any) -> Any:
 
 
 def state_delta(first: JsonDict, state: JsonDict, *, checks: bool = True) -> JsonDict:
-    """The difference between a state and the initial state of a scene (see `LiveScene.state`). For
-    each surface it holds the indices "at" and the new values "to" of the words that changed, and
-    all other entries that changed. If the surfaces have other kernels or tables of other sizes, the
-    whole state is returned. `applyDelta` in slider_states.js is the inverse.
+    """Return the difference between a state and the initial state of a scene (see
+    `LiveScene.state`). For each surface it holds the indices "at" and the new values "to" of the
+    words that changed, and all other entries that changed. If the surfaces have other kernels or
+    tables of other sizes, the whole state is returned. `applyDelta` in slider_states.js is the
+    inverse.
 
+    first: the initial state.
     checks: whether the test rays with their results are included. The whole state always includes
         them, as no browser has checked its kernels yet.
     """
@@ -685,7 +738,12 @@ def state_delta(first: JsonDict, state: JsonDict, *, checks: bool = True) -> Jso
         return state
     surfaces: list[JsonDict] = []
     for old, new in pairs:
-        changes = {k: v for k, v in new.items() if k not in ("data", "check") and v != old[k]}
+        changes = {
+            name: entry
+            for name, entry in new.items()
+            if name not in ("data", "check") and entry != old[name]
+        }
+        # Only the words that differ, by their places.
         at = np.flatnonzero(old["data"] != new["data"]).astype(np.uint32)
         changes |= {"at": at, "to": new["data"][at]}
         surfaces.append(changes | ({"check": new["check"]} if checks else {}))

@@ -1,4 +1,6 @@
-"""Writes one HTML file, a page, that opens in any browser and traces surfaces there."""
+"""Writes one HTML file, a page, that opens in any browser and traces surfaces there. The page holds
+a state (the surfaces as data) for each combination of slider values that it offers; states other
+than the initial one are stored as differences from it."""
 
 from __future__ import annotations
 
@@ -106,6 +108,7 @@ def page(
     check_title(title)
     if not target.lower().endswith((".html", ".htm")):
         raise ValueError(f"{target}: a page is written as .html")
+    # The states for all slider values are computed part by part, here or on a cluster.
     job = PageJob(surfaces, settings, register().variant())
     with progress_bar("page", progress) as advance:
         live = job.live
@@ -131,7 +134,7 @@ def check_title(title: Any) -> None:
 
 
 def still_png(live: LiveScene) -> str:
-    """A picture of the initial state, as base64 text of a PNG file. A page shows it where the
+    """Draw the initial state, and return it as base64 text of a PNG file. A page shows it where the
     browser cannot trace."""
     camera = Camera(**live.pose)
     still: Any = live.render_still(
@@ -141,17 +144,17 @@ def still_png(live: LiveScene) -> str:
 
 
 def _places(live: LiveScene) -> dict[str, list[float]]:
-    """The slider values for which a page stores states, a list for each slider by name. A slider
-    with a step has all its values; a slider without a step has evenly spaced values, fewer if the
-    states are large (see `_TARGET_BYTES`).
+    """Choose the slider values for which a page stores states. Returns a list of values for each
+    slider by name. A slider with a step has all its values. A slider without a step has evenly
+    spaced values, fewer if the states are large (see `_TARGET_BYTES`).
 
     Raises:
         ValueError: there are more than `_MOST_CHOICES` combinations of slider values.
     """
     sliders = live.content.sliders
     count = max(2, min(_MAX_SLIDER_VALUES, int(_CHOICES ** (1 / max(1, len(sliders))))))
-    places = {name: slider.values(count) for name, slider in sliders.items()}
-    total = math.prod(map(len, places.values()))
+    values_by_name = {name: slider.values(count) for name, slider in sliders.items()}
+    total = math.prod(map(len, values_by_name.values()))
     if total > _MOST_CHOICES:
         raise ValueError(
             f"the sliders {', '.join(sliders)} have {total:,} choices of places, which a page "
@@ -159,34 +162,46 @@ def _places(live: LiveScene) -> dict[str, list[float]]:
             "steps or fewer sliders, or use harnack.view"
         )
     if all(slider.step is not None for slider in sliders.values()):
-        return places
-    ends = ({name: values[k] for name, values in places.items()} for k in (0, -1))
-    largest = max(len(json.dumps(_slider_state(live, place))) for place in ends)
+        return values_by_name
+    ends = ({name: values[k] for name, values in values_by_name.items()} for k in (0, -1))
+    # The size of a state is estimated by those with all sliders at their lower, and at their upper
+    # ends.
+    largest_bytes = max(
+        len(json.dumps(_slider_state(live, slider_values))) for slider_values in ends
+    )
     fewest = min(count, _FEWEST[len(sliders) > 1])
-    while count > fewest and largest * math.prod(map(len, places.values())) > _TARGET_BYTES:
+    while (
+        count > fewest
+        and largest_bytes * math.prod(map(len, values_by_name.values())) > _TARGET_BYTES
+    ):
         count = max(fewest, (count + 1) // 2)
-        places = {name: slider.values(count) for name, slider in sliders.items()}
-    return places
+        values_by_name = {name: slider.values(count) for name, slider in sliders.items()}
+    return values_by_name
 
 
 def _framing_values(places: Mapping[str, list[float]]) -> Mapping[str, list[float]]:
-    """The slider values by which the picture is framed. places: the values of each slider in the
-    page. They are returned unchanged if they have at most `_FRAMED` combinations; otherwise every
-    other value and the last one of each slider."""
+    """Return the slider values by which the picture is framed.
+
+    places: the values of each slider in the page. They are returned unchanged if they have at most
+        `_FRAMED` combinations; otherwise every other value and the last one of each slider.
+    """
     if math.prod(map(len, places.values())) <= _FRAMED:
         return places
     return {name: sorted({*values[::2], values[-1]}) for name, values in places.items()}
 
 
 def _slider_combinations(places: Mapping[str, list[float]]) -> list[dict[str, float]]:
-    """All combinations of the values of the sliders, each as a value by slider name. The last
-    slider changes fastest."""
+    """Return all combinations of the values of the sliders, each as a value by slider name. The
+    last slider changes fastest.
+
+    places: the values of each slider, by name.
+    """
     return [dict(zip(places, place, strict=True)) for place in itertools.product(*places.values())]
 
 
 def _slider_state(live: LiveScene, values: Mapping[str, float]) -> JsonDict:
-    """The state at the given slider values, as its difference from the initial state, in JSON
-    data."""
+    """Return the state at the given slider values, as its difference from the initial state, in
+    JSON data."""
     with slider_values_in_errors(values):
         state = live.state(ControlState(values))
     return encode_arrays(state_delta(live.initial_state, state, checks=False))
@@ -194,12 +209,12 @@ def _slider_state(live: LiveScene, values: Mapping[str, float]) -> JsonDict:
 
 @dataclass(frozen=True)
 class PageJob:
-    """The arguments of `page` in a form that can be sent to workers, which compute the states of
-    the page.
+    """The arguments of `page`, in a form that can be sent to other processes, which compute the
+    states of the page. A state is the surfaces as data for given slider values.
 
     surfaces: the content of the page, as `page` takes it.
     settings: the options of `page` by name, sliders included.
-    variant: the Mitsuba variant of this process, which workers are to use too.
+    variant: the Mitsuba variant of this process, which the other processes are to use too.
     """
 
     surfaces: Any
@@ -231,7 +246,7 @@ class PageJob:
         ).hexdigest()
 
     def state(self, values: Mapping[str, float], digest: str) -> TaskResult:
-        """The difference of the state at the given slider values from the initial state, as
+        """Return the difference of the state at the given slider values from the initial state, as
         {"text": bytes of JSON in an array of uint8}.
 
         digest: the hash of the page's initial state, in the process that writes the page.
@@ -249,10 +264,12 @@ class PageJob:
 
 
 def _slider_states(job: PageJob, workers: Executor, advance: Any) -> JsonDict:
-    """{"places": the values of each slider, "frames": the difference from the initial state for
-    each combination of them}, in the order of `_slider_combinations`.
+    """Compute the states of a page. Returns {"places": the values of each slider, "frames": the
+    difference from the initial state for each combination of them, in the order of
+    `_slider_combinations`}.
 
-    workers: run the tasks. advance: called with the finished fraction of the work after each task.
+    workers: run the parts of the work, in this process or on a cluster.
+    advance: called with the finished fraction of the work after each part.
     """
     frames: list[JsonDict] = []
     tasks = [(values, job.digest) for values in _slider_combinations(job.places)]
@@ -263,17 +280,18 @@ def _slider_states(job: PageJob, workers: Executor, advance: Any) -> JsonDict:
 
 
 def script(*names: str) -> str:
-    """The named JavaScript modules of this folder, joined into one script without imports and
-    exports."""
+    """Return the named JavaScript modules of this folder, joined into one script without imports
+    and exports."""
     parts = [resource(name) for name in names]
     text = "\n".join(re.sub(r"^import .*?;\n", "", part, flags=re.M | re.S) for part in parts)
     return re.sub(r"^export ", "", text, flags=re.M)
 
 
 def document(scene: Mapping[str, Any], still: str, link: str = "frames") -> str:
-    """The text of an HTML page.
+    """Return the text of an HTML page.
 
-    scene: the data of `LiveScene.scene`. still: base64 text of a PNG file.
+    scene: the data of `LiveScene.scene`.
+    still: base64 text of a PNG file.
     link: where the page gets other states from: "frames" for states stored in it, or "server" for
         Python's answers.
     """
@@ -281,6 +299,7 @@ def document(scene: Mapping[str, Any], still: str, link: str = "frames") -> str:
     return _PAGE.substitute(
         title=html.escape(scene["title"]),
         style=resource("panel.css"),
+        # Text must not end the element in which it stands.
         script=script(*MODULES).replace("</script", "<\\/script"),
         passes=passes.replace("</", "<\\/"),
         scene=json.dumps(scene).replace("<", "\\u003c"),
@@ -290,7 +309,7 @@ def document(scene: Mapping[str, Any], still: str, link: str = "frames") -> str:
 
 
 def resource(name: str) -> str:
-    """The text of a file of this folder, such as a JavaScript module."""
+    """Return the text of a file of this folder, such as a JavaScript module."""
     return resources.files("harnack.live").joinpath(name).read_text(encoding="utf-8")
 
 

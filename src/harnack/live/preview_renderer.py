@@ -1,9 +1,11 @@
 """Draws live scenes on the processor of the machine that runs Python, for visitors whose own device
-is slower.
+is slower. A preview is such a picture: `show="shaded"` with one ray per pixel, by the same
+formulas, or the colors of numbers that rays found. The stage is the scaled world in which surfaces
+stand on a floor. `mi` is the Mitsuba module.
 
-The pictures are those of `show="shaded"` with one ray per pixel, by the same formulas. They need no
-Mitsuba scene, whose setup takes longer than tracing a small picture. Cameras, levels, slider values
-and vertices are parameters of the kernels, so that changing them compiles no new kernel.
+Previews need no Mitsuba scene, whose setup takes longer than tracing a small picture. Cameras,
+levels, slider values and vertices are parameters of the kernels, so that changing them compiles no
+new kernel.
 """
 
 from __future__ import annotations
@@ -42,7 +44,7 @@ _DARKER = 0.45
 
 @dataclass(frozen=True)
 class CameraAxes:
-    """A camera on the stage.
+    """A camera on the stage (the scaled world in which surfaces stand on a floor).
 
     origin: (3,) its position.
     right, up, forward: unit vectors (3,).
@@ -71,7 +73,9 @@ class Preview:
 
 @dataclass(frozen=True)
 class PreviewSurface:
-    """A surface on the stage, and its colors, as `live_scene.surface_colors` returns them."""
+    """A surface on the stage (the scaled world, with a floor), and its colors `paints`: for the
+    surface itself, fillings of holes, cut faces, and isolines, as `live_scene.surface_colors`
+    returns them."""
 
     placed: PlacedSurface
     paints: Sequence[Mapping[str, Any]]
@@ -79,9 +83,9 @@ class PreviewSurface:
 
 @dataclass
 class PreviewRenderer:
-    """Draws surfaces on the stage as preview pictures. It keeps the shadow on the floor while
-    things move, and the hits of the last picture for a picture of the same surfaces, camera and
-    size."""
+    """Draws surfaces on the stage (the scaled world, with a floor) as preview pictures. It keeps
+    the shadow on the floor while things move, and the hits of the last picture for a picture of the
+    same surfaces, camera and size."""
 
     floor: FloorShadow | None = None
     _hit_cache: tuple[Any, dict[str, Any]] | None = None
@@ -109,46 +113,51 @@ class PreviewRenderer:
         mi = register()
         light = StudioLight.of(_matrix(eye))
         has_floor = show == "shaded" and eye.origin[2] > FLOOR_HEIGHT
-        numbers = [eye.origin, eye.right, eye.up, eye.forward]
-        key = painted, np.ravel(numbers).tolist(), eye.pixel, size, has_floor
+        camera_vectors = [eye.origin, eye.right, eye.up, eye.forward]
+        cache_key = painted, np.ravel(camera_vectors).tolist(), eye.pixel, size, has_floor
         if (
             self._hit_cache is None
             or self._hit_cache[0][0] is not painted
-            or self._hit_cache[0][1:] != key[1:]
+            or self._hit_cache[0][1:] != cache_key[1:]
         ):
-            self._hit_cache = key, self._trace(mi, painted, eye, size, has_floor=has_floor)
+            self._hit_cache = cache_key, self._trace(mi, painted, eye, size, has_floor=has_floor)
             dr.eval(self._hit_cache[1])
         hits = self._hit_cache[1]
         if show != "shaded":
             return _aov_preview(hits, show, _BEHIND[ground], size)
-        # First: it evaluates, and what is recorded before that makes another kernel of the rest.
+        # The shadow is computed first: it evaluates arrays, and whatever was recorded before
+        # would then be evaluated separately.
         if has_floor and (is_idle or self.floor is None):
             self.floor = FloorShadow.of(_Casting(mi, painted), light)
         width = hits["t"] * eye.pixel * dr.dot(hits["d"], _vector(mi, eye.forward))
         sky = ambient_visibility(mi, hits["position"], hits["normal"], width, size)
         reflectance = reflectance_of(ground)
         color = hits["color"]
-        sun: Any = mi.Float(1)
+        key_fraction: Any = mi.Float(1)
         if self.floor is not None and has_floor:
-            sun, floor_visibility = self.floor.at(hits["position"])
-            sun, floor_visibility = (
-                dr.select(hits["ground"], sun, 1),
+            key_fraction, floor_visibility = self.floor.at(hits["position"])
+            key_fraction, floor_visibility = (
+                dr.select(hits["ground"], key_fraction, 1),
                 dr.select(hits["ground"], floor_visibility, 1),
             )
             sky = dr.minimum(sky, floor_visibility)
             color = dr.select(hits["ground"], _vector(mi, reflectance, mi.Color3f), color)
-        unclipped = light.shade(color, hits["normal"], -hits["d"], hits["glossy"], sky, sun)
+        light_at_hits = light.shade(
+            color, hits["normal"], -hits["d"], hits["glossy"], sky, key_fraction
+        )
         floor_color, z = _vector(mi, reflectance, mi.Color3f), mi.Vector3f(0, 0, 1)
+        # The wall has the color of the floor far away, and is darker higher up.
         wall = light.shade(floor_color, z, z, mi.Bool(False), mi.Float(1))
         wall = wall * (1 - _DARKER * dr.power(dr.clip(hits["d"].z, 0, 1), 0.7))
+        # Tone mapping and the transfer function of sRGB, as in `images.tone_map`.
         headroom = 1 - SHOULDER_START
-        compressed = 1 - headroom * dr.exp((SHOULDER_START - unclipped) / headroom)
-        shown = dr.select(
-            hits["met"], dr.select(unclipped > SHOULDER_START, compressed, unclipped), wall
+        compressed = 1 - headroom * dr.exp((SHOULDER_START - light_at_hits) / headroom)
+        linear = dr.select(
+            hits["met"], dr.select(light_at_hits > SHOULDER_START, compressed, light_at_hits), wall
         )
-        shown = dr.clip(dr.select(hits["lost"], mi.Color3f(OUT_OF_STEPS_COLOR), shown), 0, 1)
+        linear = dr.clip(dr.select(hits["lost"], mi.Color3f(OUT_OF_STEPS_COLOR), linear), 0, 1)
         srgb = dr.select(
-            shown <= 0.0031308, 12.92 * shown, 1.055 * dr.power(shown, 1 / 2.4) - 0.055
+            linear <= 0.0031308, 12.92 * linear, 1.055 * dr.power(linear, 1 / 2.4) - 0.055
         )
         red, green, blue = (mi.UInt32(255 * part + 0.5) for part in srgb)
         packed = red | (green << 8) | (blue << 16) | (255 << 24)
@@ -161,16 +170,17 @@ class PreviewRenderer:
         """Trace the rays through the middles of the pixels, row by row. Returns Dr.Jit arrays by
         name, with a lane for each pixel.
 
-        "t", "d", "position": distance, unit direction and position of the nearest hit.
-        "normal", "gradient": the unit normal towards the camera, and the unit normal towards larger
-        values.
-        "color", "glossy": the color of the hit surface, and whether it is glossy.
-        "met", "lost", "ground": whether the ray hits something, runs out of steps, or hits the
-        floor.
-        "evaluations": the number of evaluations of all surfaces' fields.
         has_floor: whether the floor is drawn.
+
+        - "t", "d", "position": distance, unit direction and position of the nearest hit.
+        - "normal", "gradient": the unit normal toward the camera, and the unit normal toward larger
+          values.
+        - "color", "glossy": the color of the hit surface, and whether it is glossy.
+        - "met", "lost", "ground": whether the ray hits something, runs out of steps, or hits the
+          floor.
+        - "evaluations": the number of evaluations of all surfaces' fields.
         """
-        columns, rows = (dr.opaque(mi.UInt32, n) for n in size)
+        columns, rows = (dr.opaque(mi.UInt32, surface_normal) for surface_normal in size)
         index = dr.arange(mi.UInt32, size[0] * size[1])
         pixel = dr.opaque(mi.Float, eye.pixel)
         x = (mi.Float(index % columns) + 0.5 - 0.5 * mi.Float(columns)) * pixel
@@ -184,22 +194,25 @@ class PreviewRenderer:
         t, normal, color = mi.Float(dr.inf), mi.Vector3f(0, 0, 1), mi.Color3f(0)
         glossy, lost, ground = mi.Bool(False), mi.Bool(False), mi.Bool(False)
         if has_floor:
-            far = (FLOOR_HEIGHT - origin.z) / dr.minimum(d.z, -1e-9)
-            ground = (d.z < 0) & (dr.norm(origin + far * d) < 100.0)
-            t = dr.select(ground, far, t)
+            t_floor = (FLOOR_HEIGHT - origin.z) / dr.minimum(d.z, -1e-9)
+            ground = (d.z < 0) & (dr.norm(origin + t_floor * d) < 100.0)
+            t = dr.select(ground, t_floor, t)
         evaluations = mi.UInt32(0)
         for surface in painted:
             met = surface.placed.intersect(o, vector(d), mi.Float(dr.inf), mi.Bool(True))
             evaluations += met.evaluations
             lost |= met.is_out_of_steps
-            # The floor stands below what was drawn at first: it hides nothing that has moved below.
+            # The floor was placed below what was drawn at first. A surface that has moved below it
+            # since is drawn nevertheless.
             nearer = met.is_hit & ~met.is_out_of_steps & (ground | (met.t < t))
-            n = mi.Vector3f(met.normal)
-            paint_color, shines = _color(mi, surface.paints, color_index(met), dr.dot(n, d) < 0)
+            surface_normal = mi.Vector3f(met.normal)
+            paint_color, paint_is_glossy = _color(
+                mi, surface.paints, color_index(met), dr.dot(surface_normal, d) < 0
+            )
             t = dr.select(nearer, met.t, t)
-            normal = dr.select(nearer, n, normal)
+            normal = dr.select(nearer, surface_normal, normal)
             color = dr.select(nearer, paint_color, color)
-            glossy = dr.select(nearer, shines, glossy)
+            glossy = dr.select(nearer, paint_is_glossy, glossy)
             ground &= ~nearer
         met = dr.isfinite(t) & ~lost
         return {
@@ -219,8 +232,8 @@ class _Casting:
     painted: Sequence[PreviewSurface]
 
     def occluded(self, ray: Any, active: Any) -> Any:
-        """For each Mitsuba ray, whether some surface lies between the ray's origin and its end;
-        False for lanes that are not active."""
+        """Return for each Mitsuba ray whether some surface lies between the ray's origin and its
+        end; False for lanes that are not active."""
         vector = mitsuba_backend(self.mi).Array3f
         is_occluded = self.mi.Bool(False)
         for surface in self.painted:
@@ -231,7 +244,8 @@ class _Casting:
 def _color(
     mi: Any, paints: Sequence[Mapping[str, Any]], index: Any, in_front: Any
 ) -> tuple[Any, Any]:
-    """For each ray, the color of the surface that it hits, and whether that surface is glossy.
+    """Return for each ray the color of the surface that it hits, and whether that surface is
+    glossy.
 
     paints: the colors of the surface, as `live_scene.surface_colors` returns them.
     index: the index in `paints` for each ray.
@@ -246,16 +260,16 @@ def _color(
 
 
 def _vector(mi: Any, numbers: Any, kind: Any = None) -> Any:
-    """Three numbers as a vector of type `kind` whose entries are parameters of kernels, so that
-    other numbers use the same kernel."""
+    """Return three numbers as a vector of type `kind` (by default Vector3f) whose entries are
+    parameters of kernels, so that other numbers use the same kernel."""
     return (mi.Vector3f if kind is None else kind)(
         *(dr.opaque(mi.Float, float(x)) for x in numbers)
     )
 
 
 def _matrix(eye: CameraAxes) -> FloatArray:
-    """The 4 x 4 matrix whose first three columns are the camera's unit vectors to the left, up and
-    forward."""
+    """Return the 4 x 4 matrix whose first three columns are the camera's unit vectors to the left,
+    up and forward."""
     matrix = np.eye(4)
     matrix[:3, :3] = np.stack([-eye.right, eye.up, eye.forward], axis=1)
     return matrix
@@ -264,7 +278,7 @@ def _matrix(eye: CameraAxes) -> FloatArray:
 def _aov_preview(
     hits: dict[str, Any], show: str, behind: Sequence[float], size: tuple[int, int]
 ) -> Preview:
-    """A picture whose colors stand for numbers: normals, depths, numbers of evaluations, or
+    """Return a picture whose colors stand for numbers: normals, depths, numbers of evaluations, or
     outcomes of rays (`show` = "normal", "depth", "evaluations", "status").
 
     hits: the result of `PreviewRenderer._trace`.
@@ -285,6 +299,7 @@ def _aov_preview(
         picture[:] = viridis(evaluations_share(to_numpy(hits["evaluations"])))
     elif show == "status":
         picture[met] = HIT_COLOR
+    # Rays out of steps are magenta in all pictures.
     picture[lost] = linear_to_srgb(np.array(OUT_OF_STEPS_COLOR))
     opaque = np.column_stack([picture, np.ones(len(picture))])
     return Preview(to_uint8(opaque).reshape(size[1], size[0], 4), depths)

@@ -115,7 +115,8 @@ def check_sources(sources: Any) -> None:
 
 
 class SceneFileError(ValueError):
-    """The text is no valid scene file, or an object cannot be written to a scene file."""
+    """The error for a text that is no valid scene file, or an object that cannot be written to a
+    scene file."""
 
 
 @dataclass(frozen=True)
@@ -137,8 +138,8 @@ class SceneFile:
 
     @property
     def surfaces_with_options(self) -> tuple[Surface, ...]:
-        """The surfaces, each with those options of the scene that are keywords of `Surface` (level,
-        clip, ...). `harnack.trace` and other functions of a `Surface` take them."""
+        """The surfaces, each with those options of the scene that are keywords of `Surface`
+        (level, clip, ...). `harnack.trace` and other functions of a `Surface` take them."""
         shorthand = {k: value for k, value in self.settings.items() if k in SURFACE_OPTIONS}
         return tuple(
             surface_and_options("a scene", surface, None, shorthand, SURFACE_OPTIONS)[0]
@@ -146,7 +147,9 @@ class SceneFile:
         )
 
     def settings_of(self, verb: str) -> dict[str, Any]:
-        """The settings that a verb, such as "page", has; `show` only if the verb draws it."""
+        """Return those settings that a function of the library takes. verb: the name of the
+        function, such as "page". `show` is left out if the function cannot draw this kind of
+        picture."""
         names = {option.name for option in options_of(verb)}
         settings = {name: value for name, value in self.settings.items() if name in names}
         if verb in LIVE and settings.get("show") not in (None, *LIVE_MODES):
@@ -187,9 +190,9 @@ def read_scene(path: str | os.PathLike[str]) -> SceneFile:
 
 
 def _resolve_file(folder: Path, name: str) -> Path:
-    """The path of a file that a scene in `folder` names: the named path or, if nothing exists
-    there, a file of the same name in the folder itself. So a scene can be sent to other people
-    together with its files."""
+    """Return the path of a file that a scene in `folder` names: the named path or, if nothing
+    exists there, a file of the same name in the folder itself. So a scene can be sent to other
+    people together with its files."""
     path = folder / name
     return path if path.exists() or not (folder / path.name).exists() else folder / path.name
 
@@ -228,9 +231,11 @@ def write_scene(
 
 
 def to_scene_text(surfaces: Any, settings: Mapping[str, Any], sources: FieldSources = ()) -> str:
-    """The text of a scene file. surfaces, settings, sources: as for `write_scene`, that is
-    surfaces, options of `render` by name (with sliders), and pairs of a field and its entry in
-    scene files.
+    """Write surfaces and options as the text of a scene file, and return it.
+
+    surfaces: a field, a `Surface`, or a list of them.
+    settings: options of `render` by name; values may be sliders.
+    sources: pairs of a field and its entry in scene files.
 
     Raises:
         SceneFileError: something cannot be written as text; or an option is wrong.
@@ -257,6 +262,7 @@ def to_scene_text(surfaces: Any, settings: Mapping[str, Any], sources: FieldSour
     }
     starts = {name: slider.start for name, slider in sliders.items()}
     values = {name: value for name, value in settings.items() if value is not None}
+    # Errors appear on writing and not when the file is read.
     _check_values(SceneFile(tuple(surface_list), {**values, **starts}))
     if settings_json:
         scene["settings"] = settings_json
@@ -269,8 +275,8 @@ def to_scene_text(surfaces: Any, settings: Mapping[str, Any], sources: FieldSour
 
 
 def with_flat_options(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """The options by name, in which the entry "options" (a `TraceOptions`) is replaced by its
-    attributes that differ from their defaults.
+    """Return the options by name, in which the entry "options" (a `TraceOptions`) is replaced by
+    its attributes that differ from their defaults.
 
     Raises:
         TypeError: an option of traces stands in both places.
@@ -279,6 +285,7 @@ def with_flat_options(settings: Mapping[str, Any]) -> dict[str, Any]:
     options = flat.pop("options", None)
     if options is None:
         return flat
+    # This raises the error for options that stand in both places.
     trace_options_among(options, flat)
     for option in dataclasses.fields(TraceOptions):
         value = getattr(options, option.name)
@@ -288,26 +295,28 @@ def with_flat_options(settings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _json(value: Any, depth: int = 0) -> str:
-    """A value as JSON text with a line for each entry; an entry that fits on one line, such as a
-    row of numbers, stays on one line. depth: the depth of nesting, by which the text is
+    """Return a value as JSON text with a line for each entry; an entry that fits on one line, such
+    as a row of numbers, stays on one line. depth: the depth of nesting, by which the text is
     indented."""
-    flat = json.dumps(value, allow_nan=False)
-    if len(flat) <= 88 - 2 * depth or not isinstance(value, dict | list):
-        return flat
-    space = "  " * (depth + 1)
+    one_line = json.dumps(value, allow_nan=False)
+    if len(one_line) <= 88 - 2 * depth or not isinstance(value, dict | list):
+        return one_line
+    indent = "  " * (depth + 1)
     entries: list[str] = []
     if isinstance(value, dict):
         for name, entry in cast("Plain", value).items():
-            entries.append(f"{space}{json.dumps(name)}: {_json(entry, depth + 1)}")
+            entries.append(f"{indent}{json.dumps(name)}: {_json(entry, depth + 1)}")
     else:
-        entries = [space + _json(entry, depth + 1) for entry in cast("list[Any]", value)]
-    first, last = "{}" if isinstance(value, dict) else "[]"
-    return f"{first}\n" + ",\n".join(entries) + "\n" + "  " * depth + last
+        entries = [indent + _json(entry, depth + 1) for entry in cast("list[Any]", value)]
+    opening, closing = "{}" if isinstance(value, dict) else "[]"
+    return f"{opening}\n" + ",\n".join(entries) + "\n" + "  " * depth + closing
 
 
 def _surface_to_json(surface: Any, sources: FieldSources) -> Plain:
-    """A field or surface as an entry of "surfaces" in a scene file: its field, its levels and its
-    other keywords.
+    """Return a field or surface as an entry of "surfaces" in a scene file: its field, its levels
+    and its other keywords.
+
+    sources: pairs of a field and its entry in scene files.
 
     Raises:
         SceneFileError: some part of it cannot be written as text.
@@ -328,8 +337,10 @@ def _surface_to_json(surface: Any, sources: FieldSources) -> Plain:
 
 
 def _field_to_json(field: Field, sources: FieldSources) -> Plain:
-    """A field as an entry of a scene file: its entry in `sources` if it has one, otherwise its
-    formula, its curves, or its class and arguments.
+    """Return a field as an entry of a scene file: its entry in `sources` if it has one, otherwise
+    its formula, its curves, or its class and arguments.
+
+    sources: pairs of a field and its entry in scene files.
 
     Raises:
         SceneFileError: the field cannot be written, or would not be the same when read again.
@@ -342,6 +353,7 @@ def _field_to_json(field: Field, sources: FieldSources) -> Plain:
             "formula": field.function.text,
             "parameters": dict(field.function.parameters),
         }
+        # Only arguments that differ from their defaults are written.
         keywords = {
             "domain": field.domain,
             "level": field.default_level,
@@ -361,6 +373,7 @@ def _field_to_json(field: Field, sources: FieldSources) -> Plain:
             f"a {type(field).__name__} that was made in Python cannot be written into a scene "
             "file, which holds curves, formulas, solids, surfaces of files and of the gallery"
         )
+    # The field is read back to find out whether its arguments say all of it.
     data = _object_to_json(field)
     _check_round_trip(field, _field_of(data, "field", None))
     return data
@@ -374,8 +387,8 @@ def _check_cells(options: Mapping[str, Any]) -> None:
 
 
 def _check_round_trip(field: Field, copy: Field) -> None:
-    """Raise `SceneFileError` if `copy`, which was read back from the text of `field`, has other
-    values at 256 random points, another default level or another domain."""
+    """Raise `SceneFileError` if `copy`, which was read back from the text of `field`, is another
+    field: if it has other values at 256 random points, another default level or another domain."""
     points = np.random.default_rng(0).normal(size=(256, 3))
     same = np.array_equal(field.value(points), copy.value(points), equal_nan=True)
     if not same or field.default_level != copy.default_level or field.domain != copy.domain:
@@ -384,9 +397,9 @@ def _check_round_trip(field: Field, copy: Field) -> None:
 
 
 def _object_to_json(instance: Any) -> Plain:
-    """A field or a volume as {class name: {argument: JSON value}}. Arguments that equal their
-    default are left out. An argument that the object does not keep as an attribute is left out too;
-    `_check_round_trip` reports an object that this changes."""
+    """Return a field or a volume as {class name: {argument: JSON value}}. Arguments that equal
+    their default are left out. An argument that the object does not keep as an attribute is left
+    out too; `_check_round_trip` reports an object that this changes."""
     arguments: Plain = {}
     for name, parameter in inspect.signature(instance.__class__).parameters.items():
         if name.startswith("_") or not hasattr(instance, name):
@@ -399,8 +412,8 @@ def _object_to_json(instance: Any) -> Plain:
 
 
 def _equals_default(value: Any, default: Any) -> bool:
-    """Whether a value equals the default of its argument; False for values that cannot be compared
-    as a whole, such as arrays."""
+    """Return whether a value equals the default of its argument; False for values that cannot be
+    compared as a whole, such as arrays."""
     try:
         return bool(value == default)
     except (TypeError, ValueError):  # arrays
@@ -408,8 +421,11 @@ def _equals_default(value: Any, default: Any) -> bool:
 
 
 def _to_json_value(value: Any) -> Any:
-    """A number, string, sequence, array, volume or field as JSON data. Raises `SceneFileError` for
-    other values."""
+    """Return a number, string, sequence, array, volume or field as JSON data.
+
+    Raises:
+        SceneFileError: another value.
+    """
     if value is None or isinstance(value, bool | int | str):
         return value
     if isinstance(value, float | np.floating):
@@ -428,17 +444,21 @@ def _to_json_value(value: Any) -> Any:
 
 
 def _finite_or_text(value: float) -> Any:
-    """A number for JSON, which has no infinities: they become "inf" and "-inf". Raises
-    `SceneFileError` for NaN."""
+    """Return a number for JSON, which has no infinities: they become "inf" and "-inf".
+
+    Raises:
+        SceneFileError: the number is NaN.
+    """
     if math.isnan(value):
         raise SceneFileError("NaN cannot be written")
     return value if math.isfinite(value) else ("inf" if value > 0 else "-inf")
 
 
 def _setting_to_json(name: str, value: Any, sources: FieldSources) -> Any:
-    """The value of an option as JSON data.
+    """Return the value of an option as JSON data.
 
     name: of the option, a keyword of `render` or of `Surface`.
+    sources: pairs of a field and its entry in scene files.
 
     Raises:
         SceneFileError: the option is unknown, or its value cannot be written, such as a Python
@@ -451,6 +471,7 @@ def _setting_to_json(name: str, value: Any, sources: FieldSources) -> Any:
         return value.distance
     if name == "enclosures" and not isinstance(value, str):
         raise SceneFileError("enclosures: only those chosen by name can be written")
+    # Attributes that equal their defaults are left out.
     if isinstance(value, Camera):
         values = {option.name: getattr(value, option.name) for option in dataclasses.fields(value)}
         defaults = {option.name: option.default for option in dataclasses.fields(value)}
@@ -472,7 +493,7 @@ def _setting_to_json(name: str, value: Any, sources: FieldSources) -> Any:
 
 
 def parse_scene(text: str, find: Callable[[str], Path] | None = None) -> SceneFile:
-    """The scene that the text of a scene file describes.
+    """Return the scene that the text of a scene file describes.
 
     find: returns the path of a file from its name in the text; None refuses texts that name files.
 
@@ -490,8 +511,12 @@ def parse_scene(text: str, find: Callable[[str], Path] | None = None) -> SceneFi
 
 
 def _scene_of(data: Any, find: Callable[[str], Path] | None) -> SceneFile:
-    """The scene that JSON data describes, with all its values checked. find: as for `parse_scene`,
-    returns the path of a named file."""
+    """Return the scene that JSON data describes, with all its values checked. find: returns the
+    path of a file from its name; None refuses named files.
+
+    Raises:
+        SceneFileError: the data is no scene; the message names the part that is wrong.
+    """
     scene_data = _object(data, "a scene")
     if scene_data.get("harnack") != VERSION or scene_data["harnack"] is True:
         raise SceneFileError(f'it must say "harnack": {VERSION}, the version of scene files')
@@ -511,6 +536,7 @@ def _scene_of(data: Any, find: Callable[[str], Path] | None) -> SceneFile:
     for name, entry in entries.items():
         _check_name(name, SLIDER_OPTIONS, "slider")
         sliders[name] = _construct(Slider, entry, f"sliders: {name}")
+        # The option of a slider has the slider's start value in the settings.
         settings[name] = sliders[name].start
     scene = SceneFile(surfaces, settings, sliders, tuple(sources))
     _check_values(scene)
@@ -523,6 +549,7 @@ def _check_values(scene: SceneFile) -> None:
     settings = scene.settings
     show = settings.get("show", "shaded")
     try:
+        # These properties raise the errors of `Surface` and `TraceOptions`.
         _ = scene.surfaces_with_options, scene.trace_options
         for name, value in settings.items():
             if name in BY_NAME:
@@ -548,7 +575,11 @@ def _no_number(name: str) -> float:
 
 
 def _reject_duplicate_keys(pairs: list[tuple[str, Any]]) -> Plain:
-    """The pairs of a JSON object as a dictionary. Raises `ValueError` if a name occurs twice."""
+    """Return the pairs of a JSON object as a dictionary.
+
+    Raises:
+        ValueError: a name occurs twice.
+    """
     data: Plain = {}
     for name, value in pairs:
         if name in data:
@@ -558,8 +589,12 @@ def _reject_duplicate_keys(pairs: list[tuple[str, Any]]) -> Plain:
 
 
 def _object(value: Any, where: str) -> Plain:
-    """The value, if it is a JSON object (a dictionary); otherwise raise `SceneFileError`. where:
-    the place in the file, for the message."""
+    """Return the value, if it is a JSON object (a dictionary). where: the place in the file, for
+    the message.
+
+    Raises:
+        SceneFileError: it is no object.
+    """
     if not isinstance(value, dict):
         raise SceneFileError(f"{where} must be an object with names, not {value!r:.60}")
     return cast("Plain", value)
@@ -575,11 +610,14 @@ def _check_name(name: str, known: Sequence[str], kind: str) -> None:
 def _surface_of(
     entry: Any, where: str, find: Callable[[str], Path] | None, sources: list[tuple[Field, Plain]]
 ) -> Field | Surface:
-    """The field or surface that an entry of "surfaces" describes.
+    """Return the field or surface that an entry of "surfaces" describes.
 
     where: the place in the file, for messages.
     find: returns the path of a named file; None refuses named files.
     sources: gets a pair of the field and its entry, if the field comes from a file or the gallery.
+
+    Raises:
+        SceneFileError: the entry describes no surface.
     """
     data = dict(_object(entry, where))
     try:
@@ -592,6 +630,8 @@ def _surface_of(
         for name in data:
             _check_name(name, _SURFACE_KEYS, "keyword of a surface")
         field_entry = data.pop("field")
+        # Fields of files and of the gallery keep their entry, by which the scene can be written
+        # again.
         field = _source_of(field_entry, where, find)
         if field is not None:
             sources.append((field, field_entry))
@@ -606,7 +646,12 @@ def _surface_of(
 
 
 def _gallery_surface(data: Plain) -> Surface:
-    """The surface of the gallery that {"scene": name, "number": index of its surface} describes."""
+    """Return the surface of the gallery that {"scene": name, "number": index of its surface}
+    describes.
+
+    Raises:
+        SceneFileError: there is no such scene or surface.
+    """
     for name in data:
         _check_name(name, ("scene", "number"), "part of a surface of the gallery")
     scene, number = data["scene"], data.get("number", 0)
@@ -619,9 +664,13 @@ def _gallery_surface(data: Plain) -> Surface:
 
 
 def _source_of(text: Any, where: str, find: Callable[[str], Path] | None) -> Field | None:
-    """The field of a surface of the gallery or of a file; None if the entry `text` (JSON data)
-    describes another kind of field. where, find: as for `_surface_of`, the place in the file for
-    messages, and the function that returns the path of a named file."""
+    """Return the field of a surface of the gallery or of a file; None if the entry describes
+    another kind of field.
+
+    text: the entry, JSON data.
+    where: the place in the file, for messages.
+    find: returns the path of a named file; None refuses named files.
+    """
     data = _object(text, f"{where}: field")
     if "scene" in data:
         return _gallery_surface(data).field
@@ -639,9 +688,12 @@ def _source_of(text: Any, where: str, find: Callable[[str], Path] | None) -> Fie
 
 
 def _field_of(value: Any, where: str, find: Callable[[str], Path] | None) -> Field:
-    """The field that an entry describes by curves, by a formula, or by a class and its arguments.
-    where, find: the place in the file for messages, and the function that returns the path of a
-    named file.
+    """Return the field that an entry describes by curves, by a formula, or by a class and its
+    arguments.
+
+    value: the entry, JSON data.
+    where: the place in the file, for messages.
+    find: returns the path of a named file; None refuses named files.
 
     Raises:
         SceneFileError: the entry describes no field; errors of constructors pass through.
@@ -678,8 +730,8 @@ def _field_of(value: Any, where: str, find: Callable[[str], Path] | None) -> Fie
 
 
 def _from_json_value(value: Any, where: str) -> Any:
-    """A JSON value as an argument of a constructor: lists become tuples, "inf" and "-inf" become
-    floats, and an object (a dictionary) becomes the field, volume or map of space that it
+    """Return a JSON value as an argument of a constructor: lists become tuples, "inf" and "-inf"
+    become floats, and an object (a dictionary) becomes the field, volume or map of space that it
     describes. Other values stay as they are. where: the place in the file, for messages."""
     if isinstance(value, list):
         return tuple(_from_json_value(entry, where) for entry in cast("list[Any]", value))
@@ -690,6 +742,7 @@ def _from_json_value(value: Any, where: str) -> Any:
     data = cast("Plain", value)
     if "curves" in data or "formula" in data:
         return _field_of(data, where, None)
+    # Any other object is a class name with arguments.
     kinds = _constructible_types()
     if len(data) != 1:
         raise SceneFileError(f"{where}: write one name and its arguments, not {data!r:.60}")
@@ -700,7 +753,10 @@ def _from_json_value(value: Any, where: str) -> Any:
 
 def _construct(kind: type, value: Any, where: str) -> Any:
     """Call the constructor `kind` with arguments from a JSON object, after checks of their names
-    and types. where: the place in the file, for messages.
+    and types. Returns the new object.
+
+    value: the JSON object, with the arguments by name.
+    where: the place in the file, for messages.
 
     Raises:
         SceneFileError: an argument is unknown, has the wrong type, or is refused by the
@@ -721,8 +777,8 @@ def _construct(kind: type, value: Any, where: str) -> Any:
 
 
 def _settings_of(data: Plain, known: Sequence[str]) -> Plain:
-    """The options that a JSON object describes, by name. known: the names of the options that are
-    allowed."""
+    """Return the options that a JSON object describes, by name. known: the names of the options
+    that are allowed."""
     settings: Plain = {}
     for name, value in data.items():
         _check_name(name, known, "setting")
@@ -733,6 +789,8 @@ def _settings_of(data: Plain, known: Sequence[str]) -> Plain:
             settings[name] = [_construct(Isolines, style, name) for style in listed]
         else:
             plain = _from_json_value(value, name)
+            # Lists of materials and levels stay lists, which is how `render` knows several from
+            # one.
             settings[name] = (
                 [*plain] if name in ("material", "level") and type(plain) is tuple else plain
             )
@@ -740,8 +798,8 @@ def _settings_of(data: Plain, known: Sequence[str]) -> Plain:
 
 
 def _constructible_types() -> dict[str, type]:
-    """The classes that scene files can name: solids, volumes, maps of space and a few more fields,
-    each determined by its arguments. None of their constructors reads files or calls its
+    """Return the classes that scene files can name: solids, volumes, maps of space and a few more
+    fields, each determined by its arguments. None of their constructors reads files or calls its
     arguments."""
     types: dict[str, type] = {kind.__name__: kind for kind in _EXTRA_FIELD_TYPES}
     modules = [

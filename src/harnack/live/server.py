@@ -1,4 +1,5 @@
-"""`view`: a small web server on this machine. Its page asks Python for all changes of the scene."""
+"""`view`: a small web server on this machine. A page is what the browser shows; it asks Python for
+all changes of the scene. A question is one request of a page, and a client is an open page."""
 
 from __future__ import annotations
 
@@ -75,7 +76,7 @@ class LiveView:
         self.close()
 
     def _repr_html_(self) -> str:
-        """The page in a frame, as notebooks on this machine show it."""
+        """Return the page in a frame, as notebooks on this machine show it."""
         return f'<iframe src="{self.address}" style="width:100%;height:480px;border:0"></iframe>'
 
 
@@ -137,6 +138,7 @@ def view(
     live = LiveScene.of(surfaces, settings, edits=True, sources=sources)
     live = live.framed(extreme_slider_values(live.content.sliders))
     title = title or live.content.name
+    # A notebook shows a widget, unless the caller asks for the server by its options.
     if open_browser and port == 0 and host == _LOCAL[0] and block is None and in_notebook():
         try:
             from harnack.live.widget import Widget
@@ -148,6 +150,7 @@ def view(
         else:
             return Widget(live, title, height)
     scene = live.scene(title)
+    # A page that is open to the network is protected by a secret in its address.
     token = "" if host in _LOCAL else secrets.token_urlsafe(16)
     server = _PageServer(live, document(scene, still_png(live), link="server"), token)
     live_view = server.start(host, port)
@@ -156,6 +159,7 @@ def view(
         print("open to the network: whoever has this address can use it", file=sys.stderr)
     if open_browser:
         webbrowser.open(live_view.address)
+    # A script would end at once, and the page with it.
     if block is None:
         block = not (hasattr(sys, "ps1") or "ipykernel" in sys.modules)
     if block:
@@ -164,7 +168,7 @@ def view(
 
 
 def check_height(height: Any) -> int:
-    """The height of a widget in pixels, if it is a whole number from 16 to 10,000.
+    """Return the height of a widget in pixels, if it is a whole number from 16 to 10,000.
 
     Raises:
         ValueError: the height is not such a number.
@@ -173,16 +177,19 @@ def check_height(height: Any) -> int:
 
 
 def in_notebook() -> bool:
-    """Whether Python runs in a notebook."""
+    """Return whether Python runs in a notebook, of Jupyter or marimo."""
     shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
     marimo = sys.modules.get("marimo")
     return hasattr(shell, "kernel") or (marimo is not None and marimo.running_in_notebook())
 
 
 class _PageServer:
-    """The server of a view's page, and of the requests of its clients (open pages).
+    """The web server that sends a view's page, and answers the questions of its clients (the open
+    pages). One worker thread computes all answers, one after the other.
 
-    live: the scene. page: the HTML text. token: a secret that requests must have; "" for none.
+    live: the scene.
+    page: the HTML text.
+    token: a secret that requests must have; "" for none.
     """
 
     def __init__(self, live: LiveScene, page: str, token: str) -> None:
@@ -192,8 +199,12 @@ class _PageServer:
         self.clients: set[MessageHandler] = set()
 
     def start(self, host: str, port: int) -> LiveView:
-        """Serve the page in a new thread, and return the view. Raises `OSError` if the address
-        cannot be served at."""
+        """Serve the page in a new thread, and return the view.
+
+        Raises:
+            OSError: the address cannot be served at.
+            ModuleNotFoundError: the package aiohttp is not installed.
+        """
         try:
             from aiohttp import web
         except ImportError:
@@ -232,18 +243,18 @@ class _PageServer:
         # In a thread of its own from the start: notebooks have a loop that runs in this one.
         threading.Thread(target=serve, name="harnack-view", daemon=True).start()
         try:
-            bound = asyncio.run_coroutine_threadsafe(begin(), loop).result()
+            bound_port = asyncio.run_coroutine_threadsafe(begin(), loop).result()
         except OSError as wrong:
             LiveView("", loop, ended).close()
             raise OSError(f"a view cannot be served at {host}, port {port}: {wrong}") from None
-        shown = f"[{host}]" if ":" in host else host
+        host_in_url = f"[{host}]" if ":" in host else host
         query = f"?token={self.token}" if self.token else ""
-        return LiveView(f"http://{shown}:{bound}/{query}", loop, ended)
+        return LiveView(f"http://{host_in_url}:{bound_port}/{query}", loop, ended)
 
     def _reason_to_refuse(self, request: web.Request) -> str:
-        """The reason to refuse a request as text, or "" to answer it. With a token, the request
-        must have it. Without a token, the request must come from this machine and from the server's
-        own page, since web pages of other sites could send requests too."""
+        """Return the reason to refuse a request as text, or "" to answer it. With a token, the
+        request must have it. Without a token, the request must come from this machine and from the
+        server's own page, since web pages of other sites could send requests too."""
         name = request.host.rsplit(":", 1)[0].strip("[]")
         if self.token:
             token = request.query.get("token", "")
@@ -289,6 +300,7 @@ class _PageServer:
             await socket.prepare(request)
         except ConnectionError:  # the page was closed before it was answered
             return web.Response()
+        # Each open page has its own session, and tasks for its questions.
         client, waiting = MessageHandler(self.live), set[asyncio.Task[None]]()
         self.clients.add(client)
         try:
@@ -302,6 +314,7 @@ class _PageServer:
                     continue
                 if question is None:
                     continue
+                # Too many questions at once are refused, so that a page cannot fill the memory.
                 if len(waiting) >= _WAITING:
                     problem = f"more than {_WAITING} questions at once"
                     await _send(socket, {"id": question["id"], "error": problem})
@@ -310,6 +323,7 @@ class _PageServer:
                 waiting.add(task)
                 task.add_done_callback(waiting.discard)
         finally:
+            # The page was closed: its computations stop.
             client.is_gone = True
             for task in waiting:
                 task.cancel()

@@ -1,7 +1,8 @@
-"""Answers the requests of a page about its live scene, whether they come by a socket or from a
-notebook.
+"""Answers the questions of a page about its live scene, whether they come by a socket or from a
+notebook. A client is an open page. A state of the controls is the values of all sliders, the edited
+curve, the cut and the settings that a person has changed.
 
-A request is {"kind": ..., ...} of plain numbers, lists and text. All of its parts are checked, as
+A question is {"kind": ..., ...} of plain numbers, lists and text. All of its parts are checked, as
 it comes from outside.
 """
 
@@ -66,16 +67,17 @@ def _ignore_progress(part: float) -> None:
 
 
 class RequestError(ValueError):
-    """A request is malformed or asks for something impossible."""
+    """The error for a question that is malformed or asks for something impossible."""
 
 
 class Cancelled(Exception):
-    """The computation was stopped because its client cancelled it or is gone."""
+    """The exception by which a computation stops because its client cancelled it or is gone."""
 
 
 @dataclass
 class _PreviewCache:
-    """The surfaces of one state of the controls, prepared for previews.
+    """The surfaces of one state of the controls, prepared for previews (quick pictures that Python
+    draws).
 
     key: the state of the controls, as a tuple that can be compared.
     drawn: the surfaces as objects of the studio.
@@ -103,8 +105,8 @@ class MessageHandler:
         self._cancelled: set[int] = set()
 
     def read(self, text: str) -> JsonDict | None:
-        """The question in a message; None for a message of kind "cancel", whose question is marked
-        as cancelled.
+        """Return the question in a message; None for a message of kind "cancel", whose question is
+        marked as cancelled.
 
         Raises:
             RequestError: the message is no JSON object with a whole number "id".
@@ -125,10 +127,10 @@ class MessageHandler:
         return question
 
     def answer(self, question: JsonDict, send: Callable[[JsonDict], None]) -> JsonDict | bytes:
-        """Answer a question. The result is the message to send back: a JSON object or, for a
-        picture, bytes. The bytes are five little-endian numbers of four bytes (the question's id,
-        height, width, and the two ends of the depths in single precision), and then the pixels:
-        red, green, blue and alpha, row by row. Errors become messages too.
+        """Answer a question. Returns the message to send back: a JSON object or, for a picture,
+        bytes. The bytes are five little-endian numbers of four bytes (the question's id, height,
+        width, and the two ends of the depths in single precision), and then the pixels: red, green,
+        blue and alpha, row by row. Errors become messages too.
 
         send: called with messages about the progress of long work.
         """
@@ -136,7 +138,11 @@ class MessageHandler:
 
         def report(part: float) -> None:
             """Note that a fraction `part` of the work was finished, and send the progress from time
-            to time. Raises `Cancelled` if the client cancelled the question `number` or is gone."""
+            to time.
+
+            Raises:
+                Cancelled: the client cancelled the question `number` or is gone.
+            """
             nonlocal done, last
             if self.is_gone or number in self._cancelled:
                 raise Cancelled("stopped, as asked")
@@ -146,6 +152,7 @@ class MessageHandler:
                 send({"id": number, "done": done})
 
         try:
+            # A question that was cancelled while it waited is not begun.
             report(0.0)
             answer = self.session.answer(question, report)
         except Exception as wrong:
@@ -155,13 +162,15 @@ class MessageHandler:
             self._cancelled.discard(number)
         if isinstance(answer, dict):
             return {"id": number, "answer": answer}
+        # The message of a picture: id, height and width, the ends of the depths, and the pixels.
         head = np.array([number, *answer.pixels.shape[:2]], dtype="<u4").tobytes()
         return head + np.array(answer.depths, dtype="<f4").tobytes() + answer.pixels.tobytes()
 
 
 class Session:
-    """Answers questions about a live scene for one client, and keeps what the next preview can use
-    again."""
+    """Answers questions about a live scene for one client (an open page), and keeps what the next
+    preview can use again. Each kind of question has a method, which gets the question, the state of
+    the controls, and `report`, a function to be called with each finished fraction of the work."""
 
     def __init__(self, live: LiveScene) -> None:
         self.live = live
@@ -171,7 +180,7 @@ class Session:
     def answer(
         self, question: Mapping[str, Any], report: Progress = _ignore_progress
     ) -> JsonDict | Preview:
-        """Answer a question: JSON data, or a picture for the kind "draw".
+        """Answer a question. Returns JSON data, or a picture for the kind "draw".
 
         question: "kind" selects what is asked; "sliders", "loops", "cut" and "settings" are the
             state of the controls.
@@ -196,7 +205,7 @@ class Session:
         return kinds[kind](question, self.controls(question), report)
 
     def controls(self, question: Mapping[str, Any]) -> ControlState:
-        """The state of the controls that a question asks about.
+        """Return the state of the controls that a question asks about.
 
         Raises:
             RequestError: some part of the state is malformed or out of its range.
@@ -206,9 +215,12 @@ class Session:
         return ControlState(values, loops, cut, _settings(question.get("settings", {})))
 
     def _values(self, numbers: Any) -> dict[str, float]:
-        """The values of all sliders by name: the values in `numbers`, moved to steps, and start
-        values for the others. Raises `RequestError` for an unknown slider or a value beyond its
-        ends."""
+        """Return the values of all sliders by name: the values in `numbers`, moved to steps, and
+        start values for the others.
+
+        Raises:
+            RequestError: an unknown slider, or a value beyond its ends.
+        """
         sliders = self.live.content.sliders
         if not isinstance(numbers, dict):
             raise RequestError("sliders must be numbers by name")
@@ -225,8 +237,11 @@ class Session:
         return values
 
     def _loops(self, curves: Any) -> list[FloatArray] | None:
-        """The vertices (n, 3) of each edited loop; None if `curves` is None, for no edits. Raises
-        `RequestError` for malformed or too many points."""
+        """Return the vertices (n, 3) of each edited loop; None if `curves` is None, for no edits.
+
+        Raises:
+            RequestError: malformed or too many points.
+        """
         if curves is None:
             return None
         if not self.live.editable:
@@ -241,7 +256,8 @@ class Session:
     def _delta_response(
         self, question: Mapping[str, Any], controls: ControlState, report: Progress
     ) -> JsonDict:
-        """The state for the controls as its difference from the initial state, in JSON data."""
+        """Answer "change": return the state for the controls as its difference from the initial
+        state, in JSON data."""
         state = self.live.state(controls)
         checks = question.get("checks") is True
         return encode_arrays(state_delta(self.live.initial_state, state, checks=checks))
@@ -249,15 +265,25 @@ class Session:
     def _probe(
         self, question: Mapping[str, Any], controls: ControlState, report: Progress
     ) -> JsonDict:
-        """The nearest hit of one ray of the surfaces' coordinates, in JSON data: its status,
-        position, normal, value and curvatures, and the distances that the tracer's successive steps
-        reached."""
+        """Answer "probe": trace one ray, given in the surfaces' coordinates. Returns its nearest
+        hit as JSON data: status, position, normal, value and curvatures, and "steps", the distances
+        that the tracer's successive steps reached.
+
+        The steps are found by tracing the ray again with 1, 2, 3, ... steps. A hit on a jump of the
+        field has the index of a triangle in place of value and curvatures.
+        """
         origin = _points([question.get("origin")], "origin")
         direction = _points([question.get("direction")], "direction")
-        surfaces = [s.surface for s in self.live.surfaces_at(controls)]
-        results = [trace(s.surface, origin, direction, options=s.options) for s in surfaces]
+        surfaces = [
+            surface_of_scene.surface for surface_of_scene in self.live.surfaces_at(controls)
+        ]
+        results = [
+            trace(surface_of_scene.surface, origin, direction, options=surface_of_scene.options)
+            for surface_of_scene in surfaces
+        ]
         nearest = min(range(len(results)), key=lambda k: float(results[k].t[0]))
         hits, surface = results[nearest], surfaces[nearest]
+        # A ray with a limit of `count` evaluations ends where its step of that number ends.
         steps = [0.0]
         for count in range(1, min(int(hits.evaluations[0]), _MOST_STEPS)):
             options = surface.options.replace(max_steps=count)
@@ -277,6 +303,7 @@ class Session:
             "position": point[0].tolist(),
             "normal": hits.normal[0].tolist(),
         }
+        # A hit on a triangle, across which f jumps: there are no derivatives.
         if hits.primitive_index[0] >= 0:  # f jumps there, and has no derivatives
             return answer | {"triangle": int(hits.primitive_index[0])}
         value, period = float(surface.field.value(point)[0]), surface.field.period
@@ -287,15 +314,19 @@ class Session:
             value += float(shifts[np.argmin(np.abs(value + shifts - levels))])
         answer["value"] = value
         try:
-            kappa = curvature(surface.field, point)
+            curvatures = curvature(surface.field, point)
         except NotImplementedError:
             return answer
-        return answer | {"mean": float(kappa.mean[0]), "gaussian": float(kappa.gaussian[0])}
+        return answer | {
+            "mean": float(curvatures.mean[0]),
+            "gaussian": float(curvatures.gaussian[0]),
+        }
 
     def _preview_response(
         self, question: Mapping[str, Any], controls: ControlState, report: Progress
     ) -> Preview:
-        """A preview with one ray per pixel, from the camera "eye" of the question."""
+        """Answer "draw": return a preview with one ray per pixel, from the camera "eye" of the
+        question."""
         size = _size(question)
         show, ground = question.get("show", "shaded"), question.get("ground", self.live.backdrop)
         if show not in LIVE_MODES or ground not in GROUNDS:
@@ -320,9 +351,14 @@ class Session:
         )  # fmt: skip
 
     def _surfaces(self, controls: ControlState, rays: int) -> list[PreviewSurface]:
-        """The surfaces prepared for previews. They are prepared again if the controls changed, or
-        if so many rays were traced that building cells (local expansions of the field, which make
-        each ray cheaper) pays. rays: the number of rays of the next picture."""
+        """Return the surfaces prepared for previews.
+
+        rays: the number of rays of the next picture.
+
+        They are prepared again if the controls changed. They are also prepared again once so many
+        rays were traced that building cells takes less time than it saves. Cells hold local
+        expansions of the field, which make each ray faster.
+        """
         loops = None if controls.curves is None else [loop.tobytes() for loop in controls.curves]
         key = controls.values, loops, controls.cut_volume, controls.settings
         state = self._painted
@@ -331,7 +367,11 @@ class Session:
         state.rays += rays
         drawn = [replace(body, surface=body.surface.for_rays(state.rays)) for body in state.drawn]
         pairs = zip(drawn, state.drawn, strict=True)
-        if not state.prepared or any(a.surface.field is not b.surface.field for a, b in pairs):
+        # `for_rays` returns another field once cells take less time than they save.
+        if not state.prepared or any(
+            prepared_body.surface.field is not old_body.surface.field
+            for prepared_body, old_body in pairs
+        ):
             state.drawn = drawn
             state.prepared = [
                 PreviewSurface(self.live.place(body), surface_colors(body)) for body in drawn
@@ -341,8 +381,8 @@ class Session:
     def _picture_response(
         self, question: Mapping[str, Any], controls: ControlState, report: Progress
     ) -> JsonDict:
-        """A picture of `render` from the camera of the question, as {"png": base64 text of a PNG
-        file}."""
+        """Answer "picture": draw by `render` from the camera of the question. Returns {"png":
+        base64 text of a PNG file}."""
         size = _size(question)
         picture: Any = self.live.render_still(
             controls, show=question.get("show", "shaded"), size=size, progress=report,
@@ -352,18 +392,18 @@ class Session:
         return {"png": base64.b64encode(picture._repr_png_()).decode()}
 
     def _camera(self, question: Mapping[str, Any]) -> Camera:
-        """The camera of a question. The question gives it in stage coordinates; the result has the
-        surfaces' coordinates."""
-        place = self.live.placement
+        """Return the camera of a question. The question gives it in stage coordinates; the result
+        has the surfaces' coordinates."""
+        placement = self.live.placement
         eye, target, fov = parse_camera(question.get("camera"))
-        eye, target = (place.apply_inverse(point[None])[0] for point in (eye, target))
+        eye, target = (placement.apply_inverse(point[None])[0] for point in (eye, target))
         return Camera(position=tuple(eye.tolist()), target=tuple(target.tolist()), fov=fov)
 
     def _save(
         self, question: Mapping[str, Any], controls: ControlState, report: Progress
     ) -> JsonDict:
-        """{"text": the scene file of the state, "lost": names of the sliders that it cannot
-        hold}."""
+        """Answer "save": return {"text": the scene file of the state, "lost": names of the sliders
+        that it cannot hold}."""
         text, lost = self.live.to_scene_text(
             controls, camera=self._camera(question), show=question.get("show", "shaded"),
             backdrop=question.get("ground", self.live.backdrop), up=self.live.up,
@@ -373,9 +413,9 @@ class Session:
     def _load(
         self, question: Mapping[str, Any], controls: ControlState, report: Progress
     ) -> JsonDict:
-        """Replace the scene by that of a scene file, whose text is in the question, and return the
-        new scene's data as `LiveScene.scene` does. Of the settings of the file only those that
-        `live_options` selects are used."""
+        """Answer "load": replace the scene by that of a scene file, whose text is in the question,
+        and return the new scene's data as `LiveScene.scene` does. Of the settings of the file only
+        those that `live_options` selects are used."""
         text = question.get("text")
         if not isinstance(text, str):
             raise RequestError("text must be that of a scene file")
@@ -388,8 +428,8 @@ class Session:
 
 
 def parse_camera(camera: Any) -> tuple[FloatArray, FloatArray, float]:
-    """Position (3,), target (3,) and field of view in degrees from {"position": ..., "target": ...,
-    "fov": ...}.
+    """Return position (3,), target (3,) and field of view in degrees from {"position": ...,
+    "target": ..., "fov": ...}.
 
     Raises:
         RequestError: `camera` is no such object, or its numbers make no camera.
@@ -411,8 +451,11 @@ def parse_camera(camera: Any) -> tuple[FloatArray, FloatArray, float]:
 
 
 def _size(question: Mapping[str, Any]) -> tuple[int, int]:
-    """The size (w, h) of the asked picture in pixels. Raises `RequestError` if a side is too
-    long."""
+    """Return the size (w, h) in pixels of the picture that a question asks for.
+
+    Raises:
+        RequestError: a side is too long.
+    """
     size = check_image_size(question.get("size"))
     if max(size) > _LARGEST_PICTURE:
         raise RequestError(f"size: at most {_LARGEST_PICTURE} pixels a side")
@@ -420,8 +463,14 @@ def _size(question: Mapping[str, Any]) -> tuple[int, int]:
 
 
 def _volume(cut: Any) -> Volume | None:
-    """The volume that cuts all surfaces, in their coordinates, from {"ball": center and radius},
-    {"box": two corners} or {"plane": normal and offset of a half-space}; None for no cut."""
+    """Return the volume that cuts all surfaces, in their coordinates; None for no cut.
+
+    cut: {"ball": [center, radius]}, {"box": [two corners]} or {"plane": [normal, offset]} of a
+        half-space, each a flat list of numbers; None for no cut.
+
+    Raises:
+        RequestError: `cut` is none of these.
+    """
     if cut is None:
         return None
     kinds = {"ball": 4, "box": 6, "plane": 4}
@@ -440,8 +489,11 @@ def _volume(cut: Any) -> Volume | None:
 
 
 def _settings(data: Any) -> dict[str, Any]:
-    """The options that a person has changed, by name, if they are valid values of `LIVE_OPTIONS`;
-    otherwise raise `RequestError`."""
+    """Return the options that a person has changed, by name.
+
+    Raises:
+        RequestError: they are not valid values of `LIVE_OPTIONS`.
+    """
     if not isinstance(data, dict):
         raise RequestError("settings must be an object with names")
     settings = cast("JsonDict", data)
@@ -454,6 +506,7 @@ def _settings(data: Any) -> dict[str, Any]:
             if not isinstance(value, str):
                 raise RequestError(f"material must be a name or a color, not {value!r:.60}")
             try:
+                # Light must not pass through what is drawn live.
                 check_opaque(parse_material(value))
             except ValueError as wrong:
                 raise RequestError(str(wrong)) from None
@@ -463,8 +516,11 @@ def _settings(data: Any) -> dict[str, Any]:
 
 
 def _points(numbers: Any, name: str) -> FloatArray:
-    """An array of points (n, 3) from a list of lists. Raises `RequestError`, whose message begins
-    with `name`, unless each has three finite numbers."""
+    """Return an array of points (n, 3) from a list of lists.
+
+    Raises:
+        RequestError: not three finite numbers each. The message begins with `name`.
+    """
     wrong = f"{name}: points are three finite numbers each"
     try:
         points: FloatArray = np.array(numbers, dtype=np.float64)
@@ -476,7 +532,7 @@ def _points(numbers: Any, name: str) -> FloatArray:
 
 
 def _is_number(value: Any) -> bool:
-    """Whether a value is a finite int or float, and no bool."""
+    """Return whether a value is a finite int or float, and no bool."""
     try:
         as_finite(value, "it")
     except (TypeError, ValueError):

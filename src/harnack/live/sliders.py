@@ -1,4 +1,5 @@
-"""Sliders, numbers that a person moves, and the content of a live view as a function of them."""
+"""Sliders, numbers that a person moves, and the content of a live view (its surfaces and options)
+as a function of them."""
 
 from __future__ import annotations
 
@@ -67,28 +68,29 @@ class Slider:
             raise ValueError(f"start must lie between {self.low} and {self.high}: {self.start}")
 
     def nearest(self, number: float) -> float:
-        """The largest value of the slider that is at most `number`, clipped to the slider's ends. A
-        slider without a step takes the clipped number itself. A number that differs from a step by
-        rounding only is returned unchanged."""
+        """Move a number to a value that the slider can have. The number is first clipped to the
+        slider's ends. A slider without a step then takes it as it is. A slider with a step takes
+        the largest of its values that is at most the number; a number that differs from such a
+        value by rounding only is returned unchanged."""
         number = min(max(number, self.low), self.high)
         if self.step is None:
             return number
-        steps = math.floor((number - self.low) / self.step + 1e-9)
-        step_value = min(self.low + self.step * steps, self.high)
+        step_count = math.floor((number - self.low) / self.step + 1e-9)
+        step_value = min(self.low + self.step * step_count, self.high)
         return number if abs(number - step_value) <= 1e-9 * self.step else step_value
 
     def values(self, count: int) -> list[float]:
-        """All values of the slider in ascending order; for a slider without a step `count` evenly
-        spaced values, both ends included."""
+        """Return all values of the slider in ascending order; for a slider without a step `count`
+        evenly spaced values, both ends included."""
         if self.step is None:
             return [self.low + (self.high - self.low) * k / (count - 1) for k in range(count)]
-        steps = math.floor((self.high - self.low) / self.step + 1e-9)
-        return [min(self.low + self.step * k, self.high) for k in range(steps + 1)]
+        step_count = math.floor((self.high - self.low) / self.step + 1e-9)
+        return [min(self.low + self.step * k, self.high) for k in range(step_count + 1)]
 
 
 @dataclass(frozen=True)
 class SlidingContent:
-    """The surfaces and options of a live view as functions of sliders.
+    """The surfaces and options of a live view as functions of sliders, numbers that a person moves.
 
     content: surfaces that `hk.render` accepts, or a function of sliders that returns them.
     settings: options of `view` by name; a value is a constant, a slider or a function of sliders.
@@ -105,11 +107,15 @@ class SlidingContent:
         an option that is a number, or has a name of its own, which is an argument of the functions
         that depend on it.
 
+        content: surfaces, or a function of sliders that returns them.
+        options: options and sliders by name.
+
         Raises:
             TypeError: a function has an argument that is no slider, or nothing depends on a slider.
         """
         sliders = {name: value for name, value in options.items() if isinstance(value, Slider)}
         settings = {name: value for name, value in options.items() if name not in sliders}
+        # A slider whose name is an option that is a number is the value of this option.
         settings |= {name: sliders[name] for name in sliders if name in SLIDER_OPTIONS}
         used: set[str] = set(settings) & set(sliders)
         for name, value in {"the first argument": content, **settings}.items():
@@ -146,25 +152,29 @@ class SlidingContent:
         return ", ".join(repr(getattr(surface, "field", surface)) for surface in surfaces)
 
     def at(self, values: Mapping[str, float]) -> tuple[Any, dict[str, Any]]:
-        """The surfaces, and the options by name, for the given values of all sliders."""
+        """Return the surfaces, and the options by name, for the given values of all sliders."""
         settings = {name: self._at(name, value, values) for name, value in self.settings.items()}
         return self._at("", self.content, values), settings
 
     def _at(self, name: str, value: Any, values: Mapping[str, float]) -> Any:
-        """The value of one option (or of the content) at the given slider values: a slider's value,
-        a function's result, or the constant itself. name: of the option."""
+        """Return the value of one option (or of the content) at the given slider values: a slider's
+        value, a function's result, or the constant itself.
+
+        name: of the option.
+        value: the constant, slider or function.
+        """
         if isinstance(value, Slider):
             return values[name]
         if not _is_function(value):
             return value
-        by_place: list[Any] = []
-        by_name: dict[str, Any] = {}
+        positional: list[Any] = []
+        keywords: dict[str, Any] = {}
         for argument, parameter in _arguments(value).items():
             if parameter.kind is parameter.POSITIONAL_ONLY:
-                by_place.append(values.get(argument, parameter.default))
+                positional.append(values.get(argument, parameter.default))
             elif argument in values:
-                by_name[argument] = values[argument]
-        return value(*by_place, **by_name)
+                keywords[argument] = values[argument]
+        return value(*positional, **keywords)
 
 
 class SliderValueError(ValueError):
@@ -194,9 +204,9 @@ def slider_values_in_errors(values: Mapping[str, float]) -> Generator[None]:
 
 
 def extreme_slider_values(sliders: Mapping[str, Slider]) -> list[dict[str, float]]:
-    """Combinations of slider values at the ends of the sliders' intervals, each by slider name. Up
-    to three sliders: all combinations of ends. More sliders: each slider in turn at its two ends,
-    while all other sliders have their start values."""
+    """Return combinations of slider values at the ends of the sliders' intervals, each by slider
+    name. Up to three sliders: all combinations of ends. More sliders: each slider in turn at its
+    two ends, while all other sliders have their start values."""
     ends = {name: (slider.low, slider.high) for name, slider in sliders.items()}
     if len(sliders) <= _COMBINED:
         return [dict(zip(ends, place, strict=True)) for place in itertools.product(*ends.values())]
@@ -205,12 +215,12 @@ def extreme_slider_values(sliders: Mapping[str, Slider]) -> list[dict[str, float
 
 
 def _arguments(function: Any) -> dict[str, inspect.Parameter]:
-    """The parameters of a function by name, without `*args` and `**kwargs`."""
+    """Return the parameters of a function by name, without `*args` and `**kwargs`."""
     parameters = inspect.signature(function).parameters
     kinds = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
     return {name: p for name, p in parameters.items() if p.kind not in kinds}
 
 
 def _is_function(value: Any) -> bool:
-    """Whether a value is a function of sliders: callable, but no class, field or surface."""
+    """Return whether a value is a function of sliders: callable, but no class, field or surface."""
     return callable(value) and not isinstance(value, type | Field | Surface)

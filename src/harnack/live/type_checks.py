@@ -1,5 +1,6 @@
-"""Checks values of a scene file against the type annotations of the constructor they are passed to,
-so that errors appear on reading and not on drawing."""
+"""Checks values of a scene file against the type annotations of the function or class that they are
+passed to, so that errors appear on reading and not on drawing. Lists of the file have become
+tuples."""
 
 from __future__ import annotations
 
@@ -24,7 +25,7 @@ _WORDS: dict[Any, str] = {
 
 
 class ValueTypeError(TypeError):
-    """An argument does not have the type of its annotation."""
+    """The error for an argument that does not have the type of its annotation."""
 
 
 def check_types(function: Callable[..., Any], arguments: dict[str, Any]) -> None:
@@ -44,8 +45,8 @@ def check_types(function: Callable[..., Any], arguments: dict[str, Any]) -> None
 
 
 def _fits(value: Any, hint: Any) -> bool:
-    """Whether a value, in which lists have become tuples, can be passed where `hint` is the type
-    annotation."""
+    """Return whether a value, in which lists have become tuples, can be passed where `hint` is the
+    type annotation."""
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if hint is Any or origin is np.ndarray:
         return True
@@ -53,13 +54,16 @@ def _fits(value: Any, hint: Any) -> bool:
         return any(_fits(value, member) for member in arguments)
     if origin is typing.Literal:
         return value in arguments
+    # An int may stand for a float, but a bool for neither.
     if hint is float or hint is int:
         return isinstance(value, int if hint is int else int | float) and type(value) is not bool
     if isinstance(origin, type) and issubclass(origin, Mapping):
         return isinstance(value, dict)
+    # A tuple of a fixed length, with a type for each entry.
     if origin is tuple and arguments[-1] is not Ellipsis:
         entries = cast("tuple[Any, ...]", value if isinstance(value, tuple) else ())
         return len(entries) == len(arguments) and all(map(_fits, entries, arguments))
+    # A tuple or other sequence of any length, with one type for all entries.
     if origin is tuple or (isinstance(origin, type) and issubclass(origin, Iterable)):
         is_list = isinstance(value, tuple)
         return is_list and all(_fits(part, arguments[0]) for part in cast("tuple[Any, ...]", value))
@@ -67,8 +71,8 @@ def _fits(value: Any, hint: Any) -> bool:
 
 
 def _type_in_words(hint: Any) -> str:
-    """A type annotation in words, such as "a list of 3 entries, each a number", for people who
-    write scene files."""
+    """Return a type annotation in words, such as "a list of 3 entries, each a number", for people
+    who write scene files."""
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin in (typing.Union, types.UnionType):
         return " or ".join(map(_type_in_words, arguments))

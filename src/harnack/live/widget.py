@@ -1,4 +1,5 @@
-"""The view as a notebook widget, by anywidget."""
+"""The live view as a notebook widget, by the package anywidget. The widget sends a page into the
+notebook, and answers the page's questions, messages about changes of the scene."""
 
 from __future__ import annotations
 
@@ -84,7 +85,7 @@ class Widget(anywidget.AnyWidget):
             self._worker.submit(self._answer, question)
 
     def _answer(self, question: JsonDict) -> None:
-        """Answer a question, and send the answer."""
+        """Answer a question, and send the answer. A picture is sent as a buffer of bytes."""
         answer = self._client.answer(question, self._send_answer)
         if isinstance(answer, bytes):
             self.send({"id": question["id"]}, buffers=[answer])
@@ -97,7 +98,7 @@ class Widget(anywidget.AnyWidget):
 
     @traitlets.validate("height")
     def _checked_height(self, proposal: Any) -> int:
-        """The proposed height, if it is valid; otherwise raise `TraitError`."""
+        """Return the proposed height, if it is valid; otherwise raise `TraitError`."""
         try:
             return check_height(proposal["value"])
         except ValueError as wrong:
@@ -105,11 +106,12 @@ class Widget(anywidget.AnyWidget):
 
     @traitlets.validate("sliders", "points", "camera")
     def _checked(self, proposal: Any) -> Any:
-        """The proposed value of `sliders`, `points` or `camera` as plain Python numbers, if it is
-        valid; otherwise raise `TraitError`."""
+        """Return the proposed value of `sliders`, `points` or `camera` as plain Python numbers, if
+        it is valid; otherwise raise `TraitError`."""
         name, value = proposal["trait"].name, proposal["value"]
         session = self._client.session
         try:
+            # Through JSON, NumPy's arrays and numbers become plain lists and numbers.
             value = json.loads(json.dumps(value, default=_listed, allow_nan=False))
             if name == "camera":
                 parse_camera(value)
@@ -123,5 +125,5 @@ class Widget(anywidget.AnyWidget):
 
 
 def _listed(value: Any) -> Any:
-    """A NumPy array or number as Python lists and numbers; JSON's encoder calls this."""
+    """Return a NumPy array or number as Python lists and numbers; JSON's encoder calls this."""
     return value.tolist()

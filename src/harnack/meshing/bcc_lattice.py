@@ -1,20 +1,21 @@
-"""A body-centered lattice: tetrahedra that fill cells of a box without a Delaunay triangulation.
+"""Tetrahedra that fill a box, or chosen cells of it, in a regular pattern: a body-centered lattice.
+In these tetrahedra the level set {f = 0} of a function f is meshed. The box is divided into equal
+boxes, the cells. The points of the lattice are the corners and the centers of all cells, and the
+centers of those faces of cells that lie on the boundary of the box.
 
-The box is divided into equal cells. The points of the lattice are the corners and the centers of
-all cells, and the centers of those faces of cells that lie on the boundary of the box. A face
-between two cells belongs to four tetrahedra, one for each of its edges: the corners of such a
-tetrahedron are the two ends of the edge and the centers of the two cells. At the boundary of the
-box, the center of the face takes the place of the missing center, and tetrahedra are half as large.
-So the tetrahedra fill the box, and the tetrahedra at all faces of a cell together contain the cell.
-If the cells are cubes, dihedral angles are 60 and 90 degrees (Labelle and Shewchuk 2007).
+Each face between two cells belongs to four tetrahedra, one for each edge of the face: the corners
+of such a tetrahedron are the two ends of the edge and the centers of the two cells. At the boundary
+of the box, the center of the face takes the place of the missing center, and tetrahedra are half as
+large. So the tetrahedra fill the box, and the tetrahedra at all faces of a cell together contain
+the cell. If the cells are cubes, dihedral angles are 60 and 90 degrees (Labelle and Shewchuk 2007).
 
-Cells that are proved to hold no point of the level set need no tetrahedra. Proof. Let the level set
-meet chosen cells only, and take a tetrahedron between a chosen cell and a cell that is not chosen.
-The cell that is not chosen holds no point of the level set, so its center and all of its corners,
-also those of the face between the two cells, are on one side of the level. Then the level set
-crosses only those faces of the tetrahedron that contain the center of the chosen cell. The
-tetrahedron behind such a face belongs to a face of the chosen cell as well, so the surface goes on
-there.
+Tetrahedra are made at the faces of chosen cells only. Cells that are proved to hold no point of the
+level set need not be chosen. Proof that the surface has no gap then. Take a tetrahedron at a face
+between a chosen cell and a cell that is not chosen. The cell that is not chosen holds no point of
+the level set. So f has the same sign at its center and at all of its corners, also at the corners
+of the face between the two cells. Then the level set crosses only those faces of the tetrahedron
+that contain the center of the chosen cell. The tetrahedron behind such a face belongs to a face of
+the chosen cell as well, so the surface goes on there.
 """
 
 from __future__ import annotations
@@ -43,15 +44,15 @@ _MAX_ROOT_CELLS = 200_000
 @dataclass(frozen=True)
 class BccLattice:
     """A body-centered lattice that fills a box: its points are the corners and centers of equal
-    cells.
+    cells (boxes), and the centers of cell faces on the boundary of the box. A cell is named by its
+    three integer indices along the axes. A point is named by three integers too, its lattice
+    coordinates: its position from the lower corner of the box in units of half a cell. They are
+    even for corners of cells and odd for centers; the center of a face on the boundary has one even
+    coordinate.
 
     lower: (3,) the lower corner of the box.
     size: (3,) the edges of each cell.
     counts: (3,) the number of cells along each axis.
-
-    Points are given by integer coordinates (n, 3), from the lower corner in units of half a cell:
-    even numbers for corners of cells, odd ones for centers. The center of a face on the boundary of
-    the box has one even coordinate.
     """
 
     lower: FloatArray
@@ -62,8 +63,8 @@ class BccLattice:
     def covering_box(
         cls, lower: FloatArray, upper: FloatArray, spacing: float, layers: int = 0
     ) -> BccLattice:
-        """A lattice whose cells fill a box. Cells have edges of at most `spacing`, as nearly equal
-        as an integer number of cells along each side allows.
+        """Make a lattice whose cells fill a box. Cells have edges of at most `spacing`, as nearly
+        equal as an integer number of cells along each side allows.
 
         lower, upper: the corners (3,) of the box.
         layers: how many layers of cells are added on all sides of the box.
@@ -74,6 +75,7 @@ class BccLattice:
         sides = upper - lower
         if not (sides > 0).all():
             raise MeshingError("the box to be filled has no volume: choose a larger `clip`")
+        # Rounding must not add a cell where the side is a multiple of the spacing.
         counts = np.maximum(1, np.ceil(sides / spacing * (1 - 1e-9))).astype(np.int64)
         size = sides / counts
         return cls(lower - layers * size, size, counts + 2 * layers)
@@ -84,24 +86,26 @@ class BccLattice:
         return self.lower + self.counts * self.size
 
     def points(self, coordinates: IntArray) -> FloatArray:
-        """Points (n, 3) in space, from their integer lattice coordinates (n, 3). Points on the
-        boundary of the box lie exactly on it."""
+        """The points (n, 3) in space with the lattice coordinates `coordinates` (n, 3). Points on
+        the boundary of the box lie exactly on it."""
         x = self.lower + 0.5 * self.size * coordinates
         x = np.where(coordinates == 0, self.lower, x)
         return np.where(coordinates == 2 * self.counts, self.upper, x)
 
     def is_on_box(self, coordinates: IntArray) -> BoolArray:
-        """(n,) whether points, given by lattice coordinates (n, 3), lie on the boundary of the
-        box."""
+        """Whether points lie on the boundary of the box, (n,); `coordinates` (n, 3) are their
+        lattice coordinates."""
         return ((coordinates == 0) | (coordinates == 2 * self.counts)).any(axis=1)
 
     def nonempty_cells(self, clearance: Clearance, most_faces: int) -> IntArray:
-        """(n, 3) indices of the cells that are not proved to be free of the level set. They are
-        found by octrees, each of which subdivides a block of cells.
+        """Find the cells that are not proved to be free of the level set; returns their indices (n,
+        3). The search begins with blocks of 2^k cells along each axis. It drops blocks that are
+        proved empty and halves the others k times (octrees).
 
-        clearance: gives for points (k, 3) proved lower bounds (k,) of their distances from the
+        clearance: returns for points (k, 3) proved lower bounds (k,) of their distances from the
             level set.
-        most_faces: the largest number of triangles; a cell makes about three.
+        most_faces: the largest number of triangles of the mesh. It also limits the number of cells;
+            a cell makes about three triangles.
 
         Raises:
             TriangleLimitError: there are too many cells.
@@ -110,6 +114,8 @@ class BccLattice:
         max_cells = min(MOST_CELLS, most_faces)
         if (min_cells := float(np.prod(np.sort(self.counts)[:2].astype(float)))) > max_cells:
             raise triangle_limit_error(min_cells, max_cells)
+        # Blocks have up to 8 cells along each axis, but each axis has at least two blocks. Blocks
+        # are larger if there are too many of them.
         halvings = 0
         while halvings < 3 and (self.counts >= 2 ** (halvings + 2)).all():
             halvings += 1
@@ -124,33 +130,37 @@ class BccLattice:
         leaves = refine_cells(root, clearance, 8 * max_cells, halvings).occupied
         if not len(leaves.corners):
             return np.zeros((0, 3), np.int64)
+        # If the search ended early, a surface goes on through about 4 times as many cells in each
+        # halving.
         rounds = round(math.log2(edges[0] / leaves.size[0]))
         expected = len(leaves.corners) * 4 ** (halvings - rounds)
         if expected > max_cells or rounds < halvings:
             raise triangle_limit_error(expected, max_cells)
         index = np.rint((leaves.corners - self.lower) / self.size).astype(np.int64)
+        # The last block along an axis may reach beyond the box.
         return index[(index < self.counts).all(axis=1)]
 
     def relevant_cells(
         self, clearance: Clearance, matter: IntArray, values: Clearance, most_faces: int
     ) -> tuple[IntArray, BoolArray]:
-        """Choose the cells to be meshed, if the surface is needed only in some cells, the relevant
-        ones. In irrelevant cells, also at the points that they share with relevant cells, the
-        function counts as positive.
+        """Choose the cells in which the surface is meshed, if it is needed only in some cells, the
+        relevant ones. The function f counts as positive in irrelevant cells, also at the points
+        that these share with relevant cells.
 
         Two kinds of relevant cells are chosen: cells that may hold the level set; and cells that
-        have an irrelevant neighbor and a center at which the function is not positive. Then every
-        tetrahedron with corners of both signs belongs to a chosen cell: the center of a cell that
-        is not chosen has the sign of its relevant corners, and if one of its corners belongs to an
-        irrelevant cell, its center and all of its corners are positive.
+        have an irrelevant neighbor and a center at which f <= 0. Then every tetrahedron with
+        corners of both signs belongs to a chosen cell. Proof: take a relevant cell that is not
+        chosen. It holds no point of the level set, so its center has the sign of its relevant
+        corners. If one of its corners belongs to an irrelevant cell, f is positive at its center
+        (else it would be chosen), and so at all of its corners.
 
-        clearance: gives for points (n, 3) proved lower bounds (n,) of their distances from the
+        clearance: returns for points (n, 3) proved lower bounds (n,) of their distances from the
             level set.
-        matter: (k, 3) indices of the relevant cells (`nonempty_cells`).
-        values: returns (n,) the function's values at points.
-        most_faces: the largest number of triangles.
+        matter: (k, 3) indices of the relevant cells.
+        values: returns the values (n,) of f at points (n, 3).
+        most_faces: the largest number of triangles of the mesh; it also limits the number of cells.
 
-        Returns the indices (n, 3) of the chosen cells, and a mask of all relevant cells, of the
+        Returns the indices (n, 3) of the chosen cells; and a mask of all relevant cells, of the
         shape `counts`.
 
         Raises:
@@ -160,6 +170,8 @@ class BccLattice:
         is_relevant[tuple(matter.T)] = True
         centers = self.points(2 * matter + 1)
         half_diagonal = 0.5 * float(np.linalg.norm(self.size))
+        # A ball about the center that is free of the level set and contains the cell proves it
+        # empty.
         chosen = clearance(centers) <= half_diagonal * (1 + 1e-9)
         at_rim = np.flatnonzero(~chosen & ~self.interior_cells(is_relevant)[tuple(matter.T)])
         chosen[at_rim[values(centers[at_rim]) <= 0]] = True
@@ -168,8 +180,9 @@ class BccLattice:
         return matter[chosen], is_relevant
 
     def interior_cells(self, cells: BoolArray) -> BoolArray:
-        """The cells of a mask whose neighbors in the lattice all belong to the mask as well, as a
-        mask. Cells that share a corner are neighbors. Both masks have the shape `counts`."""
+        """The cells of a mask whose neighbors in the lattice all belong to the mask as well;
+        returns a mask. Cells that share a corner are neighbors, and neighbors outside of the box
+        count as in the mask. Both masks have the shape `counts`."""
         padded = np.pad(cells, 1, constant_values=True)
         inner = cells.copy()
         for shift in itertools.product((0, 1, 2), repeat=3):
@@ -177,14 +190,17 @@ class BccLattice:
         return inner
 
     def cell_indices(self, points: FloatArray) -> IntArray:
-        """(n, 3) indices of the cells that points (n, 3) lie in; of the nearest cells for points
-        outside of the box."""
+        """The indices (n, 3) of the cells that contain points (n, 3); for a point outside of the
+        box, the indices of the nearest cell."""
         index = np.floor((points - self.lower) / self.size).astype(np.int64)
         return np.clip(index, 0, self.counts - 1)
 
     def touches_cells(self, coordinates: IntArray, cells: BoolArray) -> BoolArray:
-        """(n,) whether points, given by lattice coordinates (n, 3), are corners or centers of cells
-        in the mask `cells`, which has the shape `counts`."""
+        """Whether points are corners or centers of cells in a mask, (n,).
+
+        coordinates: (n, 3) the lattice coordinates of the points.
+        cells: the mask, of the shape `counts`.
+        """
         padded = np.pad(cells, 1)
         touches = np.zeros(len(coordinates), np.bool_)
         for offset in itertools.product((-1, 0), repeat=3):
@@ -194,62 +210,78 @@ class BccLattice:
         return touches
 
     def outer_cells(self) -> IntArray:
-        """(n, 3) indices of the cells that have a face on the boundary of the box."""
+        """The indices (n, 3) of the cells that have a face on the boundary of the box."""
         layers: list[IntArray] = []
         for axis in range(3):
             ends = self.counts.copy()
             ends[axis] = 1
             layer: IntArray = np.indices(tuple(ends.tolist())).reshape(3, -1).T.copy()
+            # The layer of cells with index 0 along the axis, then the last layer.
             layers.append(layer.copy())
             layer[:, axis] = self.counts[axis] - 1
             layers.append(layer)
         return distinct_rows(np.concatenate(layers))
 
     def tetrahedra(self, cells: IntArray) -> tuple[IntArray, IntArray]:
-        """The tetrahedra at all faces of the cells with indices `cells` (k, 3); each belongs to an
-        edge of a face.
+        """The tetrahedra at all faces of chosen cells. Each belongs to an edge of a face: its
+        corners are the ends of the edge, and the points on both sides of the face (centers of cells
+        or, on the boundary of the box, the center of the face).
 
-        Returns the lattice coordinates (n, 3) of their corners, each point once, and for each
-        tetrahedron the indices (m, 4) of its corners among these points.
+        cells: (k, 3) the indices of the chosen cells.
+
+        Returns the lattice coordinates (n, 3) of the corners of all tetrahedra, each point once;
+        and for each tetrahedron the indices (m, 4) of its corners among these points.
         """
         shape = 2 * self.counts + 1
         keys_by_axis: list[list[IntArray]] = []  # of each face: centers, then corners in turn
         for axis in range(3):
-            lower = 2 * cells
-            lower[:, axis] += 2
-            face = np.concatenate([2 * cells, lower])
-            face = _lattice_coordinates(sorted_unique(_flat_indices(face, shape)), shape)
+            # A face is named by the lattice coordinates of its lower corner.
+            upper_face = 2 * cells
+            upper_face[:, axis] += 2
+            face_corner = np.concatenate([2 * cells, upper_face])
+            face_corner = _lattice_coordinates(
+                sorted_unique(_flat_indices(face_corner, shape)), shape
+            )
             plane_axes = [k for k in range(3) if k != axis]
             face_keys: list[IntArray] = []
             for side in (-1, 1):
-                center = face + 1
-                center[:, axis] = np.clip(face[:, axis] + side, 0, shape[axis] - 1)
+                # The centers of the two cells at the face; `clip` leaves the face's own center on
+                # the boundary.
+                center = face_corner + 1
+                center[:, axis] = np.clip(face_corner[:, axis] + side, 0, shape[axis] - 1)
                 face_keys.append(_flat_indices(center, shape))
+            # The four corners of the face, in turn around it.
             for i, j in ((0, 0), (2, 0), (2, 2), (0, 2)):
-                corner = face.copy()
+                corner = face_corner.copy()
                 corner[:, plane_axes] += [i, j]
                 face_keys.append(_flat_indices(corner, shape))
             keys_by_axis.append(face_keys)
+        # Six arrays: for all faces the centers on both sides, and the four corners in turn.
         keys = [np.concatenate(column) for column in zip(*keys_by_axis, strict=True)]
         used = sorted_unique(np.concatenate(keys))
+        # From lattice points to their positions in `used`: by a table if it is small, else by
+        # searches.
         if math.prod(shape.tolist()) < _MAX_TABLE_SIZE:
             index = np.zeros(math.prod(shape.tolist()), np.int64)
             index[used] = np.arange(len(used))
-            first, second, *ring = (index[column] for column in keys)
+            center_below, center_above, *ring = (index[column] for column in keys)
         else:
-            first, second, *ring = (np.searchsorted(used, column) for column in keys)
-        corners = [np.stack([first, second, ring[k - 1], ring[k]], axis=1) for k in range(4)]
+            center_below, center_above, *ring = (np.searchsorted(used, column) for column in keys)
+        # A tetrahedron for each edge of the face: from corner k - 1 to corner k of the ring.
+        corners = [
+            np.stack([center_below, center_above, ring[k - 1], ring[k]], axis=1) for k in range(4)
+        ]
         return _lattice_coordinates(used, shape), np.concatenate(corners)
 
 
 def distinct_rows(rows: IntArray) -> IntArray:
-    """The unique rows of an array (n, 3) of nonnegative integers, sorted."""
+    """The distinct rows of an array (n, 3) of nonnegative integers, in lexicographic order."""
     shape = rows.max(axis=0, initial=0) + 1
     return _lattice_coordinates(sorted_unique(_flat_indices(rows, shape)), shape)
 
 
 def triangle_limit_error(cells: float, max_cells: int) -> TriangleLimitError:
-    """The error to raise if a mesh would need too many cells; its message names the limit and
+    """Make the error to raise if a mesh would need too many cells; its message names the limit and
     remedies.
 
     cells: about how many cells hold the surface.
@@ -264,7 +296,7 @@ def triangle_limit_error(cells: float, max_cells: int) -> TriangleLimitError:
 
 def _flat_indices(coordinates: IntArray, shape: IntArray) -> IntArray:
     """(n,) a unique integer for each point with integer coordinates (n, 3): its index in a
-    flattened array of the shape `shape` (3,)."""
+    flattened array of the shape `shape` (3,). Coordinates are smaller than the shape."""
     return (coordinates[:, 0] * shape[1] + coordinates[:, 1]) * shape[2] + coordinates[:, 2]
 
 

@@ -1,5 +1,10 @@
-"""Closed components of meshes: the faces that form them, how components are nested, and the solid
-that they bound."""
+"""Closed components of meshes: the faces that form them, which components lie in which, and the
+boundary of the solid that they describe together. A component is a connected group of faces, and it
+is closed if its faces run every edge as often in one direction as in the other. It winds around a
+point k times: k is its winding number there, 1 inside of a component whose faces look outwards (it
+winds counter-clockwise), -1 inside of a component that is inside out (it winds clockwise), and 0
+outside. Lengths named relative to the size are fractions of the longest side of the bounding
+box."""
 
 from __future__ import annotations
 
@@ -24,33 +29,33 @@ if TYPE_CHECKING:
 
 __all__ = ["closed_parts", "mended_by_cuts", "nested", "united_parts", "volume_of"]
 
-# The smallest number of faces of a closed component; and the largest number of components: if there
-# are more, `closed_parts` returns none.
+# The smallest number of faces of a closed component. If there are more components than the second
+# number, `closed_parts` returns none.
 _MIN_FACES, _MAX_PARTS = 4, 200
 # About how many points of a component are tested for lying in another component.
 _TEST_POINTS = 16
 # How deep inside of the component these points are, relative to its size.
 _TEST_DEPTH = 1e-6
-# Faces in contact: parallel faces that are no farther apart than the first count as in contact, and
-# one of them is moved into the other's component by the second. Both are relative to the size.
+# Two parallel faces of two components count as in contact if they are no farther apart than the
+# first number. Then one of them is moved into the other's component by the second. Both are
+# relative to the size.
 _CONTACT_DISTANCE, _OVERLAP = 1e-12, 1e-8
 # How far components whose union crosses itself are moved outwards, relative to the size.
 _GROWTH = 1e-9
 
 
 def closed_parts(x: FloatArray, raw: IntArray, joined: IntArray) -> list[IntArray]:
-    """The closed components of a mesh: connected groups of faces, each as an array of indices of
-    faces. A component is closed if its faces run every edge as often in one direction as in the
-    other. The list is empty if there are more than 200 of them.
+    """Find the closed components of a mesh. Each is returned as an array (k,) of indices of its
+    faces. The list is empty if there are more than 200 components.
+
+    Two faces are connected at a common edge. If the edge has two faces, they are connected; if it
+    has more, two faces are connected if they have material of the solid between them.
 
     x: (n, 3) the vertices.
-    raw: (m, 3) the faces as in the input. They are searched first. Components that touch are told
-        apart here if each has vertices of its own.
-    joined: (m, 3) the same faces, with one vertex for all vertices at the same position. The faces
-        that belong to no component of `raw` are searched here.
-
-    Faces are connected at edges: the two faces at an edge of two faces; at an edge of more faces,
-    those that have the material between them.
+    raw: (m, 3) the faces as in the input. They are searched first: here components that touch are
+        still separate if each has vertices of its own.
+    joined: (m, 3) the same faces, with one vertex in place of all vertices at the same position.
+        The faces that belong to no component of `raw` are searched in this form.
     """
     parts: list[IntArray] = []
     is_left = np.ones(len(raw), np.bool_)
@@ -58,6 +63,7 @@ def closed_parts(x: FloatArray, raw: IntArray, joined: IntArray) -> list[IntArra
         remaining = np.flatnonzero(is_left)
         for rows in _connected_groups(x, faces[remaining]) if len(remaining) else ():
             rows = remaining[rows]
+            # Closed up to vertices at the same position.
             if len(rows) >= _MIN_FACES and _runs_edges_both_ways(joined[rows]):
                 parts.append(rows)
                 is_left[rows] = False
@@ -65,9 +71,10 @@ def closed_parts(x: FloatArray, raw: IntArray, joined: IntArray) -> list[IntArra
 
 
 def _connected_groups(x: FloatArray, faces: IntArray) -> list[IntArray]:
-    """The connected groups of faces (m, 3), each as an array of indices of faces. Two faces are
-    connected if they belong together at an edge (`neighbors`): the two faces at an edge of two
-    faces; and at an edge of more faces, each two that have the material between them.
+    """Divide faces (m, 3) into their connected groups; each is an array (k,) of indices of faces.
+    Two faces are connected at a common edge (`neighbors`): if the edge has two faces, they are
+    connected; if it has more, two faces are connected if they have material of the solid between
+    them.
 
     x: (n, 3) the vertices.
     """
@@ -92,15 +99,17 @@ def _runs_edges_both_ways(faces: IntArray) -> bool:
 
 
 def volume_of(x: FloatArray, faces: IntArray) -> float:
-    """The signed volume of a closed mesh with faces (m, 3); negative if it is inside out."""
+    """The signed volume of a closed mesh with vertices x (n, 3) and faces (m, 3). It is negative if
+    the mesh is inside out."""
     # Relative to the center, so that rounding errors are relative to the size of the mesh.
     corner = x[faces] - x[faces].mean(axis=(0, 1))
     return float(row_dots(corner[:, 0], area_normals(corner)).sum()) / 6
 
 
 def nested(x: FloatArray, parts: list[IntArray]) -> list[list[int]]:
-    """For each closed component, the indices of the components that contain all of it, in order of
-    increasing volume. Components may touch, since each is tested at points a little inside of it.
+    """Find for each closed component the components that contain all of it. Returns for each a list
+    of the indices of these, in order of increasing volume. Components may touch, since each is
+    tested at points a little inside of it.
 
     x: (n, 3) the vertices.
     parts: the faces (k, 3) of each component.
@@ -114,7 +123,10 @@ def nested(x: FloatArray, parts: list[IntArray]) -> list[list[int]]:
         depth = _TEST_DEPTH * float((high - low).max())
         sample = parts[i][:: max(1, len(parts[i]) // _TEST_POINTS)]
         normals = _unit_normals(x[sample])
+        # Against the normals, or along them if the component is inside out.
         points = x[sample].mean(axis=1) - math.copysign(depth, volumes[i]) * normals
+        # A container has a box that holds this box, a larger volume, and winds around all test
+        # points.
         containers = [
             j
             for j, (lower, upper) in enumerate(boxes)
@@ -129,12 +141,12 @@ def nested(x: FloatArray, parts: list[IntArray]) -> list[list[int]]:
 
 
 def mended_by_cuts(x: FloatArray, faces: IntArray, within: float) -> TriangleMesh:
-    """The boundary of the points around which a closed mesh winds at least once. Faces are cut
-    where they cross, and the boundary is made of the pieces (`boundary_of_solid`).
+    """Make the boundary of the set of points around which a closed mesh winds at least once. Faces
+    are cut where they cross, and the boundary is composed of the pieces (`boundary_of_solid`).
 
-    faces: (m, 3).
-    within: a length; to remove slivers, which arise where faces cross, the surface may be moved by
-        half of it.
+    x, faces: (n, 3), (m, 3) the mesh.
+    within: a length; the surface may be moved by half of it, to remove the thin triangles that
+        arise where faces cross.
 
     Raises:
         MeshingError: nothing is left, or pieces do not fit together.
@@ -147,20 +159,23 @@ def mended_by_cuts(x: FloatArray, faces: IntArray, within: float) -> TriangleMes
 def united_parts(
     x: FloatArray, faces: IntArray, parts: list[IntArray], within: float
 ) -> TriangleMesh:
-    """The boundary of the set of points around which closed components, all together, wind at least
-    once. Components may touch, contain and intersect each other, and may be inside out (wind
-    clockwise).
+    """Make the boundary of the set of points around which closed components, all together, wind at
+    least once. Components may touch, contain and intersect each other, and may be inside out. If
+    the result intersects itself, as where components touch up to rounding, the components are
+    enlarged by a tiny length and united again.
 
-    Proof. Let L_k be the points around which the components so far wind at least k times. Add
-    another component, and let P be the set of points inside of it. If it winds counter-clockwise,
-    L_k becomes the union of L_k with the intersection of L_(k-1) and P. If it winds clockwise, L_k
-    becomes the union of L_(k+1) with the points of L_k outside of P. Components that wind clockwise
-    are added last, so that all sets but L_0, which is all of space, are bounded.
+    Proof of the method. Let L_k be the set of points around which the components so far wind at
+    least k times. Add another component, and let P be the set of points inside of it. If it winds
+    counter-clockwise, it adds 1 to the winding number in P. So L_k becomes the union of L_k with
+    the intersection of L_(k-1) and P. If it winds clockwise, it subtracts 1 in P. So L_k becomes
+    the union of L_(k+1) with the points of L_k outside of P. Components that wind clockwise are
+    added last, so that all sets but L_0, which is all of space, are bounded.
 
     x: (n, 3) the vertices.
     faces: (m, 3).
     parts: for each component the indices of its faces.
-    within: a length; slivers at intersections may be moved by up to it.
+    within: a length; the surface may be moved by half of it, to remove thin triangles at
+        intersections.
 
     Raises:
         MeshError: a component intersects itself.
@@ -171,6 +186,7 @@ def united_parts(
     try:
         return _union_of_components(shells, within)
     except SelfIntersectionError:  # parts touch up to rounding, along an edge
+        # The sign makes components that are inside out larger as well.
         size = _GROWTH * float(np.ptp(x[faces], axis=(0, 1)).max())
         signs = [math.copysign(1, volume_of(shell.vertices, shell.faces)) for shell in shells]
         return _union_of_components(
@@ -179,8 +195,8 @@ def united_parts(
 
 
 def _make_overlap(parts: list[TriangleMesh]) -> list[TriangleMesh]:
-    """The components, with vertices moved where two components are in contact only up to rounding,
-    so that they overlap there. Otherwise their union would have gaps as thin as rounding errors.
+    """Move vertices of components that are in contact only up to rounding, so that these overlap
+    there; returns all components. Otherwise their union would have gaps as thin as rounding errors.
 
     A face counts as in contact with an earlier component if that component has a parallel face that
     looks the opposite way, and the distance from the plane of that face is not 0 but at most
@@ -189,7 +205,7 @@ def _make_overlap(parts: list[TriangleMesh]) -> list[TriangleMesh]:
     """
     corners = [shell.vertices[shell.faces] for shell in parts]
     size = float(np.ptp(np.concatenate(corners), axis=(0, 1)).max())
-    planes = [_unit_normals(corner) for corner in corners]
+    normals_of_part = [_unit_normals(corner) for corner in corners]
     lows = [corner.min(axis=1) - _CONTACT_DISTANCE * size for corner in corners]
     highs = [corner.max(axis=1) + _CONTACT_DISTANCE * size for corner in corners]
     moved = [parts[0]]
@@ -197,33 +213,42 @@ def _make_overlap(parts: list[TriangleMesh]) -> list[TriangleMesh]:
         x, faces = parts[k].vertices.copy(), parts[k].faces
         for j in range(k):
             low, high = lows[k].min(axis=0), highs[k].max(axis=0)
-            near = np.flatnonzero(((lows[j] <= high) & (highs[j] >= low)).all(axis=1))
-            for face in range(len(faces)) if len(near) else ():
-                normal = planes[k][face]
-                facing = near[row_norms(planes[j][near] + normal) <= _CONTACT_DISTANCE]
-                is_met = (lows[j][facing] <= highs[k][face]) & (highs[j][facing] >= lows[k][face])
-                facing = facing[is_met.all(axis=1)]
-                gap = np.abs((corners[j][facing] - corners[k][face, 0]) @ normal)
-                gap = gap.max(axis=1, initial=0.0)
-                if ((gap > 0) & (gap <= _CONTACT_DISTANCE * size)).any():
+            near_faces = np.flatnonzero(((lows[j] <= high) & (highs[j] >= low)).all(axis=1))
+            for face in range(len(faces)) if len(near_faces) else ():
+                normal = normals_of_part[k][face]
+                # Unit normals whose sum is nearly 0 are opposite.
+                opposite_faces = near_faces[
+                    row_norms(normals_of_part[j][near_faces] + normal) <= _CONTACT_DISTANCE
+                ]
+                is_met = (lows[j][opposite_faces] <= highs[k][face]) & (
+                    highs[j][opposite_faces] >= lows[k][face]
+                )
+                opposite_faces = opposite_faces[is_met.all(axis=1)]
+                # The largest distance of a corner of the earlier face from the plane of this face.
+                plane_distances = np.abs(
+                    (corners[j][opposite_faces] - corners[k][face, 0]) @ normal
+                )
+                plane_distances = plane_distances.max(axis=1, initial=0.0)
+                if ((plane_distances > 0) & (plane_distances <= _CONTACT_DISTANCE * size)).any():
                     x[faces[face]] = parts[k].vertices[faces[face]] + _OVERLAP * size * normal
         moved.append(TriangleMesh(x, faces))
     return moved
 
 
 def _unit_normals(corner: FloatArray) -> FloatArray:
-    """(m, 3) unit normals, by the right-hand rule, of triangles with corners `corner` (m, 3, 3); 0
+    """Unit normals (m, 3) of triangles with corners `corner` (m, 3, 3), by the right-hand rule; 0
     for triangles without an area."""
     normal = area_normals(corner)
     return normal / np.maximum(row_norms(normal), 1e-300)[:, None]
 
 
 def _union_of_components(components: list[TriangleMesh], within: float) -> TriangleMesh:
-    """The boundary of the set of points around which the closed components, all together, wind at
-    least once; `united_parts` has the proof. No two components may be in contact only up to
+    """Make the boundary of the set of points around which closed components, all together, wind at
+    least once. `united_parts` has the proof. No two components may be in contact only up to
     rounding (`_make_overlap`).
 
-    within: a length by which slivers at intersections may be moved.
+    within: a length; the surface may be moved by half of it, to remove thin triangles at
+        intersections.
 
     Raises:
         MeshError: a component intersects itself.
@@ -233,7 +258,8 @@ def _union_of_components(components: list[TriangleMesh], within: float) -> Trian
 
     bodies = [_manifold_of_component(component) for component in components]
     clockwise = [body for body, is_outward in bodies if not is_outward]
-    # sets[k]: the points around which the components so far wind at least k + 1 times.
+    # sets[k] is L_(k+1) of the proof: the points around which the components so far wind at least k
+    # + 1 times. Each clockwise component needs one set more, since it moves L_(k+1) to L_k.
     sets = [Manifold() for _ in range(len(clockwise) + 1)]
     for solid in (body for body, is_outward in bodies if is_outward):
         shared = [sets[k] ^ solid for k in range(len(sets) - 1)]
@@ -246,8 +272,8 @@ def _union_of_components(components: list[TriangleMesh], within: float) -> Trian
 
 
 def _manifold_of_component(component: TriangleMesh) -> tuple[Manifold, bool]:
-    """The solid that a closed component bounds, and whether the component's faces look outwards. If
-    they do, the component winds counter-clockwise around the points of the solid.
+    """The manifold3d solid inside of a closed component; and whether the component's faces look
+    outwards, so that it winds counter-clockwise.
 
     Raises:
         MeshError: the component intersects itself.

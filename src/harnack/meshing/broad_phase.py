@@ -1,10 +1,12 @@
-"""The broad phase of the intersection test: the pairs of triangles that may meet. All other pairs
-are proved apart, in floating point.
+"""Which pairs of triangles may intersect: the broad phase of the intersection test. All other pairs
+are proved apart, in floating point: the two triangles have nothing in common but vertices that they
+share. Triangles are the faces of a mesh; some of them may be chosen, and only pairs with a chosen
+face count. A lane is one of the many runs of a kernel on the device, each for one face or one pair.
 
-For each triangle a tree of bounding boxes is searched, and the pairs whose boxes overlap are
-listed: about eight for each triangle. The listed pairs are then tested in parallel, one pair in
-    each lane. Nearly all pairs are proved apart by the sign of a determinant that rounding cannot
-    change. The remaining pairs are decided by exact arithmetic (`checks.intersecting_faces`).
+A tree of bounding boxes is searched for each face, and the pairs whose boxes overlap are listed:
+about eight for each face. The listed pairs are then tested in parallel, one pair in each lane.
+Nearly all pairs are proved apart by the sign of a determinant that rounding cannot change. The
+remaining pairs are decided by exact arithmetic (`checks.intersecting_faces`).
 """
 
 from __future__ import annotations
@@ -41,23 +43,26 @@ __all__ = ["ROUNDING", "near_pairs"]
 # Columns of a box's record, after its two corners: the face's index, and whether it is chosen.
 _FACE_INDEX, _IS_CHOSEN = 6, 7
 _LEAF_SIZE = 8
-# The number of triangles that walk the tree at once, and the smallest number of pairs that there is
-# room for.
+# The number of faces for which the tree is searched at once, and the smallest number of pairs for
+# which memory is reserved.
 _WALK_SIZE, _PAIRS_AT_ONCE = 1 << 17, 1 << 22
-# A bound of the rounding of a product of three vectors, or of two, whose components are differences
-# of coordinates, relative to the product of their lengths: at most seven roundings of up to six
-# terms, whose sum is at most 1.16 times that product, and four of three terms, whose sum is at most
-# that product. The rounding is a third of this bound.
+# The rounding error of a product of vectors u, v, w whose components are differences of coordinates
+# is at most ROUNDING times the product of their lengths. That holds for the determinant u . (v x
+# w): at most seven roundings of up to six terms, and the sum of the terms is at most 1.16 times the
+# product of the lengths. It holds for the dot product of two vectors: four roundings of three
+# terms, and their sum is at most the product of the lengths. The error is at most a third of this
+# bound.
 ROUNDING = 16 * 2.0**-52
 # A bound of the error by underflow, for coordinates of order one.
 _UNDERFLOW = 1e-290
 
 
 def near_pairs(vertices: FloatArray, faces: IntArray, among: BoolArray | None) -> IntArray:
-    """Pairs (k, 2) of faces (m, 3) that may meet in more points than the vertices that they share;
-    each pair once. All other pairs are proved to meet only in shared vertices (`_are_apart`).
+    """Find the pairs of faces that may meet in more points than the vertices that they share.
+    Returns the indices (k, 2) of the faces, each pair once. All other pairs are proved to meet only
+    in shared vertices (`_are_apart`).
 
-    vertices: (n, 3), all finite.
+    vertices, faces: (n, 3), (m, 3) the mesh; all vertices are finite.
     among: (m,) mask of chosen faces; pairs without a chosen face are left out. None if all are
         chosen.
     """
@@ -75,7 +80,8 @@ def near_pairs(vertices: FloatArray, faces: IntArray, among: BoolArray | None) -
     while pending:
         batch = pending.pop()
         listed = boxes.overlapping(batch, room)
-        if listed is None:  # a single triangle always has room
+        # Too many pairs: search for each half of the faces. A single face always has room.
+        if listed is None:
             pending += np.array_split(batch, 2)
             continue
         batches.append(pairs.unseparated(*listed))
@@ -84,12 +90,13 @@ def near_pairs(vertices: FloatArray, faces: IntArray, among: BoolArray | None) -
 
 @dataclass(frozen=True)
 class _FaceBoxTree:
-    """A tree of the bounding boxes of all faces, on the device.
+    """A tree of the bounding boxes of all faces, on the device. A record is the row of numbers that
+    describes one face there: the lower and the upper corner of its box, its index, and whether it
+    is chosen (1 or 0).
 
-    tree: the nodes, and as primitives the boxes.
-    records: (m, 8) for each face the lower and the upper corner of its box, the face's index, and 1
-        if it is chosen, else 0.
-    order: (m,) indices of the faces, leaf by leaf.
+    tree: the nodes, and the records of the faces in their leaves.
+    records: (m, 8) the records in the order of the faces.
+    order: (m,) the indices of the faces, leaf by leaf.
     """
 
     tree: PackedTree
@@ -105,16 +112,17 @@ class _FaceBoxTree:
         a, b, c = (corners[:, k] for k in range(3))
         lower, upper = np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
         hierarchy = build_balanced_tree(0.5 * (lower + upper), leaf_size=_LEAF_SIZE)
-        numbers = np.column_stack([np.arange(len(corners)), chosen]).astype(np.float64)
-        records = np.concatenate([lower, upper, numbers], axis=1)
+        index_and_choice = np.column_stack([np.arange(len(corners)), chosen]).astype(np.float64)
+        records = np.concatenate([lower, upper, index_and_choice], axis=1)
         slots = hierarchy.values_in_slots(records)
+        # Leaves have the same number of slots for faces; an empty slot has the index -1.
         slots[hierarchy.leaf_slots == NO_PRIMITIVE, _FACE_INDEX] = -1.0
         boxes = node_boxes(hierarchy, lower, upper)
         order = hierarchy.leaf_slots[hierarchy.leaf_slots != NO_PRIMITIVE]
         return cls(pack_tree(choose_backend("double"), hierarchy, boxes, slots), records, order)
 
     def overlapping(self, rows: IntArray, room: int) -> tuple[Any, Any] | None:
-        """The pairs of a face in `rows` and any other face whose boxes overlap. A pair of two
+        """List the pairs of a face in `rows` and any other face whose boxes overlap. A pair of two
         chosen faces is listed once.
 
         rows: (k,) indices of chosen faces.
@@ -125,47 +133,51 @@ class _FaceBoxTree:
         """
         backend = self.tree.backend
         real, vector, integer = backend.Float, backend.Array3f, backend.UInt32
-        columns = [real(np.ascontiguousarray(column)) for column in self.records[rows].T]
+        columns = [real(np.ascontiguousarray(own_faces)) for own_faces in self.records[rows].T]
         low, high, own_index = vector(*columns[:3]), vector(*columns[3:6]), columns[_FACE_INDEX]
         pair_count, max_count = dr.zeros(integer, 1), dr.opaque(integer, room)
-        column, partners = dr.zeros(integer, room), dr.zeros(integer, room)
+        # The pairs found so far: face column[i] with face partners[i], for i < pair_count.
+        own_faces, partners = dr.zeros(integer, room), dr.zeros(integer, room)
 
         def overlap(row: Any) -> Mask:
-            """Whether the box in the record `row` overlaps the lane's own box."""
+            """Whether the box in the record `row` overlaps the box of the lane's own face."""
             return dr.all((vector(*row[:3]) <= high) & (vector(*row[3:6]) >= low))
 
         def visit(node: VisitedNode, state: LoopValues) -> tuple[Mask, LoopValues]:
-            """Descend where the node's box overlaps the lane's own box; in a leaf, list its
-            faces."""
+            """Visit a node: returns whether to descend, which is where its box overlaps the box of
+            the lane's own face. In a leaf, the pairs with its faces are listed."""
             is_near = overlap(node.head)
             return is_near, for_each_primitive(node, is_near & node.is_leaf, add_pair, state)
 
         def add_pair(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
-            """List the pair of the lane's own face and the face of `row`, if their boxes
-            overlap."""
+            """List the pair of the lane's own face and the face of the record `row`, if their boxes
+            overlap. `active` masks the lanes that do so; the state, which is unused, is
+            returned."""
             index = row[_FACE_INDEX]
-            # Two chosen faces are listed once.
+            # Two chosen faces are listed once, by the face of smaller index. Empty slots (index -1)
+            # are never listed.
             is_new = (index > own_index) | ((row[_IS_CHOSEN] == 0) & (index >= 0))
             is_pair = active & is_new & overlap(row)
+            # The next free position, counted by all lanes together.
             slot = dr.scatter_inc(pair_count, integer(0), is_pair)
             has_room = is_pair & (slot < max_count)
-            dr.scatter(column, integer(own_index), slot, has_room)
+            dr.scatter(own_faces, integer(own_index), slot, has_room)
             dr.scatter(partners, integer(index), slot, has_room)
             return state
 
         traverse(self.tree, visit, (real(0),))
-        dr.eval(pair_count, column, partners)
+        dr.eval(pair_count, own_faces, partners)
         count = int(to_numpy(pair_count)[0])
         if count > room:
             return None
         listed = dr.arange(integer, count)
-        return dr.gather(integer, column, listed), dr.gather(integer, partners, listed)
+        return dr.gather(integer, own_faces, listed), dr.gather(integer, partners, listed)
 
 
 @dataclass(frozen=True)
 class _PairTests:
-    """Tests, on the device, that prove of pairs of faces that they have nothing in common but
-    shared vertices.
+    """Tests of pairs of faces, on the device: they prove that the two faces have nothing in common
+    but shared vertices.
 
     points: the record table of the vertices.
     corners: three index arrays on the device: the first, second and third vertices of all faces.
@@ -176,13 +188,14 @@ class _PairTests:
 
     @classmethod
     def of(cls, vertices: FloatArray, faces: IntArray) -> _PairTests:
-        """Upload vertices (n, 3) and faces (m, 3)."""
+        """Upload vertices (n, 3) and faces (m, 3) to the device."""
         backend = choose_backend("double")
         a, b, c = (backend.UInt32(np.ascontiguousarray(column, np.uint32)) for column in faces.T)
         return cls(RecordTable.upload(backend, vertices), (a, b, c))
 
     def unseparated(self, first: Any, second: Any) -> IntArray:
-        """(k, 2) the pairs of faces that are not proved apart, sorted.
+        """Find the pairs of faces that are not proved apart. Returns the indices (k, 2) of the
+        faces, in lexicographic order.
 
         first, second: index arrays on the device, of the first and of the second faces of all
             pairs.
@@ -195,6 +208,7 @@ class _PairTests:
             tuple(backend.Array3f(*self.points.read_record(name)[:3]) for name in ids)
             for ids in vertex_ids
         ]
+        # shared[i][k]: whether corner i of the first face is corner k of the second.
         shared = [[name == another for another in vertex_ids[1]] for name in vertex_ids[0]]
         a, b = cast("tuple[Corners, Corners]", triangles)
         rows = dr.compress(~_are_apart(a, b, shared))
@@ -204,21 +218,23 @@ class _PairTests:
 
 
 def _are_apart(a: Corners, b: Corners, shared: list[list[Mask]]) -> Mask:
-    """Whether two triangles are proved to have nothing in common but the corners that they share.
+    """Whether two triangles are proved to have nothing in common but the corners that they share,
+    and the edge between these. False proves nothing.
 
+    a, b: the three corners of each triangle.
     shared: shared[i][k] is whether corner i of `a` is the same vertex as corner k of `b`.
 
     Each of three conditions proves it:
 
     - *A plane*: all corners of one triangle that are not shared lie strictly on one side of the
-      other triangle's plane (`_sides`). Points of the first triangle on that plane are then
-      combinations of shared corners.
+      other triangle's plane (`_sides`). Only combinations of shared corners are then points of the
+      first triangle on that plane.
     - *Edges*, if at most one corner is shared: two triangles in different planes meet in a segment
       on the line that the planes have in common. Each end of the segment lies on an edge of one
-      triangle that passes through the other triangle. There is no such edge if every edge without a
-      shared corner has both ends strictly on one side of the other triangle's plane, or if the line
-      of the edge passes two edges of the other triangle on different sides (`_edge_may_pierce`).
-      For triangles in one plane all these signs are 0, and nothing is proved.
+      triangle that passes through the other triangle. No edge does if every edge without a shared
+      corner has both ends strictly on one side of the other triangle's plane, or if the line of the
+      edge passes two edges of the other triangle on different sides (`_edge_may_pierce`). For
+      triangles in one plane all these signs are 0, and nothing is proved.
     - *A line*, for triangles in one plane: an edge of one triangle lies on a line that has the two
       triangles on its two sides (`_are_beside_edge`).
     """
@@ -228,14 +244,15 @@ def _are_apart(a: Corners, b: Corners, shared: list[list[Mask]]) -> Mask:
     shared_count: Real = sum((dr.select(first, real(1), real(0)) for first in is_shared_a), real(0))
     sides_of_b, sides_of_a = _sides(a, b), _sides(b, a)
     by_plane = _on_one_side(sides_of_b, is_shared_b) | _on_one_side(sides_of_a, is_shared_a)
+    # Three shared corners: the same triangle twice. (Counts are floats.)
     by_plane &= shared_count < 2.5
 
-    def by_edges_or_line(*numbers: Any) -> Mask:
+    def by_edges_or_line(*arguments: Any) -> Mask:
         """Whether the two triangles are apart by the condition on edges or by the condition on a
-        line (`_are_apart`). numbers: the corners of `a` and `b`; for each corner of `a` and of `b`
-        whether it is shared; and the number of shared corners."""
-        first, second = cast("tuple[Corners, Corners]", (numbers[:3], numbers[3:6]))
-        in_first, in_second, count = (list(numbers[6:9]), list(numbers[9:12]), numbers[12])
+        line (`_are_apart`). arguments: the three corners of `a` and of `b`; for each corner of `a`
+        and of `b` whether it is shared; and the number of shared corners."""
+        first, second = cast("tuple[Corners, Corners]", (arguments[:3], arguments[3:6]))
+        in_first, in_second, count = (list(arguments[6:9]), list(arguments[9:12]), arguments[12])
         may_pierce = _edge_may_pierce(first, second, _sides(first, second), in_second)
         may_pierce |= _edge_may_pierce(second, first, _sides(second, first), in_first)
         reordered = (
@@ -244,12 +261,13 @@ def _are_apart(a: Corners, b: Corners, shared: list[list[Mask]]) -> Mask:
         )
         return ((count < 1.5) & ~may_pierce) | _are_beside_edge(*reordered, count)
 
-    def never(*numbers: Any) -> Mask:
-        """False in all lanes: where the first condition holds, nothing more need be computed."""
-        return numbers[12] < 0
+    def never(*arguments: Any) -> Mask:
+        """False in all lanes. It stands for the other conditions where the first one holds
+        already."""
+        return arguments[12] < 0
 
-    numbers = (*a, *b, *is_shared_a, *is_shared_b, shared_count)
-    return by_plane | dr.if_stmt(numbers, ~by_plane, by_edges_or_line, never)
+    arguments = (*a, *b, *is_shared_a, *is_shared_b, shared_count)
+    return by_plane | dr.if_stmt(arguments, ~by_plane, by_edges_or_line, never)
 
 
 def _sides(base: Corners, triangle: Corners) -> list[tuple[Mask, Mask]]:
@@ -287,9 +305,9 @@ def _edge_may_pierce(
     """Whether an edge of the triangle `piercing` may pass through the triangle `pierced`. Edges
     with a shared corner are not considered.
 
-    An edge is proved not to pass through `pierced` if both of its ends are strictly on one side of
-    the plane of `pierced`, or if its line passes one edge of `pierced` on the left and another edge
-    on the right.
+    An edge is proved not to pass through if both of its ends are strictly on one side of the plane
+    of `pierced`, or if its line passes one edge of `pierced` on the left and another edge on the
+    right.
 
     sides: for each corner of `piercing` two masks, whether it is above the plane of `pierced` and
         whether below (`_sides`).
@@ -303,6 +321,7 @@ def _edge_may_pierce(
         length, lengths = dr.norm(direction), [dr.norm(offset) for offset in offsets]
         left, right = False, False
         for k, m in ((0, 1), (1, 2), (2, 0)):
+            # The volume between the edge's line and edge (k, m) of `pierced`; its sign is the side.
             value = dr.dot(direction, dr.cross(offsets[k], offsets[m]))
             error = ROUNDING * length * lengths[k] * lengths[m] + _UNDERFLOW
             left, right = (left | (value > error), right | (value < -error))
@@ -311,12 +330,13 @@ def _edge_may_pierce(
 
 
 def _shared_corners_first(tri: Corners, shared: list[Mask], count: Real) -> Corners:
-    """The corners of the triangle `tri` in the same cyclic order, begun so that shared corners come
-    first.
+    """The corners of the triangle `tri` in the same cyclic order, begun so that the shared corners
+    come first.
 
     shared: whether each corner is shared.
-    count: how many are, from 0 to 2; with three or none the order has no meaning.
+    count: how many are shared. With none or three the order has no meaning.
     """
+    # The count is a float: 1 if it is below 1.5.
     is_single = count < 1.5
     # A single shared corner comes first; with two, the corner that is not shared comes last.
     from_second = dr.select(is_single, shared[1], ~shared[0])
@@ -356,9 +376,12 @@ def _are_beside_edge(a: Corners, b: Corners, shared_count: Real) -> Mask:
     for first, second in ((a, b), (b, a)):
         for i, j, k in ((0, 1, 2), (0, 2, 1), (1, 2, 0)):
             origin = first[i]
+            # The edge e, and the third corner x of its triangle.
             e, x = first[j] - origin, first[k] - origin
+            # -x without its component along e, so m points out of the triangle.
             m = dr.fma(e, dr.dot(x, e) / dr.squared_norm(e), -x)
             m_length, e_length = dr.norm(m), dr.norm(e)
+            # The bound of |m'.x - m.x| / |x| in the proof; 1.01 covers its own rounding.
             dot_error = 1.01 * (dr.abs(dr.dot(m, e)) + ROUNDING * m_length * e_length) / e_length
             rounding = ROUNDING * m_length + dot_error
 
@@ -367,26 +390,36 @@ def _are_beside_edge(a: Corners, b: Corners, shared_count: Real) -> Mask:
                 value, error = dr.dot(m, offset), rounding * dr.norm(offset) + _UNDERFLOW
                 return value > error, value < -error
 
-            behind = sides_of(x)[1]
-            beyond = [sides_of(corner - origin)[0] for corner in second]
+            is_third_behind = sides_of(x)[1]
+            are_corners_beyond = [sides_of(corner - origin)[0] for corner in second]
+            # The shared corners come first: e has to start at corner 0, or to be the edge (0, 1).
             if i == 0:
-                is_beside = is_beside | (has_one & behind & beyond[1] & beyond[2])
+                is_beside = is_beside | (
+                    has_one & is_third_behind & are_corners_beyond[1] & are_corners_beyond[2]
+                )
             if (i, j) == (0, 1):
-                is_beside = is_beside | (has_two & behind & beyond[2])
+                is_beside = is_beside | (has_two & is_third_behind & are_corners_beyond[2])
             # Without a shared corner the edge itself is behind as well: m'.e = 0.
-            is_beside = is_beside | (has_none & behind & beyond[0] & beyond[1] & beyond[2])
+            is_beside = is_beside | (
+                has_none
+                & is_third_behind
+                & are_corners_beyond[0]
+                & are_corners_beyond[1]
+                & are_corners_beyond[2]
+            )
     return is_beside | (has_one & _are_opposite_at_corner(a, b))
 
 
 def _are_opposite_at_corner(a: Corners, b: Corners) -> Mask:
-    """Whether a plane through the first corner, which both triangles share, is proved to have the
-    other corners of `a` on one side and those of `b` on the other. For each triangle, the mean
-    direction is the sum of the unit vectors along both edges at that corner. The normal of the
-    plane is the difference of the two triangles' unit mean directions."""
+    """Whether two triangles that share their first corner are proved to lie on two sides of a plane
+    through it: the other corners of `a` strictly on one side, those of `b` strictly on the other.
+    One plane is tried. For each triangle, take the sum of the unit vectors along both edges at the
+    shared corner, scaled to length 1; the plane's normal is the difference of the two sums."""
     edges = [one[k] - one[0] for one, k in itertools.product((a, b), (1, 2))]
     mean_directions = [dr.normalize(edges[k]) + dr.normalize(edges[k + 1]) for k in (0, 2)]
     plane_normal = dr.normalize(mean_directions[1]) - dr.normalize(mean_directions[0])
     rounding = ROUNDING * dr.norm(plane_normal)
+    # The dot products with the edges of a, then of b; each with a bound of its rounding error.
     values = [(dr.dot(plane_normal, edge), rounding * dr.norm(edge) + _UNDERFLOW) for edge in edges]
     (p, one), (q, two), (r, three), (s, four) = values
     return (p < -one) & (q < -two) & (r > three) & (s > four)

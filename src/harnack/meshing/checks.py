@@ -1,10 +1,13 @@
-"""Checks that every mesh of a level set has to pass, with exact predicates.
+"""Checks that every mesh of a level set {f = 0} must pass, with exact predicates. A predicate is
+the sign of a determinant. It tells on which side of a plane a point lies or, in two dimensions, on
+which side of a line. A mesh consists of vertices (n, 3) and of triangular faces (m, 3), which hold
+the indices of their corners. The normal of a face points to the side from which its corners run
+counter-clockwise. Coordinates and distances have the unit of the vertices.
 
-The predicates are signs of determinants. A sign tells on which side of a plane a point lies or, in
-two dimensions, on which side of a line. A determinant is computed in floating point, with a bound
-of its rounding error (Shewchuk, Adaptive Precision Floating-Point Arithmetic and Fast Robust
-Geometric Predicates, 1997). Where that leaves the sign undecided, it is computed in integers: all
-coordinates are integers times the same power of two.
+A determinant is computed in floating point, with a bound of its rounding error (Shewchuk, Adaptive
+Precision Floating-Point Arithmetic and Fast Robust Geometric Predicates, 1997). Where that leaves
+the sign undecided, it is computed in integers, without rounding: all coordinates are integers times
+the same power of two.
 
 Every mesh that `mesh` returns has passed checks: vertices and centers of triangles are tested by
 samples of the field, faces that pass through each other are found by exact predicates, and the
@@ -77,35 +80,47 @@ _UNDERFLOW = 1e-290
 
 
 def orient3d(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> SignArray:
-    """(n,) the signs of det(a - d, b - d, c - d) for points (n, 3), exactly. The sign is 1 if a, b,
-    c run clockwise as seen from d, -1 if they run counter-clockwise, and 0 if the four points are
-    in one plane."""
+    """The exact signs (n,) of det(a - d, b - d, c - d), for points (n, 3). The sign is 1 if a, b, c
+    run clockwise as seen from d, -1 if they run counter-clockwise, and 0 if the four points lie in
+    one plane."""
     points = _scaled(np.stack([a, b, c, d], axis=1))
     edges = points[:, :3] - points[:, 3:]
     (ax, ay, az), (bx, by, bz), (cx, cy, cz) = (edges[:, k].T for k in range(3))
     terms = [(bx * cy, cx * by, az), (cx * ay, ax * cy, bz), (ax * by, bx * ay, cz)]
-    value = sum((plus - minus) * third for plus, minus, third in terms)
-    magnitude = sum((np.abs(plus) + np.abs(minus)) * np.abs(third) for plus, minus, third in terms)
-    # A difference of doubles is 0 where they are equal, and only there.
+    determinant = sum((plus - minus) * third for plus, minus, third in terms)
+    sum_of_terms = sum(
+        (np.abs(plus) + np.abs(minus)) * np.abs(third) for plus, minus, third in terms
+    )
+    # A row of zeros makes the determinant 0 exactly. Differences of doubles are 0 only where these
+    # are equal.
     is_zero = (edges == 0).all(axis=1).any(axis=1)
     return _signs_with_fallback(
-        np.asarray(value), _ORIENT3D_ERROR * np.asarray(magnitude), is_zero, points, _orient3d_exact
+        np.asarray(determinant),
+        _ORIENT3D_ERROR * np.asarray(sum_of_terms),
+        is_zero,
+        points,
+        _orient3d_exact,
     )
 
 
 def orient2d(a: FloatArray, b: FloatArray, c: FloatArray) -> SignArray:
-    """(n,) the signs of det(a - c, b - c) for points (n, 2), exactly. The sign is 1 if a, b, c run
-    counter-clockwise, -1 if they run clockwise, and 0 if they are in one line."""
+    """The exact signs (n,) of det(a - c, b - c), for points (n, 2). The sign is 1 if a, b, c run
+    counter-clockwise, -1 if they run clockwise, and 0 if they lie on one line."""
     points = _scaled(np.stack([a, b, c], axis=1))
     edges = points[:, :2] - points[:, 2:]
     (ax, ay), (bx, by) = (edges[:, k].T for k in range(2))
-    value, size = ax * by - ay * bx, np.abs(ax * by) + np.abs(ay * bx)
+    determinant, sum_of_terms = ax * by - ay * bx, np.abs(ax * by) + np.abs(ay * bx)
+    # A row of zeros makes the determinant 0 exactly.
     is_zero = (edges == 0).all(axis=1).any(axis=1)
-    return _signs_with_fallback(value, _ORIENT2D_ERROR * size, is_zero, points, _orient2d_exact)
+    return _signs_with_fallback(
+        determinant, _ORIENT2D_ERROR * sum_of_terms, is_zero, points, _orient2d_exact
+    )
 
 
 def _scaled(points: FloatArray) -> FloatArray:
-    """The points times a power of two that makes the largest coordinate of order one."""
+    """The points, times a power of two that makes the largest absolute value of a coordinate at
+    least 1/2 and less than 1. The signs of determinants stay the same. Short of underflow no
+    coordinate is rounded."""
     largest = float(np.abs(points).max(initial=0.0))
     return points if largest == 0 else np.ldexp(points, -int(np.frexp(largest)[1]))
 
@@ -113,14 +128,15 @@ def _scaled(points: FloatArray) -> FloatArray:
 def _signs_with_fallback(
     value: FloatArray, error: FloatArray, zero: BoolArray, points: FloatArray, exact: Any
 ) -> SignArray:
-    """(n,) the signs of numbers that are known up to an error. A sign that the error leaves
-    undecided is computed exactly.
+    """The signs (n,) of determinants that are known up to an error. A sign that the error leaves
+    undecided is computed without rounding.
 
-    value: (n,) the approximate numbers.
+    value: (n,) the approximate determinants.
     error: (n,) bounds of their errors.
-    zero: (n,) mask of the numbers that are known to be 0.
-    points: (n, k, d) the points that determine each number.
-    exact: computes the numbers without rounding from points with integer coordinates (`_integers`).
+    zero: (n,) mask of the determinants that are known to be 0.
+    points: (n, k, d) the points that determine each determinant.
+    exact: computes the determinants without rounding from points (j, k, d) with integer coordinates
+        (`_integers`).
     """
     signs: SignArray = np.sign(value).astype(np.int8)
     signs[zero] = 0
@@ -131,7 +147,9 @@ def _signs_with_fallback(
 
 
 def _integers(points: FloatArray) -> Any:
-    """The points, all times the same power of two, as an array of Python's integers."""
+    """Points with integer coordinates of Python's unlimited type `int`, in an array of objects: the
+    given points, all times the same power of two, without rounding. A double is an integer of 53
+    bits times a power of two; the smallest of these powers becomes 1."""
     mantissa, exponent = np.frexp(points)
     mantissas = np.ldexp(mantissa, 53).astype(np.int64).astype(object)
     used = mantissa != 0
@@ -140,16 +158,20 @@ def _integers(points: FloatArray) -> Any:
 
 
 def _orient3d_exact(points: Any) -> Any:
-    """(n,) det(a - d, b - d, c - d) without rounding, for integer points (n, 4, 3): a, b, c, d in
-    each row."""
+    """Compute det(a - d, b - d, c - d) without rounding, (n,) integers.
+
+    points: (n, 4, 3) integer coordinates of the points a, b, c, d in each row.
+    """
     rows = points[:, :3] - points[:, 3:]
     (ax, ay, az), (bx, by, bz), (cx, cy, cz) = (rows[:, k].T for k in range(3))
     return (bx * cy - cx * by) * az + (cx * ay - ax * cy) * bz + (ax * by - bx * ay) * cz
 
 
 def _orient2d_exact(points: Any) -> Any:
-    """(n,) det(a - c, b - c) without rounding, for integer points (n, 3, 2): a, b, c in each
-    row."""
+    """Compute det(a - c, b - c) without rounding, (n,) integers.
+
+    points: (n, 3, 2) integer coordinates of the points a, b, c in each row.
+    """
     rows = points[:, :2] - points[:, 2:]
     (ax, ay), (bx, by) = (rows[:, k].T for k in range(2))
     return ax * by - ay * bx
@@ -166,11 +188,13 @@ _MAX_AT_ONCE = 1 << 19
 
 
 def misoriented_faces(function: LevelFunction, vertices: FloatArray, faces: IntArray) -> IntArray:
-    """Indices of the faces (m, 3) that are turned over, so that their normal does not point to the
-    side on which the function is larger: the normal, by the right-hand rule, has no positive dot
-    product with the function's gradient at the face's center.
+    """Find the faces whose normal does not point to the side on which f is larger: the dot product
+    of the normal with the gradient of f at the face's center is not positive. Returns their indices
+    (k,).
 
-    vertices: (n, 3)."""
+    function: f.
+    vertices, faces: (n, 3), (m, 3) the mesh.
+    """
     corner = vertices[faces]
     normal = area_normals(corner)
     slope = function.sample(corner.mean(axis=1)).gradient
@@ -180,18 +204,18 @@ def misoriented_faces(function: LevelFunction, vertices: FloatArray, faces: IntA
 def intersecting_faces(
     vertices: FloatArray, faces: IntArray, among: BoolArray | None = None
 ) -> IntArray:
-    """Indices (k,) of the faces (m, 3) that meet another face in more than the corners and edges
-    that both faces have, decided exactly. Two kinds of pairs are found: an edge of one face passes
-    through the other face, or both faces lie in one plane and overlap.
+    """Find the faces that meet another face in more than the corners and edges that both faces
+    have, decided exactly. Two kinds of pairs are found: an edge of one face passes through the
+    other face; or both faces lie in one plane and overlap. So faces that occur twice, or are folded
+    back onto their neighbors, are found. Returns the indices (k,) of these faces, in increasing
+    order.
 
-    Two triangles in different planes meet beyond their shared corners if and only if an edge of one
-    passes through the other, with its ends on both sides of the other's plane, or ends on it. Edges
-    that only end on another triangle are not looked for: if the surface goes on behind such an end,
-    another edge passes through. Two triangles in one plane overlap, whatever they share, unless the
-    line of an edge has them on its two sides (separating axes). So faces that occur twice, or are
-    folded back onto their neighbors, are found. Only pairs whose bounding boxes overlap are tested.
+    An edge that only ends on another face does not count (`touching_pairs` finds it). If the
+    surface goes on behind that end and comes out on the other side, another edge passes through.
+    Two triangles in one plane overlap, whatever they share, unless the line of an edge separates
+    them.
 
-    vertices: (n, 3).
+    vertices, faces: (n, 3), (m, 3) the mesh.
     among: (m,) mask of chosen faces; pairs without a chosen face are not tested. None if all are
         chosen.
     """
@@ -199,8 +223,10 @@ def intersecting_faces(
     for pairs, sides in _pairs_in_doubt(vertices, faces, among):
         first, second = faces[pairs[:, 0]], faces[pairs[:, 1]]
         meet = np.zeros(len(pairs), np.bool_)
+        # Faces in one plane: all corners of each lie on the plane of the other.
         rows = np.flatnonzero((sides[0] == 0).all(axis=1) & (sides[1] == 0).all(axis=1))
         meet[rows] = _share_area(vertices[first[rows]], vertices[second[rows]])
+        # Else each face must have corners on both sides of the other's plane.
         may_cross = np.all([(s.min(axis=1) < 0) & (s.max(axis=1) > 0) for s in sides], axis=0)
         rows = np.flatnonzero(may_cross)
         meet[rows] = _edge_pierces(vertices, first[rows], second[rows], sides[0][rows])
@@ -210,35 +236,42 @@ def intersecting_faces(
 
 
 def touching_pairs(vertices: FloatArray, faces: IntArray) -> tuple[IntArray, FloatArray]:
-    """Find the pairs of faces (m, 3) that touch, decided exactly. Two faces touch if a corner or an
-    edge of one face lies on the other face; a corner that both faces have does not count.
+    """Find the pairs of faces that touch, decided exactly. Two faces touch if a corner or an edge
+    of one face lies on the other face; a corner that both faces have does not count.
 
-    Returns the pairs (k, 2); and for each pair a point (k, 3) of contact, the corner or the middle
-    of the edge.
+    Returns the pairs (k, 2) of indices of faces; and for each pair a point (k, 3) of contact: the
+    corner, or the middle of the edge.
 
-    Every pair of faces that meet is in this list or has its faces in the result of
-    `intersecting_faces`. Proof. If all of a face lies on another face, so do its edges. If two
-    edges meet between their ends, and neither edge lies in the plane of the other's face, an edge
-    passes through a face. Faces that share two corners have no more in common unless they overlap
-    in one plane. If two faces share one corner and their planes differ, the planes meet in a line
-    through that corner, and each face meets the line in a segment that begins at the corner. The
-    faces meet off the corner only if both segments run in the same direction. Then either an edge
-    passes through a face, or the shorter segment is an edge that lies on the other face.
+    Every pair of faces that meet in more than shared corners and edges is in this list or has its
+    faces in the result of `intersecting_faces`. Proof. If all of a face lies on another face, so do
+    its edges. If two edges meet between their ends, and neither edge lies in the plane of the
+    other's face, an edge passes through a face. Faces that share two corners have no more in common
+    unless they overlap in one plane. If two faces share one corner and their planes differ, the
+    planes meet in a line through that corner, and each face meets the line in a segment that begins
+    at the corner. The faces meet off the corner only if both segments run in the same direction.
+    Then either an edge passes through a face, or the shorter segment is an edge that lies on the
+    other face.
 
-    vertices: (n, 3).
+    vertices, faces: (n, 3), (m, 3) the mesh.
     """
     batches: list[IntArray] = []
     contacts: list[FloatArray] = []
 
     def add(pairs: IntArray, touches: BoolArray, p: FloatArray, q: FloatArray) -> None:
-        """Add the pairs (k, 2) selected by the mask `touches` (k,) to the result, and as their
-        points of contact the points midway between p and q, both (k, 3)."""
+        """Add pairs to the result, and for each pair its point of contact.
+
+        pairs: (k, 2) pairs of faces.
+        touches: (k,) mask of the pairs to be added.
+        p, q: (k, 3) points; the point of contact is midway between them.
+        """
         batches.append(pairs[touches])
         contacts.append(0.5 * (p + q)[touches])
 
     for pairs, heights in _pairs_in_doubt(vertices, faces, None):
+        # [pair, corner of the first face, corner of the second face]
         is_same = faces[pairs[:, 0], :, None] == faces[pairs[:, 1]][:, None]
         shared_count = is_same.sum(axis=(1, 2))
+        # Corners and edges of `other` are tested against `base`, then the two change places.
         for order, ((base, other), sides) in enumerate(
             zip((pairs.T, pairs.T[::-1]), heights, strict=True)
         ):
@@ -247,14 +280,18 @@ def touching_pairs(vertices: FloatArray, faces: IntArray) -> tuple[IntArray, Flo
                 rows = np.flatnonzero((shared_count == 0) & (sides[:, i] == 0) & (sides[:, j] == 0))
                 p, q = (vertices[faces[other[rows], k]] for k in (i, j))
                 add(pairs[rows], _segments_meet(vertices[faces[base[rows]]], p, q), p, q)
-            is_common = is_same.any(axis=1 + order)  # for the corners of the other faces
+            # for each corner of `other`, whether it is shared
+            is_common = is_same.any(axis=1 + order)
             for i in range(3):
                 rows = np.flatnonzero((shared_count == 1) & ~is_common[:, i] & (sides[:, i] == 0))
+                # Face `base`, begun at the shared corner; the edge from there to p meets the face
+                # beyond that corner if it runs within the face's angle.
                 apex = is_same.any(axis=2 - order)[rows].argmax(axis=1)[:, None]
                 turned = np.take_along_axis(faces[base[rows]], (apex + np.arange(3)) % 3, axis=1)
                 p = vertices[faces[other[rows], i]]
                 add(pairs[rows], _is_in_angle(vertices[turned], p), p, p)
     all_pairs = np.concatenate([*batches, np.zeros((0, 2), np.int64)])
+    # A pair may have been found several times; its first point of contact is kept.
     _, first = np.unique(all_pairs, axis=0, return_index=True)
     return all_pairs[first], np.concatenate([*contacts, np.zeros((0, 3))])[first]
 
@@ -262,10 +299,12 @@ def touching_pairs(vertices: FloatArray, faces: IntArray) -> tuple[IntArray, Flo
 def _pairs_in_doubt(
     vertices: FloatArray, faces: IntArray, among: BoolArray | None
 ) -> Generator[tuple[IntArray, tuple[SignArray, SignArray]]]:
-    """Generate, in batches, the pairs (k, 2) of faces that floating point does not prove to have
-    only vertices in common. With each batch come two arrays (k, 3) of signs: on which side of the
-    first face's plane the corners of the second face lie, and the reverse (`_side_signs`).
+    """Generate the pairs of faces that floating point does not prove to have only vertices in
+    common, in batches. Each batch consists of the indices (k, 2) of the faces, and two arrays (k,
+    3) of signs: for each corner of the second face, the side of the first face's plane on which it
+    lies; and the reverse (`_side_signs`).
 
+    vertices, faces: (n, 3), (m, 3) the mesh.
     among: (m,) mask of chosen faces; pairs without a chosen face are left out. None if all are
         chosen.
     """
@@ -281,13 +320,16 @@ def _pairs_in_doubt(
 
 
 def _near_pairs(corner: FloatArray, among: BoolArray | None) -> IntArray:
-    """Pairs (k, 2) of triangles (m, 3, 3) whose bounding boxes overlap, each once.
+    """Pairs of triangles whose bounding boxes overlap; returns their indices (k, 2), each pair
+    once.
 
+    corner: (m, 3, 3) the corners of the triangles.
     among: (m,) mask of chosen triangles; pairs without a chosen triangle are left out. None if all
         are chosen.
 
-    Triangles are grouped by size, up to a factor of 2, and each group is compared with each group,
-    itself included, at distances up to the sum of the largest sizes in both. So a large triangle is
+    Triangles are grouped by the radius of their boxes, up to a factor of 2. Each group is compared
+    with each group, itself included. Two triangles are compared if the centers of their boxes are
+    no farther apart than the sum of the largest radii in both groups. So a large triangle is
     compared only with the small triangles near it.
     """
     import scipy.spatial  # imported here: it takes half a second
@@ -298,17 +340,20 @@ def _near_pairs(corner: FloatArray, among: BoolArray | None) -> IntArray:
     if not chosen.any():
         return np.zeros((0, 2), np.int64)
     chosen_bounds = lower[chosen].min(axis=0), upper[chosen].max(axis=0)
+    # Only triangles near the box around all chosen ones can have a chosen partner.
     near = (lower <= chosen_bounds[1]).all(axis=1) & (upper >= chosen_bounds[0]).all(axis=1)
     center = 0.5 * (lower + upper)
     radius = 0.5 * row_norms(upper - lower)
-    octave = np.floor(np.log2(np.maximum(radius, 1e-300)))
-    groups = [np.flatnonzero(near & (octave == first)) for first in np.unique(octave[near])]
+    log2_radius = np.floor(np.log2(np.maximum(radius, 1e-300)))
+    groups = [
+        np.flatnonzero(near & (log2_radius == first)) for first in np.unique(log2_radius[near])
+    ]
     trees = [searching.cKDTree(center[rows]) for rows in groups]
     batches: list[IntArray] = []
 
     def add_if_overlapping(first: IntArray, second: IntArray) -> None:
-        """Append the pairs of triangles whose boxes overlap, of the pairs with indices `first` and
-        `second`, both (k,)."""
+        """Append those of the pairs (first, second) whose boxes overlap; `first` and `second` are
+        indices (k,) of triangles."""
         keep = (lower[first] <= upper[second]).all(axis=1)
         keep &= (lower[second] <= upper[first]).all(axis=1)
         batches.append(np.column_stack([first[keep], second[keep]]))
@@ -316,6 +361,7 @@ def _near_pairs(corner: FloatArray, among: BoolArray | None) -> IntArray:
     for i, j in itertools.product(range(len(groups)), repeat=2):
         max_distance = float(radius[groups[i]].max() + radius[groups[j]].max())
         queries = groups[i][chosen[groups[i]]]
+        # All triangles of the group are chosen: the tree lists each pair once.
         if i == j and len(queries) == len(groups[i]) <= _MAX_AT_ONCE:
             table = trees[i].query_pairs(max_distance, output_type="ndarray")
             add_if_overlapping(*groups[i][table.T])
@@ -332,12 +378,16 @@ def _near_pairs(corner: FloatArray, among: BoolArray | None) -> IntArray:
 
 
 def _are_separated(vertices: FloatArray, faces: IntArray, pairs: IntArray) -> BoolArray:
-    """(k,) whether the two faces of each pair (k, 2) are proved to meet only in shared vertices.
-    That is proved if all vertices of one face that are not shared lie strictly on one side of the
-    plane of the other face. False if rounding leaves it undecided.
+    """(k,) whether the two faces of each pair are proved to meet only in shared vertices. That is
+    proved if all vertices of one face that are not shared lie strictly on one side of the plane of
+    the other face. False if rounding leaves it undecided, and for two faces with the same three
+    corners.
 
-    The sign of the determinant `height` tells the side; its rounding error is bounded by
-    `broad_phase.ROUNDING` times a product of lengths.
+    The sign of a determinant, `height`, tells the side of the plane. Its rounding error is at most
+    `broad_phase.ROUNDING` times the product of the three vectors' lengths.
+
+    vertices, faces: (n, 3), (m, 3) the mesh.
+    pairs: (k, 2) indices of faces.
     """
     apart = np.zeros(len(pairs), np.bool_)
     for first, second in (pairs.T, pairs.T[::-1]):
@@ -361,10 +411,14 @@ def _are_separated(vertices: FloatArray, faces: IntArray, pairs: IntArray) -> Bo
 
 
 def _side_signs(vertices: FloatArray, base: IntArray, other: IntArray) -> SignArray:
-    """(k, 3) for each corner of the faces `other` (k, 3), on which side of the plane of the face in
-    the same row of `base` (k, 3) it lies, decided exactly. The sign is 1 below the plane, from
+    """For each corner of the faces `other`, the side of the plane of the face in the same row of
+    `base` on which it lies; (k, 3) signs, decided exactly. The sign is 1 below the plane, from
     where the corners of `base` run clockwise; -1 above the plane; and 0 on it. Corners that both
-    faces have get 0."""
+    faces have get 0.
+
+    vertices: (n, 3).
+    base, other: (k, 3) indices of the corners of faces.
+    """
     a, b, c = (vertices[base[:, i]] for i in range(3))
     signs = np.zeros((len(other), 3), np.int8)
     for i in range(3):
@@ -376,14 +430,18 @@ def _side_signs(vertices: FloatArray, base: IntArray, other: IntArray) -> SignAr
 def _edge_pierces(
     vertices: FloatArray, pierced: IntArray, piercing: IntArray, sides: SignArray
 ) -> BoolArray:
-    """(k,) whether an edge of the face `piercing` passes through the face `pierced`, both (k, 3),
-    or touches its boundary. It does if the edge's ends are strictly on the two sides of the plane
-    of `pierced`, and its line passes all three edges of `pierced` on the same side or touches them.
+    """(k,) whether an edge of the face `piercing` passes through the face `pierced` in the same
+    row, or touches the boundary of `pierced`. It does if the edge's ends lie strictly on the two
+    sides of the plane of `pierced`, and all three edges of `pierced` turn the same way around the
+    edge's line, or touch the line.
 
+    vertices: (n, 3).
+    pierced, piercing: (k, 3) indices of the corners of faces.
     sides: (k, 3) the `_side_signs` of the corners of `piercing` for the planes of `pierced`.
     """
     pierces = np.zeros(len(piercing), np.bool_)
     for i, j in _EDGES:
+        # Signs with a negative product: the ends are on different sides.
         rows = np.flatnonzero((sides[:, i] * sides[:, j] < 0) & ~pierces)
         p, q = vertices[piercing[rows, i]], vertices[piercing[rows, j]]
         x = [vertices[pierced[rows, k]] for k in range(3)]
@@ -393,15 +451,19 @@ def _edge_pierces(
 
 
 def _share_area(first: FloatArray, second: FloatArray) -> BoolArray:
-    """(k,) whether triangles in the same row of `first` and `second` (k, 3, 3), which lie in one
-    plane, have an area in common. They do unless the line of an edge separates them (separating
-    axes). For the test they are projected to two dimensions, along the coordinate axis nearest to
-    their normal."""
+    """(k,) whether two triangles in one plane have an area in common. They do unless the line of an
+    edge separates them (separating axes). For the test they are projected to two dimensions, along
+    the coordinate axis nearest to their normal.
+
+    first, second: (k, 3, 3) the corners of the triangles of each pair.
+    """
     normal = np.abs(area_normals(first))
+    # The two coordinates that the projection keeps.
     axes = np.array([[1, 2], [2, 0], [0, 1]])[normal.argmax(axis=1)]
     flat = [np.take_along_axis(t, axes[:, None].repeat(3, axis=1), axis=2) for t in (first, second)]
     overlaps = np.ones(len(first), np.bool_)
     for a, b in (flat, flat[::-1]):
+        # 1 if the projected triangle runs counter-clockwise; then its inside is left of its edges.
         sign = orient2d(a[:, 0], a[:, 1], a[:, 2])
         for i, j in _EDGES:
             side = [sign * orient2d(a[:, i], a[:, j], b[:, k]) for k in range(3)]
@@ -410,15 +472,20 @@ def _share_area(first: FloatArray, second: FloatArray) -> BoolArray:
 
 
 def _segments_meet(triangle: FloatArray, p: FloatArray, q: FloatArray) -> BoolArray:
-    """(k,) whether segments from `p` to `q` (k, 3) meet the triangles (k, 3, 3) in whose planes
-    they lie. A segment meets its triangle unless an edge's line has the segment strictly on its
-    outer side, or the segment's line has the triangle strictly on one side (separating axes). False
-    for triangles without an area."""
+    """(k,) whether segments meet triangles in whose planes they lie. A segment meets its triangle
+    unless an edge's line has the segment strictly on its outer side, or the segment's line has the
+    triangle strictly on one side (separating axes). False for triangles without an area.
+
+    triangle: (k, 3, 3) the corners of the triangles.
+    p, q: (k, 3) the ends of the segments; if they are equal, the segment is a point.
+    """
     normal = np.abs(area_normals(triangle))
+    # The two coordinates that a projection along the nearest axis keeps.
     axes = np.array([[1, 2], [2, 0], [0, 1]])[normal.argmax(axis=1)]
     a = np.take_along_axis(triangle, axes[:, None].repeat(3, axis=1), axis=2)
     p, q = (np.take_along_axis(corner, axes, axis=1) for corner in (p, q))
     sign = orient2d(a[:, 0], a[:, 1], a[:, 2])
+    # 1 if the projected triangle runs counter-clockwise; then its inside is left of its edges.
     is_on = sign != 0
     for i, j in _EDGES:
         side = [sign * orient2d(a[:, i], a[:, j], corner) for corner in (p, q)]
@@ -428,10 +495,14 @@ def _segments_meet(triangle: FloatArray, p: FloatArray, q: FloatArray) -> BoolAr
 
 
 def _is_in_angle(triangle: FloatArray, p: FloatArray) -> BoolArray:
-    """(k,) whether points `p` (k, 3), each in the plane of its triangle (k, 3, 3), lie in the angle
-    of the triangle at its first corner, its two sides included. False for triangles without an
-    area."""
+    """(k,) whether points lie in the angle of a triangle at its first corner, its two sides
+    included. False for triangles without an area.
+
+    triangle: (k, 3, 3) the corners of the triangles.
+    p: (k, 3) the points, each in the plane of its triangle.
+    """
     normal = np.abs(area_normals(triangle))
+    # The two coordinates that a projection along the nearest axis keeps.
     axes = np.array([[1, 2], [2, 0], [0, 1]])[normal.argmax(axis=1)]
     a = np.take_along_axis(triangle, axes[:, None].repeat(3, axis=1), axis=2)
     p = np.take_along_axis(p, axes, axis=1)
@@ -447,8 +518,10 @@ class MeshingError(ValueError):
     """A level set could not be meshed. The message says why, and names a remedy."""
 
     def may_be_fixed_by(self, smaller: float) -> bool:
-        """Whether smaller cells may help. smaller: their size, as a fraction of the size of the
-        cells that failed."""
+        """Whether smaller cells of the lattice may avoid the error.
+
+        smaller: the size of the smaller cells, as a fraction of the size of the cells that failed.
+        """
         del smaller
         return True
 
@@ -469,8 +542,8 @@ class LocalizedMeshingError(MeshingError):
 
 
 class OffLevelError(LocalizedMeshingError):
-    """Vertices and centers of faces are too far from the level set; `locations` holds these
-    points."""
+    """Vertices or centers of faces are farther from the level set than the tolerance; `locations`
+    holds these points."""
 
 
 class SelfIntersectionError(LocalizedMeshingError):
@@ -486,10 +559,10 @@ class SelfIntersectionError(LocalizedMeshingError):
 
 
 class UnrefinableError(MeshingError):
-    """An error that smaller cells do not fix."""
+    """An error that smaller cells of the lattice do not avoid."""
 
     def may_be_fixed_by(self, smaller: float) -> bool:
-        """False: no cells are small enough."""
+        """False: no cells are small enough. `smaller`, the size to be tried, plays no part."""
         del smaller
         return False
 
@@ -506,10 +579,10 @@ _MAX_FAILURES_FOR_RETRY, _REQUIRED_FAILURE_REDUCTION = 20, 0.5
 def is_retry_promising(
     now: MeshingError, before: MeshingError | None, smallest: float = 1.0
 ) -> bool:
-    """Whether it is worthwhile to try smaller cells after an attempt failed. It is not worthwhile
-    if smaller cells cannot help, or if there are more than 20 failures and more than half as many
-    as in the attempt before. Along a pole of the function, or where surfaces on which it jumps
-    cross, cells of every size fail.
+    """Whether to try again with smaller cells after an attempt at meshing failed. It is not
+    worthwhile if smaller cells cannot help. Nor is it if a check failed at more than 20 places, and
+    at more than half as many as in the attempt before: along a pole of the function, or where
+    surfaces on which it jumps cross, cells of every size fail.
 
     now: the error of the last attempt.
     before: the error of the attempt before it, or None.
@@ -526,7 +599,7 @@ def is_retry_promising(
 
 def euler_characteristic(faces: IntArray, edges: Edges | None = None) -> int:
     """The Euler characteristic of faces (m, 3): the number of vertices that they use, minus the
-    number of edges, plus the number of faces.
+    number of their edges, plus the number of faces.
 
     edges: the `Edges` of `half_edges(faces)`, if they are known.
     """
@@ -538,12 +611,13 @@ def euler_characteristic(faces: IntArray, edges: Edges | None = None) -> int:
 def check_manifold(faces: IntArray, vertices: FloatArray | None = None) -> None:
     """Raise an error unless faces (m, 3) form a manifold: every edge has one or two faces, two
     faces run their common edge in opposite directions, and the faces around every vertex are joined
-    by edges.
+    to each other by edges.
 
-    vertices: (n, 3), for the locations of failures.
+    vertices: (n, 3), for the locations of failures; may be None.
 
     Raises:
-        MeshingError: the faces are no manifold; a LocalizedMeshingError if vertices are given.
+        MeshingError: the faces are no manifold. It is a LocalizedMeshingError if vertices are
+            given.
     """
 
     def fail(message: str, vertex_ids: IntArray) -> Never:
@@ -562,6 +636,8 @@ def check_manifold(faces: IntArray, vertices: FloatArray | None = None) -> None:
             "itself, or cells are too large for it; choose a smaller `cell_size`, or another level",
             np.unique(pairs[uses[index] > 2]),
         )
+    # For each edge, how often it is run toward the larger index minus how often the other way: 0
+    # for two faces that agree.
     net = np.bincount(index, np.where(pairs[:, 0] < pairs[:, 1], 1, -1), minlength=len(uses))
     if ((uses == 2) & (net != 0)).any():
         fail(
@@ -569,6 +645,7 @@ def check_manifold(faces: IntArray, vertices: FloatArray | None = None) -> None:
             "this level set; choose a smaller `cell_size`",
             np.unique(pairs[((uses == 2) & (net != 0))[index]]),
         )
+    # A manifold has one fan of faces at each vertex that is used.
     if _vertex_fans(faces, edges)[0] > np.count_nonzero(np.bincount(faces.ravel())):
         fail(
             "sheets of the mesh touch in a point: cells are too large for this level set; choose a "
@@ -578,12 +655,14 @@ def check_manifold(faces: IntArray, vertices: FloatArray | None = None) -> None:
 
 
 def check_no_self_intersection(vertices: FloatArray, faces: IntArray) -> None:
-    """Raise an error if a vertex (n, 3) is not finite, or if faces (m, 3) pass through each other
-    or lie on each other; decided exactly.
+    """Raise an error if a vertex is not finite, or if faces pass through each other or lie on each
+    other; decided exactly.
+
+    vertices, faces: (n, 3), (m, 3) the mesh.
 
     Raises:
-        MeshingError: a vertex is not finite; a SelfIntersectionError, with the faces, if faces
-            meet.
+        MeshingError: a vertex is not finite. It is a SelfIntersectionError, with the faces, if
+            faces meet.
     """
     if not np.isfinite(vertices).all():
         raise MeshingError("vertices of the mesh are no numbers: choose another level or `clip`")
@@ -610,8 +689,8 @@ def check_triangle_limit(expected: float, max_triangles: int) -> None:
 
 
 def check_inside(vertices: FloatArray, volume: Volume, slack: float) -> None:
-    """Raise MeshingError if one of the vertices (n, 3) lies outside of a volume, by more than the
-    length `slack`."""
+    """Raise MeshingError if a vertex (n, 3) lies outside of a volume by more than the length
+    `slack`."""
     out = ~volume.padded(slack).contains_points(vertices)
     if out.any():
         raise MeshingError(
@@ -627,20 +706,21 @@ def check_near_level(
     tolerance: float,
     volume: Volume | None,
 ) -> None:
-    """Raise an error unless all vertices (n, 3) and all centers of faces (m, 3) are within
-    `tolerance`, a length, of the level set f = 0, where f is the field minus its level. That is
-    decided by samples of f.
+    """Raise an error unless all vertices and all centers of faces are within `tolerance`, a length,
+    of the level set {f = 0}, where f is the field minus its level. Samples of f decide that.
 
-    A point passes if |f|/|grad f| <= tolerance, by the gradient. It passes as well if f has
-    different signs at two points on a line through it, on both sides of it and at the same distance
-    of at most the tolerance: a continuous f is then 0 between them. Fourteen lines are
-    tried: the normal of the face, or the mean normal at the vertex, and 13 fixed lines. These are
-        askew to the axes, since many parts have faces in coordinate planes, where rounding would
-        decide the sign. Every cone of half-angle 28 degrees contains one of these directions; the
-        corner of a cube contains a cone of half-angle 35 degrees.
+    A point passes if |f| / |grad f| <= tolerance, which estimates the distance. It passes as well
+    if f has different signs at two points on a line through it, on both sides of it and at the same
+    distance of at most the tolerance: a continuous f is then 0 between them. Fourteen lines are
+    tried: the normal of the face, or the mean normal at the vertex, and 13 fixed lines. The fixed
+    lines are askew to the axes: many parts have faces in coordinate planes, where rounding would
+    decide the sign. Every cone of half-angle 28 degrees contains one of these directions; the
+    corner of a cube contains a cone of half-angle 35 degrees.
 
-    volume: a solid is cut at the boundary of this volume, so that f counts as positive outside of
-        it. None if there is no such volume.
+    function: f.
+    vertices, faces: (n, 3), (m, 3) the mesh.
+    volume: the volume that cuts the solid, so that f counts as positive outside of it. None if the
+        solid is not cut.
 
     Two kinds of points are not tested: vertices on the boundary curve of a level set of a field
     such as `SolidAngle`, since f has no value there; and centers of triangles with no edge longer
@@ -666,23 +746,27 @@ def points_off_level(
     tolerance: float,
     volume: Volume | None,
 ) -> tuple[FloatArray, int]:
-    """Find the vertices (n, 3) and centers of faces (m, 3) that are not within `tolerance` of the
-    level set, by samples of the function. `check_near_level` describes the test and the parameters.
+    """Find the vertices and centers of faces that are not within `tolerance` of the level set, by
+    samples of the function. `check_near_level` describes the test and the parameters.
 
-    Returns these points (k, 3), and the number of points that were tested."""
+    Returns these points (k, 3), and the number of points that were tested.
+    """
     corner = vertices[faces]
     normal = area_normals(corner)
     longest = np.stack([row_norms(corner[:, k] - corner[:, k - 1]) for k in range(3)]).max(axis=0)
     large = longest > 0.5 * tolerance
     is_checked = np.ones(len(vertices), np.bool_)
+    # Level sets of fields with a period may end at a curve, on which the field has no value.
     if function.period is not None:
         is_checked[boundary_edges(faces)] = False
+    # The sum of the normals of the faces around each vertex.
     mean = np.zeros_like(vertices)
     for k in range(3):
         np.add.at(mean, faces[:, k], normal)
     points = np.concatenate([vertices[is_checked], corner[large].mean(axis=1)])
     directions = np.concatenate([mean[is_checked], normal[large]])
     directions /= np.maximum(row_norms(directions), 1e-300)[:, None]
+    # Not `>`: a distance that is not a number fails too.
     rows = np.flatnonzero(~(function.sample(points).distance <= tolerance))
     # Nearer points are tried as well: behind a cap there may be little of a solid.
     for fraction, line in itertools.product((1.0, 0.25, 0.0625), (None, *_askew_lines())):
@@ -690,14 +774,15 @@ def points_off_level(
             break
         step = fraction * tolerance * (directions[rows] if line is None else line)
         ahead, behind = (_is_positive(function, points[rows] + s * step, volume) for s in (1, -1))
+        # Different signs: the level set passes between the two points.
         rows = rows[ahead == behind]
     return points[rows], len(points)
 
 
 def _askew_lines() -> FloatArray:
-    """(13, 3) unit vectors along the axes, the face diagonals and the space diagonals of a cube.
-    The cube is turned so that no vector is near a coordinate plane or a plane at 45 degrees to two
-    axes."""
+    """Directions of 13 lines as unit vectors (13, 3): the axes, the face diagonals and the space
+    diagonals of a cube. The cube is turned so that no line is near a coordinate plane or a plane at
+    45 degrees to two axes."""
     directions = np.array(list(itertools.product((-1.0, 0.0, 1.0), repeat=3)))[14:]
     frame: FloatArray = np.linalg.qr([[7, 7, -3], [3, -16, -7], [19, 7, -13]])[0]
     return (directions / row_norms(directions)[:, None]) @ frame
@@ -706,8 +791,8 @@ def _askew_lines() -> FloatArray:
 def _is_positive(
     function: LevelFunction, points: FloatArray, volume: Volume | None
 ) -> npt.NDArray[np.bool_]:
-    """(n,) whether points (n, 3) count as outside: the function is positive or not a number there,
-    or the point lies outside of the volume."""
+    """(n,) whether points (n, 3) count as outside of the solid: the function is positive or not a
+    number there, or the point lies outside of the volume."""
     is_positive = ~(function.sample(points).value <= 0)
     return is_positive if volume is None else is_positive | ~volume.contains_points(points)
 
@@ -718,9 +803,10 @@ def point_text(x: FloatArray) -> str:
 
 
 def nonmanifold_vertices(faces: IntArray) -> IntArray:
-    """Indices of the vertices at which faces (m, 3) are not a manifold: the ends of edges that have
-    more than two faces, and vertices with more than one fan of faces. A fan is a set of faces
-    around a vertex that are joined by edges."""
+    """Find the vertices at which faces (m, 3) are not a manifold: the ends of edges that have more
+    than two faces, and vertices with more than one fan of faces. A fan is a set of faces around a
+    vertex that are joined to each other by edges at that vertex. Returns the indices (k,) of these
+    vertices, in increasing order."""
     pairs, count = half_edges(faces), int(faces.max(initial=-1)) + 1
     edges = Edges.of(pairs)
     overused = np.unique(pairs[edges.multiplicity[edges.edge_of_pair] > 2])
@@ -733,13 +819,14 @@ def nonmanifold_vertices(faces: IntArray) -> IntArray:
 
 
 def _vertex_fans(faces: IntArray, edges: Edges) -> tuple[int, IntArray]:
-    """Group the corners of faces (m, 3) into fans. A fan is a maximal set of faces around a vertex
-    that are joined to each other by edges at that vertex.
+    """Group the corners of faces (m, 3) into fans. A fan is a largest set of faces around a vertex
+    that are joined to each other by edges at that vertex; each face of it takes part with its
+    corner at the vertex.
 
     edges: the `Edges` of `half_edges(faces)`.
 
-    Returns the number of fans of all vertices together, and (3m,) the index of the fan of each
-    corner: entry 3 i + k is that of corner k of face i.
+    Returns the number of fans of all vertices together, and (3m,) for each corner the index of its
+    fan; entry 3 i + k is for corner k of face i.
     """
     import scipy.sparse  # imported here: it takes half a second
     import scipy.sparse.csgraph as csgraph_module
@@ -751,6 +838,7 @@ def _vertex_fans(faces: IntArray, edges: Edges) -> tuple[int, IntArray]:
     first = np.concatenate([corner[:, 0], corner[:, 1], corner[:, 2]])
     second = np.concatenate([corner[:, 1], corner[:, 2], corner[:, 0]])
     forward, backward = edges.paired_half_edges().T  # run in opposite directions
+    # Across an edge, the corners at its one end belong together, and those at its other end.
     rows = np.concatenate([first[forward], second[forward]])
     columns = np.concatenate([second[backward], first[backward]])
     joined = sparse.coo_matrix((np.ones(len(rows)), (rows, columns)), shape=(3 * m, 3 * m))

@@ -1,5 +1,7 @@
-"""Closed meshes: their conversion to and from solids of the library manifold3d (class `Manifold`),
-other shapes as such solids, and export to files in which they stay closed."""
+"""Closed meshes: their conversion to and from solids of the library manifold3d (class `Manifold`,
+which does Boolean operations), other shapes as such solids, and export to files in which they stay
+closed. Files hold single precision. So vertices are rounded to a grid for export: the points whose
+coordinates are multiples of a power of two, its spacing."""
 
 from __future__ import annotations
 
@@ -44,17 +46,18 @@ __all__ = [
 
 # The largest number of segments around a ball or a solid of revolution.
 _MAX_SEGMENTS = 2000
-# The areas of a union and of its parts may differ by the first, relative to the area. Otherwise,
-# and where triangles of the union cross, the faces of parts are moved outwards by the second,
-# relative to the size. At sharp corners vertices are moved by at most that divided by the third.
+# The area of a union may differ from the area of the solid's boundary by the first, relative to it.
+# Otherwise, and where triangles of the union cross, the faces of parts are moved outwards by the
+# second, relative to the size. At sharp corners vertices are moved by at most that divided by the
+# third.
 _AREA_TOLERANCE, _GROWTH, _MIN_COSINE = 1e-6, 1e-9, 0.1
-# The largest number of squares of the permitted edge on a twisted outline.
+# The largest area of a twisted outline, in squares of the longest permitted edge.
 _MAX_CELLS = 1_000_000
 
 
 def to_manifold(surface: TriangleMesh) -> Manifold:
     """Convert a closed mesh to the manifold3d solid that it bounds. The faces of the mesh run
-    counter-clockwise as seen from outside of the solid.
+    counter-clockwise as seen from outside of the solid. A mesh without faces gives the empty solid.
 
     Raises:
         MeshingError: the mesh is not closed.
@@ -80,9 +83,9 @@ def mesh_manifold(solid: MeshSolid) -> Manifold | None:
 
     Components that are in contact only up to rounding would leave gaps as thin as rounding, whose
     walls add to the area, or would pass through each other. So if the area of the union differs
-    from that of the solid's boundary, or if triangles of the union cross, the faces of all
-    components are first moved outwards by a tiny length. If that does not help either, the first
-    union of the right area is returned, or None.
+    from the area of the solid's boundary, or if triangles of the union cross, the faces of all
+    components are first moved outwards by a tiny length. If triangles cross then too, the first
+    union of the right area is returned, or None if there is none.
 
     Raises:
         MeshingError: more than two faces meet at an edge.
@@ -97,6 +100,7 @@ def mesh_manifold(solid: MeshSolid) -> Manifold | None:
             f"the faces of the mesh do not meet two by two at its edges ({body.status().name}): "
             "join its parts by trimesh.boolean.union, or move them apart"
         )
+    # All triangles bound the solid: the mesh does not intersect itself.
     if surface.boundary_triangles is None:
         return body
     parts = body.decompose()
@@ -116,17 +120,20 @@ def mesh_manifold(solid: MeshSolid) -> Manifold | None:
 
 
 def _grown_part(part: Manifold, length: float) -> Manifold:
-    """The solid `part` with its faces moved outwards by `length`; the same solid if the length is
-    0."""
+    """The solid `part` with its faces moved outwards by about `length`; `part` itself if the length
+    is 0."""
     return part if length == 0 else to_manifold(grown(from_manifold(part), length))
 
 
 def grown(surface: TriangleMesh, length: float) -> TriangleMesh:
     """A closed surface with its vertices moved outwards along their normals, so far that faces move
-    by about `length`. Components that touched only up to rounding then overlap."""
+    by about `length`. Components that touched only up to rounding then overlap. A negative length
+    moves them inwards."""
     x, faces = surface.vertices, surface.faces
     mesh = trimesh.Trimesh(x, faces, process=False)
     normals = np.array(mesh.vertex_normals)
+    # The smallest cosine between a vertex normal and the faces there: a move by length / cosine
+    # moves the face by the length.
     cosine = np.ones(len(normals))
     for k in range(3):
         np.minimum.at(cosine, faces[:, k], row_dots(normals[faces[:, k]], mesh.face_normals))
@@ -135,15 +142,15 @@ def grown(surface: TriangleMesh, length: float) -> TriangleMesh:
 
 def without_short_edges(solid: Manifold, length: float) -> Manifold:
     """Remove short edges and slivers (thin triangles) of a solid, which moves its surface by up to
-    `length`. If the volume changes by more than 2 * length * area, the solid is returned as it was:
-    manifold3d may lose a part of a solid with slivers as thin as rounding."""
+    `length`. If that changes the volume by more than 2 * length * area, the solid is returned as it
+    was: manifold3d may lose a part of a solid with slivers as thin as rounding."""
     simpler = solid.simplify(length)
     max_change = 2 * length * solid.surface_area()
     return simpler if abs(simpler.volume() - solid.volume()) <= max_change else solid
 
 
 def from_manifold(manifold: Manifold) -> TriangleMesh:
-    """The triangle mesh of the surface of a manifold3d solid."""
+    """Convert the surface of a manifold3d solid to a triangle mesh."""
     mesh = manifold.to_mesh64()
     vertices = np.array(mesh.vert_properties, np.float64)[:, :3]
     return TriangleMesh(vertices, np.array(mesh.tri_verts, np.int64))
@@ -162,7 +169,8 @@ def extruded_manifold(
     outline: Outline, height: float, twist: float, taper: float, tolerance: float
 ) -> Manifold:
     """A plane outline, extruded from z = 0 to z = height, as a manifold3d solid. The cross-section
-    at the upper end is the outline turned by `twist` degrees and scaled by the factor `taper`.
+    at the upper end is the outline turned by `twist` degrees and scaled by the factor `taper`; in
+    between both change in proportion to z.
 
     Without a twist the faces are flat, and exact. With a twist the vertices lie on the exact
     surface, and faces are within `tolerance` (a length) of it. Proof. Take a triangle of the
@@ -170,8 +178,8 @@ def extruded_manifold(
     M bound the second derivatives of the map along lines. The triangle lies in a ball of radius
     L/sqrt(3), so that linear interpolation of the map between the corners errs by at most M/2 times
     the square of that radius, M L^2/6. Let the map turn by the angle a (in radians) and change the
-    scale by k per unit of z, at distances up to R from the axis; then M = q (a + a^2 R) + k (1 + 2
-    a R), with q = max(1, taper).
+    scale by k, both per unit of z, at distances up to R from the axis. Then M = q (a + a^2 R) + k
+    (1 + 2 a R), with q = max(1, taper).
 
     Raises:
         MeshingError: the tolerance is so small that there are millions of faces.
@@ -183,25 +191,26 @@ def extruded_manifold(
     rate, growth = math.radians(twist) / height, (taper - 1.0) / height
     radius = max(float(np.linalg.norm(loop, axis=1).max()) for loop in outline)
     turn, q = abs(rate), max(1.0, taper)
-    bound = q * (turn + turn**2 * radius) + abs(growth) * (1 + 2 * turn * radius)
-    length = math.sqrt(6 * tolerance / bound)
+    second_derivative = q * (turn + turn**2 * radius) + abs(growth) * (1 + 2 * turn * radius)
+    # M L^2/6 = tolerance.
+    max_edge = math.sqrt(6 * tolerance / second_derivative)
     straight = section.extrude(height * scale)
-    count = straight.surface_area() / (scale * length) ** 2
-    if count > _MAX_CELLS:
+    # The area in squares of the longest edge.
+    square_count = straight.surface_area() / (scale * max_edge) ** 2
+    if square_count > _MAX_CELLS:
         raise MeshingError(
-            f"a twisted outline within {tolerance:.3g} has about {4 * count:,.0f} faces: choose a "
-            "larger `tolerance`"
+            f"a twisted outline within {tolerance:.3g} has about {4 * square_count:,.0f} faces: "
+            "choose a larger `tolerance`"
         )
 
     def mapped(points: FloatArray) -> FloatArray:
-        """Points (n, 3) of the straight extrusion, turned and scaled in proportion to their
-        height."""
+        """Turn and scale points (n, 3) of the straight extrusion in proportion to their height."""
         z = points[:, 2] / scale
         factor, c, s = 1 + growth * z, np.cos(rate * z), np.sin(rate * z)
         x, y = factor * points[:, 0], factor * points[:, 1]
         return np.column_stack([c * x - s * y, s * x + c * y, points[:, 2]])
 
-    return straight.refine_to_length(length * scale).warp_batch(mapped).scale(inverse_scale)
+    return straight.refine_to_length(max_edge * scale).warp_batch(mapped).scale(inverse_scale)
 
 
 def revolved_manifold(outline: Outline, tolerance: float) -> Manifold:
@@ -214,6 +223,7 @@ def revolved_manifold(outline: Outline, tolerance: float) -> Manifold:
         MeshingError: the tolerance is so small that there are too many segments.
     """
     radius = max(float(loop[:, 0].max()) for loop in outline)
+    # From r (pi/n)^2/2 <= tolerance, rounded up to a multiple of 4.
     segments = 4 * math.ceil(0.25 * math.pi * math.sqrt(radius / (2 * tolerance)))
     if segments > _MAX_SEGMENTS:
         raise MeshingError(
@@ -270,10 +280,11 @@ def _ball_manifold(ball: Ball, tolerance: float) -> Manifold:
     whose faces are within `tolerance` (a length) of it.
 
     Proof. Let n be the number of segments around, and r the radius. The octahedron's faces are
-    divided into equilateral triangles, whose vertices are then moved onto the sphere. The mean
-    length of edges along a side of the octahedron is (r pi/2)/(n/4) = 2 pi r/n, and all edges are
-    at most sqrt(3) times as long. So the circle through the corners of a triangle has a radius of
-    at most c = edge/sqrt(3) <= 2 pi r/n, and the triangle is at most c^2/(2 r) from the sphere.
+    divided into equilateral triangles, whose vertices are then moved onto the sphere. A side of the
+    octahedron becomes n/4 edges along a quarter of a great circle; their mean length is (r
+    pi/2)/(n/4) = 2 pi r/n. All edges are at most sqrt(3) times as long. So the circle through the
+    corners of a triangle has a radius of at most c = edge/sqrt(3) <= 2 pi r/n, and the triangle is
+    at most c^2/(2 r) from the sphere.
 
     Raises:
         MeshingError: the tolerance is so small that there are millions of faces.
@@ -281,6 +292,7 @@ def _ball_manifold(ball: Ball, tolerance: float) -> Manifold:
     from manifold3d import Manifold
 
     r = ball.radius
+    # From (2 pi r/n)^2/(2 r) <= tolerance, rounded up to a multiple of 4.
     segments = 4 * math.ceil(0.25 * 2 * math.pi * math.sqrt(r / (2 * tolerance)))
     if segments > _MAX_SEGMENTS:
         raise MeshingError(
@@ -298,24 +310,24 @@ _MIN_STEP = 2.0**-26
 # Coordinates may be at most this large: divided by that distance, larger ones are beyond the
 # integers of readers.
 _LARGEST = 2.0**36
-# A part has to be at least this many steps of the grid long.
+# The size of a mesh has to be at least this many grid spacings.
 _MIN_STEPS_ACROSS = 1e4
-# If the mesh on the grid does not pass its checks, it is simplified, moving it by up to this many
-# steps of the grid; the numbers are tried in turn.
+# If the rounded mesh does not pass its checks, the mesh is simplified, moving it by up to this many
+# grid spacings; the numbers are tried in turn.
 _SIMPLIFY_STEPS = (4, 32)
-# Where triangles cross, the mesh is mended, moving it by up to this many steps of the grid.
+# Where triangles cross, vertices are moved by up to this many grid spacings.
 _REPAIR_STEPS = 32
 
 
 class ClosedMesh(trimesh.Trimesh):
     """A trimesh.Trimesh whose `export` writes a closed file if the mesh is closed, or else raises a
-    MeshingError.
+    MeshingError. The mesh in memory stays in double precision, unchanged. A mesh that is not closed
+    is written as trimesh writes it.
 
-    Files hold single precision, in which the ends of short edges coincide and slivers flip. So
-    vertices are rounded to a grid that single precision holds, and edges without a length are
-    contracted; then it is checked that the result is closed and does not intersect itself. The mesh
-    in memory stays in double precision, unchanged. A mesh that is not closed is written as trimesh
-    writes it. Its repr is that of a trimesh.Trimesh, since it may be open.
+    Files hold single precision, in which the ends of short edges coincide and slivers (thin
+    triangles) flip. So vertices are rounded to a grid that single precision holds, and edges
+    without a length are contracted. Then it is checked that the result is closed and does not
+    intersect itself. The mesh's repr is that of a trimesh.Trimesh, since it may be open.
     """
 
     def __repr__(self) -> str:
@@ -329,13 +341,14 @@ class ClosedMesh(trimesh.Trimesh):
         return cast("ClosedMesh", copied)
 
     def copy(self, *args: Any, **options: Any) -> trimesh.Trimesh:
+        """A copy of the mesh, as a ClosedMesh."""
         copied = super().copy(*args, **options)
         copied.__class__ = type(self)
         return copied
 
     def export(self, file_obj: Any = None, file_type: str | None = None, **options: Any) -> Any:
-        """Write the mesh as trimesh.Trimesh.export does. Metadata is not written: no file format
-        holds its arrays.
+        """Write the mesh to a file, with the parameters and the result of trimesh.Trimesh.export.
+        Metadata is not written: no file format holds its arrays.
 
         Raises:
             MeshingError: the mesh is closed, but would not be in the file: components touch, or the
@@ -346,24 +359,26 @@ class ClosedMesh(trimesh.Trimesh):
         if self.units is not None:
             written.units = self.units
         if self.is_watertight:
-            step = _grid_spacing(np.asarray(self.vertices, np.float64))
-            written = _quantize(written, step)
+            grid_spacing = _grid_spacing(np.asarray(self.vertices, np.float64))
+            written = _quantize(written, grid_spacing)
             name = file_type or str(getattr(file_obj, "name", file_obj))
-            if name.lower().endswith(("obj", "off")):  # exact decimals of a multiple of 2^-k
-                options.setdefault("digits", max(1, round(-math.log2(step))))
+            # Text files need as many decimals as 2^-k has to be exact.
+            if name.lower().endswith(("obj", "off")):
+                options.setdefault("digits", max(1, round(-math.log2(grid_spacing))))
         return cast("Any", written).export(file_obj, file_type, **options)
 
 
 def _grid_spacing(x: FloatArray) -> float:
-    """The spacing of the grid to which vertices `x` (n, 3) are rounded. It is a power of two, and
-    so large that single precision, which has 24 bits, holds all multiples of it up to the largest
-    coordinate.
+    """The spacing of the grid to which vertices x (n, 3) are rounded for a file. It is a power of
+    two, and so large that single precision, which has 24 bits, holds all multiples of it up to the
+    largest coordinate.
 
     Raises:
-        MeshingError: the grid is too coarse for the part, or coordinates are too large.
+        MeshingError: the grid is too coarse for the size of the mesh, or coordinates are too large.
     """
     largest, size = float(np.abs(x).max()), float(np.ptp(x, axis=0).max())
     step = max(math.ldexp(1.0, math.frexp(largest)[1] - 24), _MIN_STEP)
+    # `not <=` also refuses coordinates that are not numbers.
     if size < _MIN_STEPS_ACROSS * step or not largest <= _LARGEST:
         raise MeshingError(
             f"the part is {size:.3g} long, at up to {largest:.3g} from the origin, where a file "
@@ -374,12 +389,12 @@ def _grid_spacing(x: FloatArray) -> float:
 
 
 def _quantize(mesh: trimesh.Trimesh, step: float) -> trimesh.Trimesh:
-    """Round the vertices of a closed mesh to the grid of spacing `step`, and return the result. If
-    triangles cross after rounding, vertices near them are moved; if the mesh still does not pass
-    its checks, it is simplified. A mesh with colors or textures is only rounded.
+    """Round the vertices of a closed mesh to the grid of spacing `step`, and return the rounded
+    mesh. If triangles cross after rounding, vertices near them are moved; if the mesh still does
+    not pass its checks, it is simplified first. A mesh with colors or textures is only rounded.
 
     Raises:
-        MeshingError: nothing makes the mesh on the grid closed and free of intersections.
+        MeshingError: nothing makes the rounded mesh closed and free of intersections.
     """
     original = TriangleMesh(np.array(mesh.vertices, np.float64), np.array(mesh.faces, np.int64))
     x, faces, is_kept = _merge_on_grid(original, step)
@@ -397,6 +412,7 @@ def _quantize(mesh: trimesh.Trimesh, step: float) -> trimesh.Trimesh:
                 f"or pass through each other, such as near ({x:.4g}, {y:.4g}, {z:.4g}): move them "
                 "apart or make them overlap, or choose another `tolerance`"
             ) from error
+    # Otherwise the rounded mesh can be used as it is.
     if mended is not None:
         return trimesh.Trimesh(mended.vertices, mended.faces, process=False, validate=False)
     mesh.vertices, mesh.faces = x, faces
@@ -407,7 +423,8 @@ def _quantize(mesh: trimesh.Trimesh, step: float) -> trimesh.Trimesh:
 
 def _simplify_until_valid(original: TriangleMesh, step: float) -> TriangleMesh | None:
     """Simplify a closed mesh by manifold3d and round it to the grid of spacing `step`, so that no
-    triangles cross. Two strengths of simplification are tried; None if both fail."""
+    triangles cross. Two strengths of simplification are tried; None if both fail, or if no triangle
+    is left."""
     for steps in _SIMPLIFY_STEPS:
         simpler = from_manifold(without_short_edges(to_manifold(original), steps * step))
         x, faces, is_kept = _merge_on_grid(simpler, step)
@@ -422,7 +439,8 @@ def _simplify_until_valid(original: TriangleMesh, step: float) -> TriangleMesh |
 
 
 def _merge_on_grid(surface: TriangleMesh, step: float) -> tuple[FloatArray, IntArray, BoolArray]:
-    """Round the vertices of a surface to the grid of spacing `step`, and join those that coincide.
+    """Round the vertices of a surface to the grid of spacing `step`, and join vertices that
+    coincide.
 
     Returns the rounded vertices (n, 3), coinciding ones included; the faces (m, 3), in which the
     first of the vertices at each point stands for all of them; and a mask (m,) of the faces that
@@ -430,10 +448,12 @@ def _merge_on_grid(surface: TriangleMesh, step: float) -> tuple[FloatArray, IntA
     """
     grid = np.round(surface.vertices / step)
     x = grid * step
-    # Vertices at the same point, by their coordinates one after the other.
+    # group[i]: a number that vertices have in common if their coordinates so far, axis by axis, are
+    # equal.
     group = np.zeros(len(x), np.int64)
     for column in (grid - grid.min(axis=0)).astype(np.int64).T:
         _, group, _, _ = unique_with_inverse(group * (int(column.max()) + 1) + column)
+    # Of repeated indices the last assignment stays, so in reverse order the first vertex.
     first = np.empty(len(x), np.int64)
     first[group[::-1]] = np.arange(len(x))[::-1]
     faces = first[group][surface.faces]
@@ -459,6 +479,7 @@ def _resolve_after_rounding(
         if not len(intersecting_faces(original.vertices, original.faces)):
             raise
         return None
+    # The same object: nothing was moved.
     if apart is rounded:
         return None
     check_manifold(apart.faces, apart.vertices)

@@ -1,10 +1,12 @@
-"""Meshes of solids: closed meshes of smooth level sets, cut by volumes and combined by Boolean
-operations.
+"""Meshes of solids: closed meshes of level sets, cut by volumes and combined by the Boolean
+operations union, intersection and complement. A solid is the set of points where its function is at
+most a level, written {solid <= level}. The operands of a Boolean operation are the solids that it
+combines. An operand is meshed on its own, as a solid of the library manifold3d (class `Manifold`),
+which does the Boolean operations. A wall is the set {|g| <= w} of a field g.
 
-A solid is the set of points where a function is at most a level. A wall |g| <= w is not meshed as
-the level set {|g| = w}, which marching cubes breaks into hundreds of pieces if cells are thicker
-than the wall. It is meshed as {g <= w} minus {g <= -w}, with two smooth surfaces that do not meet,
-in a box a little larger than the clip; the result is then cut by the clip. Likewise unions,
+A wall is not meshed as the level set {|g| = w}, which marching cubes breaks into hundreds of pieces
+if cells are thicker than the wall. It is meshed as {g <= w} minus {g <= -w}, with two smooth
+surfaces that do not meet, in a box a little larger than the volume that cuts it. Likewise unions,
 intersections and complements are made of the meshes of their operands, so that the creases where
 operands meet are edges of the mesh. Creases of a single function, such as a cylinder's, are
 chamfered within the tolerance.
@@ -12,7 +14,7 @@ chamfered within the tolerance.
 Offsets of meshes are meshed differently, without moving vertices and refining triangles: they have
 creases everywhere, beside which moved and refined triangles would intersect each other. Their cells
 are small, and manifold3d merges coplanar triangles afterwards. If a few triangles of the whole mesh
-are still too far from the level, these are cut (`outlier_projection`).
+are still too far from the level set, these are cut (`outlier_projection`).
 """
 
 from __future__ import annotations
@@ -95,17 +97,18 @@ __all__ = [
     "solid_value_range",
 ]
 
-# For offsets of meshes: the size of cells, in tolerances; and the number of secant steps that find
-# the level on an edge of a cell.
+# For offsets of meshes: the size of cells, in tolerances; and the number of steps of the secant
+# method that find the level on an edge of a cell.
 _OFFSET_CELLS, _SECANT_STEPS = 6.0, 2
 # In lattices of at least this many cells, the cells in which the other operands of an intersection
 # leave nothing are left out from the start.
 _MANY_CELLS = 100_000
-# How far surfaces of offsets may be moved, in tolerances: by merging coplanar triangles, tried in
-# this order until the result can be mended; and by the mending of crossing triangles afterwards.
+# How far surfaces of offsets may be moved, in tolerances. First by merging coplanar triangles:
+# these lengths are tried in turn until crossing triangles can be moved apart. Then by moving them
+# apart.
 _MERGED_WITHIN, _MENDED_WITHIN = (0.5, 0.25, 0.1), 0.5
-# Triangles of offsets are cut in three if their centers are farther from the level than the first,
-# in tolerances; the second is the number of rounds.
+# Triangles of offsets are cut in three if their centers are farther from the level set than the
+# first, in tolerances; the second is how many times that is repeated.
 _FAR_OFF, _SPLITS = 1.8, 2
 
 # Meshes a level set of a solid angle, which ends at the boundary curve: takes the field and the
@@ -114,26 +117,30 @@ AngleMesher = Callable[[SolidAngle, float], TriangleMesh]
 
 
 IntersectedOperands: TypeAlias = tuple[tuple[Solid, float], ...]
-"""Solids, with levels, with which the meshed solid will be intersected. In a region in which one of
-these solids is proved to have no points, nothing need be meshed.
+"""Pairs (solid, level): sets {solid <= level} with which the meshed solid will be intersected. In a
+region in which one of these sets is proved to have no points, nothing need be meshed.
 
-Proof for a tree of unions, intersections and complements. Outside of complements, these are the
-operands of all intersections around the meshed solid. Inside a complement, they are only the
-operands without complements of the intersection that the complement is an operand of. "Omitted"
-means: not meshed, and so left empty. (1) Let nothing inside complements be omitted. Unions and
-intersections are monotone, so the mesh of every node is a subset of its true solid. At a point
-where something is omitted, an operand of an intersection around it truly has no points. So its mesh
-has none, and neither has the mesh of the intersection, which is correct. (2) Now let parts inside
-complements be omitted too. At such a point, an operand without complements of the intersection that
-contains the complement truly has no points. By (1) its mesh has none, so the mesh of the
+Which sets they are, in a tree of unions, intersections and complements: outside of complements, the
+operands of all intersections around the meshed solid. Inside a complement that is an operand of an
+intersection, only those operands of this intersection that contain no complements.
+
+Proof that the mesh of the whole tree is correct. "Omitted" means: not meshed, and so left empty.
+(1) Let nothing inside complements be omitted. Unions and intersections of smaller sets are smaller,
+so the mesh of every node of the tree is a subset of its true solid. At a point where something is
+omitted, an operand of an intersection around it truly has no points. So its mesh has none, and
+neither has the mesh of the intersection, which is correct. (2) Now let parts inside complements be
+omitted too. Where something is omitted, the intersection around the complement has an operand that
+contains no complements and truly has no points there. By (1) its mesh has none, so the mesh of the
 intersection is correct there as well.
 """
 
 
 @dataclass
 class CsgMesher:
-    """Meshes solids and their Boolean combinations (CSG) in the box from `lower` to `upper`, (3,)
-    each.
+    """Meshes solids and their Boolean combinations in the box from `lower` to `upper`, (3,) each.
+    It goes down the tree of operands, meshes the level set of each leaf in a lattice of cells, and
+    combines the results. The attributes from `evaluations` to `smallest_cell` count what was done
+    so far.
 
     tolerance: a length, the largest distance of midpoints of edges and centers of faces from the
         surface.
@@ -143,14 +150,15 @@ class CsgMesher:
     mesh_angle: meshes a level set of a `SolidAngle`; the mesh ends at the field's boundary curve.
     most_faces: the largest number of triangles of each level set.
     report: receives messages about the progress.
-    evaluations: the number of evaluations of fields so far, in points.
-    levels: the number of level sets meshed so far.
+    evaluations: the number of points at which fields were evaluated.
+    levels: the number of level sets.
     smallest_cell: the smallest size of cells used for them.
-    uploads: the prepared fields that were meshed so far.
-    intersected_with: solids, with levels, that everything meshed next will be intersected with, so
-        that it need not be meshed where they are empty (`IntersectedOperands`).
-    irrelevant_region_cache: the value of `intersected_with` for which a region was computed last,
-        and this region, in which these solids leave nothing.
+    uploads: the fields' data on the device, kept for further level sets of the same fields.
+    intersected_with: solids, with levels, with which everything that is meshed next will be
+        intersected. Where one of them has no points, nothing need be meshed
+        (`IntersectedOperands`).
+    irrelevant_region_cache: the value of `intersected_with` for which a region was computed last;
+        and this region, in which one of these solids has no points.
     """
 
     lower: FloatArray
@@ -170,7 +178,8 @@ class CsgMesher:
 
     def mesh_sublevel(self, solid: Solid, level: float) -> Manifold:
         """Mesh the set {solid <= level} in the box: the points where the solid's function is at
-        most `level`. Returns a manifold3d solid, which has no meaning outside of the box.
+        most `level`. Each kind of solid has its own method; a solid without one is meshed as a
+        level set. Returns a manifold3d solid, which has no meaning outside of the box.
 
         Raises:
             MeshingError: the solid or one of its operands cannot be meshed.
@@ -185,6 +194,7 @@ class CsgMesher:
             return Manifold() if reduced is None else self._mesh_boolean(reduced, level)
         if isinstance(solid, Complement):  # -f <= c where f >= -c
             return self._whole_box() - self.mesh_sublevel(solid.field, -level)
+        # f - distance <= c where f <= c + distance.
         if isinstance(solid, OffsetSolid):
             return self.mesh_sublevel(solid.field, level + solid.distance)
         if isinstance(solid, BandSolid):
@@ -193,6 +203,7 @@ class CsgMesher:
             return self.mesh_sublevel(solid.field, level)
         if isinstance(solid, TransformedSolid) and not is_single_level_set(solid.field):
             return self._mesh_transformed(solid, level)
+        # A box shrunk by -level keeps its sharp edges; a box that grows gets round ones.
         if isinstance(solid, Cuboid) and solid.radius == 0 and level <= 0:
             half = 0.5 * np.array(solid.sides) + level
             return box_manifold(-half, half) if (half > 0).all() else Manifold()
@@ -216,8 +227,9 @@ class CsgMesher:
 
     def _mesh_boolean(self, solid: BooleanSolid, level: float) -> Manifold:
         """Mesh the set {solid <= level} for a union or an intersection: its operands are meshed and
-        combined by manifold3d. A complement in an intersection is not meshed; its solid is meshed
-        and cut away."""
+        combined by manifold3d. An operand of an intersection that is a complement is not meshed:
+        the solid that it is the complement of is meshed and cut away. If all operands are
+        complements, they are cut from the whole box."""
         from manifold3d import Manifold, OpType
 
         indices = range(len(solid.parts))
@@ -232,14 +244,19 @@ class CsgMesher:
         return Manifold.batch_boolean([common, *cut_away], OpType.Subtract)
 
     def _mesh_operand(self, solid: BooleanSolid, number: int, level: float) -> Manifold:
-        """Mesh the set {operand <= level} for the operand with index `number` of a union or an
-        intersection; for a complement in an intersection, mesh the solid that is cut away. In an
-        intersection, the operand is meshed only where the other operands may leave something of it
-        (`IntersectedOperands`)."""
+        """Mesh the set {operand <= level} for one operand of a union or an intersection. If it is a
+        complement in an intersection, mesh the solid that it is the complement of. While an operand
+        of an intersection is meshed, `intersected_with` holds the other operands, so that it is
+        meshed only where these leave something (`IntersectedOperands`).
+
+        solid: the union or intersection.
+        number: the index of the operand.
+        """
         previous, part = self.intersected_with, solid.parts[number]
         if not solid.is_union:
             others = [operand for operand in solid.parts if operand is not part]
             if isinstance(part, Complement):
+                # Inside of a complement only these operands count: the second part of the proof.
                 self.intersected_with = tuple(
                     (operand, level) for operand in others if _is_complement_free(operand)
                 )
@@ -252,12 +269,15 @@ class CsgMesher:
             self.intersected_with = previous
 
     def _mesh_level_set(self, function: LevelFunction, lattice: BccLattice) -> TriangleMesh:
-        """The level set of `function` in the cells of `lattice`, as a closed mesh.
+        """Mesh the level set of `function` in the cells of `lattice`; returns a closed mesh.
 
-        If there are many cells, the cells in which the other operands are proved to leave nothing
-        are left out. If there are few cells, all are meshed, so that copies of a surface are the
-        same bit by bit. If that fails, cells are left out as well: in these cells a function may
-        jump, as the angle about an axis does, or have no finite value.
+        If there are many cells, cells in which the solids `intersected_with` are proved to leave
+        nothing are left out. If there are few cells, all are meshed, so that copies of a surface
+        are the same bit by bit. If that fails, cells are left out as well: in these cells a
+        function may jump, as the angle about an axis does, or have no finite value.
+
+        Raises:
+            MeshingError: the level set cannot be meshed.
         """
         region: IrrelevantRegion | None = None
         if math.prod(lattice.counts.tolist()) < _MANY_CELLS:
@@ -277,9 +297,9 @@ class CsgMesher:
         )
 
     def _empty_region(self) -> IrrelevantRegion | None:
-        """The region in which the solids `intersected_with` are proved to be empty, so that nothing
-        need be meshed there; None if there are no such solids. It is computed once for the same
-        `intersected_with`, as for the two sides of a wall."""
+        """The region in which one of the solids `intersected_with` is proved to have no points, so
+        that nothing need be meshed there; None if there are no such solids. It is computed once as
+        long as `intersected_with` is the same object, as for the two sides of a wall."""
         if not self.intersected_with:
             return None
         if (
@@ -290,8 +310,8 @@ class CsgMesher:
         functions = [self.function(solid, level) for solid, level in self.intersected_with]
 
         def clearance(points: FloatArray) -> FloatArray:
-            """(n,) for each point (n, 3) the radius of a ball about it in which one of the solids
-            is proved to have no points; 0 if there is no such ball."""
+            """(n,) for each of the points (n, 3) the radius of a ball about it in which one of the
+            solids is proved to have no points; 0 if no such ball is known."""
             radii = np.zeros(len(points))
             for solid in functions:
                 outside = np.flatnonzero(solid.values(points) > 0)
@@ -303,9 +323,11 @@ class CsgMesher:
         return region
 
     def mesh_smooth_level(self, field: Field, level: float) -> tuple[TriangleMesh, bool]:
-        """Mesh the boundary of the set {field <= level} in the box as one level set. Returns the
-        closed mesh; and whether the set is known to lie in the box. If not, the mesh is closed at
-        or outside of the faces of the box by triangles that have no meaning.
+        """Mesh the boundary of the set {field <= level} in the box as one level set. The cells fill
+        only the part of the box that may hold the set.
+
+        Returns the closed mesh; and whether the set is known to lie in the box. If not, the mesh is
+        closed at or outside of the faces of the box by triangles that have no meaning.
         """
         hull = _finite_extent(field, level)
         lower, upper = self.lower, self.upper
@@ -330,20 +352,21 @@ class CsgMesher:
         return surface, is_whole
 
     def function(self, field: Field, level: float) -> LevelFunction:
-        """The function field - level, continued beyond the field's domain by its values at the
-        closest points of the domain."""
+        """The function field - level. Outside of the field's domain it has the value of the closest
+        point of the domain."""
         return _DomainExtendedFunction(
             field, level, most_faces=self.most_faces, uploads=self.uploads
         )
 
     def _whole_box(self) -> Manifold:
-        """A box that is a little larger than the meshed one, which stands for all of space."""
+        """A box that is a little larger than the meshed one. It stands for all of space."""
         pad = 1e-3 * (self.upper - self.lower)
         return box_manifold(self.lower - pad, self.upper + pad)
 
     def _mesh_wall(self, wall: BandSolid, level: float) -> Manifold:
         """Mesh a wall: the points where its field g satisfies |g - wall.level| <= wall.half_width +
-        level.
+        level. For a field without a period it is the difference of two sublevel sets; for a solid
+        angle it lies between two level sets with a common boundary curve.
 
         Raises:
             MeshingError: the wall is thinner than the tolerance, or its field has a period and is
@@ -361,6 +384,7 @@ class CsgMesher:
             if not isinstance(field, Solid):
                 self._check_wall_thickness(field, low, high)
             return self.mesh_sublevel(inside, high) - self.mesh_sublevel(inside, low)
+        # The wall contains all values of the field.
         if 2 * half >= field.period:
             return self._whole_box()
         if not isinstance(field, SolidAngle):
@@ -373,16 +397,15 @@ class CsgMesher:
     def _check_wall_thickness(self, field: Field, low: float, high: float) -> None:
         """Raise MeshingError if the wall {low <= field <= high} is thinner than twice the
         tolerance, since the meshes of its two sides would meet. The thickness is estimated as (high
-        - low) over the median length of the gradient, at those points of a coarse lattice that are
-        nearest to the wall.
-        """
+        - low) / s. Here s is the median length of the gradient at the centers of those cells of a
+        coarse lattice that are nearest to the wall: half of all cells."""
         lattice = BccLattice.covering_box(
             self.lower, self.upper, float((self.upper - self.lower).max()) / 8
         )
         points = lattice.points(2 * np.argwhere(np.ones(lattice.counts)) + 1)
         middle = 0.5 * (low + high)
         samples = self.function(field, middle).sample(points)
-        # Cells where the wall may be near.
+        # The half of the cells that is nearest to the middle of the wall.
         near = samples.distance <= np.median(samples.distance)
         steep = float(np.median(np.linalg.norm(samples.gradient[near], axis=1)))
         self.evaluations += len(points)
@@ -394,8 +417,9 @@ class CsgMesher:
             )
 
     def _between_angle_levels(self, field: SolidAngle, low: float, high: float) -> TriangleMesh:
-        """The closed surface around the points between two levels of a solid angle: the surfaces of
-        both levels, which end at the same vertices, those of the boundary curve.
+        """The closed surface around the points where the solid angle lies between `low` and `high`.
+        It consists of the surfaces of both levels, which end at the same vertices: those of the
+        boundary curve.
 
         Raises:
             MeshingError: the two surfaces do not end at the same vertices.
@@ -404,6 +428,8 @@ class CsgMesher:
         count = sum(map(len, field.loops))
         if not np.array_equal(inner.vertices[:count], outer.vertices[:count]):
             raise MeshingError("the two sides of the solid do not end at the same curve")
+        # The first `count` vertices, those of the curve, are common; other inner vertices come
+        # last. The inner surface is turned over, so that all faces look out of the wall.
         index = np.arange(len(inner.vertices)) - count + len(outer.vertices)
         index[:count] = np.arange(count)
         vertices = np.concatenate([outer.vertices, inner.vertices[count:]])
@@ -416,10 +442,11 @@ class CsgMesher:
 
         Offsets of meshes have creases wherever the mesh has, too many for cells to be refined
         beside them. So cells are small from the beginning; and since f is a distance, it is linear
-        along their edges except at creases. Then triangles that are nearly in a plane are merged,
-        triangles across a crease are cut, and triangles that pass through each other are mended.
+        along the edges of cells except at creases. Then triangles that are nearly in a plane are
+        merged, triangles across a crease are cut, and triangles that pass through each other are
+        moved apart. If the last fails for all lengths of merging, the unmerged mesh is returned.
         Parts thinner than a cell, such as the tip of a knife edge, may be left out: their points
-        are less than a cell from the level.
+        are less than a cell from the level set.
         """
         lower, upper = (np.array(end) for end in _sublevel_bounds(solid, level))
         if not (lower < upper).all():
@@ -444,11 +471,13 @@ class CsgMesher:
         return to_manifold(surface)
 
     def _mesh_transformed(self, solid: TransformedSolid, level: float) -> Manifold:
-        """Mesh the set {solid <= level} for a solid under an affine map: the original solid is
-        meshed in the box to which the inverse map takes this box, and its mesh is then mapped."""
+        """Mesh the set {solid <= level} for a solid under an affine map. The original solid is
+        meshed in the box around the preimage of this box, with a smaller tolerance if the map
+        stretches; its mesh is then mapped."""
         matrix, offset = np.array(solid.map.matrix), np.array(solid.map.translation_vector)
         ends = np.stack([self.lower, self.upper])
         corners = np.stack(np.meshgrid(*ends.T, indexing="ij"), axis=-1).reshape(-1, 3)
+        # The box around the preimage of this box. The map stretches lengths by at most `scale`.
         local_corners = (corners - offset) @ solid.map.inverse.T
         scale = float(np.linalg.norm(matrix, 2))
         local = dataclasses.replace(
@@ -462,6 +491,7 @@ class CsgMesher:
             smallest_cell=math.inf,
             intersected_with=(),
         )
+        # The transformed function is value_factor times the original one.
         manifold = local.mesh_sublevel(solid.field, level / solid.map.value_factor)
         self.evaluations += local.evaluations
         self.levels += local.levels
@@ -470,8 +500,8 @@ class CsgMesher:
 
 
 def _is_complement_free(solid: Solid) -> bool:
-    """Whether neither a solid nor any of its operands is a complement or a wall. (A wall is meshed
-    with a complement.)"""
+    """Whether neither a solid nor any of its operands is a complement or a wall. (A wall counts
+    since it is meshed as a difference.)"""
     if isinstance(solid, BooleanSolid):
         return all(_is_complement_free(operand) for operand in solid.parts)
     if isinstance(solid, TransformedSolid | OffsetSolid):
@@ -481,7 +511,7 @@ def _is_complement_free(solid: Solid) -> bool:
 
 def is_single_level_set(solid: Solid) -> bool:
     """Whether a solid is meshed as one level set. Other solids are meshed by Boolean operations, or
-    by a method of their own that makes their edges exact."""
+    by a method of their own that makes their sharp edges exact."""
     if isinstance(solid, SublevelSolid):
         return not isinstance(solid.field, Solid) or is_single_level_set(solid.field)
     if isinstance(solid, TransformedSolid):
@@ -498,8 +528,7 @@ def _sublevel_bounds(solid: MeshSolid, level: float) -> tuple[FloatArray, FloatA
 
 def _finite_extent(field: Field, level: float) -> Volume | None:
     """A volume with finite bounds that contains {field <= level}; None if no such volume is known.
-    The field's own domain does not count as such a volume, since the set may go on beyond the
-    domain."""
+    The field's own domain does not count, since the set may go on beyond the domain."""
     if isinstance(field, Solid):
         extent = field.sublevel_extent(level)
     else:
@@ -522,21 +551,27 @@ class _DomainExtendedFunction(LevelFunction):
     """The function field - level, continued beyond the field's domain: outside of the domain it has
     the value of the closest point of the domain.
 
-    Proof that a lower bound of the distance from the level set at p's closest point is such a bound
-    at p: the closest points of two points are no farther from each other than the two points are.
+    Its clearance at a point p, a proved lower bound of p's distance from the level set, is the
+    clearance of p's closest point in the domain. Proof: the closest points of two points are no
+    farther from each other than the two points are. So if p is near a point of the level set, p's
+    closest point is at least as near to that point's closest point, which has the same value.
     """
 
     def sample(self, points: FloatArray) -> LevelSamples:
+        """Samples (value and gradient) at the closest points of the domain."""
         return super().sample(self._closest(points))
 
     def values(self, points: FloatArray) -> FloatArray:
+        """The values (n,) at the closest points of the domain."""
         return super().values(self._closest(points))
 
     def clearance(self, points: FloatArray) -> FloatArray:
+        """(n,) proved lower bounds of the distances of points (n, 3) from the level set."""
         return super().clearance(self._closest(points))
 
     def _closest(self, points: FloatArray) -> FloatArray:
-        """For each of the points (n, 3), the closest point of the field's domain.
+        """For each of the points (n, 3), the closest point of the field's domain; the points
+        themselves if the field has values everywhere.
 
         Raises:
             MeshingError: points lie outside of a domain that is neither a box nor a ball.
@@ -567,9 +602,9 @@ _CELLS_ACROSS = 24
 # How many sizes of cells are tried, and the ratio of each size to the one before.
 _MAX_ATTEMPTS = 3
 _CELL_SIZE_RATIO = 0.6
-# Where operands were cut by each other, slivers may pass through their neighbors by rounding. They
-# are removed by moving the surface by up to the first length, in tolerances; if that fails by the
-# next.
+# Where operands were cut by each other, slivers (thin triangles) may pass through their neighbors
+# by rounding. They are removed by moving the surface by up to the first length, in tolerances; if
+# that fails, by up to the next.
 _SLIVERS_WITHIN = (1e-3, 1e-4, 0.0)
 # The margin around an extent, relative to its size.
 _MARGIN = 0.01
@@ -579,8 +614,9 @@ _MARGIN = 0.01
 class SolidMeshResult:
     """The closed mesh of a solid, and facts about how it was computed.
 
-    spacing: the smallest size of cells.
-    evaluations: the number of evaluations of fields, in points.
+    surface: the mesh.
+    spacing: the smallest size of cells, a length.
+    evaluations: the number of points at which fields were evaluated.
     levels: the number of level sets that the mesh was made of.
     size: the longest edge of the box around the solid; relative tolerances are fractions of it.
     """
@@ -593,11 +629,12 @@ class SolidMeshResult:
 
 
 def solid_and_level(field: Field, solid: Any, level: float | None) -> tuple[Solid, float]:
-    """The solid that the argument `solid` of `mesh` describes, and its level. The set {solid <=
-    level} is to be meshed.
+    """The solid that the arguments `solid` and `level` of `mesh` describe, and its level. The set
+    {solid <= level} is to be meshed.
 
-    solid: True if the field itself is a solid, or values (low, high), between which the field is
-        inside the solid.
+    field: the field to be meshed.
+    solid: True if the field itself is a solid; or values (low, high), one of which may be infinite:
+        the solid is where the field lies between them.
     level: for a field that is a solid; None for its default level.
 
     Raises:
@@ -618,11 +655,13 @@ def solid_and_level(field: Field, solid: Any, level: float | None) -> tuple[Soli
 
 
 def solid_value_range(field: Field, solid: Any, level: float | None) -> tuple[float, float]:
-    """The values (low, high) of the field between which a solid lies; either may be infinite. They
-    come from the argument `solid` of `mesh`.
+    """The values (low, high) between which the field lies in a solid. They are the argument `solid`
+    of `mesh`; one of them may be infinite.
+
+    level: must be None, since the ends of the solid are its levels.
 
     Raises:
-        ValueError: the argument is True, or a level is given too, or the field has no such levels.
+        ValueError: `solid` is True, or a level is given too, or the field has no such levels.
     """
     if solid is True:
         raise ValueError(
@@ -651,14 +690,14 @@ def mesh_solid(
 
     volume: None for all of space.
     tolerance: how far triangles may be from the surface.
-    spacing: the size of cells. None for a default size; then smaller cells are tried if an attempt
-        fails.
+    spacing: the size of cells, a length. None for a default size; then smaller cells are tried if
+        an attempt fails.
     angle_mesher: given a tolerance and a size of cells, both lengths, returns a function that
         meshes level sets of solid angles.
     most_faces: the largest number of triangles of a level set.
-    check: called with a surface, none of whose triangles pass through each other, and the size of
-        the solid's box. It raises an error if the surface fails a check; the check of distances
-        from the level set comes last.
+    check: called with a surface and the longest edge of the box around the solid. No triangles of
+        the surface pass through each other. It raises an error if the surface fails a check; the
+        check of distances from the level set comes last.
     report: receives messages about the progress.
 
     If vertices or centers of triangles are too far from the level set in a few places, they are
@@ -672,6 +711,7 @@ def mesh_solid(
     lower, upper = _bounds(solid, level, volume)
     size = float((upper - lower).max())
     cell_size = size / _CELLS_ACROSS if spacing is None else spacing
+    # The other half is left for later steps.
     max_error = 0.5 * tolerance.at(size)
     attempts = _MAX_ATTEMPTS if spacing is None else 1
     per_wave = CELLS_PER_WAVE if spacing is None else None
@@ -698,6 +738,7 @@ def mesh_solid(
                 raise
             before = failure
             cell_size *= _CELL_SIZE_RATIO
+            # More cells along a wave in proportion, as these may limit the size of cells.
             per_wave = CELLS_PER_WAVE * size / (_CELLS_ACROSS * cell_size)
             if isinstance(failure, LocalizedMeshingError):
                 max_error *= 0.5
@@ -715,11 +756,11 @@ def _check_and_mend(
     size: float,
     check: Callable[[TriangleMesh, float], None],
 ) -> TriangleMesh:
-    """Check a surface, and return it. If it fails only because a few vertices or centers of
-    triangles are too far from the level set, return the surface with these places moved nearer to
+    """Check a surface, and return it. If the check fails only because a few vertices or centers of
+    triangles are too far from the level set, return the surface with these points moved nearer to
     it.
 
-    size: the longest edge of the solid's box, which `check` needs.
+    size: the longest edge of the box around the solid, which `check` needs.
     check: called with the surface and the size; raises an error if the surface fails a check.
 
     Raises:
@@ -740,10 +781,10 @@ def _check_and_mend(
 
 
 def apart_of(whole: Manifold, tolerance: float) -> TriangleMesh:
-    """The surface of a solid made by Boolean operations, with vertices moved where triangles would
-    pass through each other.
+    """The surface of a manifold3d solid made by Boolean operations. Thin triangles are removed, and
+    vertices are moved where triangles would pass through each other.
 
-    tolerance: a length; mending moves the surface by at most half of it.
+    tolerance: a length; vertices are moved by at most half of it.
 
     Raises:
         MeshingError: the solid is empty, or triangles still pass through each other.
@@ -752,15 +793,16 @@ def apart_of(whole: Manifold, tolerance: float) -> TriangleMesh:
 
 
 def _without_crossings(parts: TriangleMesh | _Assembly, tolerance: float) -> TriangleMesh:
-    """The surface of `parts`, with vertices moved where triangles would pass through each other.
-    From an assembly, slivers (thin triangles) are removed first. If triangles still pass through
-    each other in the end, fewer slivers are removed and it is tried again.
+    """A surface whose vertices are moved where triangles would pass through each other. If `parts`
+    is an assembly, its thin triangles (slivers) are removed first; if triangles still pass through
+    each other in the end, it is tried again with fewer slivers removed.
 
-    tolerance: a length; mending moves the surface by at most half of it.
+    parts: a mesh, returned with moved vertices; or an assembly, of which the surface is taken.
+    tolerance: a length; vertices are moved by at most half of it.
 
     Raises:
-        MeshingError: the surface is empty; a SelfIntersectionError if mending does not help, or if
-            hardly any fewer triangles cross when fewer slivers are removed.
+        MeshingError: the surface is empty. It is a SelfIntersectionError if moving vertices does
+            not help, or if hardly any fewer triangles cross when fewer slivers are removed.
     """
     raised: SelfIntersectionError | None = None
     for factor in _SLIVERS_WITHIN if isinstance(parts, _Assembly) else (0.0,):
@@ -778,18 +820,22 @@ def _without_crossings(parts: TriangleMesh | _Assembly, tolerance: float) -> Tri
 
 @dataclass(frozen=True)
 class _Assembly:
-    """A solid made by Boolean operations of meshes.
+    """A solid that Boolean operations made of the meshes of its operands.
 
     whole: the manifold3d solid.
-    volume: the volume that it was cut by; None for all of space."""
+    volume: the volume that cut it; None for all of space.
+    """
 
     whole: Manifold
     volume: Volume | None = None
 
     def without_slivers(self, length: float) -> TriangleMesh:
-        """The surface of the solid without short edges and slivers (thin triangles), and without
-        components that are only rounding error. Removing edges and slivers moves the surface by up
-        to `length`."""
+        """The surface of the solid without short edges, slivers (thin triangles) and components
+        that are only rounding error. Vertices within rounding of a box of the volume are moved onto
+        it.
+
+        length: how far the removal of edges and slivers may move the surface; 0 removes none.
+        """
         simpler = without_short_edges(self.whole, length) if length > 0 else self.whole
         surface = drop_degenerate_components(from_manifold(simpler))
         return surface if self.volume is None else _snap_to_boxes(surface, self.volume)
@@ -808,6 +854,7 @@ def _mesh_in_volume(
     mesher.report("putting the parts together")
     if volume is None:
         volume = Box(_as_tuple(lower), _as_tuple(upper))
+        # If the solid ends inside the box, it need not be cut at the box.
         ends = np.array(manifold.bounding_box(), np.float64)
         if (ends[:3] > lower).all() and (ends[3:] < upper).all():
             return _Assembly(manifold, volume)
@@ -817,7 +864,7 @@ def _mesh_in_volume(
 
 def _bounds(solid: Solid, level: float, volume: Volume | None) -> tuple[FloatArray, FloatArray]:
     """The lower and upper corners (3,) of a box that contains the part of {solid <= level} in the
-    volume, with a margin.
+    volume. The box has a margin where the solid ends, but not where the volume does.
 
     Raises:
         MeshingError: there is no finite box, or it is empty.
@@ -848,8 +895,9 @@ def _as_tuple(x: FloatArray) -> tuple[float, float, float]:
 
 
 def _snap_to_boxes(surface: TriangleMesh, volume: Volume) -> TriangleMesh:
-    """The surface, with vertices that are within rounding of a face of a box moved onto the face.
-    The boxes are `volume` itself or, if it is an intersection of volumes, the boxes among these."""
+    """The surface, with vertices moved onto the faces of boxes if they are outside, or within
+    rounding of a face. The boxes are `volume` itself or, if it is an intersection of volumes, the
+    boxes among these."""
     boxes = volume.volumes if isinstance(volume, VolumeIntersection) else (volume,)
     vertices = surface.vertices
     for box in boxes:

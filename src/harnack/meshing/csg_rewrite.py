@@ -1,4 +1,7 @@
-"""Factors common operands out of unions of solids.
+"""Rewrites unions and intersections of solids so that each surface occurs once, by taking common
+operands out of unions. A pair (solid, level) stands for the set {solid <= level}, the points where
+the solid's function is at most the level. The factors of a set are the sets of which it is the
+intersection; an operand is one of the solids that a union or an intersection combines.
 
 In (P - Q) | (P & W), a hollow part with a lattice inside, the surface of P occurs twice, once with
 rounded vertices where W cuts it, and the two copies would intersect. The equivalent P - (Q - W)
@@ -24,18 +27,21 @@ level."""
 
 
 def factor_common_operands(union: BooleanSolid, level: float) -> Solid | None:
-    """Factor operands that several intersections of a union have in common out of the union: (A &
-    B) | (A & C) becomes A & (B | C). Returns a solid with the function f such that {f <= 0} is
-    {union <= level}; None if no two of the intersections have a common operand."""
+    """Take operands that several intersections of a union have in common out of the union: (A & B)
+    | (A & C) becomes A & (B | C). The operand that occurs most often decides which intersections
+    are rewritten. Returns a solid with the function f such that {f <= 0} is {union <= level}; None
+    if no two of the intersections have a common operand."""
     terms = [{_key(*factor): factor for factor in _factors(part, level)} for part in union.parts]
     common_key, times = Counter(key for term in terms for key in term).most_common(1)[0]
     if times < 2:
         return None
     sharing = [term for term in terms if common_key in term]
     other_terms = [_intersection(term.values()) for term in terms if common_key not in term]
+    # All operands that occur in each of these intersections are taken out together.
     shared = {key for key in sharing[0] if all(key in term for term in sharing)}
     common = [_with_level_zero(*factor) for key, factor in sharing[0].items() if key in shared]
     remainders = [[factor for key, factor in term.items() if key not in shared] for term in sharing]
+    # If one of them has no further operand, (A) | (A & C) is A.
     if all(remainders):
         common.append(_union([_intersection(remainder) for remainder in remainders]))
     intersection = BooleanSolid(tuple(common), is_union=False)
@@ -44,7 +50,7 @@ def factor_common_operands(union: BooleanSolid, level: float) -> Solid | None:
 
 def flatten_csg(solid: BooleanSolid) -> BooleanSolid:
     """Merge nested operations of the same kind: unions in a union, or intersections in an
-    intersection. Then everything that is cut away from an operand is cut away in one operation."""
+    intersection. Then everything that is cut away from a solid is cut away in one operation."""
     parts: list[Solid] = []
     for operand in solid.parts:
         if isinstance(operand, BooleanSolid) and operand.is_union == solid.is_union:
@@ -64,6 +70,7 @@ def drop_cancelled_operands(solid: BooleanSolid, level: float) -> BooleanSolid |
     """
     if solid.is_union:
         return solid
+    # The sets that the intersection cuts away, by their keys.
     cut = {_key(term.field, -level) for term in solid.parts if isinstance(term, Complement)}
     parts: list[Solid] = []
     for term in solid.parts:
@@ -78,8 +85,9 @@ def drop_cancelled_operands(solid: BooleanSolid, level: float) -> BooleanSolid |
 
 
 def _factors(solid: Solid, level: float) -> list[SolidAtLevel]:
-    """The factors of a solid: pairs of a solid and its level such that {solid <= level} is the
-    intersection of the sets {factor <= level of the factor}."""
+    """The factors of the set {solid <= level}: pairs of a solid and its own level, whose sets have
+    {solid <= level} as their intersection. A solid that is no intersection is its own single
+    factor."""
     if isinstance(solid, BooleanSolid) and not solid.is_union:
         return [factor for part in solid.parts for factor in _factors(part, level)]
     if isinstance(solid, OffsetSolid):
@@ -89,6 +97,7 @@ def _factors(solid: Solid, level: float) -> list[SolidAtLevel]:
     if isinstance(solid, TransformedSolid):
         scale = solid.map.value_factor
         return [_image(factor, solid, at) for factor, at in _factors(solid.field, level / scale)]
+    # The wall low <= g <= high of a solid's function g: g <= high, and -g <= -low.
     if isinstance(solid, BandSolid) and isinstance(solid.field, Solid):
         half = solid.half_width + level
         if half > 0:
@@ -98,8 +107,8 @@ def _factors(solid: Solid, level: float) -> list[SolidAtLevel]:
 
 
 def _image(solid: Solid, placed: TransformedSolid, level: float) -> SolidAtLevel:
-    """The image of the set {solid <= level} under the affine map of the solid `placed`, as a solid
-    and its level."""
+    """The image of the set {solid <= level} under the affine map of the solid `placed`; returned as
+    a solid and its level. The image of a complement is the complement of the image."""
     if isinstance(solid, Complement):
         return Complement(
             TransformedSolid(solid.field, placed.map)
@@ -108,8 +117,9 @@ def _image(solid: Solid, placed: TransformedSolid, level: float) -> SolidAtLevel
 
 
 def _key(solid: Solid, level: float) -> Hashable:
-    """A key for the set {solid <= level}. Two sets with equal keys are made of the same field
-    object and consist of the same points."""
+    """A key by which sets {solid <= level} are compared. Two sets with equal keys are made of the
+    same field object and consist of the same points; sets with different keys may still be
+    equal."""
     if isinstance(solid, Complement):
         return "complement", _key(solid.field, -level)
     if isinstance(solid, OffsetSolid):
@@ -121,7 +131,7 @@ def _key(solid: Solid, level: float) -> Hashable:
 
 
 def _with_level_zero(solid: Solid, level: float) -> Solid:
-    """A solid with the function f such that {f <= 0} is {solid <= level}."""
+    """A solid whose function f makes {f <= 0} the same set as {solid <= level}."""
     if level == 0:
         return solid
     if isinstance(solid, Complement):
@@ -130,15 +140,15 @@ def _with_level_zero(solid: Solid, level: float) -> Solid:
 
 
 def _intersection(factors: Iterable[SolidAtLevel]) -> Solid:
-    """The intersection of the sets {solid <= level} of all factors, as a solid with level 0. If
-    there is a single factor, it is that solid itself."""
+    """A solid for the intersection of the sets of all factors (pairs of a solid and its level); its
+    level is 0. A single factor is not wrapped."""
     parts = tuple(_with_level_zero(*factor) for factor in factors)
     return parts[0] if len(parts) == 1 else BooleanSolid(parts, is_union=False)
 
 
 def _union(parts: Sequence[Solid]) -> Solid:
     """The union of solids. If one of them is a complement, it is written as the complement of an
-    intersection, so that no solid has to be cut away from all of space."""
+    intersection, A | ~B = ~(~A & B), so that no solid has to be cut away from all of space."""
     if any(isinstance(operand, Complement) for operand in parts):
         return Complement(BooleanSolid(tuple(~operand for operand in parts), is_union=False))
     return BooleanSolid(tuple(parts), is_union=True)

@@ -1,9 +1,12 @@
-"""Meshes of level sets of a solid angle, which end at the field's boundary curve, made from a
-Delaunay tetrahedralization.
+"""Meshes of a level set {f = 0} of a solid angle. Such a level set ends at a closed curve, the
+field's boundary curve, whose straight edges join its vertices. The space around is divided into
+tetrahedra (a Delaunay tetrahedralization of points in the cells of an octree), so that the curve's
+edges are edges of tetrahedra, and the level set is meshed in these.
 
 If a check fails in known places, the cells of the octree are made smaller in these places only and
 the mesh is computed again. If that does not help, or the places are not known, cells are made
-smaller everywhere.
+smaller everywhere. The places are given as sets of balls: a cell is halved once for each set with a
+ball that meets it.
 """
 
 from __future__ import annotations
@@ -61,16 +64,16 @@ def restore_curve_edges(
     cut: int,
     height: float,
 ) -> tuple[FloatArray, IntArray]:
-    """Restore the edges of the boundary curve that were subdivided for the tetrahedra, so that the
-    boundary of the mesh has the vertices of the given curve only. Returns the vertices (n, 3) and
-    the faces (k, 3).
+    """Make a mesh end at the vertices of the given curve only. Long edges of the curve were
+    subdivided, so that cells near them may be smaller than they are; the mesh has these extra
+    points on its boundary. They are moved off their edge into the surface, by at most `height`, and
+    the gap beside the edge is filled with triangles. Returns the vertices (n, 3) and the faces (k,
+    3).
 
-    Long edges of a curve are subdivided so that cells near them may be smaller than they are. The
-    extra points are moved off their edge into the surface, by at most `height`, and the gap beside
-    the edge is filled with triangles, so that the mesh ends at the given curve. These triangles are
-    unavoidably thin: the surface twists about the edge, so a triangle that has all of the edge as a
-    side is within the tolerance only if its height is about the tolerance.
+    These triangles are unavoidably thin: the surface twists about the edge, so a triangle that has
+    all of the edge as a side is within the tolerance only if its height is about the tolerance.
 
+    function: f.
     vertices, faces: (n, 3), (m, 3) the mesh.
     curve_count, cut: vertices 0 to curve_count - 1 are those of the curve; vertices curve_count to
         cut - 1 are the extra points on its edges.
@@ -79,6 +82,7 @@ def restore_curve_edges(
     if cut == curve_count:
         return vertices, faces
     successor = dict(boundary_edges(faces).tolist())
+    # A chain runs along the boundary of the mesh from one vertex of the curve to the next.
     chains: list[list[int]] = []
     for start in range(curve_count):
         chain = [start]
@@ -111,22 +115,26 @@ def _push_inward(
     """Move the extra points on edges of the curve off their edges and onto the surface; returns all
     vertices (n, 3).
 
-    inner: (k,) indices of the extra points.
-    edge: (k,) index of the edge that each of them is on.
-    ends: (m, 2) the two vertices at the ends of each edge.
-    height: the largest distance from the edge, a length.
-
     The distances of an edge's points from the edge form a parabola over it, so that the triangles
     that fill the gap lie between the edge and the chain of points. A point is first moved into the
     surface, along the mean direction to its neighbors at right angles to the edge. It is then
     turned about the edge towards the level set: it keeps its position along the edge and its
-    distance from it.
+    distance from it. If that would turn it by more than about 70 degrees, it stays.
+
+    function: f.
+    vertices, faces: (n, 3), (m, 3) the mesh.
+    inner: (k,) indices of the extra points.
+    edge: (k,) for each extra point, the index of its edge.
+    ends: (m, 2) the two vertices at the ends of each edge.
+    height: the largest distance from the edge, a length.
     """
     points = vertices[inner]
-    a, along = vertices[ends[:, 0]], vertices[ends[:, 1]] - vertices[ends[:, 0]]
-    length = np.linalg.norm(along, axis=1)
-    along, a = (along / length[:, None])[edge], a[edge]
-    fraction = ((points - a) * along).sum(axis=1) / length[edge]
+    a, edge_direction = vertices[ends[:, 0]], vertices[ends[:, 1]] - vertices[ends[:, 0]]
+    length = np.linalg.norm(edge_direction, axis=1)
+    edge_direction, a = (edge_direction / length[:, None])[edge], a[edge]
+    # The position of each point along its edge, from 0 to 1.
+    fraction = ((points - a) * edge_direction).sum(axis=1) / length[edge]
+    # For each vertex the sum of the vectors to its neighbors, and the length of its shortest edge.
     inwards, shortest = np.zeros_like(vertices), np.full(len(vertices), np.inf)
     for k in range(3):
         corner, second, third = (faces[:, (k + j) % 3] for j in range(3))
@@ -134,28 +142,35 @@ def _push_inward(
         for end in (second, third):
             span = np.linalg.norm(vertices[end] - vertices[corner], axis=1)
             np.minimum.at(shortest, corner, span)
-    max_lift = np.full(len(ends), height)
-    np.minimum.at(max_lift, edge, _MAX_MOVE * shortest[inner])
-    lift = 4 * fraction * (1 - fraction) * max_lift[edge]
-    direction = _unit_perpendicular(inwards[inner], along)
-    start = points + lift[:, None] * direction
-    projected = newton_to_level(function, start, function.sample(start), 0.3 * lift, None)
+    # The same parabola for all points of an edge: at most `height`, and a tenth of the shortest
+    # edge of the mesh at one of them.
+    max_distance = np.full(len(ends), height)
+    np.minimum.at(max_distance, edge, _MAX_MOVE * shortest[inner])
+    distance = 4 * fraction * (1 - fraction) * max_distance[edge]
+    direction = _unit_perpendicular(inwards[inner], edge_direction)
+    start = points + distance[:, None] * direction
+    projected = newton_to_level(function, start, function.sample(start), 0.3 * distance, None)
     # Points keep their position along the edge and their distance from it: they turn about it.
-    toward = _unit_perpendicular(projected - points, along)
+    toward = _unit_perpendicular(projected - points, edge_direction)
+    # The cosine of the angle by which the point would turn.
     is_close = (toward * direction).sum(axis=1) > 0.3
-    return points + lift[:, None] * np.where(is_close[:, None], toward, direction)
+    return points + distance[:, None] * np.where(is_close[:, None], toward, direction)
 
 
 def _unit_perpendicular(vectors: FloatArray, along: FloatArray) -> FloatArray:
-    """(k, 3) unit vectors: each of `vectors` (k, 3) without its component along the unit vector in
-    the same row of `along` (k, 3), scaled to length 1."""
+    """(k, 3) unit vectors in the directions of `vectors` (k, 3) after their components along the
+    unit vectors `along` (k, 3) are taken away; 0 if nothing is left."""
     part = vectors - (vectors * along).sum(axis=1)[:, None] * along
     return part / np.maximum(np.linalg.norm(part, axis=1), 1e-300)[:, None]
 
 
 def _triangulate_gap(chain: list[int]) -> list[tuple[int, int, int]]:
     """Triangles, as triples of indices, that fill the gap between a chain of points and the
-    straight edge between the ends of the chain. chain: the indices of the points."""
+    straight edge between the ends of the chain. The triangle at the edge has the middle point of
+    the chain as its third corner, and so on for both halves of the chain.
+
+    chain: the indices of the points, in order.
+    """
     if len(chain) < 3:
         return []
     middle = len(chain) // 2
@@ -173,7 +188,7 @@ _MAX_ATTEMPTS = 4
 # How often cells are made smaller in places where the first triangles fail, before they are made
 # smaller everywhere.
 _MOST_LOCAL = 4
-# Edges of the curve are divided into pieces no longer than this many cells.
+# Edges of the curve are divided into pieces no longer than this, in sizes of cells.
 _MAX_EDGE_CELLS = 2.5
 # How often edges of the curve that are missing among those of the tetrahedra are halved.
 _MAX_HALVINGS = 4
@@ -183,13 +198,13 @@ _CELL_SIZE_RATIO = 0.6
 
 @dataclass(frozen=True)
 class SpanningMesh:
-    """A mesh that ends at a boundary curve, and facts about how it was computed.
+    """A mesh of a level set that ends at a boundary curve, and facts about how it was computed.
 
     vertices: (n, 3).
     faces: (m, 3).
     curve: the boundary curve, with its edges as subdivided.
     spacing: the size of cells.
-    finer: sets of balls; cells were halved once for each set with a ball that they meet.
+    finer: sets of balls; a cell was halved once for each set with a ball that meets it.
     crossings: how often, and in which direction, the level set crosses each edge of the tetrahedra.
     isotopy: on how many tetrahedra the topology is proved.
     turned: how many faces look to the side on which the function is smaller.
@@ -207,12 +222,12 @@ class SpanningMesh:
 
 @dataclass(frozen=True)
 class _SpanningInput:
-    """What all attempts to mesh a level set have in common: the function and the box in which its
-    level set is meshed.
+    """What all attempts to mesh a level set have in common: the function f, and the box in which
+    its level set is meshed.
 
     lower, upper: (3,) the corners of the box.
     walls: the same corners, if the surface may end at the faces of the box; else None.
-    seed: of the random moves of points.
+    seed: the seed of the random moves of points.
     report: receives messages about the progress.
     """
 
@@ -239,11 +254,12 @@ def mesh_spanning_curve(
     there and the mesh is computed again. Triangles that are still turned over in the last attempt
     are counted in the result.
 
+    function: f, the solid angle minus its level.
     spacing: the first size of cells, a length.
     attempts: the number of sizes of cells that are tried, each smaller than the one before.
     box: the lower and upper corners (3,) of the box that cells fill.
     has_walls: whether the surface may end at the faces of the box.
-    seed: of the random moves of points.
+    seed: the seed of the random moves of points.
     tolerance: a length.
     report: receives messages about the progress.
 
@@ -253,6 +269,7 @@ def mesh_spanning_curve(
     task = _SpanningInput(function, *box, box if has_walls else None, seed, report)
     walls = task.walls
     finer: tuple[RefinementBalls, ...] = ()
+    # The mesh with the fewest faces turned over, of those whose triangles do not cross.
     best: SpanningMesh | None = None
     crossing = np.zeros(0, np.int64)
     for attempt in range(_MAX_ATTEMPTS):
@@ -287,8 +304,8 @@ def mesh_spanning_curve(
 
 
 def _curve_loops(function: LevelFunction) -> tuple[FloatArray, ...]:
-    """The closed loops, each an array (k, 3) of vertices, of the boundary curve of the function's
-    solid angle. Edges that are run in both directions are left out."""
+    """The closed loops of the boundary curve of the function's solid angle, each an array (k, 3) of
+    vertices. Edges that are run in both directions are left out."""
     assert isinstance(function.field, SolidAngle)
     return cancel_opposite_edges(function.field.loops)
 
@@ -298,10 +315,10 @@ def _mesh_with_retries(
 ) -> SpanningMesh:
     """Mesh the level set in cells of the size `spacing`, which are made smaller in places where a
     check fails. If that does not help, or the places are not known, mesh it in smaller cells
-    everywhere.
+    everywhere. The mesh is not refined yet.
 
     attempts: how many sizes of cells may be tried.
-    finer: sets of balls in which cells are halved from the beginning.
+    finer: sets of balls; a cell is halved once for each set with a ball that meets it.
 
     Raises:
         MeshingError: no attempt succeeds.
@@ -316,6 +333,7 @@ def _mesh_with_retries(
                 task.report(f"{len(error.locations)} places fail: smaller cells there")
                 balls = (*balls, RefinementBalls(error.locations, spacing * 0.5**trial))
         return _mesh_in_cells(task, spacing, balls)
+    # No places are known, or the last local attempt failed.
     except MeshingError:
         if attempts == 1:
             raise
@@ -325,16 +343,19 @@ def _mesh_with_retries(
 def _mesh_in_cells(
     task: _SpanningInput, spacing: float, finer: tuple[RefinementBalls, ...]
 ) -> SpanningMesh:
-    """The mesh before refinement, in cells of the size `spacing`, and on how many tetrahedra its
-    topology is proved. Cells are halved once for each entry of `finer` that has a ball which meets
-    them.
+    """Mesh the level set in cells of the size `spacing`, without refinement; and find out on how
+    many tetrahedra the topology is proved.
+
+    finer: sets of balls; a cell is halved once for each set with a ball that meets it.
 
     Raises:
         MeshingError: a check fails, or edges of the curve are edges of no tetrahedron.
     """
     function, walls = task.function, task.walls
     curve = BoundaryCurve.of(_curve_loops(function), _MAX_EDGE_CELLS * spacing)
-    for k, balls in enumerate(finer):  # balls on long edges leave no room for points
+    # Points keep a distance from the curve that grows with its edges, so edges are halved where
+    # smaller cells are wanted.
+    for k, balls in enumerate(finer):
         curve = curve.split_near(balls, spacing * 0.5**k)
     margin = 0.5 * spacing if walls is None else 0.0
     root = box_cells(task.lower - margin, task.upper + margin, spacing, exact=walls is not None)
@@ -362,7 +383,7 @@ def _tetrahedralize(
     it is computed again.
 
     root: cells that fill the box, and how many times they are to be halved.
-    finer: sets of balls; cells are halved once more for each set that has a ball which meets them.
+    finer: sets of balls; a cell is halved once more for each set with a ball that meets it.
 
     Returns the curve with its edges as subdivided, the points with samples of the function, and the
     tetrahedra.
@@ -389,8 +410,10 @@ def _check_boundary(
     """Raise LocalizedMeshingError unless the boundary edges of the faces are the edges of the
     curve.
 
+    vertices, faces: (n, 3), (m, 3) the mesh.
     walls: the lower and upper corners (3,) of the box if the surface may end on the faces of the
-        box as well; else None."""
+        box as well; else None.
+    """
     edges = boundary_edges(faces)
     count = max(int(faces.max()) + 1, len(curve.points))
     if walls is not None:  # the surface ends there as well
@@ -398,6 +421,7 @@ def _check_boundary(
         distances = np.minimum(np.abs(vertices - walls[0]), np.abs(vertices - walls[1]))
         is_on_wall = np.asarray((distances <= margin).any(axis=1))
         edges = edges[~is_on_wall[edges].all(axis=1)]
+    # Edges that are in one of the two sets only.
     unmatched = np.setxor1d(edge_keys(edges, count), edge_keys(curve.edges, count))
     if len(unmatched):
         ends = np.stack(np.divmod(unmatched, count), axis=1)

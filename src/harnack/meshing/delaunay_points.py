@@ -1,10 +1,13 @@
-"""The points of a Delaunay triangulation around a level set: the corners and centers of the cells
-of an octree around it, and the points of the boundary curve at which the level set ends.
+"""The points of a Delaunay tetrahedralization around the level set {f = 0} of a function f: the
+corners and centers of the cells of an octree around it, and the points of the boundary curve, the
+closed curve at which the level set ends. Tetrahedra are made of these points, and the level set is
+meshed in them. Walls are the faces of the box that cells fill, if the level set may end there:
+points on them stay on them.
 
-The vertices of the curve are points of the triangulation. All other points are kept so far from the
-curve that no point lies in a ball that has an edge of the curve as its diameter. So every edge of
-the curve is an edge of the Delaunay triangulation (Gabriel's condition). Points near the level set
-are moved onto it, which removes most slivers.
+The vertices of the curve are points of the tetrahedralization. All other points are kept so far
+from the curve that no point lies in a ball that has an edge of the curve as its diameter. So every
+edge of the curve is an edge of the Delaunay tetrahedralization (Gabriel's condition). Points near
+the level set are moved onto it, which removes most slivers (thin tetrahedra).
 """
 
 from __future__ import annotations
@@ -37,15 +40,16 @@ _MIN_CURVE_DISTANCE = 0.45  # points that are not on the curve are farther from 
 _MAX_CELLS = 4_000_000
 # A step of Newton's method that is shorter than this, relative to the longest step, is the last.
 _CONVERGED = 1e-9
-# How often steps to a multiple root are continued as a geometric series, and the range of ratios of
-# a step to the one before for which they are.
+# How often the limit of Newton's steps to a multiple root is computed from two of them; and the
+# range of ratios of a step to the one before in which that is done.
 _SERIES_STEPS, _RATE_RANGE = 4, (0.4, 0.97)
 _CORNERS = np.array(list(itertools.product((0.0, 1.0), repeat=3)))
 
 
 @dataclass(frozen=True)
 class RefinementBalls:
-    """Balls of equal radius; cells that meet one of them are halved once more.
+    """Balls of equal radius that mark where cells have to be smaller: a cell is halved once more if
+    it meets one of the balls.
 
     points: (n, 3) their centers.
     radius: the radius of every ball.
@@ -55,8 +59,10 @@ class RefinementBalls:
     radius: float
 
     def meet(self, centers: FloatArray, radii: FloatArray | float) -> BoolArray:
-        """(k,) whether each of the balls with centers `centers` (k, 3) and radii `radii` (k,) or a
-        common radius meets any of these balls."""
+        """(k,) whether other balls meet any of these balls.
+
+        centers, radii: (k, 3), (k,) of the other balls; `radii` may be a common radius.
+        """
         if not len(centers):
             return np.zeros(0, np.bool_)
         import scipy.spatial  # imported here: it takes half a second
@@ -68,7 +74,7 @@ class RefinementBalls:
 
 @dataclass(frozen=True)
 class BoundaryCurve:
-    """The curve at which a level set ends: points that edges connect to closed loops.
+    """The curve at which a level set ends: closed loops of straight edges between points.
 
     points: (n, 3).
     edges: (n, 2) indices of the two points of each edge, in the direction in which the curve runs.
@@ -79,28 +85,33 @@ class BoundaryCurve:
 
     @classmethod
     def of(cls, loops: tuple[FloatArray, ...], longest: float) -> BoundaryCurve:
-        """The curve that consists of closed loops (k, 3). Its points are first the vertices of the
-        loops, in their order; then the points that divide edges longer than the length `longest`
-        into equal parts."""
+        """Make the curve of closed loops, each an array (k, 3) of vertices. Its points are first
+        the vertices of the loops, in their order; then the points that divide edges longer than the
+        length `longest` into equal parts."""
         points = [*loops]
         inner_points: list[FloatArray] = []
         edges: list[tuple[int, int]] = []
-        first, last = 0, sum(map(len, loops))
+        loop_start, point_count = 0, sum(map(len, loops))
         for loop in loops:
             for k, (a, b) in enumerate(zip(loop, np.roll(loop, -1, axis=0), strict=True)):
-                parts = max(1, math.ceil(float(np.linalg.norm(b - a)) / longest))
-                inner = a + (np.arange(1, parts)[:, None] / parts) * (b - a)
+                part_count = max(1, math.ceil(float(np.linalg.norm(b - a)) / longest))
+                inner = a + (np.arange(1, part_count)[:, None] / part_count) * (b - a)
                 inner_points.append(inner)
-                ends = [first + k, *range(last, last + parts - 1), first + (k + 1) % len(loop)]
+                # The points of the edge in order: a, the new points, b.
+                ends = [
+                    loop_start + k,
+                    *range(point_count, point_count + part_count - 1),
+                    loop_start + (k + 1) % len(loop),
+                ]
                 edges += itertools.pairwise(ends)
-                last += parts - 1
-            first += len(loop)
+                point_count += part_count - 1
+            loop_start += len(loop)
         pairs = np.array(edges, np.int64).reshape(-1, 2)
         return cls(np.concatenate([*points, *inner_points, np.zeros((0, 3))]), pairs)
 
     def split(self, which: BoolArray) -> BoundaryCurve:
-        """The curve with those edges halved that the mask `which` (k,) selects. Their midpoints
-        become additional points, after all existing ones."""
+        """The curve with those edges halved that the mask `which` selects, (k,) for k edges. Their
+        midpoints become additional points, after all existing ones."""
         a, b = self.edges[which].T
         middle = len(self.points) + np.arange(len(a))
         points = np.concatenate([self.points, 0.5 * (self.points[a] + self.points[b])])
@@ -108,8 +119,8 @@ class BoundaryCurve:
         return BoundaryCurve(points, np.concatenate([self.edges[~which], halves]))
 
     def split_near(self, places: RefinementBalls, longest: float) -> BoundaryCurve:
-        """The curve with its edges halved, again and again, as long as they meet one of the balls
-        `places` and are longer than `longest`."""
+        """The curve with edges halved, again and again, as long as an edge is longer than the
+        length `longest` and the ball around it meets one of the balls `places`."""
         curve = self
         while True:
             ends = curve.points[curve.edges]
@@ -122,11 +133,13 @@ class BoundaryCurve:
 
 @dataclass(frozen=True)
 class TetrahedronPoints:
-    """The points of a Delaunay triangulation, with samples of the function f - level at them.
+    """The points of a Delaunay tetrahedralization, with samples (value, gradient and more) of the
+    function f at them.
 
     points: (n, 3); the points of the boundary curve come first.
-    is_on_level: (n,) whether points are on the level set; points of the curve count as on it.
-    samples: of f - level at all points; 0 at the points of the curve.
+    is_on_level: (n,) whether points are on the level set {f = 0}; points of the curve count as on
+        it.
+    samples: of f at all points; 0 at the points of the curve.
     """
 
     points: FloatArray
@@ -137,14 +150,17 @@ class TetrahedronPoints:
 def box_cells(
     lower: FloatArray, upper: FloatArray, spacing: float, exact: bool
 ) -> tuple[BoxCells, int]:
-    """A few cells that fill a box, from which octrees start; and how many times they are to be
-    halved until they are no larger than `spacing`.
+    """A few cells that fill a box, from which octrees start; and how many times these cells are to
+    be halved until they are no larger than `spacing`.
 
-    exact: whether the cells fill the box exactly; otherwise they are cubes, which fill a box that
-        may be larger.
+    lower, upper: the corners (3,) of the box.
+    spacing: a length.
+    exact: whether the cells fill the box exactly; otherwise they are cubes with edges of `spacing`
+        times a power of two, which may reach beyond the box on all sides.
     """
     size = upper - lower
     finest = max(1, math.ceil(math.log2(float(size.max()) / spacing)))
+    # At first the longest side has up to 8 cells; the rest is left to halvings.
     if exact:
         edge = float(size.max()) / 2 ** min(finest, 3)
         counts = np.maximum(1, np.ceil(size / edge * (1 - 1e-9))).astype(int)
@@ -167,34 +183,38 @@ def sample_delaunay_points(
     seed: int,
     finer: tuple[RefinementBalls, ...] = (),
 ) -> TetrahedronPoints:
-    """Choose the points of a Delaunay triangulation around a level set, and sample the function at
-    them. They are the corners and centers of the cells of an octree around the level set, moved
-    onto the level set if they are near it, and the points of the boundary curve.
+    """Choose the points of a Delaunay tetrahedralization around a level set, and sample the
+    function at them. They are the corners and centers of the cells of an octree around the level
+    set, moved onto the level set if they are near it, and the points of the boundary curve.
 
+    function: f.
     root: cells that fill the box, and how many times they are to be halved.
     boundary: the curve at which the level set ends.
     walls: the lower and upper corners (3,) of the box, if points on its faces have to stay on them;
         else None.
-    seed: of the random moves of points.
-    finer: sets of balls; cells of the octree are halved again, once for each set that has a ball
-        which meets them.
+    seed: the seed of the random moves of points, which make sure that no five points lie on a
+        sphere.
+    finer: sets of balls; a cell of the octree is halved again, once for each set with a ball that
+        meets it.
 
     Raises:
         MemoryError: there are more than four million cells.
     """
+    # Leaves of the octree are `occupied` (they may hold the level set) or proved `empty`.
     tree = refine_cells(root[0], function.clearance, _MAX_CELLS, root[1])
     points, size = _corners_and_centers(tree, _subdivided_cells(function, tree.occupied, finer))
-    free = _MIN_CURVE_DISTANCE * np.minimum(size, 2 * float(tree.occupied.size.max()))
-    is_far = _is_far(points, free, boundary)
+    min_curve_distance = _MIN_CURVE_DISTANCE * np.minimum(size, 2 * float(tree.occupied.size.max()))
+    is_far = _is_far(points, min_curve_distance, boundary)
     points, size = points[is_far], size[is_far]
     rng = np.random.default_rng(seed)
     jitter = rng.uniform(-1, 1, points.shape) * _JITTER * size[:, None]
     points = points + (jitter if walls is None else jitter * _off_walls(points, walls))
     samples = function.sample(points)
     points, samples, is_on = _move_onto_level(
-        function, points, size, free[is_far], samples, boundary, walls
+        function, points, size, min_curve_distance[is_far], samples, boundary, walls
     )
     n = len(boundary.points)
+    # The samples at the points of the curve.
     zeros = LevelSamples(np.zeros(n), np.zeros((n, 3)), np.zeros(n))
     together = [
         np.concatenate([getattr(batch, name) for batch in (zeros, samples)])
@@ -221,6 +241,7 @@ def _subdivided_cells(
             parts = cells.subset(balls.meet(cells.centers, cells.half_diagonal)).octants()
             octants.append(parts.subset(~parts.is_proved_empty(function.clearance)))
         pool += octants
+    # The first entry holds the leaves themselves.
     nonempty = [cells for cells in pool[1:] if len(cells.corners)]
     return sorted(nonempty, key=lambda cells: float(cells.size.max()))
 
@@ -228,11 +249,12 @@ def _subdivided_cells(
 def _corners_and_centers(
     tree: RefinedCells, finer: list[BoxCells]
 ) -> tuple[FloatArray, FloatArray]:
-    """Points (n, 3), each once: the corners of all cells of the octree and of `finer`, and the
-    centers of its leaves and of `finer`. Also (n,) the edge of the smallest cell that has each
-    point as its corner or center.
+    """The corners and centers of cells, each point once. Returns the points (n, 3); and for each of
+    them the edge (n,) of the smallest cell that has it as its corner or center. Cells that are
+    proved empty contribute their corners only.
 
-    finer: cells that leaves were split into, smallest first.
+    tree: the octree.
+    finer: cells that leaves were split into, grouped by size, smallest first.
     """
     leaves = [*finer, tree.occupied]
     points = [cells.centers for cells in leaves]
@@ -244,17 +266,21 @@ def _corners_and_centers(
     x, size = np.concatenate(points), np.concatenate(sizes)
     order = np.argsort(size, kind="stable")
     x, size = x[order], size[order]
+    # Coordinates in quarters of the smallest cell are integers, up to rounding.
     steps: FloatArray = (x - x.min(axis=0)) / (0.25 * leaves[0].size)
     keys = np.rint(steps).astype(np.int64)
-    # Of equal points the first, which is that of the smallest cell.
+    # Of equal points the first one is kept; it belongs to the smallest cell.
     kept: IntArray = np.sort(np.unique(keys, axis=0, return_index=True)[1])
     return x[kept], size[kept]
 
 
 def _is_far(points: FloatArray, free: FloatArray, boundary: BoundaryCurve) -> BoolArray:
-    """(n,) whether points (n, 3) are far enough from the boundary curve: farther than the lengths
-    `free` (n,), and outside of the balls, enlarged by a tenth, that have the curve's edges as
-    diameters."""
+    """(n,) whether points are far enough from the boundary curve: farther than given distances, and
+    outside of the balls that have the curve's edges as diameters, enlarged by a tenth.
+
+    points: (n, 3).
+    free: (n,) the distance for each point.
+    """
     if not len(boundary.edges):
         return np.ones(len(points), np.bool_)
     import scipy.spatial  # imported here: it takes half a second
@@ -264,25 +290,29 @@ def _is_far(points: FloatArray, free: FloatArray, boundary: BoundaryCurve) -> Bo
     middle, half = 0.5 * (a + b), 0.5 * row_norms(b - a)
     distance = np.full(len(points), np.inf)
     is_far = np.ones(len(points), np.bool_)
-    # Curves may have edges of any lengths: edges of one size are examined at a time.
-    octave = np.floor(np.log2(half))
-    for exponent in np.unique(octave):
-        rows = np.flatnonzero(octave == exponent)
+    # Curves may have edges of any lengths: edges of one size, up to a factor of 2, are examined at
+    # a time; only the eight edges with the nearest midpoints count.
+    log2_half = np.floor(np.log2(half))
+    for exponent in np.unique(log2_half):
+        rows = np.flatnonzero(log2_half == exponent)
         neighbor_count = min(8, len(rows))
         nearest: IntArray = searching.cKDTree(middle[rows]).query(points, k=neighbor_count)[1]
         index = rows[nearest.reshape(len(points), neighbor_count)]
-        edge, offset = (b - a)[index], points[:, None] - a[index]
-        fraction = np.clip((offset * edge).sum(axis=2) / (edge * edge).sum(axis=2), 0, 1)
-        gaps = np.linalg.norm(offset - fraction[..., None] * edge, axis=2)
+        edge_vectors, offset = (b - a)[index], points[:, None] - a[index]
+        fraction = np.clip(
+            (offset * edge_vectors).sum(axis=2) / (edge_vectors * edge_vectors).sum(axis=2), 0, 1
+        )
+        distances_from_edges = np.linalg.norm(offset - fraction[..., None] * edge_vectors, axis=2)
         from_middle = np.linalg.norm(points[:, None] - middle[index], axis=2)
-        distance = np.minimum(distance, gaps.min(axis=1))
+        distance = np.minimum(distance, distances_from_edges.min(axis=1))
         is_far &= (from_middle > 1.1 * half[index]).all(axis=1)
     return is_far & (distance > free)
 
 
 def _off_walls(points: FloatArray, walls: tuple[FloatArray, FloatArray]) -> FloatArray:
-    """(n, 3) factors for moves of points (n, 3) that keep points on the faces of a box: 0 for a
-    point and an axis if the point lies on a face of the box at right angles to the axis, else 1.
+    """Factors (n, 3) by which moves of points (n, 3) are multiplied, so that points on the faces of
+    a box stay on them. A factor is 0 for a point and an axis if the point lies on a face of the box
+    at right angles to the axis; else 1.
 
     walls: the lower and upper corners (3,) of the box.
     """
@@ -300,8 +330,10 @@ def _move_onto_level(
     boundary: BoundaryCurve,
     walls: tuple[FloatArray, FloatArray] | None,
 ) -> tuple[FloatArray, LevelSamples, BoolArray]:
-    """Move points that are near the level set onto it.
+    """Move points that are near the level set onto it. A point stays where it is if Newton's method
+    does not converge, or would move it by more than 0.45 cells or too near to the curve.
 
+    points: (n, 3).
     size: (n,) the edge of the smallest cell at each point.
     free: (n,) the smallest permitted distances from the boundary curve.
     samples: of the function at the points.
@@ -309,14 +341,14 @@ def _move_onto_level(
         else None.
 
     Returns the points (n, 3); their samples; and a mask (n,) of the points that are on the level
-    set. A point stays where it is if Newton's method does not converge, or would move it by more
-    than 0.45 cells or too near to the curve.
+    set.
     """
     near = np.flatnonzero(samples.distance < _SNAP_DISTANCE * size)
     moved = newton_to_level(function, points[near], samples.select(near), 0.25 * size[near], walls)
     new_samples = function.sample(moved)
     apart = row_norms(moved - points[near])
     slope = row_norms(new_samples.gradient)
+    # |f| / |grad f|, an estimate of the distance, is tiny compared with the cell.
     converged = np.abs(new_samples.value) < 1e-9 * np.maximum(slope * size[near], 1e-300)
     converged &= (apart < 1.5 * _SNAP_DISTANCE * size[near]) & _is_far(moved, free[near], boundary)
     rows = near[converged]
@@ -333,10 +365,11 @@ def newton_to_level(
     walls: tuple[FloatArray, FloatArray] | None,
     steps: int = 5,
 ) -> FloatArray:
-    """Move points (n, 3) towards the level set by steps of Newton's method along the gradient;
-    returns the moved points (n, 3).
+    """Move points towards the level set {f = 0} by steps of Newton's method along the gradient:
+    each step is -f grad f / |grad f|^2. Returns the moved points (n, 3).
 
-    samples: of the function at the points.
+    points: (n, 3).
+    samples: of f at the points.
     max_step: (n,) the largest length of each step.
     walls: the lower and upper corners of a box; points on its faces stay on them, and no point
         leaves it. None if there is none.
@@ -346,6 +379,7 @@ def newton_to_level(
     would be lost in rounding. A point for which the step is not finite, as beside a pole, is not
     moved.
     """
+    # `rows` are the points that still move.
     x, rows = points.copy(), np.arange(len(points))
     for k in range(steps):
         current = x[rows]
@@ -368,13 +402,14 @@ def newton_to_level(
 def to_multiple_roots(
     function: LevelFunction, points: FloatArray, samples: LevelSamples, max_step: FloatArray
 ) -> FloatArray:
-    """Move points (n, 3) towards a level set on which f - level has a multiple root, that is, f -
-    level = u^m near it for some function u and some m > 1. There Newton's steps converge only
-    linearly: each step is 1 - 1/m times the step before. So two of Newton's steps are computed, and
-    the points are moved to the limit of the geometric series that begins with these two. This is
-    done four times. Returns the moved points (n, 3).
+    """Move points towards a level set {f = 0} on which f has a multiple root: f = u^m near it for
+    some function u and some m > 1. There Newton's steps converge only linearly: each step is 1 -
+    1/m times the step before. So two of Newton's steps are computed, and the points are moved to
+    the limit of the geometric series that begins with these two. This is done four times. Where the
+    ratio of the two steps is no such number, both steps are taken. Returns the moved points (n, 3).
 
-    samples: of the function at the points.
+    points: (n, 3).
+    samples: of f at the points.
     max_step: (n,) the largest length of each of Newton's steps.
     """
     x = points
@@ -386,6 +421,7 @@ def to_multiple_roots(
         first_length, second_length = row_norms(once - x), row_norms(twice - once)
         ratio = second_length / np.maximum(first_length, 1e-300)
         is_slow = (ratio > _RATE_RANGE[0]) & (ratio < _RATE_RANGE[1])
+        # The second step and all further ones have the sum (second step) / (1 - ratio).
         factor = np.where(is_slow, 1 / (1 - np.minimum(ratio, _RATE_RANGE[1])), 1.0)
         x = once + factor[:, None] * (twice - once)
     return x

@@ -1,5 +1,7 @@
-"""Edges of triangles and tetrahedra, identified by integer keys; products and norms of rows;
-normals of triangles, and distances from triangles.
+"""Edges of triangles and tetrahedra; products and norms of rows; normals of triangles, and
+distances from triangles. A pair is a row (a, b) of two indices of points, and the pairs (a, b) and
+(b, a) are the same edge. Faces (m, 3) hold the indices of the corners of triangles. A half-edge is
+an edge of a face in the direction in which the face runs it.
 
 `row_dots` and `row_norms` are here because numpy's own sums along an axis of length three are slow.
 """
@@ -30,20 +32,18 @@ __all__ = [
 
 
 def row_dots(a: FloatArray, b: FloatArray) -> FloatArray:
-    """(n,) the dot product of each row of `a` with the same row of `b`, both (n, 3): in a third of
-    the time of (a * b).sum(axis=1)."""
+    """The dot product (n,) of each row of `a` with the same row of `b`, both (n, 3)."""
     return np.einsum("ij,ij->i", a, b)
 
 
 def area_normals(corners: FloatArray) -> FloatArray:
-    """(m, 3) normals of triangles (m, 3, 3) by the right-hand rule; their lengths are twice the
-    areas."""
+    """Normals (m, 3) of triangles with corners (m, 3, 3), by the right-hand rule; their lengths are
+    twice the areas."""
     return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
 
 
 def row_norms(vectors: FloatArray) -> FloatArray:
-    """(n,) the lengths of rows (n, 3), in a third of the time of np.linalg.norm(vectors,
-    axis=1)."""
+    """The lengths (n,) of vectors (n, 3)."""
     return np.sqrt(row_dots(vectors, vectors))
 
 
@@ -51,17 +51,16 @@ IntArray = npt.NDArray[np.int64]
 
 
 def distance_from_triangles(point: FloatArray, corner: FloatArray) -> float:
-    """The distance of a point (3,) from the nearest of triangles (k, 3, 3), rounded up; infinity if
-    there are no triangles."""
+    """The distance of a point (3,) from the nearest of triangles (k, 3, 3). It is infinite if there
+    are no triangles."""
     return float(distances_from_triangles(point, corner).min(initial=np.inf))
 
 
 def distances_from_triangles(points: FloatArray, corner: FloatArray) -> FloatArray:
-    """(k,) the distances of points (k, 3), each from the triangle with the same index in `corner`
-    (k, 3, 3); or the distances of a single point (3,) from all triangles. They are upper bounds
-    that differ from the distances only by rounding. A distance is the smallest distance of the
-    point from the triangle's edges and, if the projection of the point lies in the triangle, from
-    its plane."""
+    """The distances (k,) of points (k, 3), each from the triangle with the same index in `corner`
+    (k, 3, 3); or of a single point (3,) from all triangles. A distance is the smallest distance of
+    the point from the triangle's edges and, if the projection of the point lies in the triangle,
+    from its plane. It is exact up to rounding."""
     distance = np.full(len(corner), np.inf)
     for k in range(3):
         start, edge = corner[:, k], corner[:, k - 1] - corner[:, k]
@@ -72,6 +71,8 @@ def distances_from_triangles(points: FloatArray, corner: FloatArray) -> FloatArr
     size = row_norms(normal)
     is_within = size > 0  # a triangle without an area has edges alone
     size = np.maximum(size, 1e-300)
+    # The foot of the perpendicular on the plane lies in the triangle if it is on the inner side of
+    # all edges.
     height = row_dots(points - corner[:, 0], normal) / size
     foot = points - (height / size)[:, None] * normal
     for k in range(3):
@@ -82,12 +83,14 @@ def distances_from_triangles(points: FloatArray, corner: FloatArray) -> FloatArr
 
 @dataclass(frozen=True)
 class Edges:
-    """The unique edges among n pairs of points.
+    """The distinct edges among n pairs of indices of points. A pair (a, b) and its reverse (b, a)
+    are the same edge.
 
-    vertices: (k, 2) the two ends of each of the k edges, the lower index first; edges are sorted.
-    edge_of_pair: (n,) the index of the edge that each pair is.
-    multiplicity: (k,) the number of pairs that are the edge.
-    pairs_by_edge: (n,) the indices of all pairs, ordered by the edges that they are.
+    vertices: (k, 2) the two ends of each of the k edges, the lower index first, in lexicographic
+        order.
+    edge_of_pair: (n,) for each pair, the index of its edge.
+    multiplicity: (k,) for each edge, the number of pairs that are this edge.
+    pairs_by_edge: (n,) the indices of the pairs, in the order of their edges.
     """
 
     vertices: IntArray
@@ -97,57 +100,59 @@ class Edges:
 
     @classmethod
     def of(cls, pairs: IntArray) -> Edges:
-        """The unique edges among pairs (n, 2) of indices of points; the two orders of a pair are
-        one edge."""
+        """Find the distinct edges among pairs (n, 2) of indices of points."""
         count = int(pairs.max(initial=-1)) + 1
         keys, index, uses, order = unique_with_inverse(edge_keys(pairs, count))
         return cls(np.stack(np.divmod(keys, max(count, 1)), axis=1), index, uses, order)
 
     def paired_half_edges(self) -> IntArray:
-        """(j, 2) for each edge that occurs exactly twice, the indices of the two pairs that are
-        this edge."""
+        """For each edge that exactly two pairs are, the indices of these two pairs, (j, 2). If the
+        pairs are the half-edges of faces, they show which two faces meet at an edge."""
         return self.pairs_by_edge[np.repeat(self.multiplicity == 2, self.multiplicity)].reshape(
             -1, 2
         )
 
 
 def edge_keys(pairs: IntArray, count: int) -> IntArray:
-    """(k,) an integer for each pair (k, 2) of indices below `count`: the same for both orders of a
-    pair, and different for different pairs."""
+    """An integer (k,) for each pair (k, 2) of indices below `count`: the same for a pair and its
+    reverse, and different for different edges."""
     first, second = pairs.T
     return np.minimum(first, second) * count + np.maximum(first, second)
 
 
 def half_edges(faces: IntArray) -> IntArray:
-    """(3m, 2) the directed edges of faces (m, 3), by the indices of their ends: first the edges of
-    all faces from corner 0 to corner 1, then all from 1 to 2, then all from 2 to 0. So row k m + i
-    is edge k of face i."""
+    """The edges of faces (m, 3) in the directions in which the faces run them, as pairs (3m, 2) of
+    indices of points: first the edges of all faces from corner 0 to corner 1, then all from 1 to 2,
+    then all from 2 to 0. So row k m + i is edge k of face i."""
     return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
 
 
 def boundary_edges(faces: IntArray) -> IntArray:
-    """(k, 2) the edges at which faces (m, 3) have a boundary: only a single face has such an edge.
-    Each is given by the indices of its ends, in the direction in which its face runs it."""
+    """The edges (k, 2) that only a single one of the faces (m, 3) has. Each is given by the indices
+    of its ends, in the direction in which its face runs it."""
     pairs = half_edges(faces)
     edges = Edges.of(pairs)
     return pairs[edges.multiplicity[edges.edge_of_pair] == 1]
 
 
 def sorted_unique(keys: IntArray) -> IntArray:
-    """The sorted unique values of integers (n,), several times as fast as `np.unique`."""
+    """The distinct values of integers (n,), in increasing order; several times as fast as
+    `np.unique`."""
     keys = np.sort(keys)
     return keys[np.flatnonzero(np.diff(keys, prepend=keys[:1] - 1))]
 
 
 def unique_with_inverse(keys: IntArray) -> tuple[IntArray, IntArray, IntArray, IntArray]:
-    """What `np.unique` computes for nonnegative integers (n,), in a third of the time: the sorted
-    unique values (k,), for each integer the index (n,) of its value, the number (k,) of integers
-    with each value, and the permutation (n,) that sorts the integers."""
+    """What `np.unique` computes for nonnegative integers (n,), in a third of the time: the distinct
+    values (k,) in increasing order; for each integer the index (n,) of its value; the number (k,)
+    of integers with each value; and the permutation (n,) that sorts the integers."""
     bits = len(keys).bit_length()
+    # Keys too large to stand in one word with an index.
     if int(keys.max(initial=0)) >> (62 - bits):
         order = np.argsort(keys, kind="stable")
         ordered = keys[order]
-    else:  # keys and indices in one word, since sorting is far faster than `argsort`
+    else:
+        # Key and index in one word, since sorting is far faster than `argsort`.
         both = np.sort((keys << bits) | np.arange(len(keys)))
         order, ordered = both & ((1 << bits) - 1), both >> bits
     is_first = np.ones(len(keys), np.bool_)

@@ -1,5 +1,7 @@
-"""The last steps of meshing: thickening of open surfaces, simplification, and conversion to
-trimesh, with facts about the mesh in its metadata."""
+"""The last steps of meshing a surface: thickening it to a closed part, simplification, and
+conversion to trimesh, with facts about the mesh in its metadata. A surface here is a triangle mesh;
+it is open if it has boundary edges (edges with a single face). The reach of a surface is the
+largest distance up to which points have a single closest point on it."""
 
 from __future__ import annotations
 
@@ -34,13 +36,13 @@ if TYPE_CHECKING:
 
 __all__ = ["check_options", "simplify_mesh", "thicken", "to_trimesh", "vertex_normals"]
 
-# The largest fraction of the area whose triangles may turn over when they are moved to a side. So
-# few are slivers.
+# Triangles may turn over when they are moved to a side if they have at most this fraction of the
+# area: so few are slivers (thin triangles).
 _MAX_TURNED_AREA = 1e-2
 # The largest number of triangles whose hulls are computed.
 _MOST_HULLS = 20_000
-# A part is too thick if points of a side come nearer to the surface than this fraction of half of
-# the thickness.
+# A surface is thickened too much if points of a side come nearer to it than this fraction of half
+# of the thickness.
 _MIN_SIDE_DISTANCE = 0.98
 
 
@@ -50,19 +52,20 @@ def thicken(
     """Make a closed part of a given thickness around an open surface. Returns the part, and facts
     about it as a dictionary, whose entry `thickened_by` is "offset" or "hulls of balls".
 
-    Let t be the thickness, and let the surface's reach be the largest distance up to which points
-    have a single closest point on it. If the reach is larger than t/2, the part consists of the
+    Let t be the thickness. If the surface's reach is larger than t/2, the part consists of the
     surface moved by t/2 to both sides along its normals, and of walls along its boundary, straight
     between the sides, so that the boundary stays where it is. To second order in t, its volume is
-    area * t * (1 + K t^2/12), with the Gaussian curvature K. If triangles turn over in this way, or
-    come nearer to the surface than t/2, or pass through each other, the part is instead a union
-    over all triangles, each contributing the convex hull of three balls of radius t/2 around its
-    corners: all points within t/2 of the surface, with a round boundary.
+    area * t * (1 + K t^2/12), with the Gaussian curvature K. The reach is too small if triangles
+    turn over in this way, or come nearer to the surface than t/2, or pass through each other. Then
+    the part is a union over all triangles of convex hulls, each of three balls of radius t/2 around
+    the triangle's corners. These are all points within t/2 of the surface, so the boundary is
+    round.
 
+    surface: the open surface.
     normals: (n, 3) unit normals at the vertices, on the side from which faces run
         counter-clockwise.
     thickness: t, a length.
-    tolerance: of the balls' polyhedra and of the surface's triangles, a length.
+    tolerance: a length; how far the polyhedra in place of balls may be from these.
 
     Raises:
         MeshingError: hulls are needed, and there are too many triangles.
@@ -82,10 +85,11 @@ def thicken(
 
 
 def _offset_part(surface: TriangleMesh, normals: FloatArray, thickness: float) -> TriangleMesh:
-    """The closed surface that consists of both sides, each half of the thickness from the surface,
-    and of walls along its boundary, straight between the sides.
+    """The closed surface that consists of two sides, each half of the thickness from the surface,
+    and of walls along the boundary, straight between the sides.
 
     normals: (n, 3) unit normals at the vertices.
+    thickness: a length.
     """
     n = len(surface.vertices)
     offset = 0.5 * thickness * normals / _normal_cosines(surface, normals)[:, None]
@@ -99,9 +103,12 @@ def _offset_part(surface: TriangleMesh, normals: FloatArray, thickness: float) -
 
 
 def _normal_cosines(surface: TriangleMesh, normals: FloatArray) -> FloatArray:
-    """(n,) the mean cosine of the angles between a vertex normal and the normals of the faces
-    there, weighted by the faces' areas, and clipped to [0.7, 1]. A move of a vertex by thickness /
-    cosine along its normal moves the faces by about the thickness."""
+    """(n,) the mean cosine of the angles between each vertex normal and the normals of the faces
+    there, weighted by the faces' areas, and clipped to [0.7, 1]. A move of a vertex by distance /
+    cosine along its normal moves the faces by about the distance.
+
+    normals: (n, 3) unit normals at the vertices.
+    """
     cross = area_normals(surface.vertices[surface.faces])
     cosines, areas = np.zeros(len(normals)), np.zeros(len(normals))
     size = np.linalg.norm(cross, axis=1)
@@ -114,48 +121,51 @@ def _normal_cosines(surface: TriangleMesh, normals: FloatArray) -> FloatArray:
 
 def _why_too_thick(surface: TriangleMesh, normals: FloatArray, thickness: float) -> str | None:
     """The reason, in words, why half of the thickness is larger than the surface's reach; None if
-    there is no sign of that. The reach is the largest distance up to which points have a single
-    closest point on the surface.
+    there is no sign of that. There are two signs: triangles turn over when their vertices are moved
+    along the normals by half of the thickness; or a moved vertex comes nearer than that to another
+    vertex to which no edge joins it.
 
-    There are two signs: triangles turn over when their vertices are moved along the normals by half
-    of the thickness; or a moved vertex comes nearer than that to another vertex to which no edge
-    joins it.
+    normals: (n, 3) unit normals at the vertices.
+    thickness: a length.
     """
     import scipy.spatial  # imported here: it takes half a second
 
     searching: Any = scipy.spatial
     half = 0.5 * thickness
-    flat = area_normals(surface.vertices[surface.faces])
-    areas = np.linalg.norm(flat, axis=1)
+    face_normals = area_normals(surface.vertices[surface.faces])
+    areas = np.linalg.norm(face_normals, axis=1)
     tree = searching.cKDTree(surface.vertices)
     vertex_ids = np.arange(len(surface.vertices))
     neighbor_count = min(16, len(vertex_ids))
-    neighbors = sorted_unique(edge_keys(half_edges(surface.faces), len(vertex_ids)))
+    edges_of_mesh = sorted_unique(edge_keys(half_edges(surface.faces), len(vertex_ids)))
     for sign in (1, -1):
         side = surface.vertices + sign * half * normals
-        turned = (area_normals(side[surface.faces]) * flat).sum(axis=1) <= 0
-        if areas[turned].sum() > _MAX_TURNED_AREA * areas.sum():  # a smaller area is slivers
+        turned = (area_normals(side[surface.faces]) * face_normals).sum(axis=1) <= 0
+        # A smaller area is slivers.
+        if areas[turned].sum() > _MAX_TURNED_AREA * areas.sum():
             return f"{turned.sum()} triangles turn over: the surface bends more than 1/{half:.3g}"
-        # At most the neighbors of the vertex that a point was moved from are nearer to the point.
+        # Only the vertex that a point was moved from, and the neighbors of this vertex, may be near
+        # the point.
         distances, nearest = tree.query(side, k=neighbor_count)
         pairs = np.stack([np.broadcast_to(vertex_ids[:, None], nearest.shape), nearest], axis=-1)
         is_too_near = (distances < _MIN_SIDE_DISTANCE * half) & (pairs[..., 0] != pairs[..., 1])
         near_keys = sorted_unique(edge_keys(pairs[is_too_near], len(vertex_ids)))
-        count = int((~np.isin(near_keys, neighbors)).sum())
+        count = int((~np.isin(near_keys, edges_of_mesh)).sum())
         if count:
             return f"{count} points of a side are nearer to another place than to their own"
     return None
 
 
 def _hull_union(surface: TriangleMesh, radius: float, tolerance: float, why: str) -> TriangleMesh:
-    """The union over all triangles of the convex hulls of three balls around the triangle's
+    """The union over all triangles of convex hulls, each of three balls around the triangle's
     corners.
 
-    Balls are polyhedra with their corners on the sphere, so that the union lies inside of that for
-    exact balls: by at most the larger of `tolerance` and a tenth of the radius, unless that would
-    need more than 16 segments around.
+    Balls are polyhedra with their corners on the sphere, so the result lies inside of the union for
+    exact balls. The distance is at most the larger of `tolerance` and a tenth of the radius, unless
+    that would need more than 16 segments around; then there are 16.
 
-    why: the reason why hulls are needed, for the message.
+    radius: of the balls, a length.
+    why: the reason why hulls are needed, for the message of the error.
 
     Raises:
         MeshingError: there are too many triangles.
@@ -169,6 +179,7 @@ def _hull_union(surface: TriangleMesh, radius: float, tolerance: float, why: str
             "larger `tolerance`, or a smaller thickness"
         )
     max_error = max(tolerance, 0.1 * radius)
+    # A multiple of 4 whose chords are within `max_error` of the circle, from 8 to 16.
     segments = int(np.clip(4 * np.ceil(np.pi / 2 * np.sqrt(radius / (2 * max_error))), 8, 16))
     mesh = Manifold.sphere(radius, segments).to_mesh64()
     ball = np.array(mesh.vert_properties, np.float64)[:, :3]
@@ -183,8 +194,8 @@ def _hull_union(surface: TriangleMesh, radius: float, tolerance: float, why: str
 
 # An edge is a crease if the cosine of the angle between its faces' normals is below this.
 _CREASE_COSINE = math.cos(math.radians(30))
-# How far simplification may move a surface, tried in this order, and how far mending may move it
-# afterwards; relative to the tolerance.
+# How far simplification may move a surface, tried in this order; and how far vertices near crossing
+# triangles may be moved afterwards. Both are relative to the tolerance.
 _SIMPLIFIED_WITHIN, _MENDED_WITHIN = (0.4, 0.2, 0.1), 0.05
 
 
@@ -200,10 +211,13 @@ def check_options(spacing: Any, thickness: Any, seed: Any, max_triangles: Any) -
 
 
 def vertex_normals(function: LevelFunction, surface: TriangleMesh) -> FloatArray:
-    """(n, 3) unit normals at the vertices of a surface. They point along the gradient of the field.
-    At a vertex where the field has no gradient, as at a curve at which the surface ends, or where
-    the gradient is far from the direction of the faces, the normal is the mean of the normals of
-    the faces there, weighted by area."""
+    """Unit normals (n, 3) at the vertices of a surface, in the direction of the gradient of the
+    field. At a vertex where the field has no gradient, as at a curve at which the surface ends, or
+    where the gradient is far from the direction of the faces, the normal is the mean of the normals
+    of the faces there, weighted by area.
+
+    function: the field minus its level.
+    """
     corner = surface.vertices[surface.faces]
     normal = area_normals(corner)
     mean = np.zeros_like(surface.vertices)
@@ -213,8 +227,9 @@ def vertex_normals(function: LevelFunction, surface: TriangleMesh) -> FloatArray
     slope = function.sample(surface.vertices).gradient
     steep: FloatArray = np.linalg.norm(slope, axis=1)
     slope = slope / np.maximum(steep, 1e-300)[:, None]
-    # Beside the curve slopes turn within a triangle.
+    # Finite, not zero, and within 45 degrees of the mean normal of the faces.
     is_reliable = np.isfinite(steep) & (steep > 0) & ((slope * mean).sum(axis=1) > 0.7)
+    # Such surfaces end at a curve on which the field has no gradient.
     if function.period is not None:
         is_reliable[np.unique(boundary_edges(surface.faces))] = False
     chosen: FloatArray = np.where(is_reliable[:, None], slope, mean)
@@ -224,16 +239,17 @@ def vertex_normals(function: LevelFunction, surface: TriangleMesh) -> FloatArray
 def simplify_mesh(
     surface: TriangleMesh, tolerance: float, check: Callable[[TriangleMesh], None]
 ) -> tuple[TriangleMesh, dict[str, Any]]:
-    """Make a closed surface with fewer triangles. Returns the surface, or the same surface if that
-    fails, and facts about it as a dictionary.
+    """Make a closed surface with fewer triangles. Returns the new surface, or the same surface if
+    that fails; and facts about it as a dictionary.
 
     The library manifold3d simplifies the surface: it keeps some of the vertices and moves the
     surface by less than a fraction of the tolerance; half of the tolerance is left for all other
     errors. If triangles then pass through each other, vertices near them are moved. If they still
     do, or the check fails, a smaller fraction is tried.
 
-    check: raises MeshingError if a surface, none of whose triangles pass through each other, fails
-        its checks.
+    tolerance: a length.
+    check: raises MeshingError if a surface fails its checks; it is called with surfaces whose
+        triangles do not pass through each other.
     """
     facts = {"triangles_before_simplification": len(surface.faces)}
     solid = to_manifold(surface)
@@ -251,13 +267,15 @@ def simplify_mesh(
 
 
 def to_trimesh(surface: TriangleMesh, facts: dict[str, Any], is_closed: bool) -> trimesh.Trimesh:
-    """Convert a manifold surface (`check_manifold`) to a trimesh.Trimesh, with facts about it in
-    its metadata. A mesh without a boundary is oriented so that its volume is positive.
+    """Convert a surface to a trimesh.Trimesh, with facts about it in its metadata. A mesh without a
+    boundary is oriented so that its volume is positive.
 
-    is_closed: whether the mesh has to be closed.
+    surface: a manifold (`check_manifold`).
+    facts: further entries of the metadata.
+    is_closed: whether the mesh must be closed.
 
     Raises:
-        MeshingError: the mesh has to be closed, but is not, or has no positive volume.
+        MeshingError: the mesh must be closed, but is not, or has no positive volume.
     """
     from harnack.meshing.closed_mesh import ClosedMesh
 
@@ -272,7 +290,8 @@ def to_trimesh(surface: TriangleMesh, facts: dict[str, Any], is_closed: bool) ->
                 "the part did not close, or is inside out: choose a smaller `cell_size`"
             )
         facts = {**facts, "volume": volume}
-    elif not len(boundary) and mesh.volume < 0:  # f is larger inside
+    # The function is larger inside.
+    elif not len(boundary) and mesh.volume < 0:
         mesh.invert()
     mesh.metadata["harnack"] = {
         "proved": 0,
@@ -286,15 +305,17 @@ def to_trimesh(surface: TriangleMesh, facts: dict[str, Any], is_closed: bool) ->
 
 
 def _crease_count(surface: TriangleMesh, edges: Edges) -> int:
-    """The number of edges whose two faces have normals more than 30 degrees apart. edges: the
-    `Edges` of the surface's `half_edges`."""
+    """The number of edges whose two faces have normals more than 30 degrees apart.
+
+    edges: the `Edges` of the `half_edges` of the surface's faces.
+    """
     normals = _unit_normals(surface.vertices, surface.faces)
     pairs = edges.paired_half_edges() % len(surface.faces)
     return int((row_dots(normals[pairs[:, 0]], normals[pairs[:, 1]]) < _CREASE_COSINE).sum())
 
 
 def _unit_normals(vertices: FloatArray, faces: IntArray) -> FloatArray:
-    """(m, 3) unit normals of faces; 0 for faces without an area."""
+    """Unit normals (m, 3) of faces (m, 3); 0 for faces without an area."""
     corner = vertices[faces]
     cross = area_normals(corner)
     return cross / np.maximum(row_norms(cross), 1e-300)[:, None]

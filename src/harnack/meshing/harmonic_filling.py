@@ -1,11 +1,13 @@
-"""Harmonic hole fillings: they lie on the surface on which the winding number of a mesh is 1/2
-modulo 1, and fill all holes of the mesh at once.
+"""Harmonic fillings of the holes of a mesh: they lie on the surface on which the winding number w
+of the mesh is 1/2 modulo 1, and fill all holes at once. A patch is a connected piece of the
+filling; here `patches` is the filling as a whole. The mesh has vertices (n, 3) and faces (m, 3),
+which hold indices of vertices; its boundary edges have a single face.
 
-Let w be the winding number. Its level 1/2, modulo 1, is the level 2 pi of the solid angle of the
-boundary edges (`geometry.chains`): a smooth surface that ends at these edges. The surface is meshed
-so that the mesh has exactly these boundary edges, and both meshes are joined at the common
-vertices. A harmonic filling connects all boundary loops of a gap, whereas `hole_filling` closes
-each loop by itself.
+The surface w = 1/2 modulo 1 is the level set 2 pi, modulo 4 pi, of the solid angle of the boundary
+edges (`geometry.boundary_edges` has the proof): a smooth surface that ends at these edges. The
+surface is meshed so that its mesh has exactly these boundary edges, and both meshes are joined at
+the common vertices. A harmonic filling connects all boundary loops of a gap, whereas `hole_filling`
+closes each loop by itself.
 """
 
 from __future__ import annotations
@@ -58,11 +60,11 @@ __all__ = [
 _LEVEL = 2 * math.pi
 # The initial number of cells across the box around all holes.
 _CELLS_ACROSS = 24
-# How often edges of holes that are missing among those of the tetrahedra are halved; and the
-# largest number of pieces, in all and for each edge: so many arise where edges lie on each other.
+# Boundary edges that are missing among the edges of the tetrahedra are halved, at most so often.
+# The largest number of pieces in all, and for each edge: so many arise where edges lie on each
+# other.
 _MAX_HALVINGS, _MAX_PIECES, _MAX_PIECES_PER_EDGE = 12, 20_000, 64
-# How often patches (the pieces of a filling) that intersect the mesh are computed again, with
-# smaller cells.
+# How often a filling that intersects the mesh is computed again, with smaller cells.
 _MAX_MESH_RETRIES = 1
 # How far the winding number may be from 1/2, modulo 1, at vertices of patches.
 _MAX_WINDING_ERROR = 1e-6
@@ -70,13 +72,13 @@ _MAX_WINDING_ERROR = 1e-6
 
 @dataclass(frozen=True)
 class HoleFillingOptions:
-    """Options of harmonic hole fillings.
+    """Options of harmonic fillings.
 
     tolerance: how far fillings may be from the surface, relative to the size of the box around all
         holes.
     spacing: the size of cells at first, a length; None for a 24th of that box.
-    seed: of the random moves of points.
-    attempts: how many times the fillings are computed, with smaller cells where checks failed.
+    seed: the seed of the random moves of points.
+    attempts: how many times a filling is computed, with smaller cells where checks failed.
     report: receives messages about the progress.
     """
 
@@ -95,8 +97,8 @@ class HarmonicFilling:
     faces: (p, 3). Indices below the number of the mesh's vertices stand for vertices of the mesh,
         the following ones for new vertices.
     is_refined: whether the faces were refined to the tolerance.
-    spacing: the size of cells.
-    evaluations: the number of evaluations of the solid angle, in points.
+    spacing: the size of cells at first, a length.
+    evaluations: the number of points at which the solid angle was evaluated.
     triangle_fill_count: how many of the faces are single triangles that fill holes of three edges.
     """
 
@@ -111,15 +113,14 @@ class HarmonicFilling:
 def harmonic_patches(
     vertices: FloatArray, faces: IntArray, edges: IntArray, options: HoleFillingOptions
 ) -> HarmonicFilling:
-    """Fill the holes of a mesh by harmonic fillings that end at its boundary edges. If that fails,
-    holes of three edges are filled by triangles, and all other holes by harmonic fillings.
+    """Fill the holes of a mesh by a harmonic filling that ends at its boundary edges. If that
+    fails, holes of three edges are filled by triangles, and all other holes by a harmonic filling.
 
-    vertices: (n, 3) of the mesh.
-    faces: (m, 3) of the mesh.
+    vertices, faces: (n, 3), (m, 3) the mesh.
     edges: (k, 2) its boundary edges, in the direction of its faces.
 
     Raises:
-        MeshingError: fillings could not be computed, or intersect the mesh or each other.
+        MeshingError: a filling could not be computed, or intersects the mesh or itself.
     """
     try:
         return _fill_all_holes(vertices, faces, edges, options)
@@ -143,42 +144,58 @@ def harmonic_patches(
 def _fill_all_holes(
     vertices: FloatArray, faces: IntArray, edges: IntArray, options: HoleFillingOptions
 ) -> HarmonicFilling:
-    """The harmonic filling of all holes: faces that end at the boundary edges `edges` (k, 2) of the
-    mesh. If a check fails in known places, the filling is computed again with smaller cells there.
+    """Make the harmonic filling of all holes: faces that end at the boundary edges of the mesh. If
+    a check fails in known places, the filling is computed again with smaller cells there. If a
+    point lies where the function is too inaccurate, it is computed again with other random moves of
+    points.
 
-    faces: (m, 3) of the mesh.
+    vertices, faces: (n, 3), (m, 3) the mesh.
+    edges: (k, 2) its boundary edges, in the direction of its faces.
 
     Raises:
         MeshingError: the filling could not be computed, or intersects the mesh or itself.
     """
     if not len(edges):
         return HarmonicFilling(vertices[:0], faces[:0], True, 0.0, 0)
+    # Each boundary edge counts once, in its direction.
     loops = singular_loops(edges, np.ones(len(edges), np.int64))
     function = LevelFunction(SolidAngle([vertices[loop] for loop in loops]), _LEVEL)
     size = float(np.ptp(vertices[np.unique(edges)], axis=0).max())
-    width = size / _CELLS_ACROSS if options.spacing is None else float(options.spacing)
+    cell_size = size / _CELLS_ACROSS if options.spacing is None else float(options.spacing)
     report, tolerance = options.report, options.tolerance.within(size)
-    finer: tuple[RefinementBalls, ...] = ()
-    mesh_hits, seed, previous = 0, options.seed, None
+    refinement_balls: tuple[RefinementBalls, ...] = ()
+    mesh_intersection_count, seed, previous = 0, options.seed, None
     for attempt in range(options.attempts):
         is_last = attempt == options.attempts - 1
-        report(f"cells of {width:.3g}" + ", smaller in places" * bool(finer))
+        report(f"cells of {cell_size:.3g}" + ", smaller in places" * bool(refinement_balls))
         try:
             patches = _mesh_patches(
-                function, vertices, edges, width, finer, tolerance, seed, is_last, report
+                function,
+                vertices,
+                edges,
+                cell_size,
+                refinement_balls,
+                tolerance,
+                seed,
+                is_last,
+                report,
             )
             _check_filled_mesh(vertices, faces, patches, report)
         except LocalizedMeshingError as error:
-            mesh_hits += isinstance(error, _MeshIntersectionError)
+            mesh_intersection_count += isinstance(error, _MeshIntersectionError)
             is_hopeless, previous = not is_retry_promising(error, previous), error
-            if is_last or is_hopeless or mesh_hits > _MAX_MESH_RETRIES:
+            if is_last or is_hopeless or mesh_intersection_count > _MAX_MESH_RETRIES:
                 location = ", ".join(f"{c:.4g}" for c in error.locations[0])
                 raise MeshingError(
-                    f"{error} (cells were {width:.3g} wide, and smaller in {len(error.locations)} "
-                    f"places, such as near ({location}))"
+                    f"{error} (cells were {cell_size:.3g} wide, and smaller in "
+                    f"{len(error.locations)} places, such as near ({location}))"
                 ) from None
             report(f"{error} ({len(error.locations)} places)")
-            finer = (*finer, RefinementBalls(error.locations, 2 * width * 0.5 ** len(finer)))
+            # The radius is two cells, half of that in the next attempt, and so on.
+            refinement_balls = (
+                *refinement_balls,
+                RefinementBalls(error.locations, 2 * cell_size * 0.5 ** len(refinement_balls)),
+            )
         except TriangleLimitError:
             raise
         except MeshingError as error:  # a point lies where the function is too inaccurate
@@ -197,7 +214,7 @@ class _MeshIntersectionError(LocalizedMeshingError):
 
 
 def checked_boundary_edges(faces: IntArray) -> IntArray:
-    """(k, 2) the boundary edges of faces (m, 3), which have a single face each; in the direction in
+    """The boundary edges (k, 2) of faces (m, 3), which have a single face each; in the direction in
     which this face runs them.
 
     Raises:
@@ -214,6 +231,8 @@ def checked_boundary_edges(faces: IntArray) -> IntArray:
             f"{a} and {b}: such a mesh has no two sides there, and where all faces are kept none "
             "are left out"
         )
+    # For each edge, how often it is run toward the larger index minus how often the other way: 0
+    # for two faces that agree.
     sign = np.bincount(index, np.where(pairs[:, 0] < pairs[:, 1], 1, -1), minlength=len(uses))
     turned = np.flatnonzero((uses == 2) & (sign != 0))
     if len(turned):
@@ -226,31 +245,39 @@ def checked_boundary_edges(faces: IntArray) -> IntArray:
 
 
 def triangle_fills(vertices: FloatArray, faces: IntArray, edges: IntArray) -> IntArray:
-    """(k, 3) triangles that fill those holes of a mesh that have three edges. Triangles that would
-    intersect other triangles are left out.
+    """Triangles (k, 3) that fill those holes of a mesh that have three edges. Triangles without an
+    area, and triangles that would intersect others, are left out.
 
-    vertices, faces: of the mesh.
-    edges: (n, 2) its boundary edges, in the direction of the faces.
+    vertices, faces: (n, 3), (m, 3) the mesh.
+    edges: (j, 2) its boundary edges, in the direction of the faces.
     """
-    leads: dict[int, set[int]] = defaultdict(set)
+    successors: dict[int, set[int]] = defaultdict(set)
     for a, b in edges.tolist():
-        leads[a].add(b)
+        successors[a].add(b)
     existing = {tuple(sorted(face)) for face in faces.tolist()}
     fills: list[tuple[int, int, int]] = []
     for a, b in edges.tolist():
-        for c in leads[b]:
-            if a in leads[c] and tuple(sorted((a, b, c))) not in existing and b in leads[a]:
+        for c in successors[b]:
+            # A loop a, b, c whose edges are not used yet, and which is no face of the mesh itself.
+            if (
+                a in successors[c]
+                and tuple(sorted((a, b, c))) not in existing
+                and b in successors[a]
+            ):
+                # The triangle runs the edges in the other direction than the faces around the hole.
                 fills.append((a, c, b))
                 for start, end in ((a, b), (b, c), (c, a)):
-                    leads[start].discard(end)
+                    successors[start].discard(end)
                 break
     triangles = np.array(fills, np.int64).reshape(-1, 3)
     corners = vertices[triangles]
     triangles = triangles[np.linalg.norm(_unit_normals(corners), axis=1) > 0]
     together = np.concatenate([faces, triangles])
     is_new = np.arange(len(together)) >= len(faces)
-    met = np.setdiff1d(intersecting_faces(vertices, together, is_new), np.arange(len(faces)))
-    return np.delete(triangles, met - len(faces), axis=0)
+    intersecting = np.setdiff1d(
+        intersecting_faces(vertices, together, is_new), np.arange(len(faces))
+    )
+    return np.delete(triangles, intersecting - len(faces), axis=0)
 
 
 def _mesh_patches(
@@ -264,29 +291,33 @@ def _mesh_patches(
     is_last: bool,
     report: Callable[[str], None],
 ) -> HarmonicFilling:
-    """The level set of the function, meshed so that it ends at the boundary edges `edges` (k, 2) of
-    the mesh; as a filling.
+    """Mesh the level set of the function so that it ends at the boundary edges of a mesh; returns
+    it as a filling.
 
     The level set is meshed in a Delaunay tetrahedralization that contains all boundary edges. Edges
     that are missing in it are halved first, and their midpoints are removed from the filling
     afterwards.
 
+    function: the solid angle of the boundary edges, minus its level.
     vertices: (n, 3) of the mesh.
+    edges: (k, 2) its boundary edges.
     spacing: the size of cells, a length.
-    finer: sets of balls; cells are halved once for each set that has a ball which meets them.
+    finer: sets of balls; a cell is halved once for each set with a ball that meets it.
     tolerance: a length.
-    seed: of the random moves of points.
+    seed: the seed of the random moves of points.
     is_last: whether this is the last attempt; then a filling that cannot be refined to the
         tolerance is accepted.
 
     Raises:
-        MeshingError: no filling ends at the edges, or a check of the mesh fails; a
+        MeshingError: no filling ends at the edges, or a check of the mesh fails. It is a
             TriangleLimitError if edges are cut into too many pieces.
     """
+    # The vertices of the mesh at boundary edges become points 0, 1, ... of the curve.
     rim, rim_edges = np.unique(edges, return_inverse=True)
     boundary = BoundaryCurve(vertices[rim], rim_edges.reshape(-1, 2))
     extent: Any = function.field.extent((_LEVEL,))
     lower, upper = (np.array(end, np.float64) for end in extent.bounds())
+    # Cells around all points in which the level set can lie.
     root = box_cells(lower - 0.5 * spacing, upper + 0.5 * spacing, spacing, exact=False)
     curve, halved = boundary, np.zeros((0, 2), np.int64)
     points = sample_delaunay_points(function, root, curve, None, seed, finer)
@@ -314,6 +345,7 @@ def _mesh_patches(
         )
     report(f"{len(points.points):,} points, {len(tets.corners):,} tetrahedra")
     x, faces = extract_triangles(function, points, tets, count_crossings(function, points, tets))
+    # Midpoints are numbered in the order of the halvings; the last ones are removed first.
     for k, ends in reversed(list(enumerate(halved.tolist(), start=len(rim)))):
         faces = _collapse_midpoint(x, faces, k, ends)
     if not len(faces):
@@ -330,6 +362,7 @@ def _mesh_patches(
         is_refined = False
     # Faces of level sets are seen from where w is greater, those of meshes from outside.
     faces = faces[:, ::-1]
+    # Indices in the filled mesh: points of the curve are vertices of the mesh, the others are new.
     used = np.unique(faces)
     inner = used[used >= len(rim)]
     index = np.full(len(x), -1, np.int64)
@@ -349,6 +382,7 @@ def _refine_patches(
     the first result that does not pass through itself is taken: smoothing, refining and improving;
     smoothing before and after refining; refining alone.
 
+    function: f, whose level set {f = 0} is meshed.
     x, faces: (n, 3), (m, 3) the filling before refinement.
     tolerance: a length.
 
@@ -360,9 +394,14 @@ def _refine_patches(
     failed = x[:0]
     for mode in ("improving", "smoothing", "refining alone"):
         report(mode)
-        finer, split = (x if mode == "refining alone" else smooth(function, x, faces, None)), faces
-        finer, split = refine(function, finer, split, 0.5 * tolerance, None, report)
-        far = unrefined_midpoints(function, finer, split, 0.5 * tolerance)
+        new_vertices, new_faces = (
+            (x if mode == "refining alone" else smooth(function, x, faces, None)),
+            faces,
+        )
+        new_vertices, new_faces = refine(
+            function, new_vertices, new_faces, 0.5 * tolerance, None, report
+        )
+        far = unrefined_midpoints(function, new_vertices, new_faces, 0.5 * tolerance)
         if len(far):  # the patch departs from the surface, or connects two of its sheets
             raise LocalizedMeshingError(
                 f"{len(far):,} triangles of patches do not come near the surface, however they are "
@@ -370,13 +409,17 @@ def _refine_patches(
                 far,
             )
         if mode == "improving":
-            finer, split = improve(function, finer, split, 0.5 * tolerance, None, report)
+            new_vertices, new_faces = improve(
+                function, new_vertices, new_faces, 0.5 * tolerance, None, report
+            )
         elif mode == "smoothing":
-            finer = smooth(function, finer, split, None)
-        centers = finer[split[intersecting_faces(finer, split)]].mean(axis=1)
-        failed = np.concatenate([centers, finer[_new_nonmanifold_vertices(faces, split)]])
+            new_vertices = smooth(function, new_vertices, new_faces, None)
+        centers = new_vertices[new_faces[intersecting_faces(new_vertices, new_faces)]].mean(axis=1)
+        failed = np.concatenate(
+            [centers, new_vertices[_new_nonmanifold_vertices(faces, new_faces)]]
+        )
         if not len(failed):
-            return finer, split
+            return new_vertices, new_faces
     raise LocalizedMeshingError("the patches meet each other: choose a smaller `cell_size`", failed)
 
 
@@ -388,26 +431,29 @@ def _new_nonmanifold_vertices(before: IntArray, after: IntArray) -> IntArray:
 
 def _collapse_midpoint(x: FloatArray, faces: IntArray, middle: int, ends: list[int]) -> IntArray:
     """Merge the vertex `middle`, which halves a boundary edge, with one end of that edge; returns
-    the new faces. It is the end for which fewer faces intersect afterwards or, if the numbers are
-    equal, the end for which the faces around the vertex turn less.
+    the new faces. The end is chosen so that fewer faces intersect afterwards or, if the numbers are
+    equal, so that the faces around the vertex turn less.
 
-    x: (n, 3) the vertices.
+    x, faces: (n, 3), (m, 3) the filling.
     ends: the two vertices at the ends of the edge.
 
     Raises:
         LocalizedMeshingError: merging with either end would also join faces that are not at the
             edge.
     """
-    in_star = (faces == middle).any(axis=1)
-    star, others = faces[in_star], faces[~in_star]
+    is_at_middle = (faces == middle).any(axis=1)
+    faces_at_middle, others = faces[is_at_middle], faces[~is_at_middle]
     candidates: list[tuple[int, float, IntArray]] = []
     for end in ends:
         at_end = (faces == end).any(axis=1)
-        if len(np.intersect1d(star, faces[at_end])) != 3:  # these two, and the face's third corner
+        # The midpoint and the end may share three vertices: these two, and the third corner of the
+        # face between them.
+        if len(np.intersect1d(faces_at_middle, faces[at_end])) != 3:
             continue
-        moved = np.where(star == middle, end, star)
-        is_kept = ~(star == end).any(axis=1)
-        before, after = _unit_normals(x[star[is_kept]]), _unit_normals(x[moved[is_kept]])
+        moved = np.where(faces_at_middle == middle, end, faces_at_middle)
+        # The face between both vanishes.
+        is_kept = ~(faces_at_middle == end).any(axis=1)
+        before, after = _unit_normals(x[faces_at_middle[is_kept]]), _unit_normals(x[moved[is_kept]])
         cosine = float((before * after).sum(axis=1).min(initial=1.0))
         new_faces = np.concatenate([others, moved[is_kept]])
         is_moved = np.arange(len(new_faces)) >= len(others)
@@ -430,9 +476,13 @@ def _unit_normals(corners: FloatArray) -> FloatArray:
 def _check_boundary(x: FloatArray, faces: IntArray, boundary: BoundaryCurve) -> None:
     """Raise LocalizedMeshingError unless the boundary edges of a filling are the edges of the curve
     `boundary`, run in the same direction. (The filling is turned over afterwards, so that it runs
-    each edge opposite to the face of the mesh.)"""
+    each edge opposite to the face of the mesh.)
+
+    x, faces: (n, 3), (m, 3) the filling.
+    """
     directed = {(int(a), int(b)) for a, b in half_edges(faces)}
     open_edges = {(a, b) for a, b in directed if (b, a) not in directed}
+    # Edges that are in one of the two sets only.
     unmatched = open_edges ^ {(int(a), int(b)) for a, b in boundary.edges}
     if unmatched:
         raise LocalizedMeshingError(
@@ -448,13 +498,17 @@ def _check_filled_mesh(
     patches: HarmonicFilling,
     report: Callable[[str], None],
 ) -> None:
-    """Check a mesh together with its filling `patches`: it is a manifold; at the filling's vertices
-    the winding number of the mesh is 1/2 modulo 1; and the filling intersects neither the mesh nor
-    itself.
+    """Raise an error unless a mesh together with its filling passes all checks: it is a manifold;
+    at the filling's vertices the winding number of the mesh is 1/2 modulo 1; and the filling
+    intersects neither the mesh nor itself.
+
+    vertices, faces: (n, 3), (m, 3) the mesh.
+    patches: the filling.
+    report: receives a message.
 
     Raises:
-        LocalizedMeshingError: a check fails; a _MeshIntersectionError if the filling intersects the
-            mesh.
+        LocalizedMeshingError: a check fails. It is a _MeshIntersectionError if the filling
+            intersects the mesh.
     """
     report("checking the patches")
     x = np.concatenate([vertices, patches.vertices])

@@ -1,20 +1,24 @@
-"""Fills the holes of a mesh smoothly. Each hole is bounded by a loop of boundary edges (edges with
-a single face).
+"""Fills the holes of a triangle mesh smoothly. A loop is a closed chain of boundary edges (edges
+with a single face), and it bounds a hole. A patch is the set of new triangles that fills one loop;
+all patches together are the filling. Vertices (n, 3) and faces (m, 3), which hold indices of
+vertices, belong to the mesh; new vertices have indices from n on. "Existing edges" are those of the
+mesh, which a patch must not make a second time.
 
-A filling begins as a triangulation of its loop: the one that has the smallest dihedral angles, also
+A patch begins as a triangulation of its loop: the one that has the smallest dihedral angles, also
 with the faces around the loop (Liepa, Filling Holes in Meshes, 2003); or, for long loops, the one
 with the smallest area (Barequet and Sharir 1995). The two may differ: the smallest area may cut
 through a tube where the smallest angles go around it. Edges are split and flipped until triangles
-are as large as those around the hole. Then the filling is faired, so that it bends as little as
-possible: the sum of squared Laplacians of positions, over the new vertices and the vertices of the
-    loop, is minimized, while all vertices of the mesh stay (Botsch and Kobbelt 2004). So the
-    filling continues the surface around it, tangents included. The weights of the Laplacians are
-    computed from the filling before this step. If the step is repeated, with long edges split in
-    between, it converges to surfaces whose mean curvature is harmonic, such as spheres and
-    cylinders.
+are as large as those around the hole.
 
-Nothing is proved about such fillings. `fill_holes` checks the fillings and returns the ones that
-pass the checks.
+Then the patch is faired: its vertices are moved so that it bends as little as possible. The sum of
+squared Laplacians of positions, over the new vertices and the vertices of the loop, is minimized,
+while all vertices of the mesh stay (Botsch and Kobbelt 2004). So the patch continues the surface
+around it, tangents included. The weights of the Laplacians are computed from the patch before this
+step. If the step is repeated, with long edges split in between, it converges to surfaces whose mean
+curvature is harmonic, such as spheres and cylinders.
+
+Nothing is proved about such patches. `fill_holes` checks them and keeps the ones that pass the
+checks.
 """
 
 from __future__ import annotations
@@ -43,12 +47,13 @@ __all__ = ["HoleFilling", "fill_holes", "hole_loops"]
 
 # Loops of more edges are not filled: the time grows with the cube of their number.
 _MAX_LOOP_EDGES = 600
-# Loops of up to so many edges are triangulated by angles, and longer ones by areas; and loops of up
-# to so many edges are triangulated by angles even in attempts that go by areas.
+# Loops of up to the first number of edges are triangulated with the smallest angles, longer ones
+# with the smallest area. Loops of up to the second number are triangulated with the smallest angles
+# even in attempts that ask for the smallest area.
 _MAX_BY_ANGLES, _ALWAYS_BY_ANGLES = 150, 10
 # Two angles count as equal if their cosines differ by no more than this.
 _EQUAL_COSINES = 1e-9
-# Edges are split that are longer than this multiple of the usual length around the hole; and the
+# Edges are split if they are longer than this multiple of the usual length around the hole; and the
 # largest number of rounds of splitting.
 _LONG_RATIO, _SPLIT_ROUNDS = 1.4, 10
 # Patches of more faces than this are not split any more.
@@ -57,11 +62,12 @@ _MAX_FACES_TO_SPLIT = 200_000
 _MAX_FLIP_COTANGENT_SUM = -1e-3
 # The largest number of rounds of flipping.
 _FLIP_ROUNDS = 12
-# The smallest weight of an edge, and the largest absolute value of a cotangent, so that every
-# matrix is definite. The weight is half of the sum of the two cotangents.
+# The weight of an edge in a Laplacian is half of the sum of the cotangents of the two opposite
+# angles. Weights are at least the first number and cotangents at most the second in absolute value,
+# so that the matrices are positive definite.
 _MIN_WEIGHT, _MAX_COTANGENT = 0.02, 20.0
-# The strategies in the order of the attempts: whether loops are triangulated by angles, and how
-# often the patch is faired, each time with the cotangents of the patch before.
+# The strategies, tried in this order: whether loops are triangulated with the smallest angles (else
+# area), and how often the patch is faired, each time with the cotangents of the patch before.
 _STRATEGIES = ((True, 6), (False, 2), (True, 0), (False, 0))
 # The largest deviation of the mesh's winding number from 1/2 modulo 1 on a patch.
 _MAX_WINDING_DEVIATION = 0.36
@@ -71,14 +77,13 @@ Winding = Callable[[FloatArray], FloatArray]
 
 @dataclass(frozen=True)
 class HoleFilling:
-    """The vertices and faces added to a mesh by filling its holes.
+    """The vertices and faces that are added to a mesh by filling its holes.
 
     vertices: (k, 3) new vertices.
-    faces: (p, 3) the faces of the fillings. Indices below the number of the mesh's vertices stand
-        for vertices of the mesh, the following ones for new vertices.
-    unfilled_loops: the loops whose fillings failed, each an array of indices of vertices.
-    reason: why the fillings of these loops failed, in words, with the number of loops for each
-        reason.
+    faces: (p, 3) the faces of the patches that were accepted. Indices below the number of the
+        mesh's vertices stand for vertices of the mesh, the following ones for new vertices.
+    unfilled_loops: the loops whose patches were not accepted, each an array of indices of vertices.
+    reason: why these patches were not accepted, in words, with the number of loops for each reason.
     """
 
     vertices: FloatArray
@@ -90,37 +95,44 @@ class HoleFilling:
 def fill_holes(
     vertices: FloatArray, faces: IntArray, loops: list[IntArray], winding: Winding
 ) -> HoleFilling:
-    """Fill holes, each bounded by a loop of boundary edges (`hole_loops`).
+    """Fill holes of a mesh, each bounded by a loop of boundary edges.
 
-    A filling is accepted if its triangles have positive area and intersect no other triangle, and
-    if the mesh's winding number at its vertices and at the centers of its faces is near 1/2 modulo
-    1. The winding number is not near 1/2 if a loop does not bound a hole by itself: two loops bound
-    one gap, or another component stands in the hole. Loops whose fillings are not accepted are
-    tried again: with the triangulation of smallest area, then without fairing.
+    A patch is accepted if its triangles have positive area and intersect no other triangle, and if
+    the mesh's winding number at its vertices and at the centers of its faces is near 1/2 modulo 1.
+    The winding number is not near 1/2 if a loop does not bound a hole by itself: two loops bound
+    one gap, or another component stands in the hole. Loops whose patches are not accepted are tried
+    again by the next strategy: with the triangulation of smallest area, then without fairing.
 
     vertices, faces: (n, 3), (m, 3) the mesh.
     loops: the indices of the vertices of each loop (`hole_loops`).
     winding: returns the winding numbers (k,) of the mesh at points (k, 3).
     """
+    # The mesh with the patches accepted so far, and the loops that are still to be filled.
     x, together = vertices, faces
     pending: list[IntArray] = loops
     reasons = dict[int, str]()
     for by_angles, fairings in _STRATEGIES:
         if not pending:
             break
-        patched, new, owner, reasons = _make_patches(x, together, pending, by_angles, fairings)
-        reasons |= _failure_reasons(patched, together, new, owner, len(x), winding)
-        is_accepted = ~np.isin(owner, list(reasons))
+        patched, new, loop_of_face, reasons = _make_patches(
+            x, together, pending, by_angles, fairings
+        )
+        # `reasons` holds the loops without an accepted patch.
+        reasons |= _failure_reasons(patched, together, new, loop_of_face, len(x), winding)
+        is_accepted = ~np.isin(loop_of_face, list(reasons))
         x, together = _drop_unused(patched, np.concatenate([together, new[is_accepted]]), len(x))
         pending = [pending[k] for k in sorted(reasons)]
     counts = Counter(reasons.values())
-    why = ", ".join(f"{count:,} {reason}" for reason, count in counts.items())
-    return HoleFilling(x[len(vertices) :], together[len(faces) :], pending, why)
+    all_reasons = ", ".join(f"{count:,} {reason}" for reason, count in counts.items())
+    return HoleFilling(x[len(vertices) :], together[len(faces) :], pending, all_reasons)
 
 
 def _drop_unused(x: FloatArray, faces: IntArray, input_count: int) -> tuple[FloatArray, IntArray]:
     """Remove the vertices that no face uses; returns vertices and faces. The first `input_count`
-    vertices, which belong to the input mesh, are kept in any case."""
+    vertices, which belong to the input mesh, are kept in any case.
+
+    x, faces: (n, 3), (m, 3).
+    """
     used = np.zeros(len(x), np.bool_)
     used[:input_count] = True
     used[faces] = True
@@ -135,22 +147,24 @@ def _failure_reasons(
     input_count: int,
     winding: Winding,
 ) -> dict[int, str]:
-    """The reasons, in words, why patches (fillings of single loops) are not accepted; a dictionary
-    whose keys are the indices of their loops.
+    """Find the patches that are not acceptable. Returns a dictionary from the indices of their
+    loops to the reasons, in words.
 
     x: (n, 3) all vertices; the first `input_count` are the vertices of the mesh.
     faces: (m, 3) of the mesh.
     new: (p, 3) the faces of all patches.
     owner: (p,) for each face of a patch, the index of the loop that the patch fills.
-    winding: the winding number of the mesh at points (k, 3).
+    winding: returns the winding numbers (k,) of the mesh at points (k, 3).
     """
     reasons: dict[int, str] = {}
     if not len(new):
         return reasons
+    # Centers of new faces and new vertices are tested; `loops` holds the loop of each.
     vertex_loop = np.zeros(len(x), np.int64)
     vertex_loop[new] = owner[:, None]
     loops = np.concatenate([owner, vertex_loop[input_count:]])
     w = winding(np.concatenate([x[new].mean(axis=1), x[input_count:]]))
+    # The distance of w from 1/2 modulo 1; not `>`, so that values that are no numbers fail.
     is_off = ~(np.abs(w - np.floor(w) - 0.5) <= _MAX_WINDING_DEVIATION)
     reasons |= dict.fromkeys(loops[is_off].tolist(), "not where the winding number is near 1/2")
     together = np.concatenate([faces, new])
@@ -167,7 +181,7 @@ def _failure_reasons(
 
 
 def hole_loops(vertices: FloatArray, faces: IntArray, edges: IntArray) -> list[IntArray]:
-    """The closed loops that boundary edges form, each an array of indices of vertices without
+    """The closed loops that boundary edges form, each an array (k,) of indices of vertices without
     repetition.
 
     vertices, faces: (n, 3), (m, 3) the mesh.
@@ -185,6 +199,7 @@ def hole_loops(vertices: FloatArray, faces: IntArray, edges: IntArray) -> list[I
     normals = np.zeros_like(vertices)
     for k in range(3):
         np.add.at(normals, faces[:, k], area_normals(vertices[faces]))
+    # following[a, b] = c: after the edge from a to b, the loop goes on to c.
     following: dict[tuple[int, int], int] = {}
     for v, starts in arriving.items():
         ends = leaving[v]
@@ -194,10 +209,13 @@ def hole_loops(vertices: FloatArray, faces: IntArray, edges: IntArray) -> list[I
     loops: list[IntArray] = []
     while following:
         (a, b), _ = next(iter(following.items()))
+        # The path so far, and for each of its vertices the position on it.
         path, position = [a], {a: 0}
         while (a, b) in following:
             a, b = b, following.pop((a, b))
-            if a in position:  # a loop is complete; what led to it goes on
+            # A vertex is reached again: what follows it on the path is a loop; the rest of the path
+            # goes on.
+            if a in position:
                 first = position[a]
                 loops.append(np.array(path[first:]))
                 for vertex in path[first + 1 :]:
@@ -213,14 +231,16 @@ def _match_loop_edges(
     x: FloatArray, v: int, normal: FloatArray, starts: list[int], ends: list[int]
 ) -> list[int]:
     """Find the vertices with which loops go on at the vertex `v`, at which several holes meet.
-    Returns one of `ends` for each vertex in `starts`. It is the next end counter-clockwise from the
-    start, around v and as seen from where the normal points: faces are to the left of their edges,
-    and holes to the right.
+    Returns one of `ends` for each vertex in `starts`: the next one counter-clockwise from it,
+    around v and as seen from where the normal points. (Faces are to the left of their edges, and
+    holes to the right.)
 
+    x: (n, 3) all vertices.
     normal: (3,) of the surface at v, of any length.
     starts, ends: the vertices from which boundary edges lead to v, and the vertices to which
-        boundary edges lead from v.
+        boundary edges lead from v; the same number of both.
     """
+    # u and w are two directions at right angles to the normal and to each other.
     axis = np.eye(3)[np.abs(normal).argmin()]
     unit_normal = normal / max(float(np.linalg.norm(normal)), 1e-300)
     u = np.cross(unit_normal, axis)
@@ -252,12 +272,14 @@ def _make_patches(
 ) -> tuple[FloatArray, IntArray, IntArray, dict[int, str]]:
     """Triangulate all loops, refine the triangulations, and fair them.
 
-    by_angles: whether loops are triangulated so that angles between neighboring triangles are
-        small; otherwise so that the area is small.
-    fairings: how often patches are faired, that is, their vertices are moved so that they bend
-        least.
+    vertices, faces: (n, 3), (m, 3) the mesh.
+    loops: the indices of the vertices of each loop.
+    by_angles: whether loops are triangulated with the smallest angles between neighboring
+        triangles, unless they are long; otherwise with the smallest area, unless they are very
+        short.
+    fairings: how often patches are faired: their vertices are moved so that they bend least.
 
-    Returns all vertices (n, 3), the new ones last; the faces (p, 3) of patches; (p,) for each face
+    Returns all vertices (k, 3), the new ones last; the faces (p, 3) of patches; (p,) for each face
     the index of the loop that it helps to fill; and a dictionary from the indices of loops without
     a patch to the reasons, in words.
     """
@@ -269,6 +291,7 @@ def _make_patches(
         if len(loop) > _MAX_LOOP_EDGES:
             failed[k] = f"of more than {_MAX_LOOP_EDGES} edges"
             continue
+        # A patch runs the loop's edges in the other direction than the faces of the mesh.
         polygon = loop[::-1].copy()
         limit = _MAX_BY_ANGLES if by_angles else _ALWAYS_BY_ANGLES
         method = _min_dihedral_triangulation if len(polygon) <= limit else _min_area_triangulation
@@ -281,6 +304,7 @@ def _make_patches(
     if not patches:
         return vertices, faces[:0], np.zeros(0, np.int64), failed
     x, new = _refine_patches(vertices, faces, np.concatenate(patches), fixed_edges)
+    # Without new vertices nothing can be moved. The last two rounds split no edges.
     for rounds_left in range(fairings if len(x) > len(vertices) else 0, 0, -1):
         x[:, :3] = _fair_patches(x[:, :3], faces, new, len(vertices))
         new = _flip_edges(x[:, :3], new, fixed_edges)
@@ -292,29 +316,33 @@ def _make_patches(
 
 def _opposite_corners(faces: IntArray, rims: IntArray, count: int) -> dict[tuple[int, int], int]:
     """A dictionary from directed edges to the third corner of the face that runs the edge in this
-    direction; for edges between two of the vertices `rims`.
+    direction. It holds the edges between two of the vertices `rims`.
 
+    faces: (m, 3).
+    rims: (k,) indices of vertices.
     count: the number of vertices of the mesh.
     """
     is_rim = np.zeros(count, np.bool_)
     is_rim[rims] = True
     directed = half_edges(faces)
     is_kept = is_rim[directed].all(axis=1)
+    # In the order of `half_edges`: all corners 2, then all corners 0, then all corners 1.
     third = np.roll(faces, 1, axis=1).T.ravel()[is_kept].tolist()
     ends = directed[is_kept].tolist()
     return {(a, b): c for (a, b), c in zip(ends, third, strict=True)}
 
 
 def _forbidden_diagonals(polygon: IntArray, used_edges: set[tuple[int, int]]) -> BoolArray:
-    """(n, n) for each pair of positions in a polygon, whether an edge joins the two vertices
-    already, so that no diagonal may join them. False for the polygon's own edges.
+    """(n, n) for each pair of positions in a polygon, whether an existing edge joins the two
+    vertices, so that no diagonal may join them. False for the polygon's own edges.
 
     polygon: (n,) indices of vertices.
-    used_edges: all edges, the lower index first.
+    used_edges: all existing edges, the lower index first.
     """
     n = len(polygon)
     barred = np.zeros((n, n), np.bool_)
     position = {v: k for k, v in enumerate(polygon.tolist())}
+    # Go through the edges or through the pairs of the polygon's vertices, whichever are fewer.
     for a, b in used_edges if n * n > len(used_edges) else _used_pairs(polygon, used_edges):
         if a in position and b in position:
             barred[position[a], position[b]] = barred[position[b], position[a]] = True
@@ -324,8 +352,8 @@ def _forbidden_diagonals(polygon: IntArray, used_edges: set[tuple[int, int]]) ->
 
 
 def _used_pairs(polygon: IntArray, used_edges: set[tuple[int, int]]) -> list[tuple[int, int]]:
-    """The pairs of a polygon's vertices, the lower index first, that are among the edges
-    `used_edges`."""
+    """Those pairs of a polygon's vertices, the lower index first, that are joined by an existing
+    edge, one of `used_edges`."""
     ordered = sorted(polygon.tolist())
     return [(a, b) for i, a in enumerate(ordered) for b in ordered[i + 1 :] if (a, b) in used_edges]
 
@@ -336,21 +364,25 @@ def _min_area_triangulation(
     third: dict[tuple[int, int], int],
     used_edges: set[tuple[int, int]],
 ) -> IntArray | None:
-    """Triangulate a polygon with the smallest area. Returns the triangles (n - 2, 3); None if
-    existing edges exclude every triangulation. By dynamic programming: cost[i, k] is the smallest
-    area for the vertices from position i to position k.
+    """Triangulate a polygon with the smallest area. Returns the triangles (n - 2, 3) by indices of
+    vertices; None if existing edges exclude every triangulation. The method is dynamic programming:
+    cost[i, k] is the smallest area of a triangulation of the part from position i to position k. It
+    is found from the shorter parts, by trying every third corner m of the triangle at the diagonal
+    from i to k.
 
     x: (m, 3) all vertices.
     polygon: (n,) indices of vertices.
     third: unused; the parameters are those of `_min_dihedral_triangulation`.
-    used_edges: edges that exist already; they are no diagonals.
+    used_edges: existing edges, the lower index first; they are no diagonals.
     """
     n, corner = len(polygon), x[polygon]
     if n == 3:
         return polygon[None]
+    # An infinite cost excludes a diagonal; `+=` below keeps it.
     cost = np.where(_forbidden_diagonals(polygon, used_edges), np.inf, 0.0)
     apex = np.zeros((n, n), np.int64)
     for d in range(2, n):
+        # All diagonals over d positions at once: from i to i + d, with m between them.
         i = np.arange(n - d)[:, None]
         m = i + np.arange(1, d)
         area = 0.5 * row_norms(
@@ -367,8 +399,8 @@ def _min_area_triangulation(
 
 
 def _triangles_from_apexes(apex: IntArray, n: int) -> IntArray:
-    """The triangles (n - 2, 3) of a triangulated polygon of n points, by the positions of their
-    corners.
+    """The triangles (n - 2, 3) of a triangulated polygon with n corners, by positions in the
+    polygon.
 
     apex: (n, n) at [i, k] the position, between i and k, of the third corner of the triangle at the
         diagonal from i to k.
@@ -391,18 +423,19 @@ def _min_dihedral_triangulation(
 ) -> IntArray | None:
     """Triangulate a polygon so that the largest angle between the normals of neighboring triangles,
     also with the faces around the polygon, is as small as possible. Of triangulations with equal
-    angles, that of the smallest area is chosen (Liepa 2003). Returns the triangles (n - 2, 3); None
-    if existing edges exclude every triangulation.
+    angles, the one with the smallest area is chosen (Liepa 2003). Returns the triangles (n - 2, 3)
+    by indices of vertices; None if existing edges exclude every triangulation.
 
-    By dynamic programming over the vertices from position i to position k: turn[i, k] is minus the
-    cosine of the largest angle, area[i, k] twice the area, and beside[i, k] the normal of the
-    triangle at the diagonal, or of the face outside of the polygon's edge.
+    The method is dynamic programming over the part of the polygon from position i to position k.
+    turn[i, k] is minus the cosine of the largest angle in it, -1 for no angle; area[i, k] is twice
+    its area; beside[i, k] is the normal of its triangle at the diagonal or, for an edge of the
+    polygon, the normal of the face outside.
 
     x: (m, 3) all vertices.
     polygon: (n,) indices of vertices.
     third: from directed edges around the polygon to the third corners of their faces
         (`_opposite_corners`).
-    used_edges: edges that exist already; they are no diagonals.
+    used_edges: existing edges, the lower index first; they are no diagonals.
     """
     n, corner = len(polygon), x[polygon]
     if n == 3:
@@ -410,6 +443,7 @@ def _min_dihedral_triangulation(
     barred = _forbidden_diagonals(polygon, used_edges)
     beside = np.zeros((n, n, 3))  # 0: no neighbor, or not yet
     for k in range(n):
+        # The face outside runs the polygon's edge from b to a.
         a, b = int(polygon[k]), int(polygon[(k + 1) % n])
         if (b, a) in third:
             face = np.array([[b, a, third[b, a]]])
@@ -417,20 +451,25 @@ def _min_dihedral_triangulation(
     turn, area = np.full((n, n), -1.0), np.zeros((n, n))
     apex = np.zeros((n, n), np.int64)
     for d in range(2, n):
+        # All diagonals over d positions at once: from i to k, with the third corner m between them.
         i = np.arange(n - d)[:, None]
         m, k = i + np.arange(1, d), i + d
         cross = np.cross(corner[m] - corner[i], corner[k] - corner[i])
         normals = _normalized(cross)
         sides = [beside[i, m], beside[m, k]]
+        # The last diagonal is an edge of the polygon, with a face outside.
         if d == n - 1:
             sides.append(np.broadcast_to(beside[k, i], normals.shape))
         turns = [-np.einsum("imk,imk->im", normals, side) for side in sides]
+        # No neighbor, no angle.
         turns = [np.where(side.any(axis=2), t, -1.0) for side, t in zip(sides, turns, strict=True)]
+        # For each m, the largest turn of the part that is divided at m, and twice its area.
         worst = np.maximum.reduce([*turns, turn[i, m], turn[m, k]])
         size = area[i, m] + area[m, k] + np.sqrt((cross**2).sum(axis=2))
         smallest = worst.min(axis=1, keepdims=True)
         best = np.where(worst <= smallest + _EQUAL_COSINES, size, np.inf).argmin(axis=1)
         rows = np.arange(n - d)
+        # The last diagonal is an edge of the polygon and never barred.
         bar = barred[rows, rows + d] if d < n - 1 else np.zeros(1, np.bool_)
         turn[rows, rows + d] = np.where(bar, np.inf, worst[rows, best])
         area[rows, rows + d] = size[rows, best]
@@ -442,7 +481,7 @@ def _min_dihedral_triangulation(
 
 
 def _normalized(vectors: FloatArray) -> FloatArray:
-    """(..., 3) vectors scaled to length 1; 0 stays 0."""
+    """Vectors (..., 3) scaled to length 1; zero vectors stay zero."""
     return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-300)
 
 
@@ -455,11 +494,12 @@ def _refine_patches(
     """Split and flip edges of patches until the triangles are about as large as the faces around
     the patch. New vertices are moved to the means of their neighbors.
 
+    vertices, faces: (n, 3), (m, 3) the mesh.
     new: (p, 3) the faces of patches.
     fixed_edges: (t, 2) the existing edges of the mesh, which no flip may make again.
 
-    Returns all vertices (n, 4), new ones last; column 3 is the usual length of edges near the
-    vertex. Also the faces (q, 3) of patches.
+    Returns all vertices (k, 4), new ones last: their coordinates and, in column 3, the usual length
+    of edges near the vertex. Also the faces (q, 3) of patches.
     """
     input_count = len(vertices)
     x = np.column_stack([vertices, _mean_edge_lengths(vertices, faces, np.unique(new))])
@@ -473,9 +513,9 @@ def _refine_patches(
 
 
 def _split_long_edges(x: FloatArray, new: IntArray) -> tuple[FloatArray, IntArray]:
-    """Split those inner edges of patches at their midpoints that are longer than `_LONG_RATIO`
-    times the mean of the usual lengths at their ends. Returns the vertices (j, 4) and the faces of
-    patches.
+    """Split inner edges of patches at their midpoints if they are longer than `_LONG_RATIO` times
+    the mean of the usual lengths at their ends. Returns all vertices (j, 4) and the faces of
+    patches. Nothing is split if the patches have very many faces.
 
     x: (n, 4) vertices, with the usual length of edges in the last column; new vertices get the mean
         of the values at both ends.
@@ -484,6 +524,7 @@ def _split_long_edges(x: FloatArray, new: IntArray) -> tuple[FloatArray, IntArra
     edges = Edges.of(half_edges(new))
     ends = x[edges.vertices]
     is_long = row_norms(ends[:, 0, :3] - ends[:, 1, :3]) > _LONG_RATIO * ends[:, :, 3].mean(axis=1)
+    # Edges with two faces of patches: the others belong to the loop.
     rows = np.flatnonzero(is_long & (edges.multiplicity == 2))
     if not len(rows) or len(new) > _MAX_FACES_TO_SPLIT:
         return x, new
@@ -494,8 +535,11 @@ def _split_long_edges(x: FloatArray, new: IntArray) -> tuple[FloatArray, IntArra
 
 
 def _mean_edge_lengths(x: FloatArray, faces: IntArray, rims: IntArray) -> FloatArray:
-    """(n,) the mean length of the edges at each of the vertices `rims` (indices); 0 at other
-    vertices."""
+    """(n,) the mean length of the edges at each of the vertices with indices `rims`; 0 at other
+    vertices.
+
+    x, faces: (n, 3), (m, 3) the mesh.
+    """
     is_rim = np.zeros(len(x), np.bool_)
     is_rim[rims] = True
     edges = Edges.of(half_edges(faces[is_rim[faces].any(axis=1)])).vertices
@@ -508,17 +552,21 @@ def _mean_edge_lengths(x: FloatArray, faces: IntArray, rims: IntArray) -> FloatA
 
 
 def _relax_new_vertices(x: FloatArray, new: IntArray, input_count: int) -> FloatArray:
-    """Move new vertices of patches to the means of their neighbors: rows from index `input_count`
-    of x (n, 4) are replaced so that each is, in the sense of least squares, the mean of the rows of
-    its neighbors along edges of patches. Returns the new array (n, 4)."""
+    """Move new vertices of patches to the means of their neighbors along edges of patches, in the
+    sense of least squares. The usual lengths of edges, in the last column, are averaged in the same
+    way. Returns the new array (n, 4).
+
+    x: (n, 4) all vertices; those from index `input_count` on are new.
+    new: (p, 3) the faces of patches.
+    """
     ends = Edges.of(half_edges(new)).vertices
     laplacian = _graph_laplacian(ends, np.ones(len(ends)), len(x))
     return _solve_least_squares(laplacian[input_count:], x, input_count)
 
 
 def _solve_least_squares(matrix: Any, x: FloatArray, input_count: int) -> FloatArray:
-    """Replace the rows of x (n, d) from index `input_count` on so that the sum of squares of all
-    entries of matrix @ x is smallest. Returns the new array (n, d).
+    """Replace the rows of x (n, d) from index `input_count` on so that the sum of the squares of
+    all entries of matrix @ x is smallest. Returns the new array (n, d).
 
     matrix: (k, n) sparse.
     """
@@ -527,13 +575,14 @@ def _solve_least_squares(matrix: Any, x: FloatArray, input_count: int) -> FloatA
     solver = cast("Any", linalg)
     free, fixed = matrix[:, input_count:], matrix[:, :input_count]
     solution = x.copy()
+    # With x = (fixed part, y): free^T free y = -free^T (fixed @ fixed part).
     right = free.T @ (fixed @ x[:input_count])
     solution[input_count:] = -solver.splu((free.T @ free).tocsc()).solve(np.asarray(right))
     return solution
 
 
 def _graph_laplacian(ends: IntArray, weight: FloatArray, count: int) -> Any:
-    """The Laplacian (count, count) of a graph, as a sparse matrix: -weight for each edge, and at
+    """The Laplacian of a graph, as a sparse matrix (count, count): -weight for each edge, and at
     each vertex the sum of the weights of its edges.
 
     ends: (k, 2) the vertices of each edge.
@@ -556,17 +605,18 @@ def _graph_laplacian(ends: IntArray, weight: FloatArray, count: int) -> Any:
 
 
 def _fair_patches(x: FloatArray, faces: IntArray, new: IntArray, input_count: int) -> FloatArray:
-    """Move the vertices from index `input_count` on so that the patches and the faces around them
-    bend least. Returns all vertices (n, 3). The sum over the vertices of patches of |Laplacian of
-    the position|^2, times the vertex's share of the area, is made as small as possible. Vertices at
-    edges that remain open do not count in the sum.
+    """Move the new vertices so that the patches and the faces around them bend least. Returns all
+    vertices (n, 3). What is minimized is the sum, over the vertices of patches, of |Laplacian of
+    the position|^2 times the area around the vertex. Vertices at edges that remain open do not
+    count in the sum.
 
+    x: (n, 3) all vertices; those from index `input_count` on are new.
     faces: (m, 3) of the mesh.
     new: (p, 3) of patches.
     """
-    counts = np.zeros(len(x), np.bool_)
-    counts[new] = True
-    triangles = np.concatenate([faces[counts[faces].any(axis=1)], new])
+    is_in_sum = np.zeros(len(x), np.bool_)
+    is_in_sum[new] = True
+    triangles = np.concatenate([faces[is_in_sum[faces].any(axis=1)], new])
     edges = Edges.of(half_edges(triangles))
     corner = x[triangles]
     weight = np.zeros(len(edges.vertices))
@@ -577,12 +627,15 @@ def _fair_patches(x: FloatArray, faces: IntArray, new: IntArray, input_count: in
         cotangent = np.clip(row_dots(u, w) / twice_area, -_MAX_COTANGENT, _MAX_COTANGENT)
         m = len(triangles)
         np.add.at(weight, edges.edge_of_pair[k * m : (k + 1) * m], 0.5 * cotangent)
+        # A vertex gets a third of the area of each of its triangles.
         np.add.at(area, triangles[:, k], twice_area / 6)
     weight = np.maximum(weight, _MIN_WEIGHT)
-    # Beside holes that remain open only new vertices count.
-    counts[edges.vertices[edges.multiplicity != 2]] = False
-    rows = np.flatnonzero(counts & (area > 0))
+    # Beside holes that remain open the Laplacian is incomplete, so their vertices do not count.
+    is_in_sum[edges.vertices[edges.multiplicity != 2]] = False
+    rows = np.flatnonzero(is_in_sum & (area > 0))
     laplacian = _graph_laplacian(edges.vertices, weight, len(x))[rows]
+    # A row of the graph's Laplacian is the Laplacian at a vertex times the area around it, so its
+    # square is divided by the area.
     row_scale = 1 / np.sqrt(np.maximum(area[rows], 1e-300))
     return _solve_least_squares(laplacian.multiply(row_scale[:, None]).tocsr(), x, input_count)
 
@@ -592,12 +645,13 @@ def _flip_edges(x: FloatArray, new: IntArray, fixed_edges: IntArray) -> IntArray
     criterion). Returns the new faces (p, 3). An edge is flipped only if the new edge does not exist
     yet and no triangle turns over.
 
-    The edge from a to b of the faces f, with the third corner c, and g, with the third corner d, is
-    replaced by the edge from c to d. An edge is flipped if the sum of the cotangents of the angles
-    at c and d is negative enough, the smallest sums first; each face takes part in one flip per
-    round.
+    The edge from a to b is common to the faces f, with the third corner c, and g, with the third
+    corner d. A flip replaces it by the edge from c to d. An edge is flipped if the sum of the
+    cotangents of the angles at c and d is negative enough, which means that the angles add up to
+    more than 180 degrees. The smallest sums come first; each face takes part in one flip per round.
 
     x: (n, 3) all vertices.
+    new: (p, 3) the faces of patches.
     fixed_edges: (t, 2) the existing edges of the mesh.
     """
     new = new.copy()
@@ -605,6 +659,8 @@ def _flip_edges(x: FloatArray, new: IntArray, fixed_edges: IntArray) -> IntArray
     for _ in range(_FLIP_ROUNDS):
         edges = Edges.of(half_edges(new))
         paired = edges.paired_half_edges()
+        # The row of a half-edge is its position in the face times the number of faces, plus the
+        # face.
         f, g = paired.T % len(new)
         k, j = paired.T // len(new)
         a, b, c, d = new[f, k], new[f, (k + 1) % 3], new[f, (k + 2) % 3], new[g, (j + 2) % 3]
@@ -612,13 +668,17 @@ def _flip_edges(x: FloatArray, new: IntArray, fixed_edges: IntArray) -> IntArray
         cotangents = _cotangents(x[a], x[b], x[c]) + _cotangents(x[a], x[b], x[d])
         is_flippable = (cotangents < _MAX_FLIP_COTANGENT_SUM) & (c != d)
         is_flippable &= ~np.isin(key, fixed_keys) & ~np.isin(key, edge_keys(edges.vertices, len(x)))
+        # The new triangles must look to the same side as the old ones.
         before = area_normals(x[new])
         mean = before[f] + before[g]
         for triangle in ((a, d, c), (d, b, c)):
             is_flippable &= row_dots(area_normals(x[np.column_stack(triangle)]), mean) > 0
         rows = np.flatnonzero(is_flippable)
         rows = rows[np.argsort(cotangents[rows])]
+        # Of edges that would become the same edge, the one with the smallest sum.
         rows = rows[np.sort(np.unique(key[rows], return_index=True)[1])]
+        # best[face]: the first flip in which the face takes part. A flip is done if it is the first
+        # for both of its faces.
         best = np.full(len(new), len(rows))
         for side in (f, g):
             np.minimum.at(best, side[rows], np.arange(len(rows)))
@@ -632,16 +692,19 @@ def _flip_edges(x: FloatArray, new: IntArray, fixed_edges: IntArray) -> IntArray
 
 
 def _cotangents(a: FloatArray, b: FloatArray, apex: FloatArray) -> FloatArray:
-    """(k,) the cotangents of the angles at points `apex` between the directions to `a` and to `b`,
+    """The cotangents (k,) of the angles at points `apex` between the directions to `a` and to `b`,
     all (k, 3)."""
     u, w = a - apex, b - apex
     return row_dots(u, w) / np.maximum(row_norms(np.cross(u, w)), 1e-300)
 
 
 def _loop_of_faces(new: IntArray, loops: list[IntArray], count: int) -> IntArray:
-    """(p,) for each face of a patch, the index of the loop that the patch fills. The faces of a
-    patch are connected by edges, and one face is at the first edge of the loop.
+    """(p,) for each face of a patch, the index of the loop that the patch fills. It is found from
+    the connected groups of faces: the faces of a patch are connected by edges, and one of them has
+    the first edge of the loop.
 
+    new: (p, 3) the faces of all patches.
+    loops: the indices of the vertices of each loop.
     count: the number of vertices.
     """
     import scipy.sparse  # imported here: it takes half a second
@@ -654,8 +717,11 @@ def _loop_of_faces(new: IntArray, loops: list[IntArray], count: int) -> IntArray
     part = np.asarray(csgraph.connected_components(joined, directed=False)[1])
     loop_at = np.full(int(part.max()) + 1, -1, np.int64)
     keys = edge_keys(edges.vertices, count)
+    # For each edge, one of its faces.
     face_at = np.empty(len(keys), np.int64)
     face_at[edges.edge_of_pair] = np.arange(3 * len(new)) % len(new)
+    # The first edges of the loops, looked up among the edges of patches. Loops without a patch have
+    # none.
     firsts = edge_keys(np.array([loop[:2] for loop in loops]), count)
     positions = np.minimum(np.searchsorted(keys, firsts), len(keys) - 1)
     matched = np.flatnonzero(keys[positions] == firsts)

@@ -1,9 +1,12 @@
-"""On how many tetrahedra a mesh made by marching tetrahedra is proved to have the topology of the
-level set.
+"""Proves on which tetrahedra a mesh has the topology of the level set {f = 0}. Here f is the field
+minus its level, and the mesh is made by marching tetrahedra: it consists of the triangles in which
+F = 0, where F is the function that is linear on each tetrahedron and equals f at its corners. Two
+surfaces are isotopic if one can be deformed into the other without tearing or crossing. The curve
+is the boundary curve at which the level set ends; walls are the faces of the box in which it is
+meshed, if it may end there.
 
-Let f be the function minus its level. Let F be the function that is linear on each tetrahedron and
-equals f at the corners; its zero set are the triangles of `marching_tetrahedra`. Let H_t = (1-t) F
-+ t f for 0 <= t <= 1. F|T is F on the tetrahedron T, so grad F|T is a constant vector.
+Let H_t = (1-t) F + t f for 0 <= t <= 1. F|T is F on the tetrahedron T, so grad F|T is a constant
+vector.
 
 Theorem. If each tetrahedron T satisfies (a), (b) or (c), the zero sets of f and F are isotopic:
 (a) neither f nor F has a zero in T, and both have the same sign there;
@@ -11,23 +14,23 @@ Theorem. If each tetrahedron T satisfies (a), (b) or (c), the zero sets of f and
 (c) each corner v of T has a vector n with n . grad F|S > 0 and n . grad f(x) > 0 for all x in S,
     for all tetrahedra S around v that do not satisfy (a).
 
-Proof. Let H_t(x) = 0 for some t. Then x lies in no tetrahedron of kind (a). There is a vector n
-with n . grad f(x) > 0 and n . grad F|T > 0 for all T that contain x. If all of these are of kind
-(b), it is n = grad f(x). Otherwise x lies in a tetrahedron of kind (c), and so inside of a simplex
-(a face, an edge or a corner of it, or all of it). Each corner of this simplex has such an n, and
-all T that contain x are around each of these corners. H_t is Lipschitz, and its generalized
-gradient by Clarke at x is the convex hull of (1-t) grad F|T + t grad f(x) over these T. It does not
-contain 0, because all of its elements have positive products with n. By Clarke's implicit function
-theorem the zero set of H in (x, t) is near there the graph of a Lipschitz function over t and the
-plane orthogonal to n. The fields n/(n . n), patched by a partition of unity, still have positive
-products with all these gradients. Following them as t goes from 0 to 1 moves the zero set of F onto
-that of f (Thom's argument, for Lipschitz functions). On a wall, a face of the box where the surface
-ends, x moves within the wall. So for each face, edge or corner of a tetrahedron that lies in walls,
-(b) is also required of the projections of the gradients onto these walls.
+Proof. Let H_t(x) = 0 for some t. Then x lies in no tetrahedron of kind (a). We show that there is a
+vector n with n . grad f(x) > 0 and n . grad F|T > 0 for all T that contain x. If all of these are
+of kind (b), it is n = grad f(x). Otherwise x lies in a tetrahedron of kind (c), and so in the
+relative interior of a simplex (a face, an edge or a corner of it, or all of it). Each corner of
+this simplex has such an n, and all T that contain x are around each of these corners. H_t is
+Lipschitz, and its generalized gradient by Clarke at x is the convex hull of (1-t) grad F|T + t grad
+f(x) over these T. It does not contain 0, because all of its elements have positive products with n.
+By Clarke's implicit function theorem the zero set of H in (x, t) is near there the graph of a
+Lipschitz function over t and the plane orthogonal to n. The vector fields n/(n . n), patched by a
+partition of unity, still have positive products with all these gradients. Following them as t goes
+from 0 to 1 moves the zero set of F onto the zero set of f (Thom's argument, for Lipschitz
+functions). On a wall, x moves within the wall. So for each face, edge or corner of a tetrahedron
+that lies in walls, (b) is also required of the projections of the gradients onto these walls.
 
-Four corners on the level. F is 0 on such a T, and `marching_tetrahedra` gives all of T to one side
-of the level set. If two of the faces of T are in the mesh, set F to +epsilon or -epsilon at the
-middle of the edge that the other two faces share. Then T becomes two tetrahedra, and on each of
+Four corners on the level set. F is 0 on such a T, and `marching_tetrahedra` gives all of T to one
+side of the level set. If two of the faces of T are in the mesh, set F to +epsilon or -epsilon at
+the middle of the edge that the other two faces share. Then T becomes two tetrahedra, and on each of
 them grad F is a normal of one of the two faces in the mesh. Elsewhere F changes by no more than
 epsilon, which (b) and (c) allow as they are strict inequalities, and the zero set is the mesh. So
 (b) and (c) are required of both normals. If T has another number of faces in the mesh, nothing is
@@ -37,7 +40,7 @@ Angles. The lift of an angle-valued f is a continuous real-valued function that 
 period. The check of (b) includes that the lift stays within half a period of the level on T. Then
 the wrapped values at the corners are the values of this lift, and all is as for real values.
 
-The check. By the field's own promise (`Field.gradient_change_bound`), |grad f(y) - grad f(c)| <= D
+The check. The field proves a bound D (`Field.gradient_change_bound`): |grad f(y) - grad f(c)| <= D
 for all y in the ball around T with center c and radius R. So (b) holds if grad f(c) . grad F > D
 |grad F|, and f has no zero in T if |f(c)| > (|grad f(c)| + D) R. If neither holds, T is halved at
 its longest edge, a few times: grad F is the same in both halves, and (a) or (b) may hold in each.
@@ -74,9 +77,7 @@ _FAR_FROM_CURVE = 1.5
 
 @dataclass(frozen=True)
 class IsotopyCoverage:
-    """On which fraction of the tetrahedra the topology of a mesh is proved to be that of the level
-    set.
-
+    """On which fraction of the tetrahedra a mesh is proved to have the topology of the level set.
     Only tetrahedra count that may hold a point of the level set, or that hold a point of the mesh.
 
     proved: the fraction of these tetrahedra on which condition (a), (b) or (c) of the module's
@@ -85,9 +86,10 @@ class IsotopyCoverage:
     proved_off_curve: the same fraction among the tetrahedra farther than 1.5 cells from the
         boundary curve.
     count: the number of these tetrahedra. For fields that do not bound the change of their gradient
-        only those that hold a point of the mesh are counted.
+        only tetrahedra that hold a point of the mesh are counted.
     unproved_off_curve: (k, 4) the corners of the tetrahedra farther than 1.5 cells from the curve
-        on which nothing is proved."""
+        on which nothing is proved.
+    """
 
     proved: float
     proved_off_curve: float
@@ -110,52 +112,61 @@ def isotopy_of(
     spacing: float,
     walls: Walls,
 ) -> IsotopyCoverage:
-    """Find out on which tetrahedra the topology of a mesh is proved to be that of the level set.
+    """Find out on which tetrahedra a mesh is proved to have the topology of the level set {f = 0}.
 
-    points, tetrahedra: points with samples of the function, and for each tetrahedron the indices
-        (m, 4) of its corners among them.
-
+    function: f.
+    points: the corners of the tetrahedra, with samples of f.
+    tetrahedra: (m, 4) for each tetrahedron, the indices of its corners.
     is_cut: (m,) whether a tetrahedron holds a point of the mesh.
     faces: (k, 3) the triangles of the mesh; its first vertices are the points of the tetrahedra.
     boundary: the curve at which the level set ends.
     spacing: the size of cells, a length.
-    walls: the lower and the upper corner (3,) of the box, on whose faces the surface may end;
-        None if it does not end there.
+    walls: the lower and the upper corner (3,) of the box, on whose faces the surface may end; None
+        if it does not end there.
     """
     corners = points.points[tetrahedra]
     if not _has_bounds(function, corners[is_cut]):
         return IsotopyCoverage(0.0, 0.0, int(is_cut.sum()), tetrahedra[is_cut])
+    # Tetrahedra that count: those that the mesh meets, and those not proved to satisfy (a).
     uncut = np.flatnonzero(~is_cut)
-    holds = is_cut.copy()
-    holds[uncut[~_proved_empty(function, corners[uncut])]] = True
-    index, corners = tetrahedra[holds], corners[holds]
+    is_counted = is_cut.copy()
+    is_counted[uncut[~_proved_empty(function, corners[uncut])]] = True
+    index, corners = tetrahedra[is_counted], corners[is_counted]
     values = points.samples.value[index]
     values[points.is_on_level[index]] = 0.0
     slopes = _linear_gradients(function, corners, index, values, faces)
-    beside = (index < len(boundary.points)).any(axis=1)
+    has_curve_point = (index < len(boundary.points)).any(axis=1)
+    # A gradient of F is needed; then (a) or (b), for all of its gradients.
     proved = np.bincount(slopes.owner, minlength=len(index)) > 0
-    proved &= ~beside
+    proved &= ~has_curve_point
     rows = np.flatnonzero(proved[slopes.owner])
     is_regular = _proved_regular(
         function, corners[slopes.owner[rows]], values[slopes.owner[rows], 0],
         slopes.slope[rows], np.ones(3),
     )  # fmt: skip
     proved[slopes.owner[rows[~is_regular]]] = False
+    # The requirement on walls, of (b) only.
     on_walls = np.ones(len(index), np.bool_)
     if walls is not None:
         on_walls = _regular_on_walls(function, corners, values, slopes, proved, walls)
-    far = np.ones(len(index), np.bool_)
+    is_far = np.ones(len(index), np.bool_)
     if len(boundary.edges):
-        far = _distances(corners.mean(axis=1), boundary) > _FAR_FROM_CURVE * spacing
-    stars = ~proved & ~beside & far
-    proved[stars] = _proved_by_stars(function, corners, index, slopes, np.flatnonzero(stars))
+        is_far = _distances(corners.mean(axis=1), boundary) > _FAR_FROM_CURVE * spacing
+    needs_condition_c = ~proved & ~has_curve_point & is_far
+    # Condition (c) for the tetrahedra on which neither was proved.
+    proved[needs_condition_c] = _proved_by_stars(
+        function, corners, index, slopes, np.flatnonzero(needs_condition_c)
+    )
     proved &= on_walls
-    return IsotopyCoverage(_share(proved), _share(proved[far]), len(index), index[far & ~proved])
+    return IsotopyCoverage(
+        _share(proved), _share(proved[is_far]), len(index), index[is_far & ~proved]
+    )
 
 
 def _has_bounds(function: LevelFunction, corners: FloatArray) -> bool:
-    """Whether the field gives a finite bound of the change of its gradient on at least one of about
-    a hundred of the tetrahedra with corners (n, 4, 3). If it does not, nothing can be proved."""
+    """Whether the field gives a finite bound of the change of its gradient, so that something can
+    be proved: tried on about a hundred of the tetrahedra with corners (n, 4, 3), of which one must
+    have a bound."""
     tried = corners[:: max(1, len(corners) // _MAX_TRIED)]
     center, radius = _balls(tried)
     return not len(tried) or bool((function.gradient_bounds(center, radius)[1] < _NO_BOUND).any())
@@ -167,20 +178,21 @@ def _share(proved: BoolArray) -> float:
 
 
 def _balls(corners: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Balls that contain simplices with corners (n, k, 3). Returns the centers (n, 3), the means of
-    the corners, and the radii (n,)."""
+    """Balls that contain simplices with corners (n, k, 3). Returns their centers (n, 3), which are
+    the means of the corners, and their radii (n,)."""
     center = corners.mean(axis=1)
     return center, np.linalg.norm(corners - center[:, None], axis=2).max(axis=1)
 
 
 @dataclass(frozen=True)
 class _LinearGradients:
-    """The gradients of F on tetrahedra. F is the function that is linear on each tetrahedron and
-    equals f - level at the corners.
+    """The gradients, on tetrahedra, of the function F that is linear on each tetrahedron and equals
+    f at the corners. A tetrahedron with all corners on the level set has two gradients or none (see
+    the module); any other one has one, or none if it has no volume.
 
-    owner: (k,) the index of the tetrahedron that each gradient belongs to. A tetrahedron has one
-        gradient, two or none.
-    slope: (k, 3) the gradients."""
+    owner: (k,) for each gradient, the index of its tetrahedron.
+    slope: (k, 3) the gradients.
+    """
 
     owner: IntArray
     slope: FloatArray
@@ -193,37 +205,47 @@ def _linear_gradients(
     values: FloatArray,
     faces: IntArray,
 ) -> _LinearGradients:
-    """The gradients on m tetrahedra of F, the function that is linear on each tetrahedron and has
-    the values `values` (m, 4) at its corners.
+    """Compute the gradients of F on m tetrahedra, where F is linear on each tetrahedron and has the
+    values `values` (m, 4) at its corners.
 
+    A tetrahedron without a volume has no gradient. If all four corners are on the level set, F is 0
+    there. Then, if exactly two of its faces are in the mesh, F is changed a little inside of it, so
+    that it has two gradients, which are normals of these two faces (see "Four corners on the level
+    set" in the module). Otherwise it has no gradient.
+
+    function: f.
     corners, index: (m, 4, 3), (m, 4) the corners of the tetrahedra and the indices of these points.
     faces: (j, 3) of the mesh.
-
-    A tetrahedron without a volume has no gradient. If all four corners are on the level, F is 0
-    there. Then, if exactly two of its faces are in the mesh, F is changed a little inside of it, so
-    that it has two gradients, which are normals of these two faces (see "Four corners on the level"
-    in the module). Otherwise it has no gradient."""
+    """
     edges = corners[:, 1:] - corners[:, :1]
     size = np.linalg.norm(edges, axis=2).max(axis=1)
     has_volume = np.abs(np.linalg.det(edges)) > 1e-9 * size**3
     on_level = (values == 0).all(axis=1)
     rows = np.flatnonzero(has_volume & ~on_level)
+    # With d the edges from the first corner, grad F . d is the difference of the values at their
+    # ends.
     rise = values[rows, 1:] - values[rows, :1]
     slope: FloatArray = np.linalg.solve(edges[rows], rise[..., None])[..., 0].astype(np.float64)
     owners, slopes = [rows], [slope]
     rows = np.flatnonzero(has_volume & on_level)
-    count = int(index.max(initial=0)) + 1
-    keys = _triple_keys(faces[(faces < count).all(axis=1)], count)
-    triples = np.array([np.delete(np.arange(4), k) for k in range(4)])
+    point_count = int(index.max(initial=0)) + 1
+    mesh_keys = _triple_keys(faces[(faces < point_count).all(axis=1)], point_count)
+    faces_of_tetrahedron = np.array([np.delete(np.arange(4), k) for k in range(4)])
     in_mesh = np.stack(
-        [np.isin(_triple_keys(index[rows][:, triple], count), keys) for triple in triples], axis=1
+        [
+            np.isin(_triple_keys(index[rows][:, face], point_count), mesh_keys)
+            for face in faces_of_tetrahedron
+        ],
+        axis=1,
     )
+    # The side of the level set to which all of T is given: the sign of f at the center.
     sign = np.sign(function.values(corners[rows].mean(axis=1)))
     has_two = in_mesh.sum(axis=1) == 2
-    for k, triple in enumerate(triples):
+    for k, face in enumerate(faces_of_tetrahedron):
         chosen = np.flatnonzero(has_two & in_mesh[:, k])
-        a, b, c = (corners[rows[chosen], corner] for corner in triple)
+        a, b, c = (corners[rows[chosen], corner] for corner in face)
         normal = np.cross(b - a, c - a)
+        # Corner k is opposite to the face; the gradient points to it if f > 0 inside.
         inward = ((corners[rows[chosen], k] - a) * normal).sum(axis=1)
         owners.append(rows[chosen])
         slopes.append(normal * (np.sign(inward) * sign[chosen])[:, None])
@@ -231,10 +253,11 @@ def _linear_gradients(
 
 
 def _triple_keys(triples: IntArray, point_count: int) -> IntArray:
-    """(k,) an integer for each triple (k, 3) of point indices: the same for any order of the three
-    indices, and different for different triples.
+    """An integer (k,) for each triple (k, 3) of indices of points: the same for any order of the
+    three indices, and different for different triples.
 
-    point_count: more than the largest index, and less than two million."""
+    point_count: more than the largest index, and less than two million.
+    """
     a, b, c = np.sort(triples, axis=1).T
     keys: IntArray = (a * point_count + b) * point_count + c
     return keys
@@ -251,52 +274,61 @@ def _proved_by_stars(
     `rows` (k,): each corner has a vector n with n . grad F > 0 and n . grad f > 0 on all tetrahedra
     around the corner.
 
+    For each corner, the vector n is computed as by a perceptron: it starts as the sum of all unit
+    gradients of F around the corner; then the gradients whose product with n is not positive are
+    added again, for a few rounds.
+
+    function: f.
     corners, index: (m, 4, 3), (m, 4) the corners of all tetrahedra, and the indices of these
         points.
     slopes: the gradients of F on the tetrahedra.
-
-    For each corner, the vector n is computed as by a perceptron: it starts as the sum of all unit
-    gradients of F around the corner; then the gradients whose product with n is not positive are
-    added again, for a few rounds."""
+    """
     vertices = np.unique(index[rows])
-    number = np.full(int(index.max(initial=0)) + 1, -1, np.int64)
-    number[vertices] = np.arange(len(vertices))
-    # Pairs of a corner and a tetrahedron around it; then pairs of a corner and a gradient there.
-    tet, corner = np.nonzero(number[index] >= 0)
-    star = number[index[tet, corner]]
-    entry, corner_of_entry = np.nonzero(number[index[slopes.owner]] >= 0)
-    vertex = number[index[slopes.owner[entry], corner_of_entry]]
+    vertex_number = np.full(int(index.max(initial=0)) + 1, -1, np.int64)
+    vertex_number[vertices] = np.arange(len(vertices))
+    # Pairs of a tetrahedron and a corner of it among `vertices`; then pairs of a gradient and such
+    # a corner of its tetrahedron.
+    tet, corner = np.nonzero(vertex_number[index] >= 0)
+    vertex_of_pair = vertex_number[index[tet, corner]]
+    entry, corner_of_entry = np.nonzero(vertex_number[index[slopes.owner]] >= 0)
+    vertex = vertex_number[index[slopes.owner[entry], corner_of_entry]]
     units = slopes.slope[entry]
     units = units / np.maximum(np.linalg.norm(units, axis=1), 1e-300)[:, None]
-    n = np.zeros((len(vertices), 3))
-    np.add.at(n, vertex, units)
+    normal = np.zeros((len(vertices), 3))
+    np.add.at(normal, vertex, units)
     for _ in range(_MAX_PERCEPTRON_ROUNDS):
-        is_short = (n[vertex] * units).sum(axis=1) <= 0
+        is_short = (normal[vertex] * units).sum(axis=1) <= 0
         if not is_short.any():
             break
-        np.add.at(n, vertex[is_short], units[is_short])
+        np.add.at(normal, vertex[is_short], units[is_short])
     is_proved = np.ones(len(vertices), np.bool_)
-    is_proved[vertex[(n[vertex] * units).sum(axis=1) <= 1e-9]] = False
+    is_proved[vertex[(normal[vertex] * units).sum(axis=1) <= 1e-9]] = False
     has_slope = np.bincount(slopes.owner, minlength=len(index)) > 0
-    is_proved[star[~has_slope[tet]]] = False
-    tried = np.flatnonzero(is_proved[star])
+    # A tetrahedron without a gradient proves nothing at its corners.
+    is_proved[vertex_of_pair[~has_slope[tet]]] = False
+    # n . grad f > 0 on each tetrahedron around the corners that are left; n takes the place of grad
+    # F.
+    tried = np.flatnonzero(is_proved[vertex_of_pair])
     start = np.zeros(len(tried))
-    fine = _proved_regular(function, corners[tet[tried]], start, n[star[tried]], np.ones(3))
-    is_proved[star[tried[~fine]]] = False
-    return np.asarray(is_proved[number[index[rows]]].all(axis=1), np.bool_)
+    is_regular = _proved_regular(
+        function, corners[tet[tried]], start, normal[vertex_of_pair[tried]], np.ones(3)
+    )
+    is_proved[vertex_of_pair[tried[~is_regular]]] = False
+    return np.asarray(is_proved[vertex_number[index[rows]]].all(axis=1), np.bool_)
 
 
 def _proved_empty(function: LevelFunction, corners: FloatArray) -> BoolArray:
     """(n,) whether condition (a) of the module's theorem is proved on tetrahedra with corners (n,
-    4, 3) that the mesh does not meet: f - level has no zero there, and neither has its linear
-    interpolation F.
+    4, 3) that the mesh does not meet: neither f nor its linear interpolation F has a zero there.
 
     Tetrahedra are halved up to five times, until a ball around each piece is proved to hold no zero
-    of f - level. The mesh is the zero set of F, so F has no zero there. As f does not cross a level
-    on the edges either, both functions have the same sign."""
+    of f. The mesh is the zero set of F, so F has no zero there. Both functions have the same sign,
+    since they agree at the corners.
+    """
     owner, pieces = np.arange(len(corners)), corners
     for _ in range(_HALVINGS + 1):
         center, radius = _balls(pieces)
+        # The distance from the level set is more than the radius in decided pieces.
         undecided = function.clearance(center) <= radius * (1 + 1e-9)
         owner = np.concatenate([owner[undecided], owner[undecided]])
         pieces = _halved(pieces[undecided])
@@ -314,15 +346,19 @@ def _proved_regular(
     slope: FloatArray,
     free: FloatArray,
 ) -> BoolArray:
-    """(n,) whether condition (a) or (b) of the module's theorem is proved on all of each simplex
-    with corners (n, k, 3): f and F have no zero there, or grad f . grad F > 0. Simplices are halved
-    up to five times for that.
+    """(n,) whether condition (a) or (b) of the module's theorem is proved on all of each simplex: f
+    and F have no zero there, or grad f . grad F > 0. Simplices are halved up to five times for
+    that.
 
+    function: f.
+    corners: (n, k, 3) the corners of the simplices.
     start: (n,) the values of F at the first corners of the simplices.
-    slope: (n, 3) grad F on each simplex; for condition (c), the vector n of the theorem, and
+    slope: (n, 3) grad F on each simplex. For condition (c), the vector n of the theorem; then
         `start` is 0.
     free: (3,) 1 for coordinates in which points may move, 0 for coordinates that a face of the box
-        fixes."""
+        fixes.
+    """
+    # `pieces` are the parts that are undecided, and `owner` the simplices that they belong to.
     owner, first = np.arange(len(corners)), corners[:, 0]
     pieces, proved = corners, np.ones(len(corners), np.bool_)
     half_period = np.inf if function.period is None else 0.499 * function.period
@@ -340,14 +376,18 @@ def _proved_regular(
         gradient_length = np.linalg.norm(samples.gradient, axis=1)
         moved = (gradient_length + change) * radius
         product = (samples.gradient * projected).sum(axis=1)
+        # (b), with D = `change`; then (a), for f by its bound and for F by its values at the
+        # corners.
         is_regular = product > change * np.linalg.norm(projected, axis=1) * (1 + 1e-9)
         is_within_half_period = np.abs(samples.value) + moved < half_period
         linear = start[owner, None] + ((pieces - first[owner, None]) * slope[owner, None]).sum(2)
         sign = np.sign(samples.value)
         is_regular |= (np.abs(samples.value) > moved) & (linear * sign[:, None] > 0).all(axis=1)
+        # The lift stays within half a period of the level on the whole simplex.
         if halving == 0:
             proved &= is_within_half_period
         undecided = ~is_regular & proved[owner]
+        # A single point cannot be halved.
         if halving == _HALVINGS or pieces.shape[1] == 1:
             proved[owner[undecided]] = False
             break
@@ -358,9 +398,10 @@ def _proved_regular(
 
 def _halved(pieces: FloatArray) -> FloatArray:
     """Cut simplices (n, k, 3) at the middle of their longest edges. Returns (2n, k, 3): first one
-    half of each, then the other."""
+    half of each, then all other halves."""
     pairs = list(itertools.combinations(range(pieces.shape[1]), 2))
     lengths = [np.linalg.norm(pieces[:, i] - pieces[:, j], axis=1) for i, j in pairs]
+    # For each simplex, the positions of the two ends of its longest edge.
     i, j = np.array(pairs)[np.argmax(lengths, axis=0)].T if len(pieces) else (np.zeros(0, int),) * 2
     rows = np.arange(len(pieces))
     middle = 0.5 * (pieces[rows, i] + pieces[rows, j])
@@ -377,14 +418,17 @@ def _regular_on_walls(
     rows: BoolArray,
     walls: tuple[FloatArray, FloatArray],
 ) -> BoolArray:
-    """(n,) whether, on each tetrahedron, grad f . grad F > 0 is also proved for the projections of
-    the gradients onto the faces of the box (walls) in which it has corners.
+    """(n,) whether the requirement on walls is proved: where a face, an edge or a corner of a
+    tetrahedron lies in walls (faces of the box), grad f . grad F > 0 for the projections of the
+    gradients onto these walls. Tetrahedra outside of the mask `rows` count as proved if they have
+    no corner on a wall, else as not proved.
 
-    rows: (n,) the mask of the tetrahedra whose faces, edges and corners in walls are tested.
+    function: f.
+    corners, values: (n, 4, 3), (n, 4) the corners of the tetrahedra and the values of F there.
+    slopes: the gradients of F.
+    rows: (n,) mask of the tetrahedra to be tested.
     walls: the lower and the upper corner (3,) of the box.
-
-    Tetrahedra outside of the mask `rows` count as proved if they have no corner on a wall, else as
-    not proved."""
+    """
     tolerance = 1e-9 * (walls[1] - walls[0])
     on = np.stack([np.abs(corners - wall) <= tolerance for wall in walls], axis=-1)  # (n, 4, 3, 2)
     proved = rows | ~on.any(axis=(1, 2, 3))
@@ -398,11 +442,13 @@ def _regular_on_walls(
             free = np.ones(3)
             free[axes] = 0.0
             corner_count = in_planes.sum(axis=1)
+            # The part of a tetrahedron in the walls is a corner, an edge or a face: k corners.
             for k in range(1, 4):
                 entry = np.flatnonzero(((corner_count == k) & rows)[slopes.owner])
                 if not len(entry):
                     continue
                 owner = slopes.owner[entry]
+                # The positions of the corners in the walls, which come first in this order.
                 columns = np.argsort(~in_planes[owner], axis=1, kind="stable")[:, :k]
                 part = np.take_along_axis(corners[owner], columns[..., None], axis=1)
                 start = np.take_along_axis(values[owner], columns[:, :1], axis=1)[:, 0]
@@ -412,8 +458,8 @@ def _regular_on_walls(
 
 
 def _distances(points: FloatArray, boundary: BoundaryCurve) -> FloatArray:
-    """(n,) distances of points (n, 3) from the curve, measured to nine points of each of its edges.
-    The distances are too large by at most a sixteenth of the longest edge."""
+    """Distances (n,) of points (n, 3) from the curve, measured to nine points of each of its edges.
+    They are too large by at most a sixteenth of the longest edge."""
     import scipy.spatial  # imported here: it takes half a second
 
     searching: Any = scipy.spatial

@@ -1,5 +1,8 @@
-"""Meshes of level sets of real-valued functions (without a period), made in the tetrahedra of a
-lattice, and checks of these meshes.
+"""Meshes the level set of a real-valued function: a lattice divides a box into tetrahedra, and the
+level set cuts these into triangles. Also checks of these meshes. "The function" is a
+`LevelFunction`: a field minus its level, so the surface is where it is 0. A "cell" is a cube of the
+lattice. A "sample" is the function's value, gradient and estimated distance from the level set at a
+point.
 
 Points of the lattice near the level set are moved onto it and become vertices, which removes most
 slivers (Labelle and Shewchuk 2007). If parts of the surface then touch in a vertex or an edge,
@@ -92,7 +95,8 @@ _FLAT_RADIUS = 0.25
 
 
 class MissedPartsError(MeshingError):
-    """A level set has parts between the points of a lattice, which the mesh therefore misses.
+    """The error for a level set with parts that the mesh misses, because they pass between the
+    points of the lattice, as a wall thinner than a cell does.
 
     places: (k, 3) points on the level set, in the longest missed part.
     thickness: (k,) thicknesses of the part at these points, lengths: 2^-7, 2^-6, ..., 1 cells; 0 if
@@ -106,15 +110,15 @@ class MissedPartsError(MeshingError):
         self.places, self.thickness, self.size = places, thickness, size
 
     def may_be_fixed_by(self, smaller: float) -> bool:
-        """Whether smaller cells may find the missed part. smaller: the size of the smaller cells,
-        as a fraction of `size`.
+        """Whether a lattice of smaller cells may find the missed part. smaller: the size of the
+        smaller cells, as a fraction of `size`.
 
-        They cannot if they too would miss a part that is at least two of the smaller cells long and
-        thinner than a quarter of such a cell. Such a part is beside a cusp or the tip of a cone,
-        and no size of cells resolves it."""
+        It cannot if the part is thinner than a quarter of a smaller cell over a length of at least
+        two smaller cells: then the smaller cells miss a part, too. Such a part is beside a cusp or
+        the tip of a cone, and no size of cells resolves it."""
         thin_places = self.places[self.thickness < _HOPELESS_THICKNESS * smaller * self.size]
-        part = _longest_part(thin_places, _CLUSTER_DISTANCE * self.size)
-        length = float(np.ptp(part, axis=0).max()) if len(part) else 0.0
+        longest_thin_part = _longest_part(thin_places, _CLUSTER_DISTANCE * self.size)
+        length = float(np.ptp(longest_thin_part, axis=0).max()) if len(longest_thin_part) else 0.0
         return length < _MIN_MISSED_LENGTH * smaller * self.size
 
 
@@ -132,11 +136,13 @@ def check_no_missed_parts(
     long: thin walls, sharp edges, islands.
 
     points, samples: points (n, 3) of a lattice, and samples of the function at them.
-    is_beside: (n,) whether each point is a corner of a tetrahedron that the mesh cuts.
+    is_beside: (n,) whether each point is a corner of a tetrahedron that the mesh cuts. The search
+        starts only at other points.
     surface: the vertices and faces of the mesh.
     size: the size of a cell, a length.
-    box: the lower and the upper corner (3,) of the box in which the level set counts.
-    elsewhere: the radius of a ball around each point within which the level set does not count.
+    box: the lower and the upper corner (3,) of the box outside of which nothing counts as missed.
+    elsewhere: a function that gives, for points (k, 3), the radius (k,) of a ball around each
+        within which nothing counts as missed (0: the point counts); None if all points count.
 
     The signs at the points of a lattice do not show a wall between two points. Newton's method,
     started at points beside the wall, finds the sides of the wall: it ends on the level set, where
@@ -154,19 +160,25 @@ def check_no_missed_parts(
     if not len(rows):
         return
     start = points[rows]
-    step = np.full(len(rows), 0.5 * size)
-    x = newton_to_level(function, start, samples.select(rows), step, None)
+    max_step = np.full(len(rows), 0.5 * size)
+    # Move points that are less than a cell from the level set onto it.
+    x = newton_to_level(function, start, samples.select(rows), max_step, None)
     end_samples = function.sample(x)
-    on_level = end_samples.distance < _ON_LEVEL_DISTANCE * size
-    slow = ~on_level & (end_samples.distance < _SLOW_CONVERGENCE * samples.distance[rows])
-    if slow.any():
-        x[slow] = to_multiple_roots(function, x[slow], end_samples.select(slow), step[slow])
-        on_level[slow] = function.sample(x[slow]).distance < _ON_LEVEL_DISTANCE * size
-    on_level &= row_norms(x - start) < _MAX_SEED_MOVE * size
-    deep = _MIN_WALL_DISTANCE * size
-    on_level &= ((x >= box[0] + deep) & (x <= box[1] - deep)).all(axis=1)
-    x = x[on_level]
+    is_on_level = end_samples.distance < _ON_LEVEL_DISTANCE * size
+    # Slow convergence hints at a multiple root, for which another iteration is faster.
+    is_slow = ~is_on_level & (end_samples.distance < _SLOW_CONVERGENCE * samples.distance[rows])
+    if is_slow.any():
+        x[is_slow] = to_multiple_roots(
+            function, x[is_slow], end_samples.select(is_slow), max_step[is_slow]
+        )
+        is_on_level[is_slow] = function.sample(x[is_slow]).distance < _ON_LEVEL_DISTANCE * size
+    # Points count only if they moved little and do not lie beside a face of the box.
+    is_on_level &= row_norms(x - start) < _MAX_SEED_MOVE * size
+    wall_distance = _MIN_WALL_DISTANCE * size
+    is_on_level &= ((x >= box[0] + wall_distance) & (x <= box[1] - wall_distance)).all(axis=1)
+    x = x[is_on_level]
     vertices, faces = surface
+    # Keep the points that are far from the mesh: near them, triangles are missing.
     if len(faces) and len(x):
         mesh_points = np.concatenate([vertices[np.unique(faces)], vertices[faces].mean(axis=1)])
         x = x[searching.cKDTree(mesh_points).query(x)[0] > _MIN_MESH_DISTANCE * size]
@@ -190,21 +202,23 @@ def check_no_missed_parts(
 
 
 def _thickness(function: LevelFunction, x: FloatArray, size: float) -> FloatArray:
-    """(k,) the thickness, a length, of the part of the solid or of the gap at points x (k, 3) on
-    the level set.
+    """(k,) how thick the function's region of one sign is beside each of the points x (k, 3) on the
+    level set: a length. A thin wall and a thin gap count alike.
 
     It is the distance to the next change of sign along the gradient or against it, the smaller of
-    both, among distances 2^-7, 2^-6, ..., 1 times `size`. It is 0 where the sign is the same on
-    both sides of the point at the smallest distance, and inf where the sign does not change again.
-    """
+    both, among the distances 2^-7, 2^-6, ..., 1 times `size`. It is 0 if the sign is the same on
+    both sides of the point at the smallest distance: the region is thinner than that. It is inf if
+    the sign does not change again."""
     gradient = function.sample(x).gradient
     direction = gradient / np.maximum(row_norms(gradient), 1e-300)[:, None]
     distances = size * 2.0 ** np.arange(round(math.log2(_MIN_THICKNESS)), 1)
     nearest_is_above: list[BoolArray] = []
     thickness = np.full(len(x), np.inf)
     for sign in (1.0, -1.0):
+        # Signs at all distances, (k, number of distances).
         probes = x[:, None] + sign * distances[:, None] * direction[:, None]
         is_above = function.values(probes.reshape(-1, 3)).reshape(len(x), len(distances)) > 0
+        # The first distance with another sign than the smallest one.
         changed = is_above != is_above[:, :1]
         first_change = distances[changed.argmax(axis=1)]
         thickness = np.minimum(thickness, np.where(changed.any(axis=1), first_change, np.inf))
@@ -213,17 +227,19 @@ def _thickness(function: LevelFunction, x: FloatArray, size: float) -> FloatArra
 
 
 def _check_off_level_around(function: LevelFunction, points: FloatArray, radius: float) -> None:
-    """Raise if the function equals its level in a volume, as max(x, 0) does for level 0, so that no
-    cells are small enough.
+    """Raise UnrefinableError if the function equals its level in a volume, as max(x, 0) does for
+    level 0. No cells are small enough for such a function.
 
-    That is so if, for most of `points` (n, 3), it equals the level up to rounding at the point and
-    at distance `radius` from it in all six axis directions."""
+    The function is examined at some of `points` (n, 3) on the level set. The error is raised if at
+    more than half of them it equals the level, up to rounding, both at the point and at the
+    distance `radius` from it in all six axis directions."""
+    # Every k-th point, with the smallest k for which at most 2000 are left.
     probes = points[:: -(-len(points) // _MOST_PROBES)]
     offsets = radius * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
     near_points = (probes[:, None] + offsets).reshape(-1, 3)
-    is_flat = function.is_on_level(near_points).reshape(len(probes), -1).all(axis=1)
-    if is_flat.mean() > 0.5:
-        a, b, c = probes[is_flat][0]
+    is_on_level_around = function.is_on_level(near_points).reshape(len(probes), -1).all(axis=1)
+    if is_on_level_around.mean() > 0.5:
+        a, b, c = probes[is_on_level_around][0]
         raise UnrefinableError(
             f"{type(function.field).__name__} is {function.level:g}, up to rounding, at and around "
             f"points such as ({a:.4g}, {b:.4g}, {c:.4g}): its level there is a volume and no "
@@ -233,16 +249,21 @@ def _check_off_level_around(function: LevelFunction, points: FloatArray, radius:
 
 def _check_passes_level(function: LevelFunction, points: FloatArray, size: float) -> None:
     """Raise UnrefinableError if the function only touches its level, without changing sign, at more
-    than half of `points` (n, 3), which are near the level set. A square does so, and signs at the
-    corners of cells never show it.
+    than half of the points examined. The square of a function does so, and signs at the corners of
+    cells never show such a level set.
 
-    The function is examined along a line through each point, in the direction of its gradient
-    beside the point (at the point it may be 0), up to a hundredth of a cell of size `size` away.
-    The function touches its level if both ends of the line have values on the same side of the
-    level, and its value closest to the level, found by golden sections, is as close to it as
-    rounding allows."""
+    points: (n, 3) points near the level set, some of which are examined.
+    size: the size of a cell, a length.
+
+    The function is examined along a line segment through each point that reaches a hundredth of a
+    cell to both sides. The segment has the direction of the gradient at a point beside it, because
+    at the point the gradient may be 0. The function touches its level if both ends of the segment
+    have values on the same side of the level, and the value closest to the level, found by golden
+    section search, is as close to it as rounding allows."""
+    # Every k-th point, with the smallest k for which at most 60 are left.
     x = points[:: -(-len(points) // _MAX_TRIED)]
     offset = _TOUCH_OFFSET * size
+    # Of the gradients at three points beside x the steepest one gives the direction.
     gradients = function.sample((x[:, None] + offset * np.eye(3)).reshape(-1, 3)).gradient.reshape(
         -1, 3, 3
     )
@@ -250,21 +271,25 @@ def _check_passes_level(function: LevelFunction, points: FloatArray, size: float
     direction = steepest / np.maximum(row_norms(steepest), 1e-300)[:, None]
 
     def along(s: FloatArray) -> FloatArray:
-        """The function on the lines at the signed distances s (k,) from the points x."""
+        """(k,) the function's values on the segments at the signed distances s (k,) from the points
+        x."""
         return function.values(x + s[:, None] * direction)
 
     low, high = np.full(len(x), -offset), np.full(len(x), offset)
+    # Multiplied by this sign, the values at the lower ends are positive; so the smallest value
+    # along the segment is the one closest to the level.
     sign_of_point = np.sign(along(low))
     end_value = np.minimum(sign_of_point * along(low), sign_of_point * along(high))
     smallest = end_value.copy()
     for _ in range(_SECTIONS):
+        # The two inner points of a golden section of the interval from low to high.
         s, t = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
         f_left, f_right = sign_of_point * along(s), sign_of_point * along(t)
         smallest = np.minimum(smallest, np.minimum(f_left, f_right))
         low, high = np.where(f_left > f_right, s, low), np.where(f_left > f_right, high, t)
-    touches = (end_value > 0) & (smallest >= 0) & (smallest <= _TOUCHING * end_value)
-    if touches.mean() > 0.5:
-        a, b, c = x[touches][0]
+    is_touching = (end_value > 0) & (smallest >= 0) & (smallest <= _TOUCHING * end_value)
+    if is_touching.mean() > 0.5:
+        a, b, c = x[is_touching][0]
         name, level = type(function.field).__name__, function.level
         raise UnrefinableError(
             f"{name} comes to {level:g} without passing it, as a square does, at points such as "
@@ -275,11 +300,11 @@ def _check_passes_level(function: LevelFunction, points: FloatArray, size: float
 
 
 def _longest_part(x: FloatArray, max_gap: float) -> FloatArray:
-    """Group points x (n, 3) into connected parts, and return the points (k, 3) of the part with the
-    longest bounding box.
+    """The points of x (n, 3) that belong to the connected part with the longest bounding box: an
+    array (k, 3).
 
-    Two points belong to one part if a chain of points with gaps of at most `max_gap` connects them.
-    """
+    Two points belong to one part if a chain of points connects them in which successive points are
+    at most `max_gap` (a length) apart."""
     if not len(x):
         return x
     part = connected_groups(pairs_within(x, max_gap), len(x))
@@ -293,15 +318,17 @@ def _longest_part(x: FloatArray, max_gap: float) -> FloatArray:
 def check_estimated_triangles(
     function: LevelFunction, vertices: FloatArray, faces: IntArray, tolerance: float
 ) -> None:
-    """Raise an error if refining the mesh to the tolerance would, by an estimate, make more
-    triangles than `function.most_faces`.
+    """Raise an error if refining the mesh until it is within the tolerance of the level set would
+    make, by an estimate, more than `function.most_faces` triangles.
 
-    The distance of the midpoints of a triangle's edges from the surface falls with the triangle's
-    area. So a triangle with a distance of k tolerances is refined to about k triangles. A selection
-    of triangles is examined.
+    vertices, faces: (n, 3), (m, 3) the mesh before refinement. tolerance: a length.
+
+    The distance of the midpoints of a triangle's edges from the level set falls with the triangle's
+    area. So a triangle whose midpoints are k tolerances away is refined to about k triangles. About
+    20,000 triangles are examined at most.
 
     Raises:
-        MeshingError: the gradient is 0 at the midpoint of an edge.
+        MeshingError: the gradient is 0 at the midpoint of an edge that is not on the level set.
         TriangleLimitError: the estimate exceeds the limit. The message says which tolerance would
             be possible.
     """
@@ -309,23 +336,24 @@ def check_estimated_triangles(
     if not len(sampled):
         return
     corner = vertices[sampled]
-    at = function.sample(0.5 * (corner + np.roll(corner, 1, axis=1)).reshape(-1, 3))
-    is_flat = (at.value != 0) & ~at.gradient.any(axis=1)
+    # The midpoints of the three edges of each triangle; the farthest one decides.
+    midpoint_samples = function.sample(0.5 * (corner + np.roll(corner, 1, axis=1)).reshape(-1, 3))
+    is_flat = (midpoint_samples.value != 0) & ~midpoint_samples.gradient.any(axis=1)
     if is_flat.any():
         raise MeshingError(
             f"{type(function.field).__name__} is constant at {is_flat.sum():,} of "
             f"{len(is_flat):,} middles of edges, so that it does not say how far the surface is: "
             "choose a smaller `cell_size`, or a function with a slope within a cell of its surface"
         )
-    middle = at.distance
-    ratio = middle.reshape(-1, 3).max(axis=1) / tolerance
-    expected = float(np.maximum(1.0, ratio).mean()) * len(faces)
+    distance = midpoint_samples.distance
+    tolerances_away = distance.reshape(-1, 3).max(axis=1) / tolerance
+    expected = float(np.maximum(1.0, tolerances_away).mean()) * len(faces)
     limit = function.most_faces
     if expected > limit:
-        enough = expected / limit
+        excess = expected / limit
         raise TriangleLimitError(
             f"the tolerance takes about {expected:.1e} triangles, and max_triangles is {limit:,}: "
-            f"choose a `tolerance` {enough:.2g} times as large, or a larger `max_triangles`"
+            f"choose a `tolerance` {excess:.2g} times as large, or a larger `max_triangles`"
         )
 
 
@@ -340,7 +368,7 @@ _MOST_ROUNDS = 20
 
 @dataclass(frozen=True)
 class TriangleMesh:
-    """A triangle mesh.
+    """A triangle mesh in space.
 
     vertices: (n, 3).
     faces: (m, 3) the indices of the vertices of each face, counter-clockwise as seen from the
@@ -351,7 +379,8 @@ class TriangleMesh:
 
     @classmethod
     def without_unused_vertices(cls, vertices: FloatArray, faces: IntArray) -> TriangleMesh:
-        """A mesh of these faces, without the vertices that no face uses."""
+        """The mesh of `faces` (m, 3) with only those of the `vertices` (n, 3) that a face uses.
+        Their order stays; faces are renumbered."""
         used = np.flatnonzero(np.bincount(faces.ravel()))
         index = np.full(len(vertices), -1, np.int64)
         index[used] = np.arange(len(used))
@@ -364,8 +393,8 @@ class TriangleMesh:
 
 @dataclass(frozen=True)
 class IrrelevantRegion:
-    """A region of space in which a surface need not be meshed, because it will be cut away by the
-    other solids with which the meshed solid is intersected.
+    """A region of space in which a surface need not be meshed, because it will be cut away: the
+    solid that the surface bounds is intersected with other solids that have no points there.
 
     clearance: a function from points (k, 3) to radii (k,) of balls around them that lie in the
         region; 0 for points outside of it.
@@ -378,13 +407,16 @@ class IrrelevantRegion:
     )
 
     def relevant_cells(self, lattice: BccLattice, max_triangles: int) -> IntArray:
-        """The indices (n, 3) of the cells that are not proved to lie in the region, and of cells
-        around them, in a border two cells wide. max_triangles: the largest number of triangles.
+        """The indices (n, 3) of the cells of a lattice that are not proved to lie in the region,
+        and of the cells in a border two cells wide around them.
+
+        max_triangles: the largest number of triangles that the mesh may have.
 
         Raises:
             TriangleLimitError: there are more such cells than a mesh of `max_triangles` triangles
                 may have.
         """
+        # The lattice as a key of the dictionary.
         key = (
             *lattice.lower.tolist(),
             *lattice.size.tolist(),
@@ -402,17 +434,21 @@ class IrrelevantRegion:
 def mesh_open_surface(
     function: LevelFunction, lattice: BccLattice, tolerance: float, report: Callable[[str], None]
 ) -> tuple[TriangleMesh, IsotopyCoverage]:
-    """Mesh the level set in the box of a lattice; the mesh ends on the faces of the box.
+    """Mesh the level set of a function in the box of a lattice. Where the level set leaves the box,
+    the mesh ends on the box's faces.
 
     tolerance: a length, the largest distance of the midpoints of edges and of the centers of faces
         from the level set.
+    report: called with messages about progress.
 
     Returns:
-        The mesh; and on which part of the tetrahedra the topology of the mesh before refinement is
-        proved.
+        The mesh; and for which fraction of the tetrahedra it is proved that the mesh before
+        refinement has the topology of the level set.
 
     Raises:
         MeshingError: the level set does not meet the box, or there are too many cells.
+        MissedPartsError: the mesh misses parts of the level set.
+        TriangleLimitError: too many triangles would be needed for the tolerance.
         UnrefinableError: the function is not finite somewhere, or its level set is a volume.
     """
     walls = lattice.lower, lattice.upper
@@ -420,19 +456,22 @@ def mesh_open_surface(
     coordinates, corners = lattice.tetrahedra(cells)
     points = lattice.points(coordinates)
     report(f"{len(points):,} points, {len(corners):,} tetrahedra")
-    nowhere = np.zeros(len(points), np.bool_)
-    samples = _sample_lattice(function, points, lattice, nowhere)
-    first = _march(function, points, samples, corners, nowhere, nowhere, lattice, walls)
+    # No point is fixed, left out, or counted as on the level set wherever it is.
+    no_points = np.zeros(len(points), np.bool_)
+    samples = _sample_lattice(function, points, lattice, no_points)
+    first = _march(function, points, samples, corners, no_points, no_points, lattice, walls)
     vertices, faces = first.vertices, first.faces
     _check_nothing_missed(function, points, samples, corners, first, faces, lattice, walls)
     if not len(faces):
         raise MeshingError("the level set is empty: no cell of the box holds the level")
     _check_is_continuous(function, vertices, faces, lattice)
     check_estimated_triangles(function, vertices, faces, tolerance)
-    none = BoundaryCurve(np.zeros((0, 3)), np.zeros((0, 2), np.int64))
+    # The surface spans no curve.
+    no_curve = BoundaryCurve(np.zeros((0, 3)), np.zeros((0, 2), np.int64))
     size = float(lattice.size.max())
-    cut = first.is_cut(corners)
-    isotopy = isotopy_of(function, first.points, corners, cut, faces, none, size, walls)
+    is_cut = first.is_cut(corners)
+    isotopy = isotopy_of(function, first.points, corners, is_cut, faces, no_curve, size, walls)
+    # Better shapes first, then within the tolerance, then better shapes that stay within it.
     vertices = smooth(function, vertices, faces, walls)
     vertices, faces = refine(function, vertices, faces, tolerance, walls, report)
     vertices = smooth_within_tolerance(function, vertices, faces, walls, tolerance)
@@ -448,28 +487,33 @@ def mesh_closed_surface(
     as_cut: bool = False,
     elsewhere: IrrelevantRegion | None = None,
 ) -> TriangleMesh:
-    """Mesh the boundary of the points in a lattice's box at which the function is negative.
+    """Mesh the boundary of the set of points, in the box of a lattice, at which the function is
+    negative. The mesh is closed: where the set reaches the box, faces of cells on the box close it.
 
-    On the faces of the box, the boundary consists of faces of the cells whose centers are negative,
-    as if the lattice points there were on the level. Triangles in the two outermost layers of cells
-    are coarse and may touch in vertices: the caller cuts them away. The mesh has no faces if the
-    function is negative nowhere.
+    The outermost cells count as inside as a whole if the function is at most 0 at their centers.
+    Triangles in the two outermost layers of cells are coarse and may touch in vertices: the caller
+    cuts them away. The mesh has no faces if the function is negative nowhere.
 
     tolerance: a length, the largest distance of the midpoints of edges and of the centers of faces
         from the level set.
-    as_cut: whether to return the triangles as they were made in the cells, so that they never pass
-        through each other: they are not refined, and parts between lattice points are missed. This
-        is for functions with creases everywhere, such as distances from meshes, in cells of about
-        the tolerance.
-    elsewhere: a region in which the surface does not matter. In the region, except for a few cells
-        at its border, the function counts as positive, and coarse triangles close the surface
-        there.
+    report: called with messages about progress.
+    as_cut: whether to return the triangles as the level set cuts them from the tetrahedra. They
+        never pass through each other, but they are not refined, and parts between lattice points
+        are missed. This is for functions with creases everywhere, such as distances from meshes, in
+        cells of about the tolerance.
+    elsewhere: a region in which the surface does not matter, or None. In the region, except for a
+        few cells at its border, the function counts as positive, and coarse triangles close the
+        surface there.
 
     Raises:
         MeshingError: there are too many cells.
+        MissedPartsError: the mesh misses parts of the level set.
+        TriangleLimitError: too many triangles would be needed for the tolerance.
+        UnrefinableError: the function is not finite somewhere, or its level set is a volume.
     """
     limit, does_matter = function.most_faces, None
     if elsewhere is None:
+        # Cells that may hold the level set, and the outermost cells that are inside.
         cells = lattice.nonempty_cells(function.clearance, limit)
     else:
         cells, does_matter = lattice.relevant_cells(
@@ -483,32 +527,45 @@ def mesh_closed_surface(
     points = lattice.points(coordinates)
     report(f"{len(points):,} points, {len(corners):,} tetrahedra")
     is_wall = lattice.is_on_box(coordinates)
+    # Points on the box and the centers of the outermost cells must not be moved.
     is_fixed = is_wall | ((coordinates == 1) | (coordinates == 2 * lattice.counts - 1)).any(axis=1)
-    is_beyond = np.zeros(len(points), np.bool_)
+    is_in_region = np.zeros(len(points), np.bool_)
     if does_matter is not None:
-        is_beyond = lattice.touches_cells(coordinates, ~does_matter) & ~is_wall
-    samples = _sample_lattice(function, points, lattice, is_beyond)
-    first = _march(function, points, samples, corners, is_fixed | is_beyond, is_wall, lattice, None)
+        is_in_region = lattice.touches_cells(coordinates, ~does_matter) & ~is_wall
+    samples = _sample_lattice(function, points, lattice, is_in_region)
+    first = _march(
+        function, points, samples, corners, is_fixed | is_in_region, is_wall, lattice, None
+    )
     vertices, faces = first.vertices, first.faces
-    is_coarse = first.is_beside(is_wall | is_beyond)
-    is_cap = is_coarse[faces].any(axis=1)
-    rest, caps = faces[~is_cap], [faces[is_cap], _wall_faces(points, samples, corners, is_wall)]
-    inner = lattice.lower + 2 * lattice.size, lattice.upper - 2 * lattice.size
+    # Triangles at the box or at the irrelevant region are coarse: they only close the surface.
+    is_coarse_vertex = first.is_beside(is_wall | is_in_region)
+    is_coarse_face = is_coarse_vertex[faces].any(axis=1)
+    fine_faces, coarse_faces = (
+        faces[~is_coarse_face],
+        [faces[is_coarse_face], _wall_faces(points, samples, corners, is_wall)],
+    )
+    inner_box = lattice.lower + 2 * lattice.size, lattice.upper - 2 * lattice.size
     if as_cut:
-        return TriangleMesh.without_unused_vertices(vertices, np.concatenate([rest, *caps]))
+        return TriangleMesh.without_unused_vertices(
+            vertices, np.concatenate([fine_faces, *coarse_faces])
+        )
     _check_nothing_missed(
-        function, points, samples, corners, first, faces, lattice, inner,
+        function, points, samples, corners, first, faces, lattice, inner_box,
         None if elsewhere is None else elsewhere.clearance,
     )  # fmt: skip
     # Triangles that end at the outermost cells are moved and cut, their ends are not.
-    if len(rest):
-        _check_is_continuous(function, vertices, rest, lattice)
-        check_estimated_triangles(function, vertices, rest, tolerance)
-        vertices = smooth(function, vertices, rest, None)
-        counts = _refinable_points(lattice, does_matter)
-        vertices, rest = refine(function, vertices, rest, tolerance, None, report, counts)
-        vertices = smooth_within_tolerance(function, vertices, rest, None, tolerance, counts)
-    faces = np.concatenate([rest, *caps])
+    if len(fine_faces):
+        _check_is_continuous(function, vertices, fine_faces, lattice)
+        check_estimated_triangles(function, vertices, fine_faces, tolerance)
+        vertices = smooth(function, vertices, fine_faces, None)
+        may_refine = _refinable_points(lattice, does_matter)
+        vertices, fine_faces = refine(
+            function, vertices, fine_faces, tolerance, None, report, may_refine
+        )
+        vertices = smooth_within_tolerance(
+            function, vertices, fine_faces, None, tolerance, may_refine
+        )
+    faces = np.concatenate([fine_faces, *coarse_faces])
     return (
         TriangleMesh.without_unused_vertices(vertices, faces)
         if len(faces)
@@ -519,11 +576,11 @@ def mesh_closed_surface(
 def split_faces_off_level(
     function: LevelFunction, surface: TriangleMesh, farthest: float, times: int
 ) -> TriangleMesh:
-    """Cut those faces into three whose center is farther than `farthest` (a length) from the level
-    set, as happens across a crease. Returns the new mesh.
+    """Cut into three each face whose center is farther than `farthest` (a length) from the level
+    set, as happens where the face cuts across a crease. Returns the new mesh.
 
     The new vertex is the face's center, moved onto the level set. The new faces are examined in the
-    same way, so that a face is cut up to `times` times. All edges stay."""
+    same way, in `times` rounds at most. All edges stay."""
     vertices, faces = surface.vertices, surface.faces
     pending = np.arange(len(faces))
     for _ in range(times):
@@ -533,22 +590,28 @@ def split_faces_off_level(
         off_level = np.flatnonzero(samples.distance > farthest)
         if not len(off_level):
             break
-        span = 0.5 * row_norms(corner[off_level, 1] - corner[off_level, 0])
-        moved = newton_to_level(function, center[off_level], samples.select(off_level), span, None)
-        rows, inner = pending[off_level], len(vertices) + np.arange(len(off_level))
+        max_step = 0.5 * row_norms(corner[off_level, 1] - corner[off_level, 0])
+        moved = newton_to_level(
+            function, center[off_level], samples.select(off_level), max_step, None
+        )
+        # Each of these faces becomes a fan of three around its new vertex. The new faces are the
+        # last ones, and are examined in the next round.
+        rows, new_vertices = pending[off_level], len(vertices) + np.arange(len(off_level))
         a, b, c = faces[rows].T
         vertices = np.concatenate([vertices, moved])
-        fans = [np.stack([*ends, inner], axis=1) for ends in ((a, b), (b, c), (c, a))]
+        fans = [np.stack([*ends, new_vertices], axis=1) for ends in ((a, b), (b, c), (c, a))]
         faces = np.concatenate([np.delete(faces, rows, axis=0), *fans])
         pending = np.arange(len(faces) - 3 * len(rows), len(faces))
     return TriangleMesh(vertices, faces)
 
 
 def _are_negative(function: LevelFunction, lattice: BccLattice, cells: IntArray) -> BoolArray:
-    """(k,) whether the function is at most 0 at the centers of cells with indices (k, 3).
+    """(k,) whether the function is at most 0 at the centers of the cells with indices `cells` (k,
+    3).
 
-    Cells are grouped in blocks. If the level set is proved not to enter a block, the sign at the
-    block's center holds for all of its cells."""
+    Cells are grouped in blocks of 8^3. If the level set is proved not to enter a block, the sign at
+    the block's center holds for all of its cells."""
+    # Number the blocks, and keep those that contain a cell.
     shape = lattice.counts // _BLOCK + 1
     x, y, z = (cells // _BLOCK).T
     keys, block_of_cell, _, _ = unique_with_inverse((x * shape[1] + y) * shape[2] + z)
@@ -556,6 +619,7 @@ def _are_negative(function: LevelFunction, lattice: BccLattice, cells: IntArray)
     blocks = np.stack([*np.divmod(xy, shape[1]), z], axis=1)
     centers = lattice.points(_BLOCK * (2 * blocks + 1))
     half_diagonal = 0.5 * _BLOCK * float(np.linalg.norm(lattice.size))
+    # No level within half a diagonal of the center: none in the block.
     is_one_sided = function.clearance(centers) > half_diagonal * (1 + 1e-9)
     negative = (function.values(centers) <= 0)[block_of_cell]
     undecided = np.flatnonzero(~is_one_sided[block_of_cell])
@@ -574,18 +638,19 @@ def _check_nothing_missed(
     box: tuple[FloatArray, FloatArray],
     elsewhere: Clearance | None = None,
 ) -> None:
-    # Tetrahedra with corners on both sides; those with corners on the level may have no face.
     """Raise MissedPartsError if the mesh misses parts of the level set that are at least two cells
-    long. The points from which they are searched are found here; `check_no_missed_parts` does the
-    search.
+    long. This function finds the points at which the search starts; `check_no_missed_parts` does
+    the search.
 
     points, samples: points (n, 3) of the lattice, and samples of the function at them.
     corners: (m, 4) the corners of all tetrahedra.
     first: the mesh before refinement.
-    faces: the faces of it that count.
-    box: the lower and the upper corner of the box where the level set counts.
-    elsewhere: gives for points the radii of balls around them in which the level set does not
-        count; None if it counts everywhere."""
+    faces: the faces (k, 3) of that mesh near which nothing is missed.
+    box: the lower and the upper corner of the box outside of which nothing counts as missed.
+    elsewhere: a function that gives, for points, the radii of balls around them in which nothing
+        counts as missed; None if all points count."""
+    # The mesh passes through tetrahedra with corners on both sides of the level. In a tetrahedron
+    # with corners on the level it need not have a face.
     signs = np.where(first.points.is_on_level, 0.0, np.sign(first.points.samples.value))[corners]
     is_beside = np.zeros(len(points), np.bool_)
     is_beside[corners[(signs.min(axis=1) < 0) & (signs.max(axis=1) > 0)]] = True
@@ -597,37 +662,40 @@ def _check_nothing_missed(
 def _refinable_points(
     lattice: BccLattice, does_matter: BoolArray | None
 ) -> Callable[[FloatArray], BoolArray]:
-    """Make a function from points (n, 3) to a mask (n,): whether triangles may be refined at each
-    point.
+    """Make a function that tells for points (n, 3) whether triangles may be refined there, as a
+    mask (n,).
 
-    These points are farther than one and a half cells from the faces of the box, and neither in an
-    irrelevant cell nor in a cell beside one. does_matter: the mask of the relevant cells, one entry
-    for each cell of the lattice; None if all are relevant.
+    does_matter: a mask with one entry for each cell of the lattice: whether the cell is relevant;
+        None if all are.
 
-    Triangles that end in the outermost layer of cells are not refined: refinement would never end,
-    since the edges at their ends stay as they are. The centers of these triangles are less than one
-    and a half cells from the faces of the box."""
+    Triangles may be refined at points farther than one and a half cells from the faces of the box
+    that lie neither in an irrelevant cell nor in a cell beside one. Reason: where triangles end in
+    the outermost layer of cells, the edges at their ends stay as they are, so refinement of these
+    triangles would never end. Their centers are less than one and a half cells from the faces of
+    the box."""
     lower, upper = lattice.lower + 1.5 * lattice.size, lattice.upper - 1.5 * lattice.size
-    deep = None if does_matter is None else lattice.interior_cells(does_matter)
+    # Whether each cell is relevant, and all cells around it too.
+    is_interior_cell = None if does_matter is None else lattice.interior_cells(does_matter)
 
-    def counts(points: FloatArray) -> BoolArray:
-        """(n,) whether triangles may be refined at points (n, 3)."""
+    def may_refine(points: FloatArray) -> BoolArray:
+        """(n,) whether triangles may be refined at `points` (n, 3)."""
         is_inside = np.ones(len(points), np.bool_)
         for x, low, high in zip(points.T, lower, upper, strict=True):
             is_inside &= (x >= low) & (x <= high)
-        if deep is not None:
-            is_inside &= deep[tuple(lattice.cell_indices(points).T)]
+        if is_interior_cell is not None:
+            is_inside &= is_interior_cell[tuple(lattice.cell_indices(points).T)]
         return is_inside
 
-    return counts
+    return may_refine
 
 
 def _wall_faces(
     points: FloatArray, samples: LevelSamples, corners: IntArray, is_wall: BoolArray
 ) -> IntArray:
-    """Faces (m, 3) of tetrahedra that lie on the faces of the box and cover the negative part of
-    it.
+    """The faces (m, 3) of tetrahedra that lie on the box and close the mesh there: they cover the
+    part of the box's faces next to which the function is negative.
 
+    points, samples: the points (n, 3) of the lattice, and samples of the function at them.
     corners: (k, 4) the indices of the corners of each tetrahedron.
     is_wall: (n,) the mask of the points on the faces of the box.
 
@@ -640,31 +708,34 @@ def _wall_faces(
     is_negative = samples.value[apex] <= 0
     face, apex = np.stack(base, axis=1)[is_negative], apex[is_negative]
     a, b, c = (points[face[:, k]] for k in range(3))
-    faces_inwards = (np.cross(b - a, c - a) * (points[apex] - a)).sum(axis=1) > 0
-    face[faces_inwards] = face[faces_inwards][:, ::-1]
+    # The fourth corner lies inside; the normal must not point to it.
+    is_inward = (np.cross(b - a, c - a) * (points[apex] - a)).sum(axis=1) > 0
+    face[is_inward] = face[is_inward][:, ::-1]
     return face
 
 
 def _sample_lattice(
     function: LevelFunction, points: FloatArray, lattice: BccLattice, is_irrelevant: BoolArray
 ) -> LevelSamples:
-    """Samples of the function at points (n, 3) of a lattice. Points in the mask `is_irrelevant`
-    (n,) get a large positive value instead.
+    """Evaluate the function (value, gradient, distance from the level set) at `points` (n, 3) of a
+    lattice. Points in the mask `is_irrelevant` (n,) are not evaluated and get a large positive
+    value.
 
     Raises:
         UnrefinableError: the function is not finite at a point, or equals its level nearly
             everywhere.
     """
     count = len(points)
+    # The values of points that are not evaluated: far above the level.
     samples = LevelSamples(np.full(count, 10 * OUTSIDE_VALUE), np.ones((count, 3)), np.zeros(count))
     points = points[~is_irrelevant]
     samples = samples.replaced(~is_irrelevant, function.sample(points))
-    fails = ~np.isfinite(samples.value[~is_irrelevant])
-    if fails.any():
-        x, y, z = points[fails][0]
+    is_bad = ~np.isfinite(samples.value[~is_irrelevant])
+    if is_bad.any():
+        x, y, z = points[is_bad][0]
         advice = ", or a smaller `cell_size`: it is asked for three cells around other parts"
         raise UnrefinableError(
-            f"{type(function.field).__name__} has no finite value at {fails.sum():,} points, such "
+            f"{type(function.field).__name__} has no finite value at {is_bad.sum():,} points, such "
             f"as ({x:.4g}, {y:.4g}, {z:.4g}): choose a `clip` where it has"
             + (advice if is_irrelevant.any() else "")
         )
@@ -675,8 +746,9 @@ def _sample_lattice(
 def _check_is_continuous(
     function: LevelFunction, vertices: FloatArray, faces: IntArray, lattice: BccLattice
 ) -> None:
-    """Raise UnrefinableError if many vertices are far from the level set. The function changes its
-    sign at every vertex, so it jumps at these, and refinement would never end."""
+    """Raise UnrefinableError if more than 4 in 100 vertices of the mesh are farther than a tenth of
+    a cell from the level set. The function changes its sign at every vertex, so it jumps at these,
+    and refinement would never end."""
     x = vertices[np.unique(faces)]
     is_far = function.sample(x).distance > _JUMP_DISTANCE * float(lattice.size.max())
     if is_far.sum() > _MAX_JUMP_SHARE * len(x):
@@ -693,8 +765,9 @@ def _check_off_level_at_most_points(
     function: LevelFunction, points: FloatArray, lattice: BccLattice
 ) -> None:
     """Raise UnrefinableError if the function equals its level, up to rounding, at more than three
-    quarters of the points (n, 3), as x - x does for level 0. No cells of such a function are proved
-    empty, however small they are."""
+    quarters of the lattice points `points` (n, 3), as x - x does for level 0. No cells of such a
+    function are proved empty, however small they are."""
+    # Cells proved empty have no points here: with few points the level set is no volume.
     if len(points) <= _MAX_FLAT_SHARE * 2 * math.prod(lattice.counts.tolist()):
         return
     probes = points[:: -(-len(points) // _MOST_PROBES)]
@@ -709,14 +782,15 @@ def _check_off_level_at_most_points(
 
 @dataclass(frozen=True)
 class _InitialMesh:
-    """A mesh before refinement, and the tetrahedra that it was made in.
+    """The mesh before refinement, and the tetrahedra from which the level set cuts it. Vertices of
+    the mesh are of two kinds: the lattice points (the corners of the tetrahedra), and new ones on
+    the edges that the level set crosses.
 
-    vertices, faces: (n, 3), (m, 3). The first vertices are the points of the tetrahedra; the others
-        lie on edges that the level set crosses.
-    points: the points of the tetrahedra; points near the level set were moved onto it.
+    vertices, faces: (n, 3), (m, 3) the mesh. The lattice points are the first vertices.
+    points: the lattice points; those near the level set were moved onto it.
     rows: (k,) the indices of the tetrahedra that the level set may pass through.
     crossed: (k,) for each of these tetrahedra, whether the level set crosses one of its edges.
-    ends: (j, 2) the indices of the two end points of each edge that the level set crosses."""
+    ends: (j, 2) for each edge that the level set crosses, the indices of its two end points."""
 
     vertices: FloatArray
     faces: IntArray
@@ -726,15 +800,16 @@ class _InitialMesh:
     ends: IntArray
 
     def is_cut(self, corners: IntArray) -> BoolArray:
-        """(m,) whether each of all tetrahedra, given by the indices of their corners (m, 4),
-        contains a point of a face of the mesh."""
+        """(m,) whether each tetrahedron of the lattice contains a point of the mesh's faces.
+
+        corners: (m, 4) the corners of all tetrahedra, as indices of lattice points."""
         cut = _have_any(self.points.is_on_level, corners)
         cut[self.rows] |= self.crossed
         return cut
 
     def is_beside(self, chosen: BoolArray) -> BoolArray:
-        """(n,) whether each vertex is a chosen point, or lies on an edge with a chosen end. chosen:
-        a mask of the points."""
+        """(n,) for each vertex of the mesh, whether it is a chosen lattice point, or lies on an
+        edge of which one end is chosen. chosen: a mask of the lattice points."""
         return np.concatenate([chosen, chosen[self.ends].any(axis=1)])
 
 
@@ -748,66 +823,76 @@ def _march(
     lattice: BccLattice,
     walls: tuple[FloatArray, FloatArray] | None,
 ) -> _InitialMesh:
-    """The mesh before refinement, a manifold, with points near the level set moved onto it.
+    """Cut the level set from the tetrahedra of a lattice, by marching tetrahedra. Returns the mesh
+    before refinement, which is a manifold.
 
-    Where parts of the surface touch in a moved point, the point is moved back to its original
-    position, until no parts touch.
+    Before that, lattice points near the level set are moved onto it. If parts of the surface then
+    touch in a moved point, the point is moved back to its original position; this is repeated until
+    no parts touch.
 
     points, samples: points (n, 3) of the lattice, and samples of the function at them.
     corners: (m, 4) the indices of the corners of each tetrahedron.
     is_fixed: (n,) the mask of the points that must not be moved.
-    is_wall: (n,) the mask of the points that count as on the level.
-    walls: the lower and the upper corner of the box, on whose faces points stay; or None.
+    is_wall: (n,) the mask of the points that count as on the level set, wherever they are.
+    walls: the lower and the upper corner of the box; points on its faces stay on these. None for no
+        such condition.
 
     Raises:
         MeshingError: parts still touch after 20 rounds.
     """
     original_points, original_samples = points, samples
-    points, samples, is_on = _snap_points(function, points, samples, is_fixed, lattice, walls)
-    is_on |= is_wall
+    points, samples, is_on_level = _snap_points(function, points, samples, is_fixed, lattice, walls)
+    is_on_level |= is_wall
     touching, is_affected = np.zeros(0, np.int64), np.ones(len(points), np.bool_)
-    rows = cut_rows = np.flatnonzero(_may_be_cut(samples.value, is_on, corners))
+    rows = cut_rows = np.flatnonzero(_may_be_cut(samples.value, is_on_level, corners))
     for _ in range(_MOST_ROUNDS):
-        sampled, tets = (
-            TetrahedronPoints(points, is_on, samples),
+        sampled, tetrahedra = (
+            TetrahedronPoints(points, is_on_level, samples),
             Tetrahedra.of(points, corners[rows]),
         )
-        crossings = count_crossings(function, sampled, tets)
+        crossings = count_crossings(function, sampled, tetrahedra)
         # The positions of vertices on edges do not matter for whether parts touch.
-        _, faces = extract_triangles(function, sampled, tets, crossings, _middles)
+        _, faces = extract_triangles(function, sampled, tetrahedra, crossings, _middles)
+        # Only lattice points beside a change, and not on the box, are moved back.
         touching = nonmanifold_vertices(faces)
         touching = touching[touching < len(points)]
         touching = touching[(is_affected & ~is_wall)[touching]]
         if not len(touching):
             break
-        points, is_on = points.copy(), is_on.copy()
-        points[touching], is_on[touching] = original_points[touching], False
+        points, is_on_level = points.copy(), is_on_level.copy()
+        points[touching], is_on_level[touching] = original_points[touching], False
         samples = samples.replaced(touching, original_samples.select(touching))
         # Parts may touch anew only at points beside these: they are examined with all of their
         # tetrahedra.
-        near, is_affected = (np.zeros(len(points), np.bool_), np.zeros(len(points), np.bool_))
-        near[touching] = True
-        is_affected[corners[_have_any(near, corners)]] = True
+        is_touching, is_affected = (
+            np.zeros(len(points), np.bool_),
+            np.zeros(len(points), np.bool_),
+        )
+        is_touching[touching] = True
+        is_affected[corners[_have_any(is_touching, corners)]] = True
         affected = np.flatnonzero(_have_any(is_affected, corners))
-        rows = affected[_may_be_cut(samples.value, is_on, corners[affected])]
+        rows = affected[_may_be_cut(samples.value, is_on_level, corners[affected])]
         cut_rows = np.concatenate([cut_rows, rows])
     else:
         raise MeshingError(
             f"sheets of the level set touch at {len(touching)} places: choose a smaller `cell_size`"
         )
-    # Other tetrahedra have the same points as before.
+    # Cut all tetrahedra that were cut in some round once more, with the final points.
     rows = sorted_unique(cut_rows)
-    rows = rows[_may_be_cut(samples.value, is_on, corners[rows])]
-    sampled, tets = TetrahedronPoints(points, is_on, samples), Tetrahedra.of(points, corners[rows])
-    crossings = count_crossings(function, sampled, tets)
-    vertices, faces = extract_triangles(function, sampled, tets, crossings)
-    crossed: BoolArray = np.asarray((crossings.count[tets.edges] != 0).any(axis=1))
-    ends = tets.ends[np.flatnonzero(crossings.count)]
+    rows = rows[_may_be_cut(samples.value, is_on_level, corners[rows])]
+    sampled, tetrahedra = (
+        TetrahedronPoints(points, is_on_level, samples),
+        Tetrahedra.of(points, corners[rows]),
+    )
+    crossings = count_crossings(function, sampled, tetrahedra)
+    vertices, faces = extract_triangles(function, sampled, tetrahedra, crossings)
+    crossed: BoolArray = np.asarray((crossings.count[tetrahedra.edges] != 0).any(axis=1))
+    ends = tetrahedra.ends[np.flatnonzero(crossings.count)]
     return _InitialMesh(vertices, faces, sampled, rows, crossed, ends)
 
 
 def _middles(low: FloatArray, high: FloatArray) -> FloatArray:
-    """The midpoints of the edges from `low` to `high`, both (k, 3)."""
+    """The midpoints (k, 3) of the edges whose ends are `low` and `high`, both (k, 3)."""
     return 0.5 * (low + high)
 
 
@@ -819,11 +904,15 @@ def _snap_points(
     lattice: BccLattice,
     walls: tuple[FloatArray, FloatArray] | None,
 ) -> tuple[FloatArray, LevelSamples, BoolArray]:
-    """Move points near the level set onto it.
+    """Move lattice points near the level set onto it.
 
-    Points are moved if their estimated distance from the level set is less than a quarter of a cell
-    and they are not in the mask `is_fixed` (n,). A point whose move does not converge stays where
-    it is.
+    A point is moved, by Newton's method, if its estimated distance from the level set is less than
+    a quarter of a cell and it is not in the mask `is_fixed` (n,). A point stays where it is if the
+    method does not converge, or moves it by more than 0.3 cells.
+
+    points, samples: points (n, 3) of the lattice, and samples of the function at them.
+    walls: the lower and the upper corner of the box; points on its faces stay on these. None for no
+        such condition.
 
     Returns:
         The points (n, 3); samples of the function at them; and the mask (n,) of the points on the
@@ -836,44 +925,49 @@ def _snap_points(
     new_samples = function.sample(moved)
     move = row_norms(moved - points[near])
     gradient_length = row_norms(new_samples.gradient)
-    converged = np.abs(new_samples.value) < 1e-9 * np.maximum(gradient_length * size, 1e-300)
-    converged &= move < 1.2 * _SNAP_DISTANCE * size
-    rows = near[converged]
+    is_moved = np.abs(new_samples.value) < 1e-9 * np.maximum(gradient_length * size, 1e-300)
+    is_moved &= move < 1.2 * _SNAP_DISTANCE * size
+    rows = near[is_moved]
     # A point with a value of exactly 0 counts as on the level unmoved, so that all other points
     # have a sign.
-    points, is_on = points.copy(), (samples.value == 0) & ~is_fixed
-    points[rows], is_on[rows] = moved[converged], True
-    return points, samples.replaced(rows, new_samples.select(converged)), is_on
+    points, is_on_level = points.copy(), (samples.value == 0) & ~is_fixed
+    points[rows], is_on_level[rows] = moved[is_moved], True
+    return points, samples.replaced(rows, new_samples.select(is_moved)), is_on_level
 
 
 def _have_any(chosen: BoolArray, corners: IntArray) -> BoolArray:
-    """(m,) whether each tetrahedron, given by the indices of its corners (m, 4), has a corner in
-    the mask `chosen` (n,) of points."""
+    """(m,) whether each tetrahedron has a corner among the chosen points.
+
+    chosen: (n,) a mask of the points. corners: (m, 4) the corners of the tetrahedra, as indices of
+        points."""
     has_chosen = np.zeros(len(corners), np.bool_)
     for column in corners.T:  # four times as fast as chosen[corners].any(axis=1)
         has_chosen |= chosen[column]
     return has_chosen
 
 
-# Codes of a point above the level, below it, and on it: a sum of four codes tells how many points
-# there are of each kind.
+# Codes of a point above the level, below it, and on it. The sum of the codes of four points tells
+# how many of them are of each kind, because 5 and 25 are larger than 4 times the code before.
 _ABOVE, _BELOW, _ON_LEVEL = 1, 5, 25
 
 
 def _may_be_cut(value: FloatArray, is_on: BoolArray, corners: IntArray) -> BoolArray:
-    """(m,) whether the level set may pass through each tetrahedron, given by the indices of its
-    corners (m, 4): the tetrahedron has corners on both sides of the level set, or at least three
-    corners on it.
+    """(m,) whether the level set may pass through each tetrahedron: the tetrahedron has corners on
+    both sides of the level set, or at least three corners on it.
 
     value: (n,) the function at the points.
-    is_on: (n,) whether each point is on the level set."""
+    is_on: (n,) whether each point is on the level set; then the sign of its value does not count.
+    corners: (m, 4) the corners of the tetrahedra, as indices of points."""
     code = np.where(is_on, _ON_LEVEL, np.where(value > 0, _ABOVE, _BELOW)).astype(np.uint8)
     code_sum = np.zeros(len(corners), np.uint8)
     for column in corners.T:
         code_sum += code[column]
-    cut = np.zeros(4 * _ON_LEVEL + 1, np.bool_)
+    # A table with the answer for each possible sum of codes.
+    is_cut_by_code = np.zeros(4 * _ON_LEVEL + 1, np.bool_)
     for above, below in itertools.product(range(5), repeat=2):
         on = 4 - above - below
         if on >= 0:
-            cut[above * _ABOVE + below * _BELOW + on * _ON_LEVEL] = (above and below) or on >= 3
-    return cut[code_sum]
+            is_cut_by_code[above * _ABOVE + below * _BELOW + on * _ON_LEVEL] = (
+                above and below
+            ) or on >= 3
+    return is_cut_by_code[code_sum]

@@ -1,5 +1,7 @@
-"""The function f - level whose level set is meshed: its values and gradients at many points at a
-time, and proved bounds of its change around them."""
+"""The function f - level of a field f, whose level set (where it is 0) is meshed: its values and
+gradients at many points at a time, and proved bounds of its change around them. If f has a period,
+f - level is reduced by whole periods to the value nearest to 0.
+"""
 
 from __future__ import annotations
 
@@ -37,12 +39,12 @@ _PROOFS = choose_enclosures("curvature")
 
 @dataclass(frozen=True)
 class LevelSamples:
-    """Values and gradients of a function at n points.
+    """Values and gradients of f - level at n points.
 
     value: (n,) f - level; for a field with a period, such as a solid angle, reduced by multiples of
         the period to [-period/2, period/2].
     gradient: (n, 3).
-    quarter_period_radius: (n,) a radius of a ball around each point. Within the ball, f is proved
+    quarter_period_radius: (n,) the radius of a ball around each point. Within the ball, f is proved
         to differ from its value at the point by less than a quarter of its period. 0 if the field
         has no period."""
 
@@ -51,7 +53,7 @@ class LevelSamples:
     quarter_period_radius: FloatArray
 
     def select(self, rows: Any) -> LevelSamples:
-        """The samples of the selected points. rows: their indices, or a mask."""
+        """The samples of the selected points. rows: the indices of these points, or a mask."""
         return LevelSamples(self.value[rows], self.gradient[rows], self.quarter_period_radius[rows])
 
     def replaced(self, rows: Any, replacements: LevelSamples) -> LevelSamples:
@@ -76,14 +78,15 @@ class LevelSamples:
 
 
 class EvaluatorCache:
-    """A store of fields that were prepared for double precision, so that several level functions of
-    the same field share one prepared field."""
+    """A store of fields that were prepared for double precision (their data uploaded to the
+    backend), so that several level functions of the same field share one prepared field."""
 
     def __init__(self) -> None:
         self._made: dict[int, tuple[Field, Field]] = {}
 
     def of(self, field: Field) -> Field:
-        """The field, prepared for double precision; prepared at the first call only."""
+        """The field prepared for double precision. It is prepared at the first call, and the same
+        object is returned later."""
         if id(field) not in self._made:  # it is stored, so that no other field has its id
             self._made[id(field)] = field, field.prepare(choose_backend("double"))
         return self._made[id(field)][1]
@@ -136,7 +139,7 @@ class LevelFunction:
         """(n,) f - level at points (n, 3), without gradients."""
 
         def value(p: Vec3) -> tuple[Real]:
-            """The value of f at p."""
+            """The value of f at the points p."""
             with share_samples(), without_alternatives():
                 return (self._prepared.evaluate(p).value,)
 
@@ -147,7 +150,7 @@ class LevelFunction:
         computed value (rounding, and for a truncated sum its truncation)."""
 
         def value_and_error(p: Vec3) -> tuple[Real, Real]:
-            """The value of f at p, and the bound of its error."""
+            """The value of f at the points p, and the bound of its error."""
             with without_alternatives():
                 sample = self._prepared.evaluate(p)
             return sample.value, self._backend.Float(sample.value_error)
@@ -158,22 +161,23 @@ class LevelFunction:
     def gradient_bounds(
         self, points: FloatArray, radius: FloatArray
     ) -> tuple[LevelSamples, FloatArray]:
-        """Samples at points (n, 3), and bounds (n,) of |grad f(y) - grad f(x)| for all y within a
-        radius of each point x.
+        """Samples at points (n, 3), and proved bounds (n,) of |grad f(y) - grad f(x)| for each
+        point x and all y within a radius of it.
 
-        radius: (n,) this radius. The rounding error of the sampled gradient is included in the
-            bound.
+        radius: (n,) the radius of each point, a length. The rounding error of the sampled gradient
+            is included in the bound.
 
         The samples have no `quarter_period_radius`: it is 0."""
 
         def compute(p: Vec3, r: Vec3) -> tuple[Real, Vec3, Real]:
-            """The value and the gradient of f at p, and the bound of the gradient's change within
-            the distance r.x of p."""
+            """The value and the gradient of f at the points p, and the bound of the gradient's
+            change within the distance r.x of p."""
             sample = self._prepared.evaluate(p)
             change = self._prepared.gradient_change_bound(p, r.x) + sample.gradient_error
             return sample.value, sample.gradient, change
 
         self.evaluations += 2 * len(points)
+        # Kernels take vectors, so each radius is passed as a vector of three equal numbers.
         value, gradient, change = map_batches(
             self._backend, compute, points, np.column_stack([radius] * 3), at_once=1 << 18
         )
@@ -184,7 +188,7 @@ class LevelFunction:
         (`level_distance_lower_bound`)."""
 
         def bound(p: Vec3) -> tuple[Real]:
-            """The lower bound of the distance from p."""
+            """The lower bound of the distance from the points p to the level set."""
             sample = self._prepared.evaluate(p)
             return (
                 level_distance_lower_bound(self._backend, self._prepared, self._levels, p, sample),
@@ -193,7 +197,8 @@ class LevelFunction:
         return self._in_batches(points, bound)[0]
 
     def _evaluated(self, p: Vec3) -> tuple[Real, Vec3, Real]:
-        """The value and the gradient of f at points p, and a radius of a ball around each point.
+        """The value and the gradient of f at points p, and the radius of a ball around each point,
+        for `sample`.
 
         If f has a period, f is proved to change by less than a quarter of the period within this
         radius, rounding errors included. Otherwise the radius is 0."""
@@ -204,12 +209,14 @@ class LevelFunction:
         with share_samples():
             sample = self._prepared.evaluate(p)
         max_slope = safe_norm(sample.gradient) + sample.gradient_error
+        # The slope of f along any direction is at most the length of the gradient.
         slopes = SlopeRange(-max_slope, max_slope)
         enclosures = _PROOFS.from_promises(
             sample.promises, sample.alternative_promises, sample.value, sample.value_error, slopes
         )
         # A quarter above and a quarter below, minus the rounding error.
         quarter = self._backend.Float(0.2499 * self.period) - 2 * sample.value_error
+        # The longest distance within which the enclosures prove that f stays in that range.
         return (
             sample.value,
             sample.gradient,
@@ -219,7 +226,8 @@ class LevelFunction:
     def _in_batches(
         self, points: FloatArray, kernel: Callable[[Vec3], tuple[Any, ...]]
     ) -> tuple[FloatArray, ...]:
-        """Compute the results of a kernel at points (n, 3), batch by batch, and count the points as
-        evaluations. Returns an array with n rows for each result."""
+        """Compute the results of a kernel (a function of points of the backend) at points (n, 3),
+        batch by batch, and count the points as evaluations. Returns an array with n rows for each
+        result."""
         self.evaluations += len(points)
         return map_batches(self._backend, kernel, points, at_once=1 << 18)

@@ -1,5 +1,14 @@
-"""Parts of a level set that are missing from a mesh that was made from signs of the function: walls
-and gaps thinner than a cell.
+"""Finds parts of a level set that are missing from its mesh: walls and gaps thinner than a cell.
+This is for meshes that were made from the signs of a function ("the function", side * (f - level)
+for a field f) at the points of a lattice, whose cubes are the "cells". Some points on the level set
+are known without a mesh; they should be near the mesh.
+
+The signs at the points of a lattice do not show a wall or a gap between two points.
+`points_off_level` checks that all points of the mesh are near the level set. Here the converse is
+checked: that points that are known to lie on the level set are near the mesh. Suppose that such a
+point is farther than d from the mesh. Then the sign of the function changes within d of the point,
+but near the point all space is on the same side of the mesh. So there is a part of the solid, or of
+the space around it, that the mesh does not have.
 
 The signs at the points of a lattice do not show a wall or a gap between two points.
 `points_off_level` checks that all points of the mesh are near the level set. Here the converse is
@@ -70,9 +79,9 @@ class PointsOnLevel:
 
     @classmethod
     def of(cls, function: SignFunction, tolerance: float) -> PointsOnLevel:
-        """Find points on the level set without a mesh of it: on the triangles of a field that is
-        given by a mesh, beside the points of a cloud, or along rays out of blobs. For all other
-        fields there are none.
+        """Find points on the level set of a function without a mesh of it: on the triangles of a
+        field that is given by a mesh, beside the points of a cloud, or along rays out of blobs. For
+        all other fields there are none.
 
         tolerance: a length. The sign of a cloud's field is evaluated at least this far from its
             points."""
@@ -84,16 +93,20 @@ class PointsOnLevel:
         high = low
         if isinstance(field, OrientedPoints | HRBF):
             rows = _spread(len(field.points), _MAX_POINTS)
-            smoothed = field.smoothing if isinstance(field, DipolePotential) else 0.0
-            offset = max(tolerance, _MAX_SMOOTHING_LENGTHS * smoothed) * field.normals[rows]
+            smoothing_length = field.smoothing if isinstance(field, DipolePotential) else 0.0
+            # The level set passes near each point, across its normal.
+            offset = max(tolerance, _MAX_SMOOTHING_LENGTHS * smoothing_length) * field.normals[rows]
             offset /= np.maximum(row_norms(field.normals[rows]), 1e-300)[:, None]
             low, high = field.points[rows] - offset, field.points[rows] + offset
         elif isinstance(field, Blobs):
             rows = _spread(len(field.centers), _MAX_POINTS)
+            # From the center of a blob in a random direction to the end of the blob.
             offset = np.random.default_rng(0).normal(size=(len(rows), 3))
             offset *= ((field.radii * field.kernel.support)[rows] / row_norms(offset))[:, None]
             low, high = field.centers[rows], field.centers[rows] + offset
         is_low, is_high = function.values(low) > 0, function.values(high) > 0
+        # The function must be positive at the second end. Segments without a change of sign are
+        # left out.
         low, high = np.where(is_low[:, None], high, low), np.where(is_low[:, None], low, high)
         return cls(*function.crossings(low[is_low != is_high], high[is_low != is_high]))
 
@@ -103,26 +116,37 @@ class PointsOnLevel:
         of the triangles there, turned towards where the function is positive.
 
         About two thousand points are spread over the triangles by area, and a thousand triangles,
-        or all if there are fewer, have a point in their middle."""
+        or all if there are fewer, have a point in their middle. Points are left out if the function
+        does not change its sign across the triangle there."""
         normal = area_normals(triangles)
         area = row_norms(normal)
         rows = np.concatenate([_by_area(area), _spread(len(triangles), _MIDDLES)])
         barycentric = np.random.default_rng(0).dirichlet((1.0, 1.0, 1.0), len(rows))
+        # The middles of the triangles that were chosen without regard to area.
         barycentric[-min(len(triangles), _MIDDLES) :] = 1 / 3
         points, normal = np.einsum("ki,kij->kj", barycentric, triangles[rows]), normal[rows]
         normal /= np.maximum(area[rows], 1e-300)[:, None]
-        size, largest = float(np.ptp(triangles, axis=(0, 1)).max()), float(np.abs(triangles).max())
-        offset = max(_BESIDE * size, _ROUNDED * largest) * normal
-        beside = np.concatenate([points + offset, points - offset])
-        value = function.relative_to_level(function.field.value(beside, precision="double"))
-        function.evaluations += len(beside)
-        ahead, behind = value.reshape(2, -1)
-        jumps = (ahead > 0) != (behind > 0)
-        jumps &= (np.minimum(np.abs(ahead), np.abs(behind)) > _MIN_JUMP) & (area[rows] > 0)
-        return cls(points[jumps], np.where(ahead > 0, 1.0, -1.0)[jumps, None] * normal[jumps])
+        size, largest_coordinate = (
+            float(np.ptp(triangles, axis=(0, 1)).max()),
+            float(np.abs(triangles).max()),
+        )
+        # Values a little in front of the triangles and behind them.
+        offset = max(_BESIDE * size, _ROUNDED * largest_coordinate) * normal
+        points_beside = np.concatenate([points + offset, points - offset])
+        value = function.relative_to_level(function.field.value(points_beside, precision="double"))
+        function.evaluations += len(points_beside)
+        value_in_front, value_behind = value.reshape(2, -1)
+        changes_sign = (value_in_front > 0) != (value_behind > 0)
+        changes_sign &= (np.minimum(np.abs(value_in_front), np.abs(value_behind)) > _MIN_JUMP) & (
+            area[rows] > 0
+        )
+        return cls(
+            points[changes_sign],
+            np.where(value_in_front > 0, 1.0, -1.0)[changes_sign, None] * normal[changes_sign],
+        )
 
     def select(self, rows: Any) -> PointsOnLevel:
-        """The selected points, with their normals. rows: their indices, or a mask."""
+        """The selected points, with their normals. rows: the indices of these points, or a mask."""
         return PointsOnLevel(self.points[rows], self.normals[rows])
 
     def within(self, lower: FloatArray, upper: FloatArray, volume: Volume | None) -> PointsOnLevel:
@@ -135,8 +159,8 @@ class PointsOnLevel:
 
 @dataclass(frozen=True)
 class LostParts:
-    """Points of a level set that are farther from its mesh than the tolerance: signs of parts that
-    the mesh has lost.
+    """Points of a level set that are farther from its mesh than the tolerance. They are signs of
+    parts that the mesh has lost.
 
     far: the number of points that are farther from the mesh than `tolerance`.
     looked_at: the number of all points that were tested.
@@ -148,7 +172,7 @@ class LostParts:
     undecided: (i, 3) more far points, of which it is not known which of the two is the case.
     thickness: the median thickness of these parts and gaps, a length; inf if they are wider than
         cells, or if no thickness is known.
-    spacing: the size of cells.
+    spacing: the size of cells, a length.
     advice: what to do, in words."""
 
     far: int
@@ -176,14 +200,15 @@ class LostParts:
 
         known: points on the level set, near which the mesh should be.
         surface: the mesh.
-        tolerance: the largest distance that is no sign of a lost part.
+        tolerance: a length. A point within this distance of the mesh is no sign of a lost part.
         spacing: the size of the mesh's cells, a length."""
         corner = surface.vertices[surface.faces]
         distant = known.select(_are_farther(known.points, corner, tolerance))
         beyond = _are_farther(distant.points, corner, max(tolerance, _ALLOWED_CELLS * spacing))
         within = _bound_of_distances(distant.points, corner) if len(distant.points) else tolerance
-        shown = distant.select(_spread(len(distant.points), _MAX_MEASURED))
-        thickness, is_inside = _thicknesses(function, shown, spacing)
+        measured = distant.select(_spread(len(distant.points), _MAX_MEASURED))
+        # At some of the points it is measured whether they are on a thin part or in a narrow gap.
+        thickness, is_inside = _thicknesses(function, measured, spacing)
         is_thin = np.isfinite(thickness)
         thickness = thickness[is_thin]
         return cls(
@@ -192,9 +217,9 @@ class LostParts:
             tolerance,
             int(beyond.sum()),
             within,
-            shown.points[is_thin & is_inside],
-            shown.points[is_thin & ~is_inside],
-            shown.points[~is_thin],
+            measured.points[is_thin & is_inside],
+            measured.points[is_thin & ~is_inside],
+            measured.points[~is_thin],
             float(np.median(thickness)) if len(thickness) else np.inf,
             spacing,
             _advice(function.field),
@@ -202,9 +227,9 @@ class LostParts:
 
     @property
     def matter(self) -> bool:
-        """Whether the result matters: more than 1 % of the points are far from the mesh, or any
-        point is farther than half a cell. Creases and corners alone put a few points of any mesh
-        off."""
+        """Whether enough is lost to matter: more than 1 % of the points are far from the mesh, or
+        any point is farther than half a cell. Creases and corners alone put a few points of any
+        mesh off."""
         return self.beyond > 0 or self.far > _ALLOWED_SHARE * self.looked_at
 
     @property
@@ -215,12 +240,13 @@ class LostParts:
 
     def are_mended_by(self, smaller: float) -> bool:
         """Whether smaller cells may show the lost parts. They may not if the median thickness of
-        these parts is less than a quarter of such a cell.
+        these parts is less than a quarter of a smaller cell.
 
         smaller: the size of the smaller cells, as a fraction of `spacing`."""
         return self.thickness >= _THIN * smaller * self.spacing
 
     def __str__(self) -> str:
+        """The result as a sentence for messages, with a place of each kind of lost part."""
         thin = (
             (self.missing, "parts that are thinner than these are missing"),
             (self.filled, "gaps that are narrower than these are filled"),
@@ -248,7 +274,8 @@ def _advice(field: Field) -> str:
 
 
 def _by_area(area: FloatArray) -> IntArray:
-    """The indices (2000,) of triangles, each repeated about in proportion to its area.
+    """The indices (2000,) of triangles for points that are spread evenly over their surface: each
+    triangle is repeated about in proportion to its area.
 
     area: (m,) the areas of the triangles, in any unit."""
     cumulative: FloatArray = np.cumsum(area)
@@ -264,34 +291,39 @@ def _spread(count: int, max_count: int) -> IntArray:
 def _thicknesses(
     function: SignFunction, points: PointsOnLevel, spacing: float
 ) -> tuple[FloatArray, BoolArray]:
-    """The thickness, a length, of the part or the gap beside each of k points of the level set.
+    """How thick the part, or how wide the gap, is beside each of k points of the level set: a
+    length.
 
     From each point the sign of the function is followed along the normal and against it, at
-    distances up to the size of a cell. The thickness is the distance to the next change of sign, on
-    the side where it is smaller.
+    distances up to the size of a cell, `spacing`. The result is the distance to the next change of
+    sign, on the side where it is smaller.
 
     Returns:
         The thicknesses (k,), inf where the sign does not change again; and a mask (k,): True where
-        that side is inside, so that it is a part, False where it is outside, so that it is a gap.
-        For clouds all thicknesses are inf: they are not known.
+        the smaller distance is inside of the solid, so that it is a part, False where it is
+        outside, so that it is a gap. For clouds all thicknesses are inf: they are not known.
     """
     if isinstance(function.field, OrientedPoints):  # each point is in its own bubble
-        nowhere = np.full(len(points.points), np.inf)
-        return nowhere, nowhere > 0
+        unknown_thickness = np.full(len(points.points), np.inf)
+        return unknown_thickness, unknown_thickness > 0
     distances = spacing * _THICKNESSES
-    per_side: list[FloatArray] = []
+    distance_per_side: list[FloatArray] = []
     for sign in (1.0, -1.0):
         probes = points.points[:, None] + sign * distances[:, None] * points.normals[:, None]
         is_positive = function.values(probes.reshape(-1, 3)).reshape(-1, len(distances)) > 0
-        changed = is_positive != (sign > 0)
-        per_side.append(np.where(changed.any(axis=1), distances[changed.argmax(axis=1)], np.inf))
-    above, below = per_side
+        has_changed = is_positive != (sign > 0)
+        distance_per_side.append(
+            np.where(has_changed.any(axis=1), distances[has_changed.argmax(axis=1)], np.inf)
+        )
+    positive_side, negative_side = distance_per_side
     # The function is positive inside, or where its side is -1 outside.
-    return np.minimum(above, below), (above < below) == (function.side > 0)
+    return np.minimum(positive_side, negative_side), (positive_side < negative_side) == (
+        function.side > 0
+    )
 
 
 def _bound_of_distances(points: FloatArray, triangles: FloatArray) -> float:
-    """An upper bound of the distances of points (n, 3) from triangles (m, 3, 3): the largest
+    """An upper bound of the distances of all points (n, 3) from triangles (m, 3, 3): the largest
     distance of a point from the nearest corner or center of a triangle. It is inf if there are no
     triangles."""
     import scipy.spatial  # imported here: it takes half a second
@@ -305,13 +337,14 @@ def _bound_of_distances(points: FloatArray, triangles: FloatArray) -> float:
 
 
 def _are_farther(points: FloatArray, corner: FloatArray, distance: float) -> BoolArray:
-    """(n,) whether points (n, 3) are farther than `distance` from all triangles.
+    """(n,) whether each of the points (n, 3) is farther than `distance` from all triangles.
 
     corner: (m, 3, 3) the corners of the triangles.
 
-    If a triangle comes within `distance` of a point, its center is within `distance` plus r of the
-    point, where r is the largest distance of the triangle's corners from its center. Triangles
-    whose r differ by less than a factor of 2 are searched together, with the larger r."""
+    If a triangle comes within `distance` of a point, its center is within `distance` + r of the
+    point, where r is the largest distance of the triangle's corners from its center. Only such
+    triangles are measured. Triangles whose r differ by less than a factor of 2 are searched
+    together, with the larger r."""
     import scipy.spatial  # imported here: it takes half a second
 
     searching: Any = scipy.spatial
@@ -320,14 +353,18 @@ def _are_farther(points: FloatArray, corner: FloatArray, distance: float) -> Boo
         return is_far
     center = corner.mean(axis=1)
     radius = np.stack([row_norms(corner[:, k] - center) for k in range(3)]).max(axis=0)
+    # Triangles are grouped by the power of 2 above r; small ones, with r < distance, are one group.
     exponent = np.ceil(np.log2(np.maximum(radius, distance))).astype(np.int64)
     for k in np.unique(exponent).tolist():
         remaining, rows = np.flatnonzero(is_far), np.flatnonzero(exponent == k)
         tree = searching.cKDTree(center[rows], compact_nodes=False, balanced_tree=False)
-        near = tree.query_ball_point(points[remaining], 2.0**k + distance)
-        counts = np.array([len(indices) for indices in near], np.int64)
+        nearby_faces = tree.query_ball_point(points[remaining], 2.0**k + distance)
+        counts = np.array([len(indices) for indices in nearby_faces], np.int64)
         if not counts.sum():
             continue
-        query, face = (np.repeat(remaining, counts), rows[np.concatenate(near).astype(np.int64)])
+        query, face = (
+            np.repeat(remaining, counts),
+            rows[np.concatenate(nearby_faces).astype(np.int64)],
+        )
         is_far[query[distances_from_triangles(points[query], corner[face]) <= distance]] = False
     return is_far

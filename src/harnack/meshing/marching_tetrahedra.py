@@ -1,5 +1,16 @@
-"""Marching tetrahedra: the triangles in which the level set of a function cuts tetrahedra. The
-function may be an angle, known modulo its period.
+"""Marching tetrahedra: the triangles in which the level set of a function cuts tetrahedra. "The
+function" is f - level for a field f. It may be an angle, known modulo its period; then it has many
+levels, a period apart. Points of the tetrahedra ("vertices", "corners") are either on the level or
+on one side of it.
+
+For each edge of the tetrahedra, the level crossings are counted: upward ones (the function grows)
+minus downward ones. The count is 0, 1 or -1 if cells are small enough. For a real-valued function
+it follows from the signs at the ends. For an angle it follows from the continuous change of the
+function along the edge, which may differ from the difference of the values by whole periods. From
+the crossings of its edges it follows on which side of the level each corner of a tetrahedron lies.
+It is checked that the crossings of the three edges of each face add up, and that at most one level
+passes between the corners of a tetrahedron. A corner on the level, such as a vertex of the curve at
+which a surface ends, becomes a mesh vertex.
 
 For each edge of the tetrahedra, the signed number of level crossings is counted, which is 0, 1 or
 -1 if cells are small enough. For a real-valued function it follows from the signs at the ends. For
@@ -70,8 +81,8 @@ class Tetrahedra:
         return cls(points, corners, edges.vertices, edges.edge_of_pair.reshape(len(_PAIRS), -1).T)
 
     def edge_between(self, i: int, j: int, rows: IntArray) -> tuple[IntArray, IntArray]:
-        """The edge between corners i and j (from 0 to 3) of each of the tetrahedra with the indices
-        `rows` (k,).
+        """The edge between corners i and j (numbers from 0 to 3) of each of the tetrahedra with the
+        indices `rows` (k,).
 
         Returns:
             The indices (k,) of the edges; and their directions (k,): 1 if the edge leads from
@@ -87,8 +98,8 @@ class Tetrahedra:
 
 
 def delaunay(points: FloatArray) -> Tetrahedra:
-    """The Delaunay tetrahedra of points (n, 3). Points are in general position, except that many
-    may lie on the faces of a box.
+    """The Delaunay tetrahedra of points (n, 3), by Qhull. The points must be in general position,
+    except that many may lie on the faces of a box.
 
     Eight points far away are added, and removed again with their tetrahedra, because Qhull takes
     long if the convex hull of the points is flat.
@@ -105,9 +116,9 @@ def delaunay(points: FloatArray) -> Tetrahedra:
     n = len(points)
     # Relative to the middle, so that Qhull's rounding does not grow with the distance from the
     # origin.
-    together = np.concatenate([points - middle, 20 * size * far_corners])
+    all_points = np.concatenate([points - middle, 20 * size * far_corners])
     try:
-        corners: IntArray = qhull.Delaunay(together).simplices.astype(np.int64)
+        corners: IntArray = qhull.Delaunay(all_points).simplices.astype(np.int64)
     except qhull.QhullError as error:
         raise MeshingError(
             f"there are no Delaunay tetrahedra of {n:,} points, some of which are next to nothing "
@@ -122,7 +133,7 @@ class EdgeCrossings:
     """How a function crosses its level along the k edges of tetrahedra. An edge with an end on the
     level has no crossings.
 
-    count: (k,) for each edge the number of upward crossings minus that of downward crossings.
+    count: (k,) for each edge the number of upward crossings minus the number of downward crossings.
     change: (k,) the continuous change of the function from the first to the second end of each
         edge. For an angle, it may differ from the difference of the values by whole periods.
     proved: the number of edges along which the change of an angle is proved to be the difference of
@@ -154,23 +165,30 @@ def count_crossings(
     """
     a, b = tets.ends.T
     value = points.samples.value
-    is_off = ~points.is_on_level[a] & ~points.is_on_level[b]
-    change = np.where(is_off, value[b] - value[a], 0.0)
+    has_free_ends = ~points.is_on_level[a] & ~points.is_on_level[b]
+    change = np.where(has_free_ends, value[b] - value[a], 0.0)
     if function.period is None:
-        count = np.where(is_off, (value[b] > 0).astype(np.int64) - (value[a] > 0), 0)
-        return EdgeCrossings(count, change, int(is_off.sum()), 0)
+        count = np.where(has_free_ends, (value[b] > 0).astype(np.int64) - (value[a] > 0), 0)
+        return EdgeCrossings(count, change, int(has_free_ends.sum()), 0)
     period = function.period
     change -= period * np.round(change / period)
-    span = row_norms(points.points[a] - points.points[b])
-    reach = points.samples.quarter_period_radius
-    unsure = np.flatnonzero(is_off & (reach[a] + reach[b] < span * (1 + 1e-9)))
-    if len(unsure):
-        p, q = points.points[a[unsure]], points.points[b[unsure]]
-        change[unsure] = _integrate_change(function.field, p, q, change[unsure], period)
-    # Values between levels lie in (0, period).
-    level = np.remainder(value, period)
-    count = np.where(is_off, np.round((level[a] + change - level[b]) / period), 0).astype(np.int64)
-    return EdgeCrossings(count, change, int(is_off.sum()) - len(unsure), len(unsure))
+    length = row_norms(points.points[a] - points.points[b])
+    radius = points.samples.quarter_period_radius
+    unproved_rows = np.flatnonzero(has_free_ends & (radius[a] + radius[b] < length * (1 + 1e-9)))
+    if len(unproved_rows):
+        p, q = points.points[a[unproved_rows]], points.points[b[unproved_rows]]
+        change[unproved_rows] = _integrate_change(
+            function.field, p, q, change[unproved_rows], period
+        )
+    # Reduced to [0, period), a value plus the change exceeds the value at the other end by one
+    # period for each level crossed.
+    value_in_period = np.remainder(value, period)
+    count = np.where(
+        has_free_ends, np.round((value_in_period[a] + change - value_in_period[b]) / period), 0
+    ).astype(np.int64)
+    return EdgeCrossings(
+        count, change, int(has_free_ends.sum()) - len(unproved_rows), len(unproved_rows)
+    )
 
 
 def _integrate_change(
@@ -179,20 +197,23 @@ def _integrate_change(
     """(n,) the continuous change of the field's function f along the segments from p to q (n, 3),
     as the field integrates it.
 
-    wrapped: (n,) the differences f(q) - f(p). The change differs from them by whole periods.
+    wrapped: (n,) the differences f(q) - f(p), known up to whole multiples of `period`. The integral
+        only decides which multiples are added to these, so the result does not have the integral's
+        error.
 
     Raises:
         MeshingError: the field cannot integrate its change, or the result does not differ by whole
             periods.
     """
-    exact = field.continuous_change(p, q)
-    if exact is None:
+    integrated = field.continuous_change(p, q)
+    if integrated is None:
         raise MeshingError(
             f"how {type(field).__name__} changes along {len(p)} edges of the mesh is not proved, "
             "and it has no `change_along`: choose a smaller `cell_size`"
         )
-    periods = np.round((exact - wrapped) / period)
-    if np.abs(exact - wrapped - period * periods).max(initial=0.0) > 1e-6:
+    # The integral only decides how many whole periods are added.
+    periods = np.round((integrated - wrapped) / period)
+    if np.abs(integrated - wrapped - period * periods).max(initial=0.0) > 1e-6:
         raise MeshingError(
             f"{type(field).__name__}.change_along is not the difference of two values, modulo "
             "the period"
@@ -228,47 +249,58 @@ def extract_triangles(
         MeshingError: crossings do not agree around a face, or two levels pass between corners.
     """
     side = _sides(points, tets, crossings)
-    on = points.is_on_level[tets.corners]
-    lowest = np.where(on, np.iinfo(np.int64).max, side).min(axis=1)
-    highest = np.where(on, np.iinfo(np.int64).min, side).max(axis=1)
-    double = (highest - lowest > 1) & ~on.all(axis=1)
-    if double.any():
+    is_on_level = points.is_on_level[tets.corners]
+    # The lowest and the highest side of the corners that are not on the level.
+    lowest = np.where(is_on_level, np.iinfo(np.int64).max, side).min(axis=1)
+    highest = np.where(is_on_level, np.iinfo(np.int64).min, side).max(axis=1)
+    has_two_levels = (highest - lowest > 1) & ~is_on_level.all(axis=1)
+    if has_two_levels.any():
         raise LocalizedMeshingError(
             "two sheets of the level set pass between corners of one tetrahedron: choose a smaller "
             "`cell_size`",
-            _mean(points.points, tets.corners[double]),
+            _mean(points.points, tets.corners[has_two_levels]),
         )
-    cut = np.flatnonzero(~on.all(axis=1) & (highest > lowest))
+    cut_rows = np.flatnonzero(~is_on_level.all(axis=1) & (highest > lowest))
     edges = np.flatnonzero(crossings.count)
     if roots_of is None:
         roots = _roots(function, points, tets, crossings, edges)
     else:
-        upwards = (crossings.count[edges] > 0)[:, None]
-        ends = np.where(upwards, tets.ends[edges], tets.ends[edges, ::-1])
+        is_rising = (crossings.count[edges] > 0)[:, None]
+        ends = np.where(is_rising, tets.ends[edges], tets.ends[edges, ::-1])
         roots = roots_of(points.points[ends[:, 0]], points.points[ends[:, 1]])
     vertex_of_edge = np.full(len(tets.ends), -1, np.int64)
     vertex_of_edge[edges] = len(points.points) + np.arange(len(edges))
     vertices = np.concatenate([points.points, roots])
     parts: list[tuple[IntArray, FloatArray]] = []
-    above = (side > lowest[:, None]) & ~on
-    pattern = (above[cut] * [1, 2, 4, 8]).sum(axis=1) + 16 * (on[cut] * [1, 2, 4, 8]).sum(axis=1)
+    is_above = (side > lowest[:, None]) & ~is_on_level
+    # Tetrahedra with the same corners above and on the level are cut alike: bits 0 to 3 of the
+    # pattern mark corners above, bits 4 to 7 corners on the level.
+    pattern = (is_above[cut_rows] * [1, 2, 4, 8]).sum(axis=1) + 16 * (
+        is_on_level[cut_rows] * [1, 2, 4, 8]
+    ).sum(axis=1)
     for code in np.unique(pattern):
-        rows = cut[pattern == code]
+        rows = cut_rows[pattern == code]
         up = [k for k in range(4) if code >> k & 1]
         level = [k for k in range(4) if code >> (4 + k) & 1]
         down = [k for k in range(4) if k not in up and k not in level]
         corner = tets.corners[rows]
+        # A vector from the corners below to those above, for the orientation of the triangles.
         rise = _mean(points.points, corner[:, up]) - _mean(points.points, corner[:, down])
 
         def at(i: int, j: int, rows: IntArray = rows) -> IntArray:
-            """The vertices on the edges between corners i and j of tetrahedra `rows`."""
+            """The vertices (k,) on the edges between corners i and j of tetrahedra `rows`."""
             return vertex_of_edge[tets.edge_between(i, j, rows)[0]]
 
         on_level = [corner[:, k] for k in level]
         crossed = [at(i, j) for i in up for j in down]
         if len(crossed) == 4:  # two corners on each side
-            ring = [at(up[0], down[0]), at(up[0], down[1]), at(up[1], down[1]), at(up[1], down[0])]
-            for face in _halves(vertices, ring):
+            quadrilateral = [
+                at(up[0], down[0]),
+                at(up[0], down[1]),
+                at(up[1], down[1]),
+                at(up[1], down[0]),
+            ]
+            for face in _halves(vertices, quadrilateral):
                 parts.append((face, rise))
         else:
             parts.append((np.stack([*on_level, *crossed], axis=1), rise))
@@ -278,8 +310,8 @@ def extract_triangles(
     # the edges has all corners above on one side, and roots at an end, as where f jumps, leave
     # triangles without an area.
     middles = _mean(points.points, tets.ends[edges])
-    turned = row_dots(area_normals(np.concatenate([points.points, middles])[faces]), rise) < 0
-    faces[turned] = faces[turned][:, ::-1]
+    is_inward = row_dots(area_normals(np.concatenate([points.points, middles])[faces]), rise) < 0
+    faces[is_inward] = faces[is_inward][:, ::-1]
     return vertices, faces
 
 
@@ -287,14 +319,16 @@ def is_cut(points: TetrahedronPoints, tets: Tetrahedra, crossings: EdgeCrossings
     """(m,) for each tetrahedron, whether the level set passes between its corners or through one of
     them.
 
-    points: the vertices of the tetrahedra `tets`, with the values of the function there."""
+    points: the vertices of the tetrahedra `tets`, with the values of the function there.
+    crossings: how the function crosses its level along their edges."""
     return points.is_on_level[tets.corners].any(axis=1) | (crossings.count[tets.edges] != 0).any(
         axis=1
     )
 
 
 def _mean(points: FloatArray, index: IntArray) -> FloatArray:
-    """(k, 3) the mean of the points with indices (k, j)."""
+    """(k, 3) for each row of `index` (k, j), the mean of the j points with these indices. points:
+    (n, 3)."""
     return points[index].mean(axis=1)
 
 
@@ -313,16 +347,17 @@ def _halves(vertices: FloatArray, ring: list[IntArray]) -> tuple[IntArray, IntAr
 
 def _sides(points: TetrahedronPoints, tets: Tetrahedra, crossings: EdgeCrossings) -> IntArray:
     """(m, 4) for each corner of each of m tetrahedra, on which side of the level it lies: the
-    signed number of level crossings on the way to this corner from the first corner of the
-    tetrahedron that is not on the level. It is 0 for corners on the level.
+    number of level crossings (upward minus downward) on the edge to this corner from the first
+    corner of the tetrahedron that is not on the level. It is 0 for that corner and for corners on
+    the level.
 
     Raises:
         LocalizedMeshingError: the crossings of three edges of a face do not add up.
     """
     is_on = points.is_on_level[tets.corners]
     rows = np.arange(len(is_on))
-    first = np.argmin(is_on, axis=1)
-    count = np.zeros(is_on.shape, np.int64)
+    first_free_corner = np.argmin(is_on, axis=1)
+    side = np.zeros(is_on.shape, np.int64)
 
     def crossed(i: int, j: int, rows: IntArray) -> IntArray:
         """The signed crossings (k,) of the edges from corner i to corner j of tetrahedra `rows`."""
@@ -330,19 +365,20 @@ def _sides(points: TetrahedronPoints, tets: Tetrahedra, crossings: EdgeCrossings
         return sign * crossings.count[edge]
 
     for i, j in itertools.permutations(range(4), 2):
-        chosen = rows[(first == i) & ~is_on[:, j]]
-        count[chosen, j] = crossed(i, j, chosen)
+        chosen = rows[(first_free_corner == i) & ~is_on[:, j]]
+        side[chosen, j] = crossed(i, j, chosen)
+    # Going from corner to corner by another way must lead to the same side.
     is_wrong = np.zeros(len(rows), np.bool_)
     for i, j in _PAIRS:
         chosen = rows[~is_on[:, i] & ~is_on[:, j]]
-        is_wrong[chosen] |= count[chosen, j] - count[chosen, i] != crossed(i, j, chosen)
+        is_wrong[chosen] |= side[chosen, j] - side[chosen, i] != crossed(i, j, chosen)
     if is_wrong.any():
         raise LocalizedMeshingError(
             "crossings of the level set do not agree around a triangle: the curve passes "
             "through it; choose a smaller `cell_size`",
             _mean(points.points, tets.corners[is_wrong]),
         )
-    return count
+    return side
 
 
 def _roots(
@@ -354,7 +390,8 @@ def _roots(
 ) -> FloatArray:
     """(r, 3) the points where edges of tetrahedra meet the level set.
 
-    edges: (r,) the indices of these edges, each of which has a crossing.
+    crossings: the crossings and the change of the function along all edges.
+    edges: (r,) the indices of the edges that have a crossing.
 
     The points are found by the secant method if the function has `secant_steps`, else by
     Chandrupatla's method. If an end of an edge has the value `OUTSIDE_VALUE`, which stands for the
@@ -369,11 +406,11 @@ def _roots(
 
     def lifted_values(t: FloatArray, *args: FloatArray) -> FloatArray:
         """(k,) f - level at the fractions t (k,) of k edges. Values of an angle are moved by the
-        whole number of periods that brings them nearest to the middle of the change.
+        whole number of periods that brings them nearest to the middle of the change, so that they
+        change continuously along the edge.
 
         args: eight arrays (k,): the three coordinates of the start of each edge, the three of the
-            vector to its end, f - level at the start, and the change along the edge.
-        """
+            vector to its end, f - level at the start, and the change along the edge."""
         origin, edge, start, rise = (
             np.stack(args[0:3], axis=-1), np.stack(args[3:6], axis=-1), args[6], args[7]
         )  # fmt: skip
@@ -385,10 +422,15 @@ def _roots(
 
     if function.secant_steps:
         return p + _illinois(function, p, direction, value, value + change)[:, None] * direction
-    finite = np.flatnonzero(np.maximum(np.abs(value), np.abs(value + change)) < OUTSIDE_VALUE)
+    inside_rows = np.flatnonzero(np.maximum(np.abs(value), np.abs(value + change)) < OUTSIDE_VALUE)
     fraction = np.full(len(a), 0.5)
-    fraction[finite] = _chandrupatla(
-        function, p[finite], direction[finite], value[finite], change[finite], lifted_values
+    fraction[inside_rows] = _chandrupatla(
+        function,
+        p[inside_rows],
+        direction[inside_rows],
+        value[inside_rows],
+        change[inside_rows],
+        lifted_values,
     )
     return p + fraction[:, None] * direction
 
@@ -404,18 +446,21 @@ def _illinois(
     Each step replaces one end of the search interval. If it is the same end twice or more in a row,
     the value at the other end is halved for the next secant (the Illinois method)."""
     left, right = np.zeros(len(p)), np.ones(len(p))
-    up = high > low
-    low, high = (np.where(up, low, -low), np.where(up, high, -high))
+    is_rising = high > low
+    # Falling edges are negated, so that values are negative at the left ends.
+    low, high = (np.where(is_rising, low, -low), np.where(is_rising, high, -high))
     repeats = np.zeros(len(p), np.int64)
     fraction = low / (low - high)
     for _ in range(function.secant_steps):
         value = function.values(p + fraction[:, None] * edge)
-        value = np.where(up, value, -value)
+        value = np.where(is_rising, value, -value)
         is_positive = value > 0
+        # How often in a row the right end (positive) or the left end (negative) was replaced.
         repeats = np.where(is_positive, np.maximum(repeats, 0) + 1, np.minimum(repeats, 0) - 1)
         low = np.where(is_positive, np.where(repeats > 1, 0.5 * low, low), value)
         high = np.where(is_positive, value, np.where(repeats < -1, 0.5 * high, high))
         left, right = np.where(is_positive, left, fraction), np.where(is_positive, fraction, right)
+        # The root of the secant; values of equal size would divide by 0.
         fraction = left + (right - left) * low / np.minimum(low - high, -1e-300)
     return np.clip(fraction, _MIN_END_DISTANCE, 1 - _MIN_END_DISTANCE)
 
@@ -428,7 +473,8 @@ def _chandrupatla(
     change: FloatArray,
     lifted_values: Callable[..., FloatArray],
 ) -> FloatArray:
-    """(r,) the fractions of edges at which they meet the level set, by Chandrupatla's method.
+    """(r,) the fractions of edges at which they meet the level set, by Chandrupatla's method (a
+    bracketing search by inverse quadratic interpolation and bisection).
 
     start, direction: (r, 3) one end of each edge, and the vector to the other.
     value, change: (r,) f - level at that end, and its change along the edge.
@@ -466,51 +512,56 @@ def _faces_on_the_level(
         where the function is smaller to the side where it is larger.
 
     The side on which a tetrahedron lies is that of its fourth corner or, if that is on the level
-    too, of its center.
+    too, of its center. Two points on both sides of an angle's face lie on different sides if the
+    continuous change on the way from one over the face's center to the other crosses a level.
     """
     is_on = points.is_on_level[tets.corners]
-    triples: list[IntArray] = []
+    face_rows: list[IntArray] = []
     for k in range(4):
         rows = np.flatnonzero(np.delete(is_on, k, axis=1).all(axis=1))
         face = np.sort(np.delete(tets.corners[rows], k, axis=1), axis=1)
-        triples.append(np.column_stack([face, rows, np.full(len(rows), k)]))
-    table = np.concatenate(triples)
+        face_rows.append(np.column_stack([face, rows, np.full(len(rows), k)]))
+    table = np.concatenate(face_rows)
+    # Equal faces of two tetrahedra are in successive rows.
     table = table[np.lexsort(table[:, 2::-1].T)]
     shared = np.flatnonzero((table[1:, :3] == table[:-1, :3]).all(axis=1))
     first, second, face = table[shared], table[shared + 1], table[shared, :3]
     if not len(face):
         return np.zeros((0, 3), np.int64), np.zeros((0, 3))
     middle = _mean(points.points, face)
-    (before, f_before), (behind, f_behind) = (
+    (first_point, first_value), (second_point, second_value) = (
         _side_sample(function, points, tets, row) for row in (first, second)
     )
     if function.period is None:
-        count = (f_behind > 0).astype(np.int64) - (f_before > 0)
+        crossing_count = (second_value > 0).astype(np.int64) - (first_value > 0)
     else:
         period = function.period
         value = function.values(middle)
         change = sum(
             sign
             * _integrate_change(function.field, side, middle, _wrap(value - start, period), period)
-            for sign, side, start in ((1, before, f_before), (-1, behind, f_behind))
+            for sign, side, start in (
+                (1, first_point, first_value),
+                (-1, second_point, second_value),
+            )
         )
-        difference = np.remainder(f_before, period) + change - np.remainder(f_behind, period)
-        count = np.round(difference / period).astype(np.int64)
-    rise = (behind - before) * np.sign(count)[:, None]
-    return face[count != 0], rise[count != 0]
+        difference = np.remainder(first_value, period) + change - np.remainder(second_value, period)
+        crossing_count = np.round(difference / period).astype(np.int64)
+    rise = (second_point - first_point) * np.sign(crossing_count)[:, None]
+    return face[crossing_count != 0], rise[crossing_count != 0]
 
 
 def _wrap(change: FloatArray, period: float) -> FloatArray:
-    """A change, moved by whole periods into [-period/2, period/2]."""
+    """Changes (n,), moved by whole periods into [-period/2, period/2]."""
     return change - period * np.round(change / period)
 
 
 def _side_sample(
     function: LevelFunction, points: TetrahedronPoints, tets: Tetrahedra, table: IntArray
 ) -> tuple[FloatArray, FloatArray]:
-    """For tetrahedra at given faces, a point (n, 3) of each tetrahedron off the face, and the value
-    (n,) of f - level there. The point is the corner opposite to the face or, if that is on the
-    level, the center of the tetrahedron.
+    """A point (n, 3) inside of each of n tetrahedra, or at one of its corners, that lies off a
+    given face, and the value (n,) of f - level there. It is the corner opposite to the face or, if
+    that is on the level, the center of the tetrahedron.
 
     table: (n, 5) one row for each tetrahedron and face: the three corners of the face, the index of
         the tetrahedron, and which of its corners (0 to 3) is opposite to the face."""

@@ -1,4 +1,7 @@
-"""Better triangles: edges flipped, slivers contracted, vertices moved along the surface.
+"""Better triangles for a mesh of a level set: edges are flipped, slivers contracted, and vertices
+moved along the level set. "The function" is f - level for a field f; its gradient is normal to the
+level set. A "sliver" is a triangle with an angle below 4 degrees, a "thin" triangle one with an
+angle below 30 degrees. The "star" of a vertex consists of the faces around it.
 
 Flips. Two triangles (a, b, c) and (b, a, d) become (c, d, b) and (d, c, a) if that makes the
 smallest of their angles larger, if the new edge is within the tolerance of the level set, and if
@@ -54,35 +57,39 @@ def flip_edges(
     tolerance: float,
 ) -> IntArray:
     """Flip edges of a mesh in rounds, and return its faces (m, 3) after that. A flip replaces the
-    edge between two triangles by the other diagonal of their quadrilateral; it is made if the
-    smallest of all angles of both triangles becomes larger. Of several possible flips of a
-    triangle, only the best is made in a round.
+    edge between two triangles by the other diagonal of their quadrilateral. It is made if the
+    smallest of all angles of both triangles becomes larger, if the mesh stays near the level set,
+    and if the new edge does not exist already. Of several possible flips of a triangle, only the
+    best is made in a round.
 
     tolerance: a length, the largest distance of the midpoints of new edges and of the centers of
         new triangles from the level set, estimated by the gradient there."""
-    refused = np.zeros(0, np.int64)
-    boundary = edge_keys(boundary_edges(faces), len(vertices))
+    refused_keys = np.zeros(0, np.int64)
+    boundary_keys = edge_keys(boundary_edges(faces), len(vertices))
     for _ in range(_MOST_ROUNDS_OF_FLIPS):
         pairs, quads = _quadrilaterals(faces)
         a, b, c, d = quads.T
-        before = least_angles(vertices, faces)[pairs].min(axis=1)
-        new = np.stack([np.stack([c, d, b], axis=1), np.stack([d, c, a], axis=1)], axis=1)
-        after = np.minimum(*(least_angles(vertices, new[:, k]) for k in (0, 1)))
-        gain = np.cos(before) - np.cos(after)
+        old_angle = least_angles(vertices, faces)[pairs].min(axis=1)
+        new_faces = np.stack([np.stack([c, d, b], axis=1), np.stack([d, c, a], axis=1)], axis=1)
+        new_angle = np.minimum(*(least_angles(vertices, new_faces[:, k]) for k in (0, 1)))
+        gain = np.cos(old_angle) - np.cos(new_angle)
         count = len(vertices)
-        key = edge_keys(quads[:, 2:], count)
-        useful = gain > _GAIN
-        useful[useful] = ~np.isin(key[useful], refused)
+        new_edge_key = edge_keys(quads[:, 2:], count)
+        is_useful = gain > _GAIN
+        is_useful[is_useful] = ~np.isin(new_edge_key[is_useful], refused_keys)
         used_keys = sorted_unique(edge_keys(quads[:, :2], count))
-        useful[useful] = ~_are_among(used_keys, key[useful]) & ~np.isin(key[useful], boundary)
-        rows = _independent_flips(np.flatnonzero(useful), gain, pairs, key, len(faces))
+        # The new edge must be neither an edge of two faces already nor a boundary edge.
+        is_useful[is_useful] = ~_are_among(used_keys, new_edge_key[is_useful]) & ~np.isin(
+            new_edge_key[is_useful], boundary_keys
+        )
+        rows = _independent_flips(np.flatnonzero(is_useful), gain, pairs, new_edge_key, len(faces))
         if not len(rows):
             break
-        allowed = _flips_stay_near(function, vertices, new[rows], tolerance)
-        refused = np.concatenate([refused, key[rows[~allowed]]])
-        rows = rows[allowed]
+        is_allowed = _flips_stay_near(function, vertices, new_faces[rows], tolerance)
+        refused_keys = np.concatenate([refused_keys, new_edge_key[rows[~is_allowed]]])
+        rows = rows[is_allowed]
         faces = faces.copy()
-        faces[pairs[rows, 0]], faces[pairs[rows, 1]] = new[rows, 0], new[rows, 1]
+        faces[pairs[rows, 0]], faces[pairs[rows, 1]] = new_faces[rows, 0], new_faces[rows, 1]
     return faces
 
 
@@ -91,17 +98,17 @@ def _quadrilaterals(faces: IntArray) -> tuple[IntArray, IntArray]:
 
     Returns:
         The indices (k, 2) of the two faces; and the corners (k, 4) of the quadrilateral that they
-        form: the ends of the shared edge, in the direction of the first face, and the third corners
-        of the first and of the second face.
+        form: the two ends of the shared edge, in the direction of the first face, and the third
+        corners of the first and of the second face.
     """
     edges, count = half_edges(faces), int(faces.max()) + 1
     keys = edge_keys(edges, count)
     order = np.argsort(keys, kind="stable")
-    same = np.flatnonzero(keys[order[1:]] == keys[order[:-1]])
-    first, second = order[same], order[same + 1]
+    same_rows = np.flatnonzero(keys[order[1:]] == keys[order[:-1]])
+    first, second = order[same_rows], order[same_rows + 1]
     m = len(faces)
-    third = np.concatenate([faces[:, 2], faces[:, 0], faces[:, 1]])
-    quads = np.column_stack([edges[first], third[first], third[second]])
+    third_corner = np.concatenate([faces[:, 2], faces[:, 0], faces[:, 1]])
+    quads = np.column_stack([edges[first], third_corner[first], third_corner[second]])
     return np.column_stack([first % m, second % m]), quads
 
 
@@ -109,20 +116,23 @@ def _independent_flips(
     rows: IntArray, gain: FloatArray, pairs: IntArray, key: IntArray, face_count: int
 ) -> IntArray:
     """Choose flips of edges that can be made at the same time: no two change the same face or make
-    the same new edge. Returns the indices of the chosen pairs. A chosen flip gains more than every
-    other candidate that changes one of its two faces.
+    the same new edge. Returns the indices of the chosen pairs of faces. A chosen flip gains more
+    than every other candidate that changes one of its two faces.
 
     rows: (k,) the candidates, as indices of the n pairs of neighboring faces.
-    gain: (n,) how much the smallest angle grows by the flip of each pair.
+    gain: (n,) how much the smallest angle grows by the flip of each pair (as a difference of
+        cosines).
     pairs: (n, 2) the two faces of each pair.
     key: (n,) a number that identifies the new edge of each pair."""
     rows = rows[np.argsort(-gain[rows], kind="stable")]
     rank = np.arange(len(rows))
+    # For each face the rank of the best candidate that changes it; rank 0 gains most.
     best_rank = np.full(face_count, len(rows))
     for k in (0, 1):
         np.minimum.at(best_rank, pairs[rows, k], rank)
-    best = (best_rank[pairs[rows]] == rank[:, None]).all(axis=1)
-    rows = rows[best]
+    is_best = (best_rank[pairs[rows]] == rank[:, None]).all(axis=1)
+    rows = rows[is_best]
+    # Of the flips that make the same edge, keep one.
     return rows[np.unique(key[rows], return_index=True)[1]]
 
 
@@ -131,7 +141,8 @@ def _flips_stay_near(
 ) -> BoolArray:
     """(k,) for each of k flips, whether the mesh stays near the level set. That is so if the middle
     of the new edge and the centers of both new triangles are within `tolerance` (a length) of the
-    level set, estimated by the gradient there, and if both triangles face along the gradient.
+    level set, estimated by the gradient there, and if the normals of both triangles are within 60
+    degrees of the gradient.
 
     new: (k, 2, 3) the corners of the two new triangles of each flip."""
     corner = vertices[new]  # (k, 2, 3, 3)
@@ -142,12 +153,13 @@ def _flips_stay_near(
     is_near = (samples.distance <= tolerance).reshape(3, -1).all(axis=0)
     gradient = samples.gradient.reshape(3, -1, 3)[1:].transpose(1, 0, 2)
     size = np.linalg.norm(normal, axis=2) * np.linalg.norm(gradient, axis=2)
-    faces_along = ((normal * gradient).sum(axis=2) > _FACING * size).all(axis=1)
-    return is_near & faces_along
+    is_along_gradient = ((normal * gradient).sum(axis=2) > _FACING * size).all(axis=1)
+    return is_near & is_along_gradient
 
 
 def _are_among(numbers: IntArray, keys: IntArray) -> BoolArray:
-    """(k,) whether each key (k,) is among the numbers (n,), which are in ascending order."""
+    """(k,) whether each of the `keys` (k,) is among the numbers (n,), which are in ascending
+    order."""
     at = np.searchsorted(numbers, keys)
     return numbers[np.minimum(at, len(numbers) - 1)] == keys if len(numbers) else at < 0
 
@@ -158,7 +170,8 @@ def least_angles(vertices: FloatArray, faces: IntArray) -> FloatArray:
     side = np.stack([corner[:, (k + 2) % 3] - corner[:, (k + 1) % 3] for k in range(3)], axis=1)
     square = np.einsum("ijk,ijk->ij", side, side)
     twice_area = row_norms(np.cross(side[:, 0], side[:, 1]))
-    # The least angle is opposite the shortest side: tan = 2 area/(b . c).
+    # The smallest angle is opposite the shortest side a. For the other sides b and c, its tangent
+    # is 2 area/(b . c), and 2 b . c = b^2 + c^2 - a^2.
     shortest = square.argmin(axis=1)
     dot = 0.5 * (square.sum(axis=1) - 2 * square[np.arange(len(faces)), shortest])
     return np.arctan2(twice_area, dot)
@@ -171,16 +184,16 @@ def collapse_slivers(
     fixed: BoolArray,
     tolerance: float,
 ) -> IntArray:
-    """Remove slivers (triangles with a tiny angle) by contracting their shortest edge to one of its
-    ends, if possible. Returns the faces that are left, with their new corners.
+    """Remove slivers (triangles with an angle below 4 degrees) by contracting their shortest edge
+    to one of its ends, if possible. Returns the faces that are left, with their new corners.
 
     fixed: (n,) the mask of the vertices that may not be removed, such as those of the boundary.
     tolerance: a length, the largest distance of the centers of new triangles from the level set.
 
     An edge (u, v) can be contracted to u without a change of topology if v is not fixed and if u
     and v have only two neighbors in common, the third corners of the edge's two faces (the link
-    condition). It is contracted if no new triangle is a sliver, and if all of them face along the
-    gradient and are near the level set."""
+    condition). It is contracted if no new triangle is a sliver, and if the normals of all new
+    triangles are along the gradient, and their centers near the level set."""
     slivers = np.flatnonzero(least_angles(vertices, faces) < _SLIVER)
     is_removed = np.zeros(len(faces), np.bool_)
     faces = faces.copy()
@@ -191,17 +204,20 @@ def collapse_slivers(
         sides = row_norms(np.roll(corner, -1, axis=0) - corner)
         k = int(sides.argmin())
         ends = int(faces[row, k]), int(faces[row, (k + 1) % 3])
+        # Try to remove one end of the shortest edge, then the other.
         for target, source in (ends, ends[::-1]):
             if fixed[source]:
                 continue
-            star = np.flatnonzero((faces == source).any(axis=1) & ~is_removed)
-            beside = (faces[star] == target).any(axis=1)
+            star_rows = np.flatnonzero((faces == source).any(axis=1) & ~is_removed)
+            has_target = (faces[star_rows] == target).any(axis=1)
             if not _can_contract(faces[~is_removed], target, source):
                 continue
-            new = np.where(faces[star[~beside]] == source, target, faces[star[~beside]])
-            if _is_good(function, vertices, new, tolerance):
-                faces[star[~beside]] = new
-                is_removed[star[beside]] = True
+            new_faces = np.where(
+                faces[star_rows[~has_target]] == source, target, faces[star_rows[~has_target]]
+            )
+            if _is_good(function, vertices, new_faces, tolerance):
+                faces[star_rows[~has_target]] = new_faces
+                is_removed[star_rows[has_target]] = True
                 break
     return faces[~is_removed]
 
@@ -212,22 +228,25 @@ def _can_contract(faces: IntArray, target: int, source: int) -> bool:
     common, the third corners of these faces (the link condition)."""
     target_faces, source_faces = (faces[(faces == v).any(axis=1)] for v in (target, source))
     common = np.setdiff1d(np.intersect1d(target_faces, source_faces), [target, source])
-    beside = source_faces[(source_faces == target).any(axis=1)]
-    return len(beside) == 2 and np.array_equal(common, np.setdiff1d(beside, [target, source]))
+    edge_faces = source_faces[(source_faces == target).any(axis=1)]
+    return len(edge_faces) == 2 and np.array_equal(
+        common, np.setdiff1d(edge_faces, [target, source])
+    )
 
 
 def _is_good(
     function: LevelFunction, vertices: FloatArray, new: IntArray, tolerance: float
 ) -> bool:
-    """Whether all new triangles are good: each faces along the gradient, its center is within
-    `tolerance` of the level set, and it is no sliver. new: (k, 3)."""
+    """Whether all `new` triangles (k, 3) are good: the normal of each is within about 70 degrees of
+    the gradient, its center is within `tolerance` (a length) of the level set, and it is no sliver.
+    """
     corner = vertices[new]
     normal = area_normals(corner)
     samples = function.sample(corner.mean(axis=1))
     size = row_norms(normal) * row_norms(samples.gradient)
-    faces_along = row_dots(normal, samples.gradient) > _MIN_COLLAPSE_COSINE * size
+    is_along_gradient = row_dots(normal, samples.gradient) > _MIN_COLLAPSE_COSINE * size
     is_near = samples.distance <= tolerance
-    return bool((faces_along & is_near & (least_angles(vertices, new) > _SLIVER)).all())
+    return bool((is_along_gradient & is_near & (least_angles(vertices, new) > _SLIVER)).all())
 
 
 Walls = tuple[FloatArray, FloatArray] | None
@@ -245,29 +264,32 @@ def relax_vertices(
     tolerance: float,
     walls: Walls,
 ) -> FloatArray:
-    """Move vertices of thin triangles along the surface, if that makes the smallest angle of the
+    """Move vertices of thin triangles along the level set, if that makes the smallest angle of the
     triangles around them larger. Returns the vertices (n, 3). Boundary vertices stay.
 
     tolerance: a length, the largest distance of the centers of triangles around moved vertices from
         the level set.
     walls: None, or the lower and the upper corner (3,) of a box to which vertices are confined."""
-    fixed = np.zeros(len(vertices), np.bool_)
-    fixed[boundary_edges(faces)] = True
+    is_fixed = np.zeros(len(vertices), np.bool_)
+    is_fixed[boundary_edges(faces)] = True
     vertices = vertices.copy()
     for _ in range(_MOST_ROUNDS_OF_MOVES):
         angles = least_angles(vertices, faces)
-        thin = np.unique(faces[angles < _THIN])
-        stars = _VertexStars.of(faces, thin[~fixed[thin]], len(vertices))
+        thin_vertices = np.unique(faces[angles < _THIN])
+        # Only vertices of thin triangles are moved, and none on the boundary.
+        stars = _VertexStars.of(faces, thin_vertices[~is_fixed[thin_vertices]], len(vertices))
         if not len(stars.centers):
             break
-        before = stars.least(angles[stars.face])
-        moved, after = _best_places(function, vertices, faces, stars, walls)
-        gain = after - before
+        old_angle = stars.least(angles[stars.face])
+        best_positions, new_angle = _best_places(function, vertices, faces, stars, walls)
+        gain = new_angle - old_angle
         rows = _independent_moves(np.flatnonzero(gain > _GAIN), gain, stars, faces, len(vertices))
-        rows = rows[_moves_stay_near(function, vertices, faces, stars, moved, rows, tolerance)]
+        rows = rows[
+            _moves_stay_near(function, vertices, faces, stars, best_positions, rows, tolerance)
+        ]
         if not len(rows):
             break
-        vertices[stars.centers[rows]] = moved[rows]
+        vertices[stars.centers[rows]] = best_positions[rows]
     return vertices
 
 
@@ -297,15 +319,15 @@ class _VertexStars:
         return cls(centers, index[corners[:, 0]], face, corners)
 
     def least(self, of_pairs: FloatArray) -> FloatArray:
-        """(k,) for each vertex, the smallest of the numbers `of_pairs` (p,) that belong to its
-        faces."""
+        """(k,) for each vertex, the smallest number of its faces. of_pairs: (p,) one number for
+        each pair."""
         smallest = np.full(len(self.centers), np.inf)
         np.minimum.at(smallest, self.owner, of_pairs)
         return smallest
 
     def mean(self, of_pairs: FloatArray) -> FloatArray:
-        """(k, 3) for each vertex, the mean of the vectors `of_pairs` (p, 3) that belong to its
-        faces."""
+        """(k, 3) for each vertex, the mean of the vectors of its faces. of_pairs: (p, 3) one vector
+        for each pair."""
         count = np.bincount(self.owner, minlength=len(self.centers))
         sums = [
             np.bincount(self.owner, of_pairs[:, axis], minlength=len(self.centers))
@@ -355,8 +377,8 @@ def _best_places(
             angle = _least_at(x, stars, a, b, normal)
             is_better = angle > best_angle
             best[is_better], best_angle[is_better] = x[is_better], angle[is_better]
-    # Only the best position is moved onto the surface, which changes it little: the aims are near
-    # it.
+    # Only the best position is moved onto the level set. That changes it little, since the targets
+    # are near the level set.
     span = row_norms(best - start) + 1e-300
     best = newton_to_level(function, best, function.sample(best), 2 * span, walls, steps=4)
     return best, _least_at(best, stars, a, b, normal)
@@ -377,8 +399,8 @@ def _least_at(
     size = row_norms(cross)
     corner = np.stack([center, a, b], axis=1)
     angles = least_angles(corner.reshape(-1, 3), np.arange(3 * len(a)).reshape(-1, 3))
-    facing = row_dots(cross, normal) > _FACING * size
-    return stars.least(np.where(facing, angles, -1.0))
+    is_unturned = row_dots(cross, normal) > _FACING * size
+    return stars.least(np.where(is_unturned, angles, -1.0))
 
 
 def _independent_moves(
@@ -389,7 +411,7 @@ def _independent_moves(
     Returns the chosen ones of `rows`.
 
     rows: (j,) the candidates, as positions in `stars.centers`.
-    gain: (k,) for all k stars, how much the smallest angle grows by the move."""
+    gain: (k,) for all k stars, how much the smallest angle grows by the move, in radians."""
     rank = np.full(vertex_count, len(rows))
     ordered = rows[np.argsort(-gain[rows], kind="stable")]
     rank[stars.centers[ordered]] = np.arange(len(rows))
@@ -408,14 +430,16 @@ def _moves_stay_near(
     tolerance: float,
 ) -> BoolArray:
     """(j,) for each of j vertices, whether it may move to its target without the mesh leaving the
-    level set. The target has to be on the level set; the centers of the triangles around it have to
-    be within `tolerance` (a length) of the level set; and these have to face along the gradient.
+    level set. Three conditions must hold: the target is on the level set; the centers of the
+    triangles around it are within `tolerance` (a length) of the level set; and the normals of these
+    triangles are within 60 degrees of the gradient.
 
     stars: the faces around k vertices. rows: (j,) the vertices, as positions in `stars.centers`.
     targets: (k, 3) the targets of all k vertices."""
-    moved = np.zeros(len(stars.centers), np.bool_)
-    moved[rows] = True
-    pairs = np.flatnonzero(moved[stars.owner])
+    is_candidate = np.zeros(len(stars.centers), np.bool_)
+    is_candidate[rows] = True
+    pairs = np.flatnonzero(is_candidate[stars.owner])
+    # The triangles around the candidates, as they are after the move.
     corner = vertices[stars.corners[pairs]]
     corner[:, 0] = targets[stars.owner[pairs]]
     samples = function.sample(corner.mean(axis=1))
@@ -423,8 +447,10 @@ def _moves_stay_near(
     size = row_norms(normal) * row_norms(samples.gradient)
     is_near = row_dots(normal, samples.gradient) > _FACING * size
     is_near &= samples.distance <= tolerance
-    failures = np.zeros(len(stars.centers), np.int64)
-    np.add.at(failures, stars.owner[pairs[~is_near]], 1)
+    failure_count = np.zeros(len(stars.centers), np.int64)
+    np.add.at(failure_count, stars.owner[pairs[~is_near]], 1)
     length = row_norms(targets[rows] - vertices[stars.centers[rows]])
-    on = function.sample(targets[rows]).distance <= 1e-7 * np.maximum(length, 0.1 * tolerance)
-    return on & (failures[rows] == 0)
+    is_target_on_level = function.sample(targets[rows]).distance <= 1e-7 * np.maximum(
+        length, 0.1 * tolerance
+    )
+    return is_target_on_level & (failure_count[rows] == 0)

@@ -1,4 +1,9 @@
-"""The function `mesh`: triangle meshes of level sets, and closed meshes of solids."""
+"""The function `mesh`: triangle meshes of level sets of a field, and closed meshes of solids. A
+field is a function f of space. A solid is the set of points at which f lies between two values.
+Three ways of meshing are combined here: in a lattice, for functions that are smooth nearly
+everywhere; spanning a curve, for `SolidAngle`; and "by signs", for fields that jump or are rough,
+from the signs of f - level alone.
+"""
 
 from __future__ import annotations
 
@@ -204,8 +209,8 @@ def mesh(
             not have; keywords beside an object that holds them.
         ValueError: options are out of range or contradict each other; several levels.
     """
-    target, choices = surface_and_options("mesh", surface, options, keywords, _HONORED)
-    accuracy = MeshTolerance.of(choices)
+    target, trace_choices = surface_and_options("mesh", surface, options, keywords, _HONORED)
+    accuracy = MeshTolerance.of(trace_choices)
     check_options(cell_size, thickness, seed, max_triangles)
     simplify, largest = flag(simplify, "simplify"), target.largest > 0
     report = teller(progress)
@@ -215,6 +220,7 @@ def mesh(
         raise ValueError('simplify is for closed meshes: give side="below" or thickness as well')
     volume = intersection_of([field.domain, target.clip, target.section])
     asked = _MeshOptions(volume, accuracy, cell_size, seed, max_triangles, report)
+    # Three ways of meshing, by the kind of the field.
     if uses_sign_meshing(field):
         made = _mesh_from_signs(field, level, solid, thickness is not None, asked)
     elif solid:
@@ -225,14 +231,17 @@ def mesh(
     if solid:
         facts["side"] = target.side or "below"
     else:
+        # Of a level set, `largest` keeps the component with the largest area, before it is
+        # thickened.
         triangles = largest_component(triangles) if largest else triangles
         made.check_level(triangles)
     tolerance = accuracy.at(made.size)
     if thickness is not None:
         report("thickening")
         normals = vertex_normals(made.function, triangles)
-        triangles, more = thicken(triangles, normals, float(thickness), 0.5 * tolerance)
-        facts |= more
+        # Half of the tolerance is left for the simplification.
+        triangles, more_facts = thicken(triangles, normals, float(thickness), 0.5 * tolerance)
+        facts |= more_facts
     if largest and is_closed:
         triangles = largest_body(triangles)
 
@@ -243,14 +252,15 @@ def mesh(
             made.check_level(surface)
         check_manifold(surface.faces)
 
+    # Meshes that are not known to be valid are checked here.
     if not made.is_checked:
         report("checking")
         check(triangles)
         check_no_self_intersection(triangles.vertices, triangles.faces)
     if simplify:
         report("simplifying")
-        triangles, more = simplify_mesh(triangles, tolerance, check)
-        facts |= more
+        triangles, more_facts = simplify_mesh(triangles, tolerance, check)
+        facts |= more_facts
     return to_trimesh(triangles, facts, is_closed)
 
 
@@ -258,8 +268,12 @@ def mesh(
 class _MeshOptions:
     """The checked arguments of `mesh`.
 
-    volume: the volume to which the level set is cut; None if it is not cut.
+    volume: the volume to which the level set is cut (clip, section and domain); None if it is not
+        cut.
     spacing: the size of cells, a length; None to choose it.
+    most_faces: the largest number of triangles.
+    report: called with messages about progress.
+
     The other attributes are arguments of `mesh` with the same names."""
 
     volume: Volume | None
@@ -272,15 +286,16 @@ class _MeshOptions:
 
 @dataclass(frozen=True)
 class _RawMesh:
-    """A mesh of a level set before it is thickened or simplified.
+    """A mesh before it is thickened or simplified: of a level set, or the closed surface of a
+    solid.
 
-    surface: the mesh. size: the longest side of its box, a length.
+    surface: the mesh. size: the longest side of the box in which it was meshed, a length.
     facts: its entries in `metadata["harnack"]`.
-    function: the function of which it is a level set.
+    function: the function of which the mesh is a level set.
     check_level: a function that raises a MeshingError unless a given mesh is within the tolerance
         of the level set.
-    is_checked: whether it is already known that `surface` is within the tolerance of the level set,
-        and that it is a manifold that does not pass through itself."""
+    is_checked: whether it is already known that `surface` is a manifold within the tolerance of the
+        level set, and does not pass through itself."""
 
     surface: TriangleMesh
     size: float
@@ -297,13 +312,18 @@ def _mesh_from_signs(
     is_thick: bool,
     asked: _MeshOptions,
 ) -> _RawMesh:
-    """Mesh a level set of the field's function f, or the closed surface of a solid, by the signs of
-    f - level on a lattice.
+    """Mesh a level set of the field's function f, or the closed surface of a solid, from the signs
+    of f - level at the points of a lattice.
 
     level: the level; None for the field's default.
     solid: False for a level set; True for the points of a `Solid`; or the interval (low, high) of
         the values of f in a solid.
     is_thick: whether the level set will be thickened.
+    asked: the arguments of `mesh`.
+
+    A winding number whose mesh lies on its own level set is not meshed: its triangles are the
+    result (`_faces_alone`). A solid between two levels is computed from closed meshes of both level
+    sets. Warns if the mesh is coarse, or lacks parts of the level set.
 
     Raises:
         MeshingError: the result is empty, or far from the level set; or `mesh_from_signs` fails.
@@ -316,31 +336,35 @@ def _mesh_from_signs(
     size = float((box.upper - box.lower).max())
     if solid and _is_outside_inside(field, ends, box):
         box = _unlimited_box(field, volume)
-    cells, attempts = _cells_by_signs(field, size, asked.spacing)
-    # Where nothing ends at the box, its cells should not lie along what is symmetrical.
-    room = np.zeros(3) if box.has_walls else size * np.array([0.0037, 0.0053, 0.0029])
-    filled = box.lower - room, box.upper + 0.5 * room
+    cell_size, attempts = _cells_by_signs(field, size, asked.spacing)
+    # If the surface may not end at the box, the box is enlarged by uneven amounts: otherwise
+    # lattice points would lie on planes of symmetry, where f often equals its level.
+    margin = np.zeros(3) if box.has_walls else size * np.array([0.0037, 0.0053, 0.0029])
+    lattice_box = box.lower - margin, box.upper + 0.5 * margin
     facts: list[dict[str, Any]] = []
     losses: list[LostParts] = []
 
     def function(value: float, side: float) -> SignFunction:
-        """The function side * (f - value), whose level set 0 is the level set `value` of f."""
-        return SignFunction.of(field, value, filled, cells, side=side, most_faces=asked.most_faces)
+        """The function side * (f - value). Its level set 0 is the level set of f at `value`; it is
+        positive on one side of it."""
+        return SignFunction.of(
+            field, value, lattice_box, cell_size, side=side, most_faces=asked.most_faces
+        )
 
-    is_apart = False
+    is_intersection_free = False
 
     def signed(value: float, side: float, closed: bool) -> TriangleMesh:
-        """The mesh of the level set `value` of f. side: 1; or -1 to reverse all faces. closed:
-        whether the mesh is closed by parts of the box's faces, rather than ending there.
+        """The mesh of the level set of f at `value`. side: 1; or -1 to reverse all faces. closed:
+        whether parts of the box's faces close the mesh; otherwise it ends at the box.
 
-        Its entries for the metadata are appended to the list of facts; the parts of the level set
-        that it lacks, to the list of losses."""
-        nonlocal is_apart
+        As side effects, the mesh's entries for the metadata are appended to `facts`, the parts of
+        the level set that it lacks to `losses`, and `is_intersection_free` is set."""
+        nonlocal is_intersection_free
         try:
             made, lost, more = mesh_from_signs(
                 function(value, side),
-                filled,
-                cells,
+                lattice_box,
+                cell_size,
                 asked.tolerance.at(size),
                 attempts,
                 asked.report,
@@ -351,36 +375,41 @@ def _mesh_from_signs(
             raise EmptySurfaceError(f"{error}{empty_surface_hint(field)}") from error
         facts.append(more)
         losses.append(lost)
-        is_apart = made.is_intersection_free
+        # The last mesh decides; with two levels this is set to False later.
+        is_intersection_free = made.is_intersection_free
         return made.surface
 
     if not solid:
         made = signed(levels[0], 1.0, False)
         if volume is not None and not (isinstance(volume, Box) and box.has_walls):
-            made, is_apart = clip_to_volume(made, volume), False
+            # The box itself has cut the mesh already if the clip is a box.
+            made, is_intersection_free = clip_to_volume(made, volume), False
     elif volume is None and ends[1] == math.inf:
         made = signed(levels[0], -1.0, False)
     else:
-        whole = box_manifold(box.lower, box.upper)
+        # Between two levels: the points below the upper level without those below the lower one.
+        solid_so_far = box_manifold(box.lower, box.upper)
         if math.isfinite(ends[0]):
-            whole = to_manifold(signed(ends[0], -1.0, True))
+            solid_so_far = to_manifold(signed(ends[0], -1.0, True))
         if math.isfinite(ends[1]):
-            whole = whole - to_manifold(signed(ends[1], -1.0, True))
+            solid_so_far = solid_so_far - to_manifold(signed(ends[1], -1.0, True))
         if field.has_jumps and len(levels) == 2:
-            _check_has_thickness(field, whole, ends, asked.tolerance.at(size))
-        cut = volume or Box(tuple(box.lower.tolist()), tuple(box.upper.tolist()))
-        whole ^= volume_manifold(cut, box.lower, box.upper, 0.5 * asked.tolerance.at(size))
-        made, is_apart = from_manifold(whole), False
+            _check_has_thickness(field, solid_so_far, ends, asked.tolerance.at(size))
+        cut_volume = volume or Box(tuple(box.lower.tolist()), tuple(box.upper.tolist()))
+        solid_so_far ^= volume_manifold(
+            cut_volume, box.lower, box.upper, 0.5 * asked.tolerance.at(size)
+        )
+        made, is_intersection_free = from_manifold(solid_so_far), False
     if not len(made.faces):
         raise MeshingError("the level set is empty: it lies outside of the clip")
-    if is_apart:
+    if is_intersection_free:
         check_manifold(made.faces)
-    known = {"level": levels[0], **_merge_facts(facts)}
+    metadata = {"level": levels[0], **_merge_facts(facts)}
     if isinstance(field, DipolePotential):
-        known["cloud"] = field.describe()
-    is_told = _check_sign_accuracy(field, known, asked.tolerance.at(size))
+        metadata["cloud"] = field.describe()
+    is_told = _check_sign_accuracy(field, metadata, asked.tolerance.at(size))
     _warn_of_lost(field, losses, is_told)
-    return _RawMesh(made, size, known, function(levels[0], 1.0), _accept, is_apart)
+    return _RawMesh(made, size, metadata, function(levels[0], 1.0), _accept, is_intersection_free)
 
 
 def _ends_by_signs(
@@ -389,14 +418,15 @@ def _ends_by_signs(
     solid: tuple[float, float] | bool,
     is_thick: bool,
 ) -> tuple[float, float]:
-    """The interval (low, high) of the values of f inside of a solid. For a level set it is the
-    interval from its level to infinity.
+    """The interval (low, high) of the values of f in the solid that is to be meshed by signs. For a
+    level set it is (level, inf).
 
-    level: the level; None for the field's default. is_thick: whether it will be thickened.
+    level: the level; None for the field's default. is_thick: whether the level set will be
+        thickened.
     solid: False for a level set; True for the points of a `Solid`; or the interval itself.
 
     Raises:
-        TypeError: a surface across which f jumps is to be thickened.
+        TypeError: the level set is to be thickened, but f jumps across it.
         ValueError: the field has no such level.
     """
     if is_thick and field.has_jumps:
@@ -412,19 +442,20 @@ def _ends_by_signs(
 
 
 def _cells_by_signs(field: Field, size: float, spacing: float | None) -> tuple[float, int]:
-    """The size of the cells that are tried first, a length, and the largest number of attempts with
-    ever smaller cells.
+    """The size of the lattice cells that are tried first when meshing by signs (a length), and the
+    largest number of attempts, each with smaller cells.
 
     size: the longest side of the box, a length.
-    spacing: the size that the caller asked for; None to choose it."""
+    spacing: the size of cells that the caller asked for; then there is only one attempt. None to
+        choose it: a 48th of the box, or smaller if the field is smoothed over a shorter length."""
     if spacing is not None:
         return float(spacing), 1
-    cells, attempts = size / _SIGN_CELLS, _SIGN_ATTEMPTS
-    detailed = cell_size_for_smoothing(
-        field, cells, CELL_REFINEMENT_FACTOR, CELL_REFINEMENT_FACTOR**2
+    cell_size, attempts = size / _SIGN_CELLS, _SIGN_ATTEMPTS
+    smaller_size = cell_size_for_smoothing(
+        field, cell_size, CELL_REFINEMENT_FACTOR, CELL_REFINEMENT_FACTOR**2
     )
-    # At once what would be tried next.
-    return (detailed, attempts - 1) if detailed < cells else (cells, attempts)
+    # Begin with smaller cells at once; that counts as the first attempt.
+    return (smaller_size, attempts - 1) if smaller_size < cell_size else (cell_size, attempts)
 
 
 def _faces_alone(
@@ -433,11 +464,12 @@ def _faces_alone(
     solid: tuple[float, float] | bool,
     asked: _MeshOptions,
 ) -> _RawMesh:
-    """Mesh the level set of the winding number of an open mesh whose triangles lie on that level
-    set, such as a mesh of a `SolidAngle`. The result are these triangles, cut by the volume of the
-    arguments and otherwise unchanged.
+    """Mesh the level set of a `WindingNumber` whose open mesh lies on that level set, such as a
+    mesh of a `SolidAngle`. The result consists of the triangles of that mesh, cut by the volume of
+    the arguments and otherwise unchanged.
 
-    level: the level. solid: False; any other value is an error here.
+    level: the level. solid: must be False.
+    asked: the arguments of `mesh`.
 
     Raises:
         MeshingError: a solid was asked for, nothing is left, or there are too many triangles.
@@ -459,18 +491,20 @@ def _faces_alone(
             f"{len(surface.faces):,} triangles of the mesh are its surface, and max_triangles is "
             f"{asked.most_faces:,}: choose a larger `max_triangles`, or a smaller `clip`"
         )
-    known = {"level": level, "made_by": "faces", "spacing": math.nan, "evaluations": 0}
+    facts = {"level": level, "made_by": "faces", "spacing": math.nan, "evaluations": 0}
     function = LevelFunction(field, level, most_faces=asked.most_faces)
-    return _RawMesh(surface, size, known, function, _accept, False)
+    return _RawMesh(surface, size, facts, function, _accept, False)
 
 
 def _check_has_thickness(
     field: Field, whole: Manifold, ends: tuple[float, float], tolerance: float
 ) -> None:
-    """Raise a MeshingError if a solid between two levels has no thickness. That is so if the field
-    jumps from below the one to above the other: then both level sets are the same triangles.
+    """Raise a MeshingError if the solid between two levels has no thickness. That is so if the
+    field jumps from below the lower to above the upper level: then both level sets are the same
+    triangles.
 
-    whole: the solid. ends: the two levels. tolerance: a length."""
+    whole: the solid. ends: the two levels. tolerance: the smallest mean thickness, a length."""
+    # A thin sheet of thickness h has the volume h * area / 2, as both of its sides count.
     if 2 * abs(whole.volume()) < tolerance * whole.surface_area():
         low, high = (f"{one:g}" for one in ends)
         raise MeshingError(
@@ -480,8 +514,9 @@ def _check_has_thickness(
 
 
 def _merge_facts(facts: list[dict[str, Any]]) -> dict[str, Any]:
-    """Merge the metadata entries (facts) of the surfaces at the two levels of a solid: counts are
-    added, and of two lengths the larger one is taken."""
+    """Merge the metadata entries of the surfaces at the two levels of a solid into one dictionary:
+    counts are added, and of two lengths the larger one is taken. facts: one dictionary for each
+    level."""
     sums = ("evaluations", "undecided", "flat", "far", "looked_at", "lost", "sought")
     larger = {key: max(one[key] for one in facts) for key in ("spacing", "within")}
     return {**facts[0], **larger, **{key: sum(one[key] for one in facts) for key in sums}}
@@ -491,10 +526,10 @@ def _check_sign_accuracy(field: Field, facts: dict[str, Any], tolerance: float) 
     """Warn if more than one in a hundred vertices and centers of triangles are farther than
     `tolerance` (a length) from the level set. Returns whether there was a warning.
 
-    facts: the metadata entries that `mesh_from_signs` returned.
+    facts: the metadata entries that `mesh_from_signs` returned; they hold the measured distances.
 
     Raises:
-        MeshingError: some of them are farther than several cells from the level.
+        MeshingError: some of them are farther than several cells from the level set.
     """
     far, count, within = facts["far"], facts["looked_at"], facts["within"]
     kind = type(field).__name__
@@ -533,8 +568,8 @@ def _warn_of_lost(field: Field, losses: list[LostParts], is_told: bool) -> None:
 
 
 def _accept(surface: TriangleMesh) -> None:
-    """Accept every surface. This is the check of the distance from the level set for meshes that
-    were made from signs, whose distances have been measured before."""
+    """Accept every mesh. It serves as `_RawMesh.check_level` of meshes by signs, whose distances
+    from the level set have been measured before."""
 
 
 def _level_and_solid(
@@ -542,7 +577,7 @@ def _level_and_solid(
 ) -> tuple[float | None, tuple[float, float] | bool]:
     """Decide what to mesh: a level set of the field's function f, or a solid.
 
-    thickness: of the closed part that is made of the surface; None for none.
+    thickness: the thickness of the closed part that is made of a level set; None for none.
 
     Returns:
         The level, or None for the field's default; and one of three: False for the level set; True
@@ -574,19 +609,21 @@ def _check_level(
     function: LevelFunction, made: TriangleMesh, tolerance: float, volume: Volume | None
 ) -> None:
     """Raise a MeshingError unless the mesh `made` is within `tolerance` (a length) of the level set
-    of the function, and inside the volume if there is one."""
+    of the function, and inside the volume if there is one. The distance is tested at vertices and
+    centers of triangles."""
     if volume is not None:
         check_inside(made.vertices, volume, tolerance)
     check_near_level(function, made.vertices, made.faces, tolerance, volume)
 
 
 def _checked(field: Field) -> Field:
-    """Return the field, if it can be meshed. For a `SolidAngle`, return a new one with the same
-    loops.
+    """Return the field if it can be meshed. For a `SolidAngle`, return a new one with the same
+    loops, so that no setting of the given one counts.
 
     Raises:
-        TypeError: it has patches, circles, jumps that meshing by signs does not handle, or values
-            that are angles although it is no `SolidAngle`.
+        TypeError: it has patches (several functions in boxes of their own), circles, jumps that
+            meshing by signs does not handle, or values that are angles although it is no
+            `SolidAngle`.
     """
     check_is_field(field)
     if field.has_patches or (field.has_jumps and not uses_sign_meshing(field)):
@@ -599,6 +636,7 @@ def _checked(field: Field) -> Field:
             raise TypeError(
                 "the mesh of a circle ends on a polygon: give circle.polygon(n) in its place"
             )
+        # Without the settings of the given one.
         return SolidAngle(list(field.loops))
     if field.period is not None:
         raise TypeError(
@@ -614,38 +652,43 @@ def _mesh_solid(
     solid: tuple[float, float] | Literal[True],
     asked: _MeshOptions,
 ) -> _RawMesh:
-    """Make the closed surface of a solid from meshes of smooth level sets, which are combined by
-    unions, intersections and differences.
+    """Mesh the closed surface of a solid: the smooth level sets of its parts are meshed and then
+    combined by unions, intersections and differences.
 
     level: the level; None for the field's default.
     solid: True for the points of a `Solid`; or the interval (low, high) of the values of f in the
-        solid."""
+        solid.
+    asked: the arguments of `mesh`."""
     region = LevelFunction(*solid_and_level(field, solid, level), most_faces=asked.most_faces)
-    evaluations = [0]
+    # In a list, so that a nested function can change it.
+    angle_evaluations = [0]
 
     def angle_mesher(error: float, cells: float) -> AngleMesher:
-        """A function that meshes level sets of angles. error: the tolerance of these meshes; cells:
-        their size of cells; both are lengths."""
+        """Make a function that meshes level sets of angles. error: the tolerance of these meshes;
+        cells: the size of their cells; both are lengths."""
 
         def mesh_angle(angle: SolidAngle, value: float) -> TriangleMesh:
-            """The mesh of the level set of an angle at `value`."""
+            """The mesh of the level set of `angle` at `value`. Its evaluations are added to the
+            count."""
             angle = cast("SolidAngle", _checked(angle))
             box = _box(angle, (value,), None)
             function = LevelFunction(angle, value, most_faces=asked.most_faces)
             made, facts = _mesh_spanning_curve(
                 function, box, error, cells, 1, asked.seed, asked.report
             )
-            evaluations[0] += facts["evaluations"]
+            angle_evaluations[0] += facts["evaluations"]
             return made
 
         return mesh_angle
 
     def check_level(surface: TriangleMesh, size: float) -> None:
+        """Raise a MeshingError unless the mesh is within the tolerance of the solid's level set.
+        size: the longest side of its box, a length, to which the tolerance is relative."""
         _check_level(region, surface, asked.tolerance.at(size), asked.volume)
 
     def check(surface: TriangleMesh, size: float) -> None:
         """Raise a MeshingError unless the mesh is a manifold within the tolerance of the level set.
-        size: the longest side of its box."""
+        size: the longest side of its box, a length, to which the tolerance is relative."""
         check_manifold(surface.faces, surface.vertices)
         check_level(surface, size)
 
@@ -663,7 +706,7 @@ def _mesh_solid(
     facts = {
         "level": region.level,
         "spacing": made.spacing,
-        "evaluations": made.evaluations + evaluations[0],
+        "evaluations": made.evaluations + angle_evaluations[0],
         "surfaces_with_options": made.levels,
     }
     return _RawMesh(
@@ -672,32 +715,42 @@ def _mesh_solid(
 
 
 def _mesh_level_set(field: Field, level: float | None, asked: _MeshOptions) -> _RawMesh:
-    """Mesh a level set of a function that is smooth nearly everywhere, or of an angle.
+    """Mesh a level set of a function that is smooth nearly everywhere, or of a `SolidAngle`, and
+    cut it by the volume of the arguments.
 
-    level: the level; None for the field's default."""
+    level: the level; None for the field's default.
+    asked: the arguments of `mesh`.
+
+    Raises:
+        MeshingError: the level set is empty or cannot be meshed.
+    """
     level = field.default_level if level is None else float(level)
     function = LevelFunction(field, level, most_faces=asked.most_faces)
     field.validate_levels((level,))
     volume, report = asked.volume, asked.report
     box = _box(field, (level,), volume)
     size = float((box.upper - box.lower).max())
-    error = 0.5 * asked.tolerance.at(size)
-    cells = size / _CELLS_ACROSS if asked.spacing is None else float(asked.spacing)
+    # The other half of the tolerance is left for changes of the mesh that follow.
+    mesh_tolerance = 0.5 * asked.tolerance.at(size)
+    cell_size = size / _CELLS_ACROSS if asked.spacing is None else float(asked.spacing)
     if asked.spacing is None and field.min_wavelength is not None:
-        cells = min(cells, field.min_wavelength / CELLS_PER_WAVE)
+        cell_size = min(cell_size, field.min_wavelength / CELLS_PER_WAVE)
     attempts = 1 if asked.spacing is not None else _MAX_ATTEMPTS
     if isinstance(field, SolidAngle):
         made, facts = _mesh_spanning_curve(
-            function, box, error, cells, attempts, asked.seed, report
+            function, box, mesh_tolerance, cell_size, attempts, asked.seed, report
         )
     else:
-        made, facts = _mesh_in_lattice(function, box, error, cells, attempts, report)
+        made, facts = _mesh_in_lattice(function, box, mesh_tolerance, cell_size, attempts, report)
+    # If the clip is a box, the lattice has ended the mesh there already.
     if volume is not None and not (isinstance(volume, Box) and box.has_walls):
         made = clip_to_volume(made, volume)
         if not len(made.faces):
             raise MeshingError("the level set is empty: it lies outside of the clip")
 
     def check_level(surface: TriangleMesh) -> None:
+        """Raise a MeshingError unless the mesh is within the tolerance of the level set and in the
+        volume."""
         _check_level(function, surface, asked.tolerance.at(size), volume)
 
     return _RawMesh(made, size, {"level": level, **facts}, function, check_level, False)
@@ -714,13 +767,15 @@ def _mesh_in_lattice(
     """Mesh the level set of a real-valued function in a box. Returns the mesh, and its entries in
     `metadata["harnack"]`.
 
-    The mesh is made in lattice cells of size `spacing`. If that fails in a way that smaller cells
-    may mend, it is made again in smaller ones, with at most `attempts` attempts in all.
+    tolerance: the largest distance of triangles from the level set, a length.
+    spacing: the size of the lattice cells that are tried first, a length.
+    attempts: the largest number of attempts. If one fails in a way that smaller cells may mend, the
+        next one has cells 0.6 times as large.
 
     Raises:
-        MeshingError: the last attempt failed.
+        MeshingError: the last attempt failed, or one that smaller cells do not mend.
     """
-    before: MeshingError | None = None
+    previous_error: MeshingError | None = None
     while True:
         report(f"cells of {spacing:.3g}")
         try:
@@ -730,14 +785,15 @@ def _mesh_in_lattice(
             check_near_level(function, made.vertices, made.faces, 2 * tolerance, None)
             check_no_self_intersection(made.vertices, made.faces)
             break
-        except MeshingError as wrong:
+        except MeshingError as error:
             attempts -= 1
+            # Give up after the last attempt, or if even the smallest cells to come would not help.
             if not attempts or not is_retry_promising(
-                wrong, before, CELL_REFINEMENT_FACTOR**attempts
+                error, previous_error, CELL_REFINEMENT_FACTOR**attempts
             ):
                 raise
-            before, spacing = wrong, CELL_REFINEMENT_FACTOR * spacing
-            report(f"{wrong}; so smaller cells")
+            previous_error, spacing = error, CELL_REFINEMENT_FACTOR * spacing
+            report(f"{error}; so smaller cells")
     facts = {
         "spacing": spacing,
         "evaluations": function.evaluations,
@@ -757,12 +813,12 @@ def _mesh_spanning_curve(
     seed: int,
     report: Callable[[str], None],
 ) -> tuple[TriangleMesh, dict[str, Any]]:
-    """Mesh the level set of an angle, a surface that ends at the angle's curve. Returns the mesh,
-    and its entries in `metadata["harnack"]`.
+    """Mesh the level set of a `SolidAngle`, a surface that ends at the curve of this angle. Returns
+    the mesh, and its entries in `metadata["harnack"]`.
 
     tolerance: the largest distance of triangles from the level set, a length.
     spacing: the size of the cells that are tried first, a length.
-    attempts: the largest number of attempts with ever smaller cells.
+    attempts: the largest number of attempts, each with smaller cells.
     seed: of the small random moves that keep points in general position."""
     ends = box.lower, box.upper
     made = mesh_spanning_curve(
@@ -784,7 +840,7 @@ class _MeshingBox:
     """The box in which a level set is meshed.
 
     lower, upper: (3,) its corners.
-    has_walls: whether the surface may end at the faces of the box."""
+    has_walls: whether the surface may reach the faces of the box, and end there."""
 
     lower: FloatArray
     upper: FloatArray
@@ -792,11 +848,13 @@ class _MeshingBox:
 
 
 def _is_outside_inside(field: Field, ends: tuple[float, float], box: _MeshingBox) -> bool:
-    """Whether the outside of `box` belongs to the solid in which f lies between two levels.
+    """Whether the points outside of `box` belong to the solid in which f lies between two levels.
 
-    ends: the two levels. The box contains both level sets. So the outside belongs to the solid
-    either as a whole or not at all, and the value of f at one point of it decides."""
+    ends: the two levels. The box contains both level sets. So either all points outside belong to
+        the solid or none does, and the value of f at one of them decides. False if no such point is
+        in the field's domain."""
     center, half = 0.5 * (box.lower + box.upper), 0.5 * (box.upper - box.lower)
+    # Points around the box: its corners and the centers of its edges and faces, moved outwards.
     signs = np.array(np.meshgrid(*[[-1.0, 0.0, 1.0]] * 3)).reshape(3, -1).T
     signs = signs[signs.any(axis=1)]
     points = np.concatenate([center + factor * half * signs for factor in (1.5, 1.02)])
@@ -809,11 +867,11 @@ def _is_outside_inside(field: Field, ends: tuple[float, float], box: _MeshingBox
 
 
 def _unlimited_box(field: Field, volume: Volume | None) -> _MeshingBox:
-    """The box of the clip volume, for a solid that continues outside of the box that contains its
-    level sets.
+    """The bounding box of the clip volume. It is the box for meshing if the solid continues outside
+    of the box that contains its level sets.
 
     Raises:
-        MeshingError: the volume has no bounds, so that the solid has none.
+        MeshingError: there is no clip volume, or it is unbounded: so is the solid.
     """
     bounds = None if volume is None else _bounds_of(volume)
     if bounds is None or not np.isfinite(bounds).all():
@@ -826,8 +884,8 @@ def _unlimited_box(field: Field, volume: Volume | None) -> _MeshingBox:
 
 def _box(field: Field, levels: tuple[float, ...], volume: Volume | None) -> _MeshingBox:
     """The box in which level sets of a field are meshed. It contains the intersection of two
-    regions: the extent of the level sets (a region proved to contain them) and the clip volume.
-    Either may be unknown or unbounded.
+    regions: the extent (a region proved to contain the level sets) and the clip volume. Either may
+    be unknown or unbounded.
 
     levels: the levels. volume: the clip volume, or None.
 
@@ -870,14 +928,15 @@ def _box(field: Field, levels: tuple[float, ...], volume: Volume | None) -> _Mes
 def _around_curve(field: SolidAngle, extent: Volume | None, volume: Volume | None) -> _MeshingBox:
     """The box in which a level set of a `SolidAngle` is meshed, a surface that spans a curve.
 
-    extent: a region proved to contain the surface, or None. If there is one, the box contains the
-        whole surface, which is cut later; otherwise it contains the curve and the clip volume.
-    volume: the clip volume, or None.
+    extent: a region proved to contain the surface, or None. If there is one, it is the box, and the
+        surface is cut by the clip later; otherwise the box contains the curve and the clip volume.
+    volume: the clip volume; it must not be None if there is no extent.
 
     Raises:
         MeshingError: there is no extent, and the clip volume is unbounded.
     """
     if extent is not None:
+        # The surface lies inside of its extent, so it does not end at the box.
         return _MeshingBox(*_bounds_of(extent), False)
     assert volume is not None
     points = np.concatenate(list(field.loops))
@@ -890,7 +949,7 @@ def _around_curve(field: SolidAngle, extent: Volume | None, volume: Volume | Non
 
 
 def _bounds_of(volume: Volume | None) -> tuple[FloatArray, FloatArray]:
-    """The lower and the upper corner (3,) of the bounding box of a volume, which must not be
+    """The lower and the upper corner (3,) of the bounding box of a volume. The volume must not be
     None."""
     assert volume is not None
     lower, upper = (np.array(end, np.float64) for end in volume.bounds())

@@ -13,15 +13,17 @@ __all__ = ["MeshTolerance"]
 
 @dataclass(frozen=True)
 class MeshTolerance:
-    """The largest distance of triangles from a surface.
+    """The largest allowed distance of the triangles of a mesh from the surface that they stand for.
 
-    length: a length; None for 1e-3 of the size of the surface."""
+    length: this distance, a length; None for 1e-3 of the size of the surface (the longest side of
+        its bounding box)."""
 
     length: float | None = None
 
     @classmethod
     def of(cls, options: TraceOptions) -> MeshTolerance:
-        """The tolerance of a call of `mesh` or `repair`, from its options.
+        """The tolerance of a call of `mesh` or `repair`, from the options of traces that were
+        given.
 
         Raises:
             TypeError: a `HitTolerance` that is more than a length.
@@ -32,7 +34,8 @@ class MeshTolerance:
         return cls(None if hits is None else hits.distance)
 
     def at(self, size: float) -> float:
-        """The tolerance, a length, for a surface of this size (the longest side of its box).
+        """The tolerance, as a length, for a surface of this size (the longest side of its bounding
+        box).
 
         Raises:
             ValueError: the tolerance that was given is half of the size or more.
@@ -46,9 +49,10 @@ class MeshTolerance:
         return length
 
     def within(self, size: float) -> float:
-        """The tolerance, a length, for one component of a surface. size: the longest side of the
-        component's box.
+        """The tolerance, as a length, for one component of a surface. size: the longest side of the
+        component's bounding box.
 
         It is the tolerance that was given, but at most 0.4 `size`, since a small component could
-        vanish within a larger one. If none was given, it is 1e-3 of `size`. It never raises."""
+        vanish within a larger tolerance. If none was given, it is 1e-3 of `size`. Unlike `at`, it
+        never raises."""
         return self.at(size) if self.length is None else min(self.length, 0.4 * size)

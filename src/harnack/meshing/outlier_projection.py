@@ -1,4 +1,6 @@
-"""The local repair of closed meshes of which a few vertices or faces are off the level set.
+"""The local repair of closed meshes of which a few vertices or centers of faces are too far from
+the level set. "The function" is f - level for a field f; the level set is where it is 0. These
+vertices and centers ("outliers") are moved onto the level set, and faces are split for that.
 
 A triangle may lie across a crease of the surface, with its center near the level set. If another
 solid cuts this triangle, the pieces have other centers and corners, which may be farther from the
@@ -40,17 +42,21 @@ def project_outliers(
     check: Callable[[TriangleMesh], None],
 ) -> TriangleMesh | None:
     """Mend a closed surface of which a few vertices or centers of faces are too far from the level
-    set (far, for short).
+    set.
 
-    Far vertices are moved onto the level set. A face with a far center is split at the midpoints of
-    those of its edges that are off the level set, or at its center if there are none, and the new
-    vertices are moved onto the level set.
+    A vertex that is too far is moved onto the level set. A face whose center is too far is split at
+    the midpoints of those of its edges that are off the level set, or at its center if there are
+    none, and the new vertices are moved onto the level set. The changed faces are checked, and
+    split again up to four times.
 
-    surface: none of its triangles pass through each other, and nearly all are near the level set.
-    places: (k, 3) the far vertices and the far centers of faces.
+    surface: a mesh of which no triangles pass through each other, and nearly all are near the level
+        set.
+    places: (k, 3) the vertices and the centers of faces that are too far. Nothing is tried if there
+        are more than 100.
     tolerance: a length; no point is moved farther than twice that.
-    check: raises a MeshingError for a surface that is not near the level. It is called with the
-        changed faces; whether these pass through other triangles is decided exactly.
+    check: a function that raises a MeshingError for a surface that is not near the level set. It is
+        called with the changed faces. Whether these pass through other triangles is decided
+        exactly.
 
     Returns:
         The mended surface, or None if that fails.
@@ -67,9 +73,10 @@ def project_outliers(
             return None
         (vertices, faces), is_new = changed
         try:
+            # New points off the level set are mended in the next round.
             check(TriangleMesh.without_unused_vertices(vertices, faces[is_new]))
-        except OffLevelError as far:
-            places = far.locations
+        except OffLevelError as error:
+            places = error.locations
             continue
         except MeshingError:
             return None
@@ -99,17 +106,20 @@ def _project_and_split(
         the center of a face, or would be moved by more than two tolerances.
     """
     vertices, faces = surface.vertices, surface.faces
-    corners = _rows_at(points, vertices)
-    centers = _rows_at(points, vertices[faces].mean(axis=1))
-    if len(corners) + len(centers) < len(points):
+    moved_vertices = _rows_at(points, vertices)
+    center_rows = _rows_at(points, vertices[faces].mean(axis=1))
+    if len(moved_vertices) + len(center_rows) < len(points):
         return None
-    pairs = half_edges(faces[centers])
-    midpoints = vertices[pairs].mean(axis=1)
-    pairs = pairs[function.sample(midpoints).distance > _MAX_MIDPOINT_DISTANCE * tolerance]
+    split_edges = half_edges(faces[center_rows])
+    midpoints = vertices[split_edges].mean(axis=1)
+    split_edges = split_edges[
+        function.sample(midpoints).distance > _MAX_MIDPOINT_DISTANCE * tolerance
+    ]
     count = len(vertices)
-    keys = sorted_unique(edge_keys(pairs, count))
+    # A key is the number a * count + b for the edge between the vertices a < b.
+    keys = sorted_unique(edge_keys(split_edges, count))
     ends = np.stack(np.divmod(keys, count), axis=1)
-    # Which edges are cut, of all faces at these ends.
+    # For each face the new vertices on its edges, or -1. Neighbors share the edges that are split.
     midpoint = np.full(faces.shape, -1, np.int64)
     rows = np.flatnonzero(np.isin(faces, ends).any(axis=1))
     position = np.searchsorted(keys, face_keys := edge_keys(half_edges(faces[rows]), count))
@@ -117,28 +127,38 @@ def _project_and_split(
     if len(keys):
         is_cut = keys[position] == face_keys
         midpoint[rows] = np.where(is_cut, count + position, -1).reshape(3, -1).T
-    uncut = np.setdiff1d(centers, np.flatnonzero((midpoint >= 0).any(axis=1)))
+    # Other faces with a far center get a vertex there, and become a fan of three.
+    fan_rows = np.setdiff1d(center_rows, np.flatnonzero((midpoint >= 0).any(axis=1)))
+    # Move all three kinds of points at once: far vertices, new vertices on edges, new centers.
     start = np.concatenate(
-        [vertices[corners], vertices[ends].mean(axis=1), vertices[faces[uncut]].mean(axis=1)]
+        [
+            vertices[moved_vertices],
+            vertices[ends].mean(axis=1),
+            vertices[faces[fan_rows]].mean(axis=1),
+        ]
     )
     moved = newton_to_level(
         function, start, function.sample(start), np.full(len(start), tolerance), None
     )
     if not (row_norms(moved - start) <= 2 * tolerance).all():
         return None
-    vertices = np.concatenate([vertices, moved[len(corners) :]])
-    vertices[corners] = moved[: len(corners)]
+    vertices = np.concatenate([vertices, moved[len(moved_vertices) :]])
+    vertices[moved_vertices] = moved[: len(moved_vertices)]
     is_split = (midpoint >= 0).any(axis=1)
     split = split_faces(vertices, faces[is_split], midpoint[is_split])
-    inner = count + len(ends) + np.arange(len(uncut))
-    a, b, c = faces[uncut].T
-    new = [split, *(np.stack([*two, inner], axis=1) for two in ((a, b), (b, c), (c, a)))]
-    removed = np.union1d(np.flatnonzero(is_split), uncut)
-    remaining = np.delete(faces, removed, axis=0)
+    fan_centers = count + len(ends) + np.arange(len(fan_rows))
+    a, b, c = faces[fan_rows].T
+    new_faces = [
+        split,
+        *(np.stack([*edge, fan_centers], axis=1) for edge in ((a, b), (b, c), (c, a))),
+    ]
+    # To be checked: new faces, and faces at moved vertices.
+    removed_rows = np.union1d(np.flatnonzero(is_split), fan_rows)
+    remaining = np.delete(faces, removed_rows, axis=0)
     is_moved = np.zeros(len(vertices), np.bool_)
-    is_moved[corners] = True
-    is_new = np.delete(is_new, removed) | is_moved[remaining].any(axis=1)
-    faces = np.concatenate([remaining, *new])
+    is_moved[moved_vertices] = True
+    is_new = np.delete(is_new, removed_rows) | is_moved[remaining].any(axis=1)
+    faces = np.concatenate([remaining, *new_faces])
     is_new = np.concatenate([is_new, np.ones(len(faces) - len(remaining), np.bool_)])
     return (vertices, faces), is_new
 
@@ -153,6 +173,8 @@ def _check_new_faces(
     the surface by contracting and flipping edges.
 
     is_new: (m,) the mask of the new faces.
+    tolerance: a length; one contraction or flip may move the surface by a quarter of it.
+    check: a function that raises a MeshingError for a surface that is not near the level set.
 
     Returns:
         The surface, if no faces cross; the mended surface, if none cross any more and `check`
@@ -174,8 +196,8 @@ def _check_new_faces(
 
 
 def _in_boxes_of(triangles: FloatArray, rows: IntArray) -> IntArray:
-    """The indices of the triangles whose bounding box meets that of one of the triangles `rows`.
-    triangles: (m, 3, 3)."""
+    """The indices of the triangles (m, 3, 3) whose bounding box meets that of one of the triangles
+    with the indices `rows`."""
     lower, upper = triangles.min(axis=1), triangles.max(axis=1)
     meets = np.zeros(len(triangles), np.bool_)
     for row in rows.tolist():
@@ -186,5 +208,5 @@ def _in_boxes_of(triangles: FloatArray, rows: IntArray) -> IntArray:
 def _rows_at(targets: FloatArray, points: FloatArray) -> IntArray:
     """The indices of the points (n, 3) that are equal to one of the targets (k, 3), bit by bit."""
     rows = np.flatnonzero(np.isin(points[:, 0], targets[:, 0]))
-    same = (points[rows, None] == targets).all(axis=2).any(axis=1)
-    return rows[same]
+    is_equal = (points[rows, None] == targets).all(axis=2).any(axis=1)
+    return rows[is_equal]

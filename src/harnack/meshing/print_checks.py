@@ -1,4 +1,8 @@
-"""Checks of a mesh for problems that a slicer would report, and where they are."""
+"""Checks of a triangle mesh that is to be 3D printed: which problems a slicer would report, and
+where they are. A "problem" (`PrintProblem`) is one kind of defect with all of its locations; a
+"component" is a connected part of the mesh. Lengths are in the mesh's unit, which is taken to be
+the millimeter.
+"""
 
 from __future__ import annotations
 
@@ -46,10 +50,10 @@ _WORDS = re.compile(r"\{([^{}|]*)\|([^{}|]*)\}")
 
 @dataclass(frozen=True, eq=False)
 class PrintProblem:
-    """A kind of problem of a mesh that is to be printed, and where it occurs.
+    """One kind of defect of a mesh that is to be printed, and where it occurs.
 
     kind: the name of the problem, such as "open edges".
-    count: how often it occurs.
+    count: how often it occurs. A problem with count 0 does not occur, and is not reported.
     locations: (k, 3) where it occurs, or some of these places.
     message: the problem in a sentence.
     is_error: True for an error, False for a hint."""
@@ -139,30 +143,31 @@ def check_print(
         min_thickness = as_positive(min_thickness, "min_thickness")
     if build_volume is not None and np.shape(build_volume) != (3,):
         raise ValueError(f"build_volume must be (x, y, z), three lengths, not {build_volume!r}")
-    sides = (
+    checked_build_volume = (
         None
         if build_volume is None
-        else [as_positive(entry, "build_volume") for entry in build_volume]
+        else [as_positive(item, "build_volume") for item in build_volume]
     )
-    x, faces, rounded = _mesh_of(part)
+    x, faces, rounding_hint = _mesh_of(part)
+    # Later checks assume what earlier ones found: whether the mesh is closed, and whether faces
+    # cross.
     problems = _topology(x, faces)
     is_closed = not _has_errors(problems)
     shells = Shells.of(TriangleMesh(x, faces))
     crossings, touching = _contacts(x, faces, shells, is_closed)
-    is_clear = is_closed and not crossings.count
-    problems += [*_component_problems(shells, is_closed, is_clear), crossings, touching]
+    is_free_of_crossings = is_closed and not crossings.count
+    problems += [*_component_problems(shells, is_closed, is_free_of_crossings), crossings, touching]
     if min_thickness is not None:
         problems += [
             _thin_walls(x, faces, min_thickness, not _has_errors(problems)),
             _coarse_faces(x, faces, min_thickness),
         ]
-    low, high = x[faces].min(axis=(0, 1)), x[faces].max(axis=(0, 1))
-    size = cast("tuple[float, float, float]", tuple((high - low).tolist()))
-    problems += _size_problems(size, sides)
-    problems.append(rounded)
-    reported = sorted(
-        (entry for entry in problems if entry.count), key=lambda entry: not entry.is_error
-    )
+    box_lower, box_upper = x[faces].min(axis=(0, 1)), x[faces].max(axis=(0, 1))
+    size = cast("tuple[float, float, float]", tuple((box_upper - box_lower).tolist()))
+    problems += _size_problems(size, checked_build_volume)
+    problems.append(rounding_hint)
+    # Errors first.
+    reported = sorted((item for item in problems if item.count), key=lambda item: not item.is_error)
     volume = float(shells.volumes.sum()) if is_closed else None
     return PrintCheck(tuple(reported), size, volume, len(faces), len(shells.volumes))
 
@@ -178,14 +183,18 @@ def _mesh_of(part: Any) -> tuple[FloatArray, IntArray, PrintProblem]:
     part: a trimesh.Trimesh, (vertices, faces), or the name of a file.
 
     Returns:
-        The joined vertices (n, 3); the faces (m, 3), including faces without an area; and a problem
-        (a hint) that counts the vertices that differed by rounding.
+        The vertices (n, 3) of the mesh; the faces (m, 3) between joined vertices, including faces
+        without an area; and a problem (a hint) that counts the vertices that differed by rounding.
+
+    Raises:
+        TypeError: `part` is none of these.
+        MeshError: the file has no faces, or `validate_mesh` rejects the mesh.
     """
     if isinstance(part, str | os.PathLike):
         read = read_geometry(cast("Any", part), "winding")
         if not isinstance(read, LoadedMesh):
             raise MeshError(f"{part}: it holds no faces, so there is nothing to print")
-        x, faces, rounded = (
+        x, faces, rounded_count = (
             read.vertices,
             np.concatenate([read.faces, read.zero_area_faces]),
             read.rounded,
@@ -200,46 +209,58 @@ def _mesh_of(part: Any) -> tuple[FloatArray, IntArray, PrintProblem]:
                 f"of type {type(part).__name__}"
             ) from None
         x, faces = validate_mesh(vertices, raw_faces, allow_zero_area=True)
-        rounded = 0
+        rounded_count = 0
+    # Vertices that differ by rounding get the index of one of them.
     welded = Welded.of(x, faces)
-    count = rounded + welded.rounded
+    count = rounded_count + welded.rounded
     text = f"{count:,} {'corner is' if count == 1 else 'corners are'} apart from others by rounding"
-    note = PrintProblem("corners apart by rounding", count, np.zeros((0, 3)), text, is_error=False)
-    return x, welded.index[faces], note
+    rounding_hint = PrintProblem(
+        "corners apart by rounding", count, np.zeros((0, 3)), text, is_error=False
+    )
+    return x, welded.index[faces], rounding_hint
 
 
 def _problem(kind: str, locations: FloatArray, text: str, *, is_fatal: bool = True) -> PrintProblem:
     """Make a problem that occurs at k locations (k, 3), with its message.
 
+    kind: the name of the problem.
     text: a format for the message. {} stands for k; {one|several} for the word before the bar if k
         is 1, and for the word after it otherwise.
     is_fatal: whether the problem is an error, and not only a hint."""
     count = len(locations)
-    near = "" if not count else f", {'' if count == 1 else 'such as '}at {point_text(locations[0])}"
-    text = _WORDS.sub(lambda pair: pair[1 if count == 1 else 2], text)
-    return PrintProblem(kind, count, locations, text.format(f"{count:,}") + near, is_fatal)
+    first_location = (
+        "" if not count else f", {'' if count == 1 else 'such as '}at {point_text(locations[0])}"
+    )
+    text = _WORDS.sub(lambda match: match[1 if count == 1 else 2], text)
+    return PrintProblem(
+        kind, count, locations, text.format(f"{count:,}") + first_location, is_fatal
+    )
 
 
 def _topology(x: FloatArray, faces: IntArray) -> list[PrintProblem]:
-    """The problems of how faces are connected: open edges and edges of more than two faces,
-    neighbors of opposite orientation, duplicate faces, vertices where sheets touch, and faces
-    without an area.
+    """The problems of how faces are connected: open edges, edges of more than two faces, neighbors
+    of opposite orientation, duplicate faces, vertices where sheets touch, and faces without an
+    area.
 
-    x, faces: (n, 3), (m, 3) the mesh."""
-    flat = zero_area_faces(x, faces)
-    vanished = (faces == np.roll(faces, 1, axis=1)).any(axis=1)
-    used = faces[~vanished]
-    pairs = half_edges(used)
+    x, faces: (n, 3), (m, 3) the mesh. Faces with two equal corners count only as faces without an
+        area."""
+    zero_area = zero_area_faces(x, faces)
+    has_equal_corners = (faces == np.roll(faces, 1, axis=1)).any(axis=1)
+    proper_faces = faces[~has_equal_corners]
+    pairs = half_edges(proper_faces)
     edges = Edges.of(pairs)
     middle = x[edges.vertices].mean(axis=1)
-    net = np.bincount(
+    # Two faces that agree run their common edge in opposite directions, so the sum is 0.
+    direction_sum = np.bincount(
         edges.edge_of_pair,
         np.where(pairs[:, 0] < pairs[:, 1], 1, -1),
         minlength=len(edges.multiplicity),
     )
-    _, first, uses = np.unique(np.sort(used, axis=1), axis=0, return_index=True, return_counts=True)
-    touching = nonmanifold_vertices(used)
-    overused = np.unique(edges.vertices[edges.multiplicity > 2])
+    _, first, use_count = np.unique(
+        np.sort(proper_faces, axis=1), axis=0, return_index=True, return_counts=True
+    )
+    touching_vertices = nonmanifold_vertices(proper_faces)
+    at_overused_edges = np.unique(edges.vertices[edges.multiplicity > 2])
     return [
         _problem(
             "open edges", middle[edges.multiplicity == 1], "{} {edge has|edges have} one face alone"
@@ -251,22 +272,22 @@ def _topology(x: FloatArray, faces: IntArray) -> list[PrintProblem]:
         ),
         _problem(
             "sides that disagree",
-            middle[(edges.multiplicity == 2) & (net != 0)],
+            middle[(edges.multiplicity == 2) & (direction_sum != 0)],
             "at {} {edge|edges} neighboring faces do not agree on what is inside",
         ),
         _problem(
             "duplicate faces",
-            x[used[first[uses > 1]]].mean(axis=1),
+            x[proper_faces[first[use_count > 1]]].mean(axis=1),
             "{} {face is|faces are} there twice",
         ),
         _problem(
             "touching vertices",
-            x[np.setdiff1d(touching, overused)],
+            x[np.setdiff1d(touching_vertices, at_overused_edges)],
             "at {} {vertex|vertices} parts touch in a point",
         ),
         _problem(
             "faces without area",
-            x[faces[flat]].mean(axis=1),
+            x[faces[zero_area]].mean(axis=1),
             "{} {face has|faces have} no area",
             is_fatal=False,
         ),
@@ -277,18 +298,20 @@ def _component_problems(shells: Shells, is_closed: bool, is_clear: bool) -> list
     """The problems of the connected components of a mesh: components that are inside out, or lie in
     the material of other components; several separate bodies; tiny bodies; and cavities.
 
-    is_closed: whether the mesh is closed.
-    is_clear: whether the mesh is closed and no faces pass through each other. Then a component
-        lies inside another one either as a whole or not at all."""
-    volumes, none = shells.volumes, np.zeros(len(shells.volumes), np.bool_)
+    shells: the components.
+    is_closed: whether the mesh is closed. If it is not, only tiny and several bodies are reported.
+    is_clear: whether the mesh is closed and no faces pass through each other. Then a component lies
+        inside another one either as a whole or not at all."""
+    volumes, no_component = shells.volumes, np.zeros(len(shells.volumes), np.bool_)
     middle = 0.5 * (shells.lower + shells.upper)
     length = (shells.upper - shells.lower).max(axis=1)
     depth = shells.nesting_depths() if is_closed else np.zeros(len(volumes), np.int64)
+    # A cavity is a component that is inside out within another one.
     is_hollow = (volumes < 0) & (depth > 0)
     is_nested = (volumes > 0) & (depth > 0) & is_clear
-    inside_out = (volumes < 0) & ~is_hollow if is_closed else none
+    inside_out = (volumes < 0) & ~is_hollow if is_closed else no_component
     is_tiny = (length < _TINY_SHARE * length.max()) & ~is_hollow
-    loose = middle[~is_hollow]
+    body_centers = middle[~is_hollow]
     return [
         _problem(
             "inside out", middle[inside_out], "{} {part is|parts are} inside out: faces look inward"
@@ -308,7 +331,7 @@ def _component_problems(shells: Shells, is_closed: bool, is_clear: bool) -> list
         _problem("tiny parts", middle[is_tiny], "{} {part is|parts are} tiny", is_fatal=False),
         _problem(
             "loose parts",
-            loose if len(loose) > 1 else loose[:0],
+            body_centers if len(body_centers) > 1 else body_centers[:0],
             "there are {} parts that are not joined by vertices",
             is_fatal=False,
         ),
@@ -324,10 +347,14 @@ def _contacts(
     If a component has faces without an area, its contacts with itself are not reported: such faces
     close gaps of width zero, where other faces touch each other necessarily.
 
-    x, faces: (n, 3), (m, 3) the mesh. shells: its connected components."""
+    x, faces: (n, 3), (m, 3) the mesh. shells: its connected components.
+    is_closed: whether the mesh is closed; then the message advises how to unite parts that overlap.
+    """
     is_flat = np.zeros(len(faces), np.bool_)
     is_flat[zero_area_faces(x, faces)] = True
-    is_plain = np.isin(shells.component_of_face, shells.component_of_face[is_flat], invert=True)
+    is_without_flat_faces = np.isin(
+        shells.component_of_face, shells.component_of_face[is_flat], invert=True
+    )
     rows = np.flatnonzero((faces != np.roll(faces, 1, axis=1)).all(axis=1))
     # Duplicates are reported separately.
     rows = rows[np.unique(np.sort(faces[rows], axis=1), axis=0, return_index=True)[1]]
@@ -342,7 +369,7 @@ def _contacts(
     rows = rows[~is_flat[rows]]
     pairs, contacts = touching_pairs(x, faces[rows])
     first, second = rows[pairs.T]
-    is_contact = is_plain[first] | (
+    is_contact = is_without_flat_faces[first] | (
         shells.component_of_face[first] != shells.component_of_face[second]
     )
     touching = _problem(
@@ -355,12 +382,14 @@ def _contacts(
 
 
 def _thin_walls(x: FloatArray, faces: IntArray, wall: float, is_solid: bool) -> PrintProblem:
-    """The problem of places that are thinner than `wall`, a length. If the mesh bounds no solid,
-    the problem says instead that thickness could not be measured."""
+    """The problem of places where the part is thinner than `wall`, a length.
+
+    is_solid: whether the mesh bounds a solid. If it does not, the problem says instead that
+        thickness could not be measured."""
     if not is_solid:
         # The name differs from that of walls that were measured to be thin.
-        why = "how thick walls are is not known before the rest is mended"
-        return PrintProblem("walls not measured", 1, np.zeros((0, 3)), why)
+        message = "how thick walls are is not known before the rest is mended"
+        return PrintProblem("walls not measured", 1, np.zeros((0, 3)), message)
     thickness = wall_thickness(MeshSolid(x, faces))
     locations = thickness.thin_locations(wall - _ROUNDING * float(np.ptp(x, axis=0).max()))
     suffix = f"; the thinnest is {thickness.thinnest:.3g}"
@@ -369,8 +398,9 @@ def _thin_walls(x: FloatArray, faces: IntArray, wall: float, is_solid: bool) -> 
 
 
 def _coarse_faces(x: FloatArray, faces: IntArray, wall: float) -> PrintProblem:
-    """The problem of faces so long, relative to the smallest thickness `wall`, that thin places
-    beside their centers may be missed."""
+    """The problem (a hint) of faces longer than five times the smallest allowed thickness `wall`, a
+    length: thickness is measured at the centers of faces, so thin places beside these may be
+    missed."""
     corner = x[faces]
     longest = np.stack([row_norms(corner[:, k] - corner[:, k - 1]) for k in range(3)]).max(axis=0)
     centers = corner[longest > _COARSE * wall].mean(axis=1)
@@ -384,23 +414,24 @@ def _size_problems(size: tuple[float, float, float], bed: list[float] | None) ->
     (inches or meters); and it does not fit into the printer.
 
     size: (x, y, z) the edge lengths of the part's bounding box.
-    bed: [x, y, z] those of the space into which it has to fit; None if any size fits."""
-    longest, nowhere = max(size), np.zeros((0, 3))
+    bed: [x, y, z] the edge lengths of the space into which it has to fit, possibly turned by a
+        right angle about z; None if any size fits."""
+    longest, no_locations = max(size), np.zeros((0, 3))
     text = " x ".join(f"{length:.4g}" for length in size)
     problems: list[PrintProblem] = []
     if longest < _SMALLEST or longest > _LARGEST:
-        why = f"it is {text} mm, if files are in millimeters"
+        message = f"it is {text} mm, if files are in millimeters"
         if longest < _SMALLEST:
-            why += f"; in meters {longest * 1000:.4g}, in inches {longest * _INCH:.4g} mm long"
-        problems.append(PrintProblem("unit", 1, nowhere, why, is_error=False))
+            message += f"; in meters {longest * 1000:.4g}, in inches {longest * _INCH:.4g} mm long"
+        problems.append(PrintProblem("unit", 1, no_locations, message, is_error=False))
     elif longest < 10 * _SMALLEST:
-        why = f"it is {text} mm; if that is meant in inches, scale it by 25.4"
-        problems.append(PrintProblem("unit", 1, nowhere, why, is_error=False))
+        message = f"it is {text} mm; if that is meant in inches, scale it by 25.4"
+        problems.append(PrintProblem("unit", 1, no_locations, message, is_error=False))
     if bed is not None:
         x, y, z = size
         a, b, c = (side * (1 + _ROUNDING) for side in bed)
         fits = z <= c and ((x <= a and y <= b) or (y <= a and x <= b))
         if not fits:
             space = " x ".join(f"{length:g}" for length in bed)
-            problems.append(PrintProblem("bed", 1, nowhere, f"{text} does not fit on {space}"))
+            problems.append(PrintProblem("bed", 1, no_locations, f"{text} does not fit on {space}"))
     return problems

@@ -1,7 +1,11 @@
-"""The refinement of meshes: edges are split where the surface is too far from them, vertices are
-moved onto the surface and smoothed.
+"""The refinement of triangle meshes of a level set. Edges are split where the mesh is too far from
+the level set, the new vertices are moved onto it, and vertices are smoothed. "The function" is f -
+level for a field f, so the level set is where it is 0; "normals" of the level set are its
+gradients, normalized. A "crease" is a sharp edge of the level set. "Boundary edges" belong to one
+face only; they and their vertices stay as they are, unless "walls" are given: a box on whose faces
+the boundary lies.
 
-Vertices and edges of the boundary stay as they are.
+The distance of a point from the level set is estimated as |f - level|/|gradient|.
 """
 
 from __future__ import annotations
@@ -76,11 +80,13 @@ def refine(
     is within `tolerance` of it.
 
     That is, until the midpoints of all edges, except boundary edges, and the centers of all faces
-    are within the tolerance (a length); or until refinement is found to diverge, which the caller
-    has to check (`check_near_level`).
+    are within the tolerance (a length). It also ends if refinement is found to diverge, and after
+    12 rounds; then the mesh is not within the tolerance, which the caller has to check
+    (`check_near_level`).
 
     walls: None, or the lower and the upper corner (3,) of a box on whose faces the boundary lies.
         If it is None, boundary edges stay as they are; otherwise they are split too.
+    report: called with messages about progress.
     where: a function of points (k, 3) that returns the mask (k,) of the points that lie in the
         region to be refined; None for everywhere. An edge that leads out of that region may be
         split as well. Its midpoint is always moved onto the level set: otherwise the new edges
@@ -91,36 +97,38 @@ def refine(
     Raises:
         TriangleLimitError: it takes more triangles than the function allows.
     """
-    smallest_count, before = math.inf, 0
+    smallest_count, last_count = math.inf, 0
     for round_number in range(_MOST_ROUNDS):
         report(f"refining, round {round_number + 1}: {len(faces):,} triangles")
         marks = _RefinementMarks.of(function, vertices, faces, tolerance, walls, where)
-        marked = marks.marked
-        count = int(marked.sum()) + int(marks.misses_corner.sum())
+        is_split = marks.marked
+        count = int(is_split.sum()) + int(marks.misses_corner.sum())
         if not count:
             break
         if count > _DIVERGENCE_FACTOR * smallest_count:
             break
-        smallest_count = min(smallest_count, count) if count < before else smallest_count
-        before = count
+        smallest_count = min(smallest_count, count) if count < last_count else smallest_count
+        last_count = count
         # Every edge that is cut adds one triangle on each side, and so does every center.
         check_triangle_limit(len(faces) + 2 * count, function.most_faces)
-        samples, reach = marks.samples.select(marked), 0.5 * marks.span[marked]
-        moved = newton_to_level(function, marks.middle[marked], samples, reach, walls)
+        # The midpoints of the edges that are split become new vertices.
+        samples, max_step = marks.samples.select(is_split), 0.5 * marks.span[is_split]
+        moved = newton_to_level(function, marks.middle[is_split], samples, max_step, walls)
         if function.field.has_creases:
-            moved = _project_to_creases(function, vertices, marks.ends[marked], moved, walls)
-        new_vertex = np.full(len(marked), -1, np.int64)
-        new_vertex[marked] = len(vertices) + np.arange(int(marked.sum()))
+            moved = _project_to_creases(function, vertices, marks.ends[is_split], moved, walls)
+        new_vertex = np.full(len(is_split), -1, np.int64)
+        new_vertex[is_split] = len(vertices) + np.arange(int(is_split.sum()))
         vertices = np.concatenate([vertices, moved])
-        cut_off = marks.misses_corner & ~marked[marks.edges].any(axis=1)
-        inner = len(vertices) + np.arange(np.count_nonzero(cut_off))
+        # Faces with a new vertex in their interior become a fan of three around it.
+        is_fan = marks.misses_corner & ~is_split[marks.edges].any(axis=1)
+        fan_centers = len(vertices) + np.arange(np.count_nonzero(is_fan))
         vertices = np.concatenate(
-            [vertices, _crease_corners(function, vertices, faces[cut_off], walls)]
+            [vertices, _crease_corners(function, vertices, faces[is_fan], walls)]
         )
-        a, b, c = faces[cut_off].T
-        fans = [np.stack([*ends, inner], axis=1) for ends in ((a, b), (b, c), (c, a))]
-        split = split_faces(vertices, faces[~cut_off], new_vertex[marks.edges[~cut_off]])
-        faces = np.concatenate([split, *fans])
+        a, b, c = faces[is_fan].T
+        fans = [np.stack([*ends, fan_centers], axis=1) for ends in ((a, b), (b, c), (c, a))]
+        smaller_faces = split_faces(vertices, faces[~is_fan], new_vertex[marks.edges[~is_fan]])
+        faces = np.concatenate([smaller_faces, *fans])
     if function.field.has_variable_accuracy:
         vertices = _converge_vertices(function, vertices, faces, tolerance, walls)
     return vertices, faces
@@ -129,15 +137,15 @@ def refine(
 def _converge_vertices(
     function: LevelFunction, vertices: FloatArray, faces: IntArray, tolerance: float, walls: Walls
 ) -> FloatArray:
-    """Make more of Newton's steps for the vertices that are not yet on the level set. Returns all
-    vertices (n, 3).
+    """Make more steps of Newton's method for the vertices that are not yet on the level set.
+    Returns all vertices (n, 3).
 
     There are such vertices beside the dipoles of a point cloud, where the gradient changes much
     within a step. A vertex is moved only if that brings it closer to the level set, and by less
     than `tolerance` (a length). Boundary vertices stay if `walls` is None.
 
-    walls: None, or the lower and the upper corner (3,) of a box on whose faces the boundary
-        lies."""
+    walls: None, or the lower and the upper corner (3,) of a box on whose faces the boundary lies.
+    """
     samples = function.sample(vertices)
     is_off = samples.distance > _ON_SURFACE * tolerance
     if walls is None:
@@ -146,6 +154,7 @@ def _converge_vertices(
     if not len(rows):
         return vertices
     max_step = np.full(len(rows), 0.5 * tolerance)
+    # Twenty short steps, of half of the tolerance at most.
     moved = newton_to_level(
         function, vertices[rows], samples.select(rows), max_step, walls, steps=20
     )
@@ -160,68 +169,85 @@ def _project_to_creases(
     function: LevelFunction, vertices: FloatArray, ends: IntArray, moved: FloatArray, walls: Walls
 ) -> FloatArray:
     """The new vertices (k, 3) of k edges that are split. If an edge cuts off a sharp crease of the
-    surface, its new vertex is put onto the crease; otherwise it is the given one.
+    level set, its new vertex is put onto the crease; otherwise it is the given one.
 
     ends: (k, 2) the indices of the vertices at the ends of each edge.
-    moved: (k, 3) the midpoints of the edges, moved onto the level set by Newton's method.
+    moved: (k, 3) the given new vertices: the midpoints of the edges, moved onto the level set by
+        Newton's method.
     walls: None, or the lower and the upper corner (3,) of a box to which points are confined.
 
     Newton's method moves a midpoint to one of the two sides of a crease, possibly back to an end of
-    the edge; then splitting would not shorten the edge. Instead, take the point nearest to the
-    midpoint in the line in which the tangent planes at both ends meet. It is on the crease if the
+    the edge; then splitting would not shorten the edge. Instead, take the line in which the tangent
+    planes at both ends meet, and its point nearest to the midpoint. It is on the crease if the
     sides of the crease are flat (Kobbelt et al. 2001). The new vertex is where the segment from the
     midpoint to this point passes the level.
 
     An edge cuts off a crease if the normals at its ends differ by 20 degrees or more, and the
     normals at the moved midpoint and at one of the ends differ by nearly that angle. On a smooth
-    surface the latter two differ by about half of it."""
-    used, index = np.unique(ends, return_inverse=True)
-    slope = function.sample(vertices[used]).gradient
-    at_ends = (slope / np.maximum(row_norms(slope), 1e-300)[:, None])[index.reshape(-1, 2)]
-    n = function.sample(moved).gradient
-    n = n / np.maximum(row_norms(n), 1e-300)[:, None]
-    n_a, n_b = at_ends[:, 0], at_ends[:, 1]
+    surface the latter two differ by about half of it. The given vertex is also kept if the segment
+    does not pass the level, or passes it too near to an end of the edge."""
+    used, vertex_rows = np.unique(ends, return_inverse=True)
+    gradient = function.sample(vertices[used]).gradient
+    end_normals = (gradient / np.maximum(row_norms(gradient), 1e-300)[:, None])[
+        vertex_rows.reshape(-1, 2)
+    ]
+    midpoint_normal = function.sample(moved).gradient
+    midpoint_normal = midpoint_normal / np.maximum(row_norms(midpoint_normal), 1e-300)[:, None]
+    n_a, n_b = end_normals[:, 0], end_normals[:, 1]
     cosine = row_dots(n_a, n_b)
-    angle = np.arccos(np.clip(np.minimum(row_dots(n_a, n), row_dots(n_b, n)), -1, 1))
-    total = np.arccos(np.clip(cosine, -1, 1))
-    rows = np.flatnonzero((total > _CREASE) & (angle > _SHARE * total) & (1 - cosine**2 > 0.01))
+    angle_to_end = np.arccos(
+        np.clip(np.minimum(row_dots(n_a, midpoint_normal), row_dots(n_b, midpoint_normal)), -1, 1)
+    )
+    angle_of_ends = np.arccos(np.clip(cosine, -1, 1))
+    rows = np.flatnonzero(
+        (angle_of_ends > _CREASE) & (angle_to_end > _SHARE * angle_of_ends) & (1 - cosine**2 > 0.01)
+    )
     if not len(rows):
         return moved
     n_a, n_b, cosine = n_a[rows], n_b[rows], cosine[rows]
     a, b = (vertices[ends[rows, k]] for k in (0, 1))
     middle, span = 0.5 * (a + b), row_norms(b - a)
+    # The point nearest to the midpoint is u n_a + v n_b, relative to the midpoint, with u and v
+    # such that it lies in both planes: n_a . point = h_a and n_b . point = h_b.
     h_a, h_b = row_dots(n_a, a - middle), row_dots(n_b, b - middle)
     weights = np.stack([h_a - cosine * h_b, h_b - cosine * h_a]) / (1 - cosine**2)
     direction = weights[0][:, None] * n_a + weights[1][:, None] * n_b
-    projected, found = _level_along(function, middle, direction, _OFFSET * span, walls)
-    found &= np.minimum(row_norms(projected - a), row_norms(projected - b)) > _FROM_ENDS * span
+    projected, is_found = _level_along(function, middle, direction, _OFFSET * span, walls)
+    is_found &= np.minimum(row_norms(projected - a), row_norms(projected - b)) > _FROM_ENDS * span
     moved = moved.copy()
-    moved[rows[found]] = projected[found]
+    moved[rows[is_found]] = projected[is_found]
     return moved
 
 
 def _crease_corners(
     function: LevelFunction, vertices: FloatArray, faces: IntArray, walls: Walls
 ) -> FloatArray:
-    """New vertices (k, 3) on the level set for faces (k, 3) that cut off a corner of the surface,
+    """New vertices (k, 3) on the level set for faces (k, 3) that cut off a corner of the level set,
     one for each face.
 
     If the normals at the three vertices of a face are linearly independent, the tangent planes at
     these vertices meet in a point. The new vertex is where the segment from the face's center to
     this point passes the level. If it does not pass the level, or if the normals are dependent, the
-    new vertex is the center of the face, moved onto the level set by Newton's method."""
+    new vertex is the center of the face, moved onto the level set by Newton's method.
+
+    walls: None, or the lower and the upper corner (3,) of a box to which points are confined."""
     corner = vertices[faces]
     center = corner.mean(axis=1)
-    span = np.stack([row_norms(corner[:, k] - corner[:, k - 1]) for k in range(3)]).max(axis=0)
-    moved = newton_to_level(function, center, function.sample(center), 0.5 * span, walls)
-    slope = function.sample(corner.reshape(-1, 3)).gradient
-    normal = (slope / np.maximum(row_norms(slope), 1e-300)[:, None]).reshape(-1, 3, 3)
+    longest_edge = np.stack([row_norms(corner[:, k] - corner[:, k - 1]) for k in range(3)]).max(
+        axis=0
+    )
+    moved = newton_to_level(function, center, function.sample(center), 0.5 * longest_edge, walls)
+    gradient = function.sample(corner.reshape(-1, 3)).gradient
+    normal = (gradient / np.maximum(row_norms(gradient), 1e-300)[:, None]).reshape(-1, 3, 3)
     rows = np.flatnonzero(np.abs(np.linalg.det(normal)) > _INDEPENDENT)
+    # The planes n_k . p = offset_k, with p relative to the center.
     offsets = (normal * (corner - center[:, None])).sum(axis=2)
     solve: Any = np.linalg.solve
     direction: FloatArray = solve(normal[rows], offsets[rows][:, :, None])[:, :, 0]
-    crossing, found = _level_along(function, center[rows], direction, _OFFSET * span[rows], walls)
-    moved[rows[found]] = crossing[found]
+    crossing, is_found = _level_along(
+        function, center[rows], direction, _OFFSET * longest_edge[rows], walls
+    )
+    moved[rows[is_found]] = crossing[is_found]
     return moved
 
 
@@ -241,21 +267,22 @@ def _level_along(
     """
     along = along * np.minimum(1, limit / np.maximum(row_norms(along), 1e-300))[:, None]
     low, high = np.zeros(len(start)), np.full(len(start), _SEARCH_LENGTH)
-    found = np.ones(len(start), np.bool_)
+    is_found = np.ones(len(start), np.bool_)
     fractions = np.linspace(0, 1, _SAMPLES)
+    # Evaluate at 33 points, then at 33 points within the first interval with a change of sign.
     for _ in range(2):
         t = low[:, None] + (high - low)[:, None] * fractions
         x = start[:, None] + t[:, :, None] * along[:, None]
         x = x if walls is None else np.clip(x, *walls)
         is_above = (function.sample(x.reshape(-1, 3)).value > 0).reshape(t.shape)
-        passes = is_above[:, 1:] != is_above[:, :-1]
-        found &= passes.any(axis=1)
-        first = passes.argmax(axis=1)[:, None]
-        low, high = (np.take_along_axis(t, first + k, axis=1)[:, 0] for k in (0, 1))
+        changes_sign = is_above[:, 1:] != is_above[:, :-1]
+        is_found &= changes_sign.any(axis=1)
+        first_change = changes_sign.argmax(axis=1)[:, None]
+        low, high = (np.take_along_axis(t, first_change + k, axis=1)[:, 0] for k in (0, 1))
     crossing = start + low[:, None] * along
     crossing = crossing if walls is None else np.clip(crossing, *walls)
     max_step = 4 * (high - low) * row_norms(along)
-    return newton_to_level(function, crossing, function.sample(crossing), max_step, walls), found
+    return newton_to_level(function, crossing, function.sample(crossing), max_step, walls), is_found
 
 
 def unrefined_midpoints(
@@ -269,7 +296,8 @@ def unrefined_midpoints(
 
 @dataclass(frozen=True)
 class _RefinementMarks:
-    """The k edges of a mesh with m faces, and which edges are to be split.
+    """Which edges of a mesh with m faces and k edges are to be split, because the mesh is too far
+    from the level set; and the measurements from which that follows.
 
     edges: (m, 3) the indices of the edges of each face.
     ends: (k, 2) the vertices at the ends of each edge.
@@ -307,14 +335,14 @@ class _RefinementMarks:
 
         These are the edges whose midpoint is farther than `tolerance` (a length) from the level
         set; and of each face whose center is that far, the longest edge that may be split. Boundary
-        edges and very short edges are never split. A face that cuts off a corner of a surface with
-        creases is noted in `misses_corner` instead.
+        edges and very short edges are never split. If the function has creases and a face cuts off
+        a corner, no edge is split for the sake of its center; it is noted in `misses_corner`.
 
         vertices, faces: (n, 3), (m, 3) the mesh.
         walls: None, or the lower and the upper corner (3,) of a box on whose faces the boundary of
             the mesh lies; then boundary edges may be split too.
-        where: a function of points (k, 3) that returns the mask (k,) of those that count. Midpoints
-            and centers that do not count are taken to be on the level set. None: all count."""
+        where: a function of points (k, 3) that returns the mask (k,) of the points that lie in the
+            region to be refined; others are taken to be on the level set. None: all lie in it."""
         ends, edges, is_boundary = _edges(faces)
         if walls is not None:  # the boundary lies in the walls, and so do the middles of its edges
             is_boundary = np.zeros_like(is_boundary)
@@ -329,26 +357,29 @@ class _RefinementMarks:
             is_off &= where(center)
         marked = is_beyond.copy()
         must_split = is_off & (span[edges].max(axis=1) > _MIN_EDGE_LENGTH * tolerance)
-        cuts_off = np.zeros(len(faces), np.bool_)
-        lone = np.flatnonzero(must_split & ~marked[edges].any(axis=1))
+        misses_corner = np.zeros(len(faces), np.bool_)
+        # Faces whose center is far although no midpoint of their edges is.
+        center_only_rows = np.flatnonzero(must_split & ~marked[edges].any(axis=1))
         if function.field.has_creases:
-            cuts_off[lone] = _normals_turn(function, vertices[faces[lone]])
-        must_split &= ~cuts_off
+            misses_corner[center_only_rows] = _normals_turn(
+                function, vertices[faces[center_only_rows]]
+            )
+        must_split &= ~misses_corner
         # For a face that is off the surface, the longest edge that may be cut.
-        free = np.where(is_boundary[edges], 0.0, span[edges])
-        worst = edges[np.arange(len(faces)), free.argmax(axis=1)]
-        marked[worst[must_split]] = True
+        splittable_length = np.where(is_boundary[edges], 0.0, span[edges])
+        longest_edge = edges[np.arange(len(faces)), splittable_length.argmax(axis=1)]
+        marked[longest_edge[must_split]] = True
         marked &= ~is_boundary & (span > _MIN_EDGE_LENGTH * tolerance)
-        return cls(edges, ends, middle, span, samples, is_beyond, is_off, marked, cuts_off)
+        return cls(edges, ends, middle, span, samples, is_beyond, is_off, marked, misses_corner)
 
 
 def _normals_turn(function: LevelFunction, corner: FloatArray) -> BoolArray:
-    """(k,) for each of k faces, whether the normals of the level set at two of its corners differ
-    by so much that the surface between them has a crease.
+    """(k,) for each of k faces, whether the level set between its corners has a crease: the normals
+    at two corners differ by more than 20 degrees.
 
     corner: (k, 3, 3) the corners of the faces."""
-    slope = function.sample(corner.reshape(-1, 3)).gradient
-    normal = (slope / np.maximum(row_norms(slope), 1e-300)[:, None]).reshape(-1, 3, 3)
+    gradient = function.sample(corner.reshape(-1, 3)).gradient
+    normal = (gradient / np.maximum(row_norms(gradient), 1e-300)[:, None]).reshape(-1, 3, 3)
     cosines = [row_dots(normal[:, k], normal[:, k - 1]) for k in range(3)]
     return np.min(cosines, axis=0) < math.cos(_CREASE)
 
@@ -357,8 +388,9 @@ def _edges(faces: IntArray) -> tuple[IntArray, IntArray, BoolArray]:
     """The edges of faces (m, 3).
 
     Returns:
-        The vertices (k, 2) of all edges; the indices (m, 3) of the edges of each face, that between
-        its first two corners first; and the mask (k,) of the edges that belong to one face only.
+        The vertices (k, 2) of all edges; the indices (m, 3) of the edges of each face, first the
+        edge between its first two corners; and the mask (k,) of the edges that belong to one face
+        only.
     """
     edges = Edges.of(half_edges(faces))
     return edges.vertices, edges.edge_of_pair.reshape(3, -1).T, edges.multiplicity == 1
@@ -368,28 +400,39 @@ def split_faces(vertices: FloatArray, faces: IntArray, middle: IntArray) -> IntA
     """Split faces (m, 3) at the midpoints of some of their edges, into two, three or four faces
     each. Returns all faces (k, 3), unsplit ones first.
 
+    vertices: (n, 3) the positions of all vertices, midpoints included.
     middle: (m, 3) the vertices at the midpoints of the edges 01, 12 and 20 of each face; -1 for
-        edges that are not split."""
-    cut = middle >= 0
-    number = cut.sum(axis=1)
-    parts = [faces[number == 0]]
-    all_cut = number == 3
-    (a, b, c), (x, y, z) = faces[all_cut].T, middle[all_cut].T
+        edges that are not split.
+
+    If two edges of a face are split, what is left beside the corner between them is a
+    quadrilateral. It is divided along its shorter diagonal."""
+    is_edge_split = middle >= 0
+    split_count = is_edge_split.sum(axis=1)
+    parts = [faces[split_count == 0]]
+    # All three edges split: three faces at the corners and one in the middle.
+    has_three = split_count == 3
+    (a, b, c), (x, y, z) = faces[has_three].T, middle[has_three].T
     parts += [np.stack(t, axis=1) for t in ((a, x, z), (x, b, y), (z, y, c), (x, y, z))]
     for k in range(3):
         order = [k, (k + 1) % 3, (k + 2) % 3]
-        single = (number == 1) & cut[:, k]
-        (a, b, c), x = faces[single][:, order].T, middle[single, k]
+        # One edge split, from a to b: two faces.
+        has_one = (split_count == 1) & is_edge_split[:, k]
+        (a, b, c), x = faces[has_one][:, order].T, middle[has_one, k]
         parts += [np.stack(t, axis=1) for t in ((a, x, c), (x, b, c))]
-        pair = (number == 2) & ~cut[:, k]
-        # The edge from a to b is not cut; y and z are the middles of the other edges.
-        (a, b, c), y, z = faces[pair][:, order].T, middle[pair, order[1]], middle[pair, order[2]]
+        has_two = (split_count == 2) & ~is_edge_split[:, k]
+        # Two edges split: three faces. The edge from a to b is whole; y and z are the middles of
+        # the other two.
+        (a, b, c), y, z = (
+            faces[has_two][:, order].T,
+            middle[has_two, order[1]],
+            middle[has_two, order[2]],
+        )
         length_ay = row_norms(vertices[a] - vertices[y])
         length_bz = row_norms(vertices[b] - vertices[z])
-        shorter = (length_ay < length_bz)[:, None]
+        is_ay_shorter = (length_ay < length_bz)[:, None]
         parts.append(np.stack([z, y, c], axis=1))
-        parts.append(np.where(shorter, np.stack([a, b, y], 1), np.stack([a, b, z], 1)))
-        parts.append(np.where(shorter, np.stack([a, y, z], 1), np.stack([b, y, z], 1)))
+        parts.append(np.where(is_ay_shorter, np.stack([a, b, y], 1), np.stack([a, b, z], 1)))
+        parts.append(np.where(is_ay_shorter, np.stack([a, y, z], 1), np.stack([b, y, z], 1)))
     return np.concatenate(parts)
 
 
@@ -407,14 +450,14 @@ def improve(
     are split where triangles are no longer within `tolerance` (a length) of the level set. Finally
     edges are flipped and vertices moved for larger angles.
 
-    walls: None, or the lower and the upper corner (3,) of a box on whose faces the boundary
-        lies."""
+    walls: None, or the lower and the upper corner (3,) of a box on whose faces the boundary lies.
+    report: called with messages about progress."""
     for _ in range(2):
         faces = flip_edges(function, vertices, faces, tolerance)
         vertices = smooth(function, vertices, faces, walls, rounds=2)
-    fixed = np.zeros(len(vertices), np.bool_)
-    fixed[boundary_edges(faces)] = True
-    faces = collapse_slivers(function, vertices, faces, fixed, 2 * tolerance)
+    is_boundary_vertex = np.zeros(len(vertices), np.bool_)
+    is_boundary_vertex[boundary_edges(faces)] = True
+    faces = collapse_slivers(function, vertices, faces, is_boundary_vertex, 2 * tolerance)
     vertices, faces = refine(function, vertices, faces, tolerance, walls, report)
     for _ in range(2):
         faces = flip_edges(function, vertices, faces, tolerance)
@@ -429,35 +472,40 @@ def smooth(
     walls: Walls,
     rounds: int = 3,
 ) -> FloatArray:
-    """Smooth a mesh: in each round, every vertex is moved halfway to the mean of its neighbors, and
-    then back onto the level set. Returns the vertices (n, 3). Boundary vertices stay, and moves
-    that turn a face by much are undone.
+    """Smooth a mesh: in each of `rounds` rounds, every vertex is moved halfway to the mean of its
+    neighbors, and then back onto the level set. Returns the vertices (n, 3).
+
+    Boundary vertices stay. A vertex that does not come back to the level set stays too, and moves
+    that turn a face by more than about 70 degrees are undone.
 
     walls: None, or the lower and the upper corner (3,) of a box to which vertices are confined."""
     ends, _, _ = _edges(faces)
     boundary = np.unique(boundary_edges(faces))
-    free = np.zeros(len(vertices), np.bool_)
-    free[np.unique(faces)] = True
-    free[boundary] = False
-    count = np.maximum(np.bincount(ends.ravel(), minlength=len(vertices)), 1)
-    rows = np.flatnonzero(free)
-    size = float(np.ptp(vertices[free], axis=0).max(initial=0.0)) if len(rows) else 0.0
+    is_free = np.zeros(len(vertices), np.bool_)
+    is_free[np.unique(faces)] = True
+    is_free[boundary] = False
+    neighbor_count = np.maximum(np.bincount(ends.ravel(), minlength=len(vertices)), 1)
+    free_rows = np.flatnonzero(is_free)
+    size = float(np.ptp(vertices[is_free], axis=0).max(initial=0.0)) if len(free_rows) else 0.0
     for _ in range(rounds):
-        sums = np.zeros_like(vertices)
+        neighbor_sum = np.zeros_like(vertices)
+        # The sum of the neighbors of each vertex, over both directions of all edges.
         for i, j in ((0, 1), (1, 0)):
             for axis in range(3):
-                sums[:, axis] += np.bincount(
+                neighbor_sum[:, axis] += np.bincount(
                     ends[:, i], vertices[ends[:, j], axis], minlength=len(vertices)
                 )
-        aim = 0.5 * (vertices + sums / count[:, None])
-        start = function.sample(aim[rows])
-        # No farther than the neighbors: beside the curve gradients turn.
-        span = row_norms(aim[rows] - vertices[rows]) + 1e-300
+        target = 0.5 * (vertices + neighbor_sum / neighbor_count[:, None])
+        target_samples = function.sample(target[free_rows])
+        # Newton's steps are limited to twice the move: beside the boundary, gradients turn.
+        move_length = row_norms(target[free_rows] - vertices[free_rows]) + 1e-300
         moved = vertices.copy()
-        moved[rows] = newton_to_level(function, aim[rows], start, 2 * span, walls)
-        after = function.sample(moved[rows])
-        worse = after.distance > 1e-7 * size + 1e-12 * row_norms(moved[rows])
-        moved[rows[worse]] = vertices[rows[worse]]
+        moved[free_rows] = newton_to_level(
+            function, target[free_rows], target_samples, 2 * move_length, walls
+        )
+        moved_samples = function.sample(moved[free_rows])
+        is_off = moved_samples.distance > 1e-7 * size + 1e-12 * row_norms(moved[free_rows])
+        moved[free_rows[is_off]] = vertices[free_rows[is_off]]
         vertices = _undo_flipped(vertices, moved, faces)
     return vertices
 
@@ -475,7 +523,8 @@ def smooth_within_tolerance(
 
     Beside a crease, that can move faces away from the level set. A face is too far if its center,
     or the midpoint of one of its edges, is farther than `tolerance` (a length) from it. The
-    vertices of such faces get their former positions.
+    vertices of such faces get their former positions, and so do the vertices of the faces around
+    them. If that does not come to an end, all vertices do.
 
     walls: None, or the lower and the upper corner (3,) of a box to which vertices are confined.
     where: a function of points (k, 3) that returns the mask (k,) of those that are to be within the
@@ -499,23 +548,25 @@ def smooth_within_tolerance(
 
 
 def _undo_flipped(before: FloatArray, after: FloatArray, faces: IntArray) -> FloatArray:
-    """The vertices (n, 3) after a move, with the move undone at faces (m, 3) that it turned over: a
-    face whose normal turned by more than about 70 degrees gets its former vertices.
+    """The vertices (n, 3) after a move, except that the move is undone at faces (m, 3) that it
+    turned over: a face whose normal turned by more than about 70 degrees gets its former vertices.
 
     before, after: (n, 3) the vertices before and after the move.
 
     Undoing a move at some vertices may turn other faces over, so this is repeated. If it does not
-    come to an end, all vertices get their positions in `before`.
-    """
+    come to an end, all vertices get their positions in `before`."""
     for _ in range(8):
-        corner = after[faces]
-        normal = area_normals(corner)
-        old = before[faces]
-        old_normal = area_normals(old)
-        turned = row_dots(normal, old_normal) <= 0.3 * row_norms(normal) * row_norms(old_normal)
-        if not turned.any():
+        new_corner = after[faces]
+        new_normal = area_normals(new_corner)
+        old_corner = before[faces]
+        old_normal = area_normals(old_corner)
+        # The cosine between both normals is at most 0.3.
+        is_turned = row_dots(new_normal, old_normal) <= 0.3 * row_norms(new_normal) * row_norms(
+            old_normal
+        )
+        if not is_turned.any():
             return after
         after = after.copy()
-        reverted = np.unique(faces[turned])
+        reverted = np.unique(faces[is_turned])
         after[reverted] = before[reverted]
     return before

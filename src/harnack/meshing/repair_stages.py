@@ -1,5 +1,8 @@
-"""Repairs triangle meshes: computes a closed mesh from a damaged one, and keeps its valid triangles
-where possible.
+"""The function `repair`: computes a closed triangle mesh from a damaged one, and keeps its valid
+triangles where possible. The solid that the damaged mesh was meant to bound is known by its winding
+number w, which says how often the mesh winds around a point: 1 inside of a closed mesh, 0 outside,
+and values between for an open one. A "stage" is one way of repairing; a "filling" (or "patch")
+consists of new triangles that close a hole; the "boundary edges" around a hole have a single face.
 
 Stages are tried in turn, from the one that keeps most to the one that always gives a result: all
 triangles stay and holes are filled; bodies that overlap are united (`bodies`; for a surface that
@@ -240,9 +243,11 @@ def repair(
 class _RepairOptions:
     """The arguments of `repair`, checked.
 
-    patches: "smooth" or "harmonic", the argument `filling`.
-    spacing: the size of cells, a length, the argument `cell_size`; None to choose it.
-    report: called with messages, the argument `progress`."""
+    keep: which stages to try, "all", "valid" or "none"; None for all stages.
+    patches: how holes are filled, "smooth" or "harmonic": the argument `filling`.
+    tolerance: the largest distance of new triangles from the surface w = 1/2.
+    spacing: the size of cells, a length: the argument `cell_size`; None to choose it.
+    report: called with messages: the argument `progress`."""
 
     keep: Keep | None
     patches: Patches
@@ -260,7 +265,8 @@ def _checked_settings(
     seed: int,
     report: Callable[[str], None],
 ) -> _RepairOptions:
-    """Check the arguments of `repair`, and collect them in one object.
+    """Check the arguments of `repair`, and collect them in one object. patches: the argument
+    `filling`. spacing: the argument `cell_size`. The others have the same names.
 
     Raises:
         ValueError: one of them is not among the allowed values.
@@ -275,10 +281,10 @@ def _checked_settings(
 
 @dataclass(frozen=True)
 class _Result:
-    """The result of a stage.
+    """The repaired mesh that one stage computed.
 
-    surface: the closed mesh. facts: what `metadata["harnack"]` says of it.
-    difference: how it differs from the input; None if it does not."""
+    surface: the closed mesh. facts: its entries in `metadata["harnack"]`.
+    difference: how it differs from the solid that the input describes; None if it does not."""
 
     surface: TriangleMesh
     facts: dict[str, Any]
@@ -286,12 +292,13 @@ class _Result:
 
     @property
     def badness(self) -> float:
-        """How much the result differs from the input, by which results are compared
-        (`Difference.badness`); 0 if it does not differ."""
+        """A number that says how much the result differs from the input (`Difference.badness`); 0
+        if it does not differ. Of several results, the one with the smallest is returned."""
         return 0.0 if self.difference is None else self.difference.badness
 
     def finished(self, more: dict[str, Any], largest: bool) -> trimesh.Trimesh:
-        """The mesh that `repair` returns. Warns if the result differs from the input.
+        """The mesh that `repair` returns, with its metadata. Warns if the result differs from the
+        input.
 
         more: entries that are added to `metadata["harnack"]`.
         largest: whether to keep only the body with the largest volume."""
@@ -309,6 +316,7 @@ class _Result:
         dropped = 0
         if largest and len(parts) > 1:
             surface = largest_body(surface)
+            # A body may have several components: its cavities.
             dropped = len(parts) - len(component_facts(surface))
             facts["kept"] = _count_kept(surface, self.surface, facts["kept"])
         repaired = ClosedMesh(surface.vertices, surface.faces, process=False, validate=False)
@@ -321,12 +329,12 @@ class _Result:
         return repaired
 
 
-def _count_kept(surface: TriangleMesh, whole: TriangleMesh, first: int) -> int:
-    """How many of the first `first` faces of the mesh `whole` are also faces of `surface`. Faces
-    are the same if their corners have the same coordinates."""
-    corners = [one.vertices[one.faces].reshape(-1, 9) for one in (surface, whole)]
+def _count_kept(surface: TriangleMesh, whole: TriangleMesh, input_count: int) -> int:
+    """How many of the first `input_count` faces of the mesh `whole` are also faces of `surface`.
+    Faces are the same if their corners have the same coordinates, in the same order."""
+    corners = [mesh.vertices[mesh.faces].reshape(-1, 9) for mesh in (surface, whole)]
     present = {row.tobytes() for row in corners[0]}
-    return sum(row.tobytes() in present for row in corners[1][:first])
+    return sum(row.tobytes() in present for row in corners[1][:input_count])
 
 
 def _check_is_mesh(mesh: Any) -> None:
@@ -341,6 +349,8 @@ def _check_is_mesh(mesh: Any) -> None:
 def _check_encloses(mesh: Any) -> None:
     """Check that a mesh can enclose something.
 
+    mesh: any object with `vertices` (n, 3) and `faces` (m, 3).
+
     Raises:
         MeshError: all faces lie in a plane, or the mesh has one side only, like a Moebius strip; or
             `validate_mesh` rejects it.
@@ -350,6 +360,7 @@ def _check_encloses(mesh: Any) -> None:
     )
     x = vertices[np.unique(faces)]
     x = x - x.mean(axis=0)
+    # Points lie in a plane if one singular value is nearly 0.
     largest, *_, smallest = np.linalg.svd(x / np.abs(x).max(), compute_uv=False)
     if smallest <= _FLATNESS * largest:
         raise MeshError(
@@ -369,24 +380,25 @@ def _check_encloses(mesh: Any) -> None:
 def _unite_bodies(
     intended: IntendedSolid, settings: _RepairOptions
 ) -> tuple[TriangleMesh, dict[str, Any]]:
-    """Stage "boolean_union" of the repair. It is for a closed mesh that passes through itself or
-    whose components overlap or touch: compute the boundary of the solid that the mesh describes,
-    the points around which it winds at least once.
+    """Stage "boolean_union" of the repair. It is for a closed mesh that passes through itself, or
+    whose components overlap or touch. It computes the boundary of the solid that the mesh
+    describes: the set of points around which the mesh winds at least once.
 
     Three methods are tried, each if the one before fails: the union of the closed parts of the
     mesh, if there are several; cutting all faces along each other; and meshing the solid anew by
     cells.
 
-    intended: the mesh, with faces that agree in orientation.
+    intended: the damaged mesh, with faces that agree in orientation.
     settings: the options of the repair. Slivers that arise from cuts are removed by moving the
-        surface by at most a fraction of `settings.tolerance`.
+        surface by at most half of `settings.tolerance`.
 
     Returns:
-        The boundary; and its entries in `metadata["harnack"]`. The entry "kept", how many of the
-        first faces are faces of the given mesh, is 0.
+        The boundary; and its entries in `metadata["harnack"]`. The entry "kept" (how many faces of
+        the input are there) is 0.
 
     Raises:
-        MeshError, MeshingError: nothing of the mesh overlaps, or the union cannot be computed.
+        MeshError, MeshingError: the mesh is not closed, no parts of it overlap, or the union cannot
+            be computed.
     """
     vertices, faces = intended.vertices, intended.oriented
     if len(singular_edges(faces)[0]):
@@ -412,8 +424,8 @@ def _unite_bodies(
 
 
 def _bounds_a_solid(vertices: FloatArray, faces: IntArray) -> bool:
-    """Whether a mesh bounds a solid: its triangles meet only in shared edges and vertices, and no
-    component is inside out or in the material of another one."""
+    """Whether a mesh bounds a solid. It does if its triangles meet only in shared edges and
+    vertices, and if no component is inside out or lies in the material of another one."""
     try:
         _check_sides(TriangleMesh.without_unused_vertices(vertices, faces))
     except MeshError:
@@ -427,15 +439,20 @@ def _bounds_a_solid(vertices: FloatArray, faces: IntArray) -> bool:
 def _remesh(
     intended: IntendedSolid, settings: _RepairOptions
 ) -> tuple[TriangleMesh, dict[str, Any]]:
-    """Stage "remeshed": extract the surface on which the winding number of the mesh is 1/2. It is
-    closed whatever the mesh is. Returns it, and its entries in `metadata["harnack"]`."""
+    """Stage "remeshed" of the repair: extract the surface on which the winding number of the mesh
+    is 1/2. It is closed whatever the mesh is. Returns this mesh, and its entries in
+    `metadata["harnack"]`.
+
+    If cells of a 48th of the mesh's size (and larger ones) fail, cells 0.6 times as large are
+    tried."""
     intended.check_encloses()
-    corners = without_zero_area_faces(intended.vertices, intended.oriented)
-    field = WindingNumber(*corners)
+    mesh_arrays = without_zero_area_faces(intended.vertices, intended.oriented)
+    field = WindingNumber(*mesh_arrays)
+    # Cells of a given size are used as they are; otherwise several sizes are tried.
     if settings.spacing is not None:
         made = _mesh_half_level(field, settings.spacing, settings)
     else:
-        spacing = float(np.ptp(corners[0], axis=0).max()) / _CELLS_ACROSS
+        spacing = float(np.ptp(mesh_arrays[0], axis=0).max()) / _CELLS_ACROSS
         try:
             made = _remesh_of_bounded_size(field, spacing, settings)
         except MeshingError:
@@ -447,9 +464,10 @@ def _remesh(
 def _remesh_of_bounded_size(
     field: WindingNumber, spacing: float, settings: _RepairOptions
 ) -> trimesh.Trimesh:
-    """Extract the surface on which the winding number is 1/2. If it has too many triangles, as for
-    a noisy mesh, it is extracted again from larger cells, because the time of the checks grows with
-    the number of triangles.
+    """Extract the surface on which the winding number is 1/2, with at most 80,000 triangles if
+    possible. If there are more, as for a noisy mesh, it is extracted again from larger cells,
+    because the time of the checks grows with the number of triangles. After three attempts the
+    surface is extracted from still larger cells without this limit.
 
     spacing: the size of cells that is tried first, a length."""
     for k in range(_MAX_GROWTHS):
@@ -463,10 +481,12 @@ def _remesh_of_bounded_size(
 def _mesh_half_level(
     field: WindingNumber, spacing: float, settings: _RepairOptions, most: int = 2_000_000
 ) -> trimesh.Trimesh:
-    """Extract the surface on which the winding number is 1/2, from the signs of its values.
+    """Extract the surface on which the winding number is 1/2, from the signs of its values in
+    cells.
 
-    spacing: the size of cells, a length. most: the largest number of triangles; a
-        TriangleLimitError is raised if it takes more."""
+    spacing: the size of cells, a length.
+    most: the largest number of triangles. If the surface takes more, a TriangleLimitError is
+        raised."""
     return mesh_of(
         field, level=0.5, side="above", tolerance=settings.tolerance.length, cell_size=spacing,
         max_triangles=most, progress=settings.report,
@@ -479,13 +499,13 @@ def _mesh_half_level(
 def _keep_valid(
     intended: IntendedSolid, settings: _RepairOptions
 ) -> tuple[TriangleMesh, dict[str, Any]]:
-    """Stage "cleaned": keep the valid triangles, and fill everything else (holes, and the places of
-    removed triangles).
+    """Stage "cleaned" of the repair: keep the valid triangles, remove the others, and fill all
+    holes.
 
     Returns:
         The closed mesh; and its entries in `metadata["harnack"]`: how many triangles were kept,
-        turned over, left out for each reason, and added by fillings ("patches"), how many holes
-        were filled, and how many fillings are harmonic (none in this stage).
+        turned over, removed for each reason ("left_out"), and added by fillings ("patches"); how
+        many holes were filled; and how many fillings are harmonic (none in this stage).
 
     Raises:
         MeshError, MeshingError: too few triangles are valid, or a hole cannot be filled.
@@ -506,15 +526,18 @@ def _keep_valid(
 
 
 def _count_turned(intended: IntendedSolid, cleaned: CleanedMesh) -> int:
-    """How many of the kept triangles have the reverse of their orientation in the input. A triangle
-    may be reversed twice, which leaves it as it was: once with its whole component
-    (`IntendedSolid`), and once to agree with its neighbors (in the cleaning)."""
-    turned_before = np.delete(
+    """How many of the triangles that the cleaning kept have the reverse of the orientation that
+    they had in the input. A triangle may be reversed twice, which leaves it as it was: once with
+    its whole component (`IntendedSolid`), and once to agree with its neighbors (in the cleaning).
+
+    cleaned: the result of the cleaning."""
+    # The cleaning counts faces without those of zero area.
+    was_turned_before = np.delete(
         intended.is_turned, zero_area_faces(intended.vertices, intended.faces)
     )
-    is_turned = np.zeros(len(turned_before), np.bool_)
+    is_turned = np.zeros(len(was_turned_before), np.bool_)
     is_turned[cleaned.turned] = True
-    return int((is_turned ^ turned_before)[cleaned.kept_faces].sum())
+    return int((is_turned ^ was_turned_before)[cleaned.kept_faces].sum())
 
 
 # Loose triangles joined.
@@ -523,8 +546,9 @@ def _count_turned(intended: IntendedSolid, cleaned: CleanedMesh) -> int:
 def _weld_loose(
     intended: IntendedSolid, settings: _RepairOptions
 ) -> tuple[TriangleMesh, dict[str, Any]]:
-    """Stage "welded": merge near corners of loose triangles (which share no vertices), clean the
-    mesh and fill its holes. Vertices move, so no triangle counts as kept.
+    """Stage "welded" of the repair, for loose triangles, which share no vertices: merge corners
+    that are near to each other, clean the mesh and fill its holes. Vertices move, so no triangle
+    counts as kept.
 
     Returns:
         The closed mesh; and its entries in `metadata["harnack"]`.
@@ -532,19 +556,19 @@ def _weld_loose(
     Raises:
         MeshError, MeshingError: the triangles are not loose, or the mesh cannot be cleaned.
     """
-    corners = without_zero_area_faces(intended.vertices, intended.faces)
-    vertices, faces, moved = weld_near_corners(*corners)
+    mesh_arrays = without_zero_area_faces(intended.vertices, intended.faces)
+    vertices, faces, moved = weld_near_corners(*mesh_arrays)
     made = clean_and_fill(vertices, faces, settings.report)
-    count = len(made.kept_faces)
+    joined_count = len(made.kept_faces)
     return made.surface, {
         "stage": "welded",
         "kept": 0,
-        "joined": count,
+        "joined": joined_count,
         "moved": moved,
         "turned": len(made.turned),
         "left_out": made.left_out | {"flat": len(intended.faces) - len(faces)},
         "holes": made.holes,
-        "patches": len(made.surface.faces) - count,
+        "patches": len(made.surface.faces) - joined_count,
         "harmonic": 0,
     }
 
@@ -555,19 +579,24 @@ def _weld_loose(
 def _fill_only(
     intended: IntendedSolid, settings: _RepairOptions
 ) -> tuple[TriangleMesh, dict[str, Any]]:
-    """Stage "filled": keep all triangles of the mesh, and fill its holes.
+    """Stage "filled" of the repair: keep all triangles of the mesh, and fill its holes.
+
+    If smooth fillings were asked for and cannot be made, all holes get harmonic fillings instead,
+    provided that `keep` is "all"; otherwise the error is raised, and `repair` tries its next stage.
 
     Returns:
         The closed mesh; and its entries in `metadata["harnack"]`.
 
     Raises:
-        MeshError: some triangles cannot be kept (`_vertices_and_faces_to_keep`).
+        MeshError: some triangles cannot be kept (`_vertices_and_faces_to_keep`), a component is
+            inside out, or, unless `keep` is "all", triangles intersect.
         MeshingError: the fillings cannot be made.
     """
     vertices, faces = _vertices_and_faces_to_keep(intended)
     if intended.is_turned.any():
         raise MeshError("a part of the mesh is inside out")
     edges = checked_boundary_edges(faces)
+    # With keep="all" crossing triangles stay as well.
     if settings.keep is None and len(crossing := intersecting_faces(vertices, faces)):
         raise MeshError(f"{len(crossing):,} triangles of the mesh pass through others")
     loops = hole_loops(vertices, faces, edges)
@@ -584,7 +613,8 @@ def _fill_only(
 
 
 def _vertices_and_faces_to_keep(intended: IntendedSolid) -> tuple[FloatArray, IntArray]:
-    """The vertices (n, 3) and faces (m, 3) of the input, if all of its triangles can be kept.
+    """The vertices (n, 3) and faces (m, 3) of the input, checked so that all of its triangles can
+    be kept.
 
     Raises:
         MeshError: several vertices are at the same place, or `validate_mesh` rejects the mesh.
@@ -615,48 +645,64 @@ def _with_filled_holes(
         The closed mesh; and its entries in `metadata["harnack"]`.
 
     Raises:
-        MeshingError: the fillings cannot be made, or meet the mesh or each other.
+        MeshingError: the fillings cannot be made, or meet the mesh or each other; or, unless `keep`
+            is "all", more than 1000 boundary edges are left without a smooth filling.
+        MeshError: unless `keep` is "all": a component of the result is inside out, or lies in
+            another one.
     """
-    x, together, left = vertices, faces, loops
+    all_vertices, all_faces, unfilled_loops = vertices, faces, loops
     if loops and settings.patches == "smooth":
         settings.report(f"filling {len(loops):,} holes")
         field = WindingNumber(vertices, faces)
         made = fill_holes(vertices, faces, loops, lambda p: field.value(p, precision="double"))
-        x, together = np.concatenate([x, made.vertices]), np.concatenate([faces, made.faces])
-        left = made.unfilled_loops
-        settings.report(f"{len(left):,} holes are left" + f": {made.reason}" * bool(left))
-    rest = HarmonicFilling(vertices[:0], faces[:0], True, 0.0, 0)
-    if left:
-        edges = checked_boundary_edges(together)
+        all_vertices, all_faces = (
+            np.concatenate([all_vertices, made.vertices]),
+            np.concatenate([faces, made.faces]),
+        )
+        unfilled_loops = made.unfilled_loops
+        settings.report(
+            f"{len(unfilled_loops):,} holes are left" + f": {made.reason}" * bool(unfilled_loops)
+        )
+    # No harmonic filling so far: no vertices, no faces.
+    harmonic = HarmonicFilling(vertices[:0], faces[:0], True, 0.0, 0)
+    if unfilled_loops:
+        edges = checked_boundary_edges(all_faces)
         if settings.keep is None and len(edges) > _FEW_EDGES:
-            raise MeshingError(f"{len(left):,} holes of {len(edges):,} edges have no smooth patch")
+            raise MeshingError(
+                f"{len(unfilled_loops):,} holes of {len(edges):,} edges have no smooth patch"
+            )
         attempts = _ATTEMPTS if settings.keep == "all" else _FEW_ATTEMPTS
-        how = HoleFillingOptions(
+        filling_options = HoleFillingOptions(
             settings.tolerance, settings.spacing, settings.seed, attempts, settings.report
         )
-        rest = harmonic_patches(x, together, edges, how)
-        x, together = np.concatenate([x, rest.vertices]), np.concatenate([together, rest.faces])
-    surface = TriangleMesh.without_unused_vertices(x, together)
+        harmonic = harmonic_patches(all_vertices, all_faces, edges, filling_options)
+        all_vertices, all_faces = (
+            np.concatenate([all_vertices, harmonic.vertices]),
+            np.concatenate([all_faces, harmonic.faces]),
+        )
+    surface = TriangleMesh.without_unused_vertices(all_vertices, all_faces)
     if loops or settings.keep is None:
-        _check_touching(together)
+        _check_touching(all_faces)
     if settings.keep is None:
         _check_sides(surface)
     return surface, {
         "stage": "filled",
         "kept": len(faces),
         "holes": len(loops),
-        "patches": len(together) - len(faces),
-        "harmonic": len(rest.faces),
-        "missing": rest.triangle_fill_count,
-        "refined": rest.is_refined,
-        "spacing": rest.spacing,
-        "evaluations": rest.evaluations,
+        "patches": len(all_faces) - len(faces),
+        "harmonic": len(harmonic.faces),
+        "missing": harmonic.triangle_fill_count,
+        "refined": harmonic.is_refined,
+        "spacing": harmonic.spacing,
+        "evaluations": harmonic.evaluations,
     }
 
 
 def _check_sides(surface: TriangleMesh) -> None:
     """Raise a MeshError if a component of a mesh is inside out, lies in the material of another
-    one, or passes through itself or another one."""
+    one, or passes through itself or another one.
+
+    A component at an even depth of nesting bounds material, one at an odd depth a cavity."""
     shells = Shells.of(surface)
     depths = shells.nesting_depths()
     if ((shells.volumes < 0) & (depths == 0)).any():
@@ -668,8 +714,8 @@ def _check_sides(surface: TriangleMesh) -> None:
 
 
 def _check_touching(faces: IntArray) -> None:
-    """Raise a MeshingError if two sheets of a mesh touch in a vertex: unless, around each vertex,
-    all faces are connected by shared edges."""
+    """Raise a MeshingError if, at some vertex of the mesh, the faces around it are not all
+    connected by shared edges: two sheets touch only in that vertex."""
     if len(places := nonmanifold_vertices(faces)):
         raise MeshingError(
             f"faces touch in {len(places):,} vertices alone, such as vertex {places[0]}: such a "

@@ -1,4 +1,7 @@
-"""The local repair of closed meshes of which a few triangles intersect each other.
+"""The local repair of closed meshes of which a few triangles intersect each other ("crossing
+faces"). It contracts edges (an end of the edge is merged into the other) and flips edges (the edge
+between two triangles becomes the other diagonal of their quadrilateral). A mesh is changed in
+"neighborhoods", small groups of faces around the crossing ones.
 
 When solids are cut along each other, the new corners are rounded. When triangles in a plane are
 merged, slivers without an area remain. In both cases some triangles intersect their neighbors by
@@ -47,7 +50,7 @@ _NO_AREA = 1e-4
 
 def resolve_self_intersections(surface: TriangleMesh, length: float) -> TriangleMesh:
     """Mend a closed surface so that no two of its triangles pass through each other, by contracting
-    and flipping edges (`resolve_local_intersections`). It is returned unchanged if none do.
+    and flipping edges (`resolve_local_intersections`). Returns the given surface if none do.
 
     length: the largest distance by which one change may move the surface.
 
@@ -74,24 +77,30 @@ def resolve_local_intersections(
     length: the largest distance by which one change may move the surface. Vertices are removed or
         stay where they are.
 
+    Nothing is changed if more than 400 faces cross. Neighborhoods of more than 5000 faces stay as
+    they are.
+
     Returns:
         The changed closed surface, and the number of triangles that still cross.
     """
     if not 0 < len(crossing) <= _MAX_CROSSING or length <= 0:
         return surface, len(crossing)
     vertices, faces = surface.vertices, surface.faces
-    is_gone, pieces, crossing_count = np.zeros(len(faces), np.bool_), [faces[:0]], 0
-    for rows, movable in _regions(vertices, faces, crossing):
-        is_gone[rows] = True
-        if len(rows) > _MAX_NEIGHBORHOOD:
-            pieces.append(faces[rows])
-            crossing_count += int(np.isin(crossing, rows).sum())
+    is_gone, new_faces, crossing_count = np.zeros(len(faces), np.bool_), [faces[:0]], 0
+    for neighborhood_rows, movable in _regions(vertices, faces, crossing):
+        # The faces of a neighborhood are replaced by what becomes of them.
+        is_gone[neighborhood_rows] = True
+        if len(neighborhood_rows) > _MAX_NEIGHBORHOOD:
+            new_faces.append(faces[neighborhood_rows])
+            crossing_count += int(np.isin(crossing, neighborhood_rows).sum())
             continue
-        patch, count = _reduce_crossings(_Neighborhood.of(vertices, faces[rows], movable), length)
-        pieces.append(patch)
+        changed_faces, count = _reduce_crossings(
+            _Neighborhood.of(vertices, faces[neighborhood_rows], movable), length
+        )
+        new_faces.append(changed_faces)
         crossing_count += count
     return TriangleMesh.without_unused_vertices(
-        vertices, np.concatenate([faces[~is_gone], *pieces])
+        vertices, np.concatenate([faces[~is_gone], *new_faces])
     ), crossing_count
 
 
@@ -108,28 +117,32 @@ def _regions(
     crossing: the indices of the crossing faces.
 
     Yields: For each neighborhood the indices of its faces; and the indices of the vertices that may
-        be removed, which are the corners of near faces. If only these are removed, the new faces
-        lie within the bounding box, so they cross no face outside of the neighborhood."""
+    be removed, which are the corners of near faces. If only these are removed, the new faces lie
+    within the bounding box, so they cross no face outside of the neighborhood."""
     import scipy.sparse  # imported here: it takes half a second
     import scipy.sparse.csgraph as csgraph_module
 
     sparse, csgraph = cast("Any", scipy.sparse), cast("Any", csgraph_module)
     corner = vertices[faces]
     lower, upper = corner.min(axis=1), corner.max(axis=1)
+    # Two rings of faces around the crossing ones. Each connected part begins a neighborhood.
     near = _faces_at_corners(faces, faces[crossing])
     second_ring = _faces_at_corners(faces, faces[near])
-    pairs = half_edges(faces[second_ring])
-    adjacency = sparse.coo_matrix((np.ones(len(pairs)), pairs.T), shape=(len(vertices),) * 2)
-    part = csgraph.connected_components(adjacency, directed=False)[1]
+    edges = half_edges(faces[second_ring])
+    adjacency = sparse.coo_matrix((np.ones(len(edges)), edges.T), shape=(len(vertices),) * 2)
+    component_of_vertex = csgraph.connected_components(adjacency, directed=False)[1]
     neighborhoods: list[IntArray] = []
-    for group in np.unique(part[faces[second_ring, 0]]):
-        rows = second_ring[part[faces[second_ring, 0]] == group]
-        low, high = lower[rows].min(axis=0), upper[rows].max(axis=0)
-        members = np.flatnonzero((lower <= high).all(axis=1) & (upper >= low).all(axis=1))
+    for component in np.unique(component_of_vertex[faces[second_ring, 0]]):
+        rows = second_ring[component_of_vertex[faces[second_ring, 0]] == component]
+        box_lower, box_upper = lower[rows].min(axis=0), upper[rows].max(axis=0)
+        # All faces whose boxes meet the box of the part.
+        face_rows = np.flatnonzero(
+            (lower <= box_upper).all(axis=1) & (upper >= box_lower).all(axis=1)
+        )
         for k in reversed(range(len(neighborhoods))):
-            if len(np.intersect1d(members, neighborhoods[k])):
-                members = np.union1d(members, neighborhoods.pop(k))
-        neighborhoods.append(members)
+            if len(np.intersect1d(face_rows, neighborhoods[k])):
+                face_rows = np.union1d(face_rows, neighborhoods.pop(k))
+        neighborhoods.append(face_rows)
     for rows in neighborhoods:
         yield rows, np.unique(faces[near[np.isin(near, rows)]])
 
@@ -143,7 +156,8 @@ def _faces_at_corners(faces: IntArray, targets: IntArray) -> IntArray:
 
 @dataclass(frozen=True)
 class _Neighborhood:
-    """A few faces of a mesh that are changed together, with their vertices numbered from 0.
+    """A few faces of a mesh that are changed together, with their vertices numbered from 0. Their
+    edges are contracted and flipped without a change of the rest of the mesh.
 
     vertices: (n, 3). faces: (m, 3).
     is_movable: (n,) the mask of the vertices that may be removed. All faces at such a vertex belong
@@ -158,9 +172,14 @@ class _Neighborhood:
     @classmethod
     def of(cls, vertices: FloatArray, faces: IntArray, movable: IntArray) -> _Neighborhood:
         """The neighborhood that consists of `faces` (m, 3) of a mesh with `vertices` (n, 3).
-        movable: the indices of the vertices that may be removed."""
-        names, index = np.unique(faces, return_inverse=True)
-        return cls(vertices[names], index.reshape(-1, 3), np.isin(names, movable), names)
+        movable: the indices of the mesh's vertices that may be removed."""
+        mesh_vertices, renumbered_faces = np.unique(faces, return_inverse=True)
+        return cls(
+            vertices[mesh_vertices],
+            renumbered_faces.reshape(-1, 3),
+            np.isin(mesh_vertices, movable),
+            mesh_vertices,
+        )
 
     def crossing(self) -> IntArray:
         """The indices of faces that pass through others."""
@@ -175,34 +194,38 @@ class _Neighborhood:
         return set(self.faces[self.around(vertex)].ravel().tolist()) - {vertex}
 
     def with_faces(self, gone: IntArray, new: IntArray) -> _Neighborhood:
-        """The neighborhood with the faces `gone` (indices) replaced by `new` (k, 3)."""
+        """A copy of the neighborhood in which `new` faces (k, 3) replace the faces with the indices
+        `gone`."""
         return dataclasses.replace(
             self, faces=np.concatenate([np.delete(self.faces, gone, axis=0), new])
         )
 
     def collapse_edge(self, a: int, b: int) -> tuple[IntArray, IntArray] | None:
-        """Contract the edge between the vertices a and b, by moving a to b. Returns the indices of
-        the faces around a, and the faces (k, 3) that replace them. Returns None if sheets of the
+        """Contract the edge between the vertices a and b, by merging a into b. Returns the indices
+        of the faces around a, and the faces (k, 3) that replace them. Returns None if sheets of the
         surface would touch, or if one of the two vertices may not be changed."""
         if not (self.is_movable[a] and self.is_movable[b]):
             return None
+        # Only the two corners opposite to the edge may be neighbors of both ends.
         if len(self.neighbors(a) & self.neighbors(b)) != 2:
             return None
-        removed = self.around(a)
-        new = np.where(self.faces[removed] == a, b, self.faces[removed])
-        return removed, new[(new != np.roll(new, 1, axis=1)).all(axis=1)]
+        old_rows = self.around(a)
+        new_faces = np.where(self.faces[old_rows] == a, b, self.faces[old_rows])
+        # Faces of which two corners are now the same vanish.
+        return old_rows, new_faces[(new_faces != np.roll(new_faces, 1, axis=1)).all(axis=1)]
 
     def flip_edge(self, a: int, b: int) -> tuple[IntArray, IntArray] | None:
         """Replace the edge between the vertices a and b by the edge between the two corners
-        opposite to it. Returns the indices of the two faces at the old edge, and the two faces
-        (2, 3) that replace them. Returns None if the new edge exists already, or if a vertex may
-        not be changed."""
+        opposite to it. Returns the indices of the two faces at the old edge, and the two faces (2,
+        3) that replace them. Returns None if the new edge exists already, or if a vertex may not be
+        changed."""
         if not (self.is_movable[a] and self.is_movable[b]):
             return None
-        removed = np.intersect1d(self.around(a), self.around(b))
-        if len(removed) != 2:
+        old_rows = np.intersect1d(self.around(a), self.around(b))
+        if len(old_rows) != 2:
             return None
-        first, second = (self.faces[row].tolist() for row in removed)
+        first, second = (self.faces[row].tolist() for row in old_rows)
+        # The first face is the one in which b follows a.
         if first[(first.index(a) + 1) % 3] != b:
             first, second = second, first
         (c,), (d,) = set(first) - {a, b}, set(second) - {a, b}
@@ -210,7 +233,7 @@ class _Neighborhood:
             return None
         if not (self.is_movable[c] or self.is_movable[d]):
             return None
-        return removed, np.array([[a, d, c], [d, b, c]])
+        return old_rows, np.array([[a, d, c], [d, b, c]])
 
 
 def _reduce_crossings(patch: _Neighborhood, length: float) -> tuple[IntArray, int]:
@@ -235,19 +258,19 @@ def _best_change(
     patch: _Neighborhood, crossing: IntArray, length: float
 ) -> tuple[_Neighborhood, IntArray] | None:
     """Find one change of an edge that reduces the number of crossing faces. Returns the
-    neighborhood after it, and the indices of the faces that still cross; None if there is no such
-    change.
+    neighborhood after it, and the indices of the faces that still cross; None if no change does so.
 
     crossing: the indices of the faces that cross now.
     length: the largest distance by which the change may move the surface.
 
-    Edges of crossing faces are tried first, then all edges at their corners. In both groups, the
-    changes that move the surface least are tried first."""
-    for rows in (crossing, _faces_at_corners(patch.faces, patch.faces[crossing])):
-        for _, removed, new in sorted(_changes(patch, rows, length), key=lambda change: change[0])[
-            :_MAX_ATTEMPTS
-        ]:
-            changed = patch.with_faces(removed, new)
+    Edges of crossing faces are tried first, then all edges of the faces that share a corner with
+    them. In both groups, the changes that move the surface least are tried first, up to 80 of them.
+    """
+    for candidate_rows in (crossing, _faces_at_corners(patch.faces, patch.faces[crossing])):
+        for _, old_rows, new_faces in sorted(
+            _changes(patch, candidate_rows, length), key=lambda change: change[0]
+        )[:_MAX_ATTEMPTS]:
+            changed = patch.with_faces(old_rows, new_faces)
             still_crossing = changed.crossing()
             if len(still_crossing) < len(crossing):
                 return changed, still_crossing
@@ -257,22 +280,25 @@ def _best_change(
 def _changes(
     patch: _Neighborhood, rows: IntArray, length: float
 ) -> Iterator[tuple[float, IntArray, IntArray]]:
-    """All contractions and flips of the edges of the faces `rows` that move the surface by at most
-    `length`.
+    """All contractions and flips of the edges of the faces with the indices `rows` that move the
+    surface by at most `length`.
 
-    Yields: For each change, how far it moves the surface; the indices of the faces that it removes;
-        and the faces (k, 3) that replace them."""
+    Yields: For each change, how far it moves the surface, a length; the indices of the faces that
+    it removes; and the faces (k, 3) that replace them."""
     count = len(patch.vertices)
+    # A key is the number a * count + b for the edge between the vertices a < b.
     keys = sorted_unique(edge_keys(half_edges(patch.faces[rows]), count))
     for a, b in np.stack(np.divmod(keys, count), axis=1).tolist():
         for source, target in ((a, b), (b, a)):
             change = patch.collapse_edge(source, target)
             if change is not None and _is_small_change(patch, *change, length):
+                # The surface moves by the distance of the removed vertex from the new faces.
                 moved = distance_from_triangles(patch.vertices[source], patch.vertices[change[1]])
                 if moved <= length:
                     yield moved, *change
         change = patch.flip_edge(a, b)
         if change is not None and _is_small_change(patch, *change, length):
+            # The surface moves by the distance between the old and the new edge.
             c, d = (patch.vertices[change[1][0, k]] for k in (2, 1))
             moved = _line_distance(patch.vertices[a], patch.vertices[b], c, d)
             if moved <= length:
@@ -282,8 +308,8 @@ def _changes(
 def _is_small_change(
     patch: _Neighborhood, old_rows: IntArray, new_faces: IntArray, max_shift: float
 ) -> bool:
-    """Whether some faces of a neighborhood may be replaced by new ones, without a fold and without
-    a large change of the surface.
+    """Whether new faces may replace some faces of a neighborhood, without a fold and without a
+    large change of the surface.
 
     old_rows: the indices of the faces that are replaced.
     new_faces: (k, 3) the faces that replace them, with vertices of the neighborhood.
@@ -292,21 +318,21 @@ def _is_small_change(
     Two conditions must hold. The normal of each new face, slivers excepted, is less than 90 degrees
     from the mean normal of the old faces. And the volume between old and new faces is at most
     `max_shift` times the area of the old faces. (The distance of a removed vertex from the new
-    faces would not do instead: it misses old faces that are folded, as at a thin spike.)
-    """
-    before, after = patch.vertices[patch.faces[old_rows]], patch.vertices[new_faces]
-    old_normals, new_normals = area_normals(before), area_normals(after)
-    mean = old_normals.sum(axis=0)
+    faces would not do instead: it misses old faces that are folded, as at a thin spike.)"""
+    old_corners, new_corners = patch.vertices[patch.faces[old_rows]], patch.vertices[new_faces]
+    old_normals, new_normals = area_normals(old_corners), area_normals(new_corners)
+    normal_sum = old_normals.sum(axis=0)
     double_area = float(row_norms(old_normals).sum())
-    origin = before[0, 0]
+    origin = old_corners[0, 0]
+    # Six times the volume between both, as a sum of tetrahedra with the apex `origin`.
     volume = (
-        row_dots(after[:, 0] - origin, new_normals).sum()
-        - row_dots(before[:, 0] - origin, old_normals).sum()
+        row_dots(new_corners[:, 0] - origin, new_normals).sum()
+        - row_dots(old_corners[:, 0] - origin, old_normals).sum()
     )
     if abs(float(volume)) / 6 > max_shift * double_area / 2:
         return False
     return bool(
-        ((new_normals @ mean > 0) | (row_norms(new_normals) <= _NO_AREA * double_area)).all()
+        ((new_normals @ normal_sum > 0) | (row_norms(new_normals) <= _NO_AREA * double_area)).all()
     )
 
 

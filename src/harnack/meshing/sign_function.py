@@ -1,5 +1,7 @@
-"""Functions that are meshed by their signs: values at points, and crossings of the level on
-segments.
+"""Functions whose level set is meshed by the signs of their values: their values at points, and the
+points where segments cross the level. "The function" is side * (f - level) for a field f and side =
+1 or -1. A "jump surface" is a surface across which f jumps, such as the triangles of a mesh whose
+winding number f is; a "facet" is one of its triangles.
 
 Every real-valued function has a sign at every point, whether or not it is continuous. Winding
 numbers jump at triangles and are known up to an error, and potentials of dipoles are infinite at
@@ -61,21 +63,21 @@ _MOST_PROBES, _MIN_VALUE_SHARE = 2000, 0.1
 
 
 def uses_sign_meshing(field: Field) -> bool:
-    """Whether the level sets of a field are meshed by the signs of its values on a lattice. It is
-    so for sums over meshes, points and blobs. Their values cost little, and their promises (proved
-    bounds of f near a point) are useful only up to the next triangle or point."""
+    """Whether the level sets of a field are meshed from the signs of its values on a lattice. It is
+    so for sums over meshes, points and blobs. Their values cost little time, and their proved
+    bounds of f near a point are useful only up to the next triangle or point."""
     return isinstance(field, BatchedField | Blobs | HRBF)
 
 
 def cell_size_for_smoothing(
     field: Field, spacing: float, largest_factor: float, smallest_factor: float
 ) -> float:
-    """The size of the lattice's cells, a length: `spacing`, or less for a point cloud with noise.
+    """The size of the lattice's cells, a length: `spacing`, or less for the field of a point cloud
+    that is smoothed.
 
-    The surface of such a cloud is likely to have details too small for cells of size `spacing` if
-    the cloud's smoothing length is less than 0.3 `spacing`. Then the size is `spacing` times a
-    factor from `smallest_factor` to `largest_factor`, so that cells are about 4.8
-    smoothing lengths wide."""
+    If the smoothing length of the cloud is less than 0.3 `spacing`, its surface is likely to have
+    details too small for cells of size `spacing`. Then cells are about 4.8 smoothing lengths wide,
+    but at least `smallest_factor` and at most `largest_factor` times `spacing`."""
     if (
         not isinstance(field, DipolePotential)
         or not 0 < field.smoothing < _UNRESOLVED_SMOOTHING * spacing
@@ -88,16 +90,16 @@ def cell_size_for_smoothing(
 
 
 def empty_surface_hint(field: Field) -> str:
-    """A likely reason why there is no surface among the cells, to be added to an error message; ""
-    if none is known."""
+    """A likely reason why a mesh is empty, as the end of an error message: some points of the cloud
+    are far from all others, so that cells are too large. "" if that is not so."""
     if not isinstance(field, DipolePotential) or len(field.points) < 2:
         return ""
-    alone = outlier_indices(field.points, build_point_tree(field.points))
-    if not len(alone):
+    outliers = outlier_indices(field.points, build_point_tree(field.points))
+    if not len(outliers):
         return ""
     return (
-        f"; {len(alone):,} of {len(field.points):,} points are far from all others, such as "
-        f"{format_vector(field.points[alone[0]])}, and make cells too large: leave them out, as "
+        f"; {len(outliers):,} of {len(field.points):,} points are far from all others, such as "
+        f"{format_vector(field.points[outliers[0]])}, and make cells too large: leave them out, as "
         'smoothing="auto" does, or give a `cell_size`'
     )
 
@@ -105,7 +107,7 @@ def empty_surface_hint(field: Field) -> str:
 @dataclass
 class SignFunction(LevelFunction):
     """The function side * (f - level) of a real-valued field f, which need not be continuous. Its
-    level set is found by the signs of values, not by Newton's method.
+    level set is found from the signs of values, not by Newton's method.
 
     side: 1; or -1 for a function that is negative where f is above the level.
     precision: the precision in which values are computed. Intersections of segments with jump
@@ -142,24 +144,28 @@ class SignFunction(LevelFunction):
         """
         if isinstance(field, DipolePotential):
             _check_encloses(field, level)
-        max_abs = float(np.abs(box).max())
-        is_near = max_abs * 2.0**-24 * _STEPS_IN_CELL < spacing
-        precision: Precision = "single" if is_near else "double"
+        largest_coordinate = float(np.abs(box).max())
+        # A thousand numbers of single precision along a cell, even at the largest coordinate.
+        is_single_enough = largest_coordinate * 2.0**-24 * _STEPS_IN_CELL < spacing
+        precision: Precision = "single" if is_single_enough else "double"
         return cls(field, level, side=side, precision=precision, most_faces=most_faces)
 
     def relative_to_level(self, value: FloatArray) -> FloatArray:
+        """(n,) the function, side * (f - level), for values (n,) of f."""
         return self.side * (np.asarray(value, np.float64) - self.level)
 
     def values(self, points: FloatArray) -> FloatArray:
+        """(n,) the values of the function at points (n, 3). They count as evaluations."""
         self.evaluations += len(points)
         return self.relative_to_level(self.field.value(points, precision=self.precision))
 
     def sample(self, points: FloatArray) -> LevelSamples:
         """The values and gradients of the function at points (n, 3). For a field that jumps,
-        gradients are set to 0, since they tell nothing about the distance to the level set."""
-        none = np.zeros(len(points))
+        gradients are set to 0, since they tell nothing about the distance to the level set. Radii
+        (`quarter_period_radius`) are 0."""
+        no_radius = np.zeros(len(points))
         if self.field.has_jumps:
-            return LevelSamples(self.values(points), np.zeros((len(points), 3)), none)
+            return LevelSamples(self.values(points), np.zeros((len(points), 3)), no_radius)
         self.evaluations += len(points)
         if isinstance(self.field, BatchedField):
             value, gradient = self.field.rough_value_and_gradient(points, precision=self.precision)
@@ -167,36 +173,40 @@ class SignFunction(LevelFunction):
             backend = choose_backend(self.precision)
             prepared = self.field.prepare(backend)
 
-            def both(p: Vec3) -> tuple[Real, Vec3]:
-                """The value and the gradient of the field at p."""
+            def value_and_gradient(p: Vec3) -> tuple[Real, Vec3]:
+                """The value and the gradient of the field at the points p."""
                 sample = prepared.evaluate(p)
                 return sample.value, sample.gradient
 
-            value, gradient = map_batches(backend, both, points)
+            value, gradient = map_batches(backend, value_and_gradient, points)
         return LevelSamples(
-            self.relative_to_level(value), self.side * np.asarray(gradient, np.float64), none
+            self.relative_to_level(value), self.side * np.asarray(gradient, np.float64), no_radius
         )
 
     def count_undecided(self, points: FloatArray, value: FloatArray) -> int:
         """The number of points at which the sign of the function is not certain, because the bound
         of the value's error is at least |value|.
 
-        value: (n,) the values of the function at points (n, 3)."""
+        value: (n,) the values of the function at points (n, 3).
+
+        The error bound is computed only where |value| is less than a hundredth of the median of
+        |value|. Without an error bound, as for blobs, the number is 0."""
         if not isinstance(self.field, BatchedField):
             return 0
-        scale = float(np.median(np.abs(value))) if len(value) else 0.0
-        near = np.abs(value) < 1e-2 * scale
-        if not near.any():
+        median_value = float(np.median(np.abs(value))) if len(value) else 0.0
+        is_small = np.abs(value) < 1e-2 * median_value
+        if not is_small.any():
             return 0
-        error = self.field.error_bound(points[near], precision=self.precision)
-        return int((np.abs(value[near]) <= error).sum())
+        error = self.field.error_bound(points[is_small], precision=self.precision)
+        return int((np.abs(value[is_small]) <= error).sum())
 
     def clearance(self, points: FloatArray) -> FloatArray:
         """(n,) a proved lower bound of the distance of points (n, 3) from the level set, computed
         by `level_distance_lower_bound`.
 
-        For a winding number it is the smaller of two lengths: the bound for the winding number
-        modulo 1, which is smooth across the triangles; and the distance from the triangles."""
+        A winding number jumps at the triangles of its mesh, but modulo 1 it is smooth across them.
+        For it the bound is the smaller of two lengths: the bound for the winding number modulo 1,
+        and the distance from the triangles."""
         self.evaluations += len(points)
         if not self._clearances:
             self._clearances = _clearances(self.field, self.level, self.precision)
@@ -216,19 +226,21 @@ class SignFunction(LevelFunction):
             return low.copy(), low.copy()
         direction = high - low
         t = np.zeros(len(low))
-        normal, is_on_sheet = np.zeros_like(low), np.zeros(len(low), np.bool_)
+        normal, is_on_jump = np.zeros_like(low), np.zeros(len(low), np.bool_)
         if self.field.has_jumps:
+            # Halve the segments until few facets are left on them, and then intersect them with
+            # these. Segments that meet none have a root.
             first, last = self._bisect(low, direction)
-            t, normal, is_on_sheet = self._on_sheets(low, direction, first, last)
-            rows = np.flatnonzero(~is_on_sheet)
+            t, normal, is_on_jump = self._on_sheets(low, direction, first, last)
+            rows = np.flatnonzero(~is_on_jump)
             t[rows] = self._roots(low[rows], direction[rows], first[rows], last[rows], 2)
         else:
             t = self._roots(low, direction, t, t + 1, _MAX_EVALUATIONS)
         x = low + t[:, None] * direction
-        smooth = np.flatnonzero(~is_on_sheet)
-        normal[smooth] = self._slopes(x[smooth], direction[smooth])
-        down = is_on_sheet & (row_dots(normal, direction) < 0)
-        normal[down] *= -1
+        smooth_rows = np.flatnonzero(~is_on_jump)
+        normal[smooth_rows] = self._slopes(x[smooth_rows], direction[smooth_rows])
+        is_falling = is_on_jump & (row_dots(normal, direction) < 0)
+        normal[is_falling] *= -1
         return x, normal / np.maximum(row_norms(normal), 1e-300)[:, None]
 
     def _slopes(self, x: FloatArray, direction: FloatArray) -> FloatArray:
@@ -240,16 +252,17 @@ class SignFunction(LevelFunction):
             return x
         self.evaluations += len(x)
         if isinstance(self.field, BatchedField) and not self.field.has_jumps:
-            slopes = self.field.rough_value_and_gradient(x, precision=self.precision)[1]
+            field_gradient = self.field.rough_value_and_gradient(x, precision=self.precision)[1]
         else:
-            slopes = self.field.gradient(x, precision=self.precision)
-        slope = self.side * np.asarray(slopes, np.float64)
-        flat = ~np.isfinite(slope).all(axis=1) | ~slope.any(axis=1)
-        slope[flat] = direction[flat]
-        return slope
+            field_gradient = self.field.gradient(x, precision=self.precision)
+        gradient = self.side * np.asarray(field_gradient, np.float64)
+        has_no_gradient = ~np.isfinite(gradient).all(axis=1) | ~gradient.any(axis=1)
+        gradient[has_no_gradient] = direction[has_no_gradient]
+        return gradient
 
     def _bisect(self, start: FloatArray, direction: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Shorten segments by halving, so that the function still has different signs at both ends.
+        """Shorten segments by halving them four times, so that the function still has different
+        signs at both ends.
 
         start, direction: (n, 3) one end of each segment, and the vector to the other. The function
             is not positive at the first end and positive at the other.
@@ -269,7 +282,8 @@ class SignFunction(LevelFunction):
         """(n,) the fractions of segments at which the function is 0, between the fractions `first`
         and `last`.
 
-        start, edge: (n, 3) one end of each segment, and the vector to the other.
+        start, edge: (n, 3) one end of each segment, and the vector to the other. The function is
+            not positive at `first` and positive at `last`.
         steps: the largest number of evaluations.
 
         The root of the secant and the middle of the interval are tried in turn, so that every
@@ -283,12 +297,16 @@ class SignFunction(LevelFunction):
         rows = np.arange(len(start))
         for k in range(steps):
             ends = first[rows], last[rows]
+            # Odd steps halve the interval, even ones take the root of the secant.
             t = 0.5 * (ends[0] + ends[1]) if k % 2 else _secant(*ends, low[rows], high[rows])
             value = self.values(start[rows] + t[:, None] * edge[rows])
-            is_up = value > 0
-            first[rows], last[rows] = np.where(is_up, ends[0], t), np.where(is_up, t, ends[1])
-            low[rows] = np.where(is_up, low[rows], value)
-            high[rows] = np.where(is_up, value, high[rows])
+            is_positive = value > 0
+            first[rows], last[rows] = (
+                np.where(is_positive, ends[0], t),
+                np.where(is_positive, t, ends[1]),
+            )
+            low[rows] = np.where(is_positive, low[rows], value)
+            high[rows] = np.where(is_positive, value, high[rows])
             rows = rows[~(np.abs(value) <= small_value[rows])]
             if not len(rows):
                 break
@@ -297,7 +315,8 @@ class SignFunction(LevelFunction):
     def _on_sheets(
         self, start: FloatArray, direction: FloatArray, first: FloatArray, last: FloatArray
     ) -> tuple[FloatArray, FloatArray, BoolArray]:
-        """Where segments first cross a jump surface, between the fractions `first` and `last`.
+        """Where segments first cross a jump surface of the field, between the fractions `first` and
+        `last`.
 
         start, direction: (n, 3) one end of each segment, and the vector to the other.
 
@@ -309,6 +328,8 @@ class SignFunction(LevelFunction):
         field = self.field.prepare(backend)
         length = row_norms(direction)
         ray = direction / np.maximum(length, 1e-300)[:, None]
+        # Rays begin a little before the interval and end a little after it, so that rounding loses
+        # no crossing at its ends.
         extension = _EXTENSION * (last - first)
         origin = start + (first - extension)[:, None] * direction
         max_t = (last - first + 2 * extension) * length
@@ -316,9 +337,11 @@ class SignFunction(LevelFunction):
         def next_jump(o: Vec3, d: Vec3, limit: Vec3) -> tuple[Real, Vec3]:
             """The t and the normal of the first crossing of a jump surface along rays o + t d, for
             t up to limit.x; t is infinite if there is none."""
-            none = backend.Array3f(0)
-            after = JumpCrossing(backend.Float(0), backend.UInt32(NO_FACET), backend.Float(0), none)
-            crossing = field.next_jump(o, d, after, limit.x, backend.Bool(True))
+            zero = backend.Array3f(0)
+            ray_start = JumpCrossing(
+                backend.Float(0), backend.UInt32(NO_FACET), backend.Float(0), zero
+            )
+            crossing = field.next_jump(o, d, ray_start, limit.x, backend.Bool(True))
             return crossing.t, crossing.normal
 
         t, normal = map_batches(backend, next_jump, origin, ray, np.column_stack([max_t] * 3))
@@ -334,31 +357,33 @@ def _check_encloses(field: DipolePotential, level: float) -> None:
 
     f is 4 pi inside of a closed surface and 0 outside. At a point of the surface, f without that
     point's own term is 2 pi; or -2 pi if normals face inwards. So the median of these values over
-    the points has to be more than a tenth of the level. If areas of the points were given, the
-    points need not represent a surface, and nothing is checked.
+    the points has to be more than a tenth of the level. Nothing is checked if areas of the points
+    were given (then the points need not represent a surface), if the field is smoothed, or if the
+    level is not positive.
 
     Raises:
         MeshingError: normals face inwards, cancel each other, or the points lie in a plane.
     """
     if field.smoothing or not field.is_estimated[1] or not level > 0:
         return
+    # The values at every step-th point, at most 2000 of them.
     step = -(-len(field.points) // _MOST_PROBES)
-    value = float(np.median(field.value(field.points[::step], precision="double")))
-    if not value > _MIN_VALUE_SHARE * level:
+    median = float(np.median(field.value(field.points[::step], precision="double")))
+    if not median > _MIN_VALUE_SHARE * level:
         fault = (
             "normals face inwards: turn them around, or mesh the level -2 pi"
-            if value < -_MIN_VALUE_SHARE * level
+            if median < -_MIN_VALUE_SHARE * level
             else "normals cancel each other, or the points lie in a plane"
         )
         raise MeshingError(
             f"the points of this {type(field).__name__} enclose nothing: its value at them, each "
-            f"without its own term, is {value:.2g} in the median where 2 pi is right; {fault}"
+            f"without its own term, is {median:.2g} in the median where 2 pi is right; {fault}"
         )
 
 
 def _secant(first: FloatArray, last: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
-    """(n,) in each interval, the root of the linear function with given values at both ends; the
-    middle of the interval if that root is not finite.
+    """(n,) for each of n intervals, the root of the linear function with given values at both ends;
+    the middle of the interval if that root is not finite.
 
     first, last: (n,) the ends of intervals. low, high: (n,) the values at these ends, of different
         signs."""
@@ -371,14 +396,14 @@ def _secant(first: FloatArray, last: FloatArray, low: FloatArray, high: FloatArr
 def _clearances(
     field: Field, level: float, precision: Precision
 ) -> list[Callable[[FloatArray], FloatArray]]:
-    """A list of functions, each of which takes points (n, 3) and returns lengths (n,). At each
-    point the smallest length is a proved lower bound of the distance to the level set. A winding
-    number has two such functions, another field has one."""
+    """Functions that bound the distance to the level set: each takes points (n, 3) and returns
+    lengths (n,). At each point the smallest of these lengths is a proved lower bound of the
+    distance to the level set. A winding number has two such functions, another field has one."""
     backend = choose_backend(precision)
 
     def bound(smooth: Field) -> Callable[[FloatArray], FloatArray]:
-        """A function of points (n, 3) that returns lower bounds (n,) of the distance to the level
-        set of `smooth`, a field without jumps."""
+        """Make a function of points (n, 3) that returns lower bounds (n,) of the distance to the
+        level set of `smooth`, a field without jumps."""
         prepared = smooth.prepare(backend)
         levels = Levels((dr.opaque(backend.Float, level),), smooth.period)
 
@@ -393,7 +418,7 @@ def _clearances(
     sheets = field.prepare(backend)
 
     def distance(p: Vec3) -> tuple[Real]:
-        """The distance of p from the triangles of the mesh."""
+        """The distance of the points p from the triangles of the mesh."""
         return (sheets.distance_to_jumps(p),)
 
     return [
@@ -405,6 +430,6 @@ def _clearances(
 def _evaluate_in_batches(
     backend: Backend, kernel: Callable[[Vec3], tuple[Any, ...]], points: FloatArray
 ) -> FloatArray:
-    """The first result (n,) of `kernel` at points (n, 3), computed in double precision for a batch
-    of points at a time, as a NumPy array."""
+    """The first result (n,) of `kernel`, a function of points, at points (n, 3), as a NumPy array.
+    It is computed for a batch of points at a time and converted to double precision."""
     return np.asarray(map_batches(backend, kernel, points, at_once=1 << 18)[0], np.float64)

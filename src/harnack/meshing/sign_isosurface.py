@@ -1,5 +1,7 @@
-"""Closed meshes from the signs of a function on a lattice, for fields that jump, are rough, or have
-few proved bounds.
+"""Closed meshes of a level set, made from the signs of a function on a lattice. This is for fields
+that jump, are rough, or have few proved bounds. "The function" is a `SignFunction`, f - level for a
+field f; the surface is where its sign changes. A lattice divides a box into cubes ("cells") and
+these into tetrahedra. A "crease" is a sharp edge of the level set.
 
 A tetrahedron with corners of both signs is cut by one triangle or quadrilateral with vertices on
 its edges. Neighbors share these edges, so every mesh edge has two faces, except on the box: the
@@ -133,53 +135,60 @@ def mesh_from_signs(
     closed: bool = False,
     volume: Volume | None = None,
 ) -> tuple[SignIsosurface, LostParts, dict[str, Any]]:
-    """Extract a mesh from signs in cells of a box (`extract_from_signs`), in smaller cells if these
-    do not suffice.
+    """Mesh the level set of a function from its signs in the cells of a box (`extract_from_signs`),
+    again with smaller cells if these do not suffice.
 
     box: the lower and the upper corner (3,) of the box.
     spacing: the size of the cells that are tried first, a length.
     tolerance: the largest distance of triangles from the level set, a length.
     attempts: the largest number of extractions.
-    closed: whether the surface is closed by parts of the box's faces, rather than ending there.
+    report: called with messages about progress.
+    closed: whether parts of the box's faces close the surface; otherwise it ends at the box.
     volume: parts of the level set that the mesh lacks are counted only if they lie in this volume;
         None for all.
 
     The mesh is extracted again, from cells 0.6 times as large, if more than one in a hundred
     vertices and centers of triangles are farther than the tolerance from the level set, or if
-    smaller cells may show parts that the mesh lacks.
+    smaller cells may show parts that the mesh lacks. A mesh of more than 100,000 triangles is not
+    extracted again.
 
     Returns:
-        The mesh; the parts of the level set that it lost; and facts for the metadata, among them
-        the number of points that are finally farther than the tolerance, and a distance within
-        which all of them are.
+        The mesh; the parts of the level set that it lacks; and entries for the metadata, among them
+        the number of vertices and centers that are finally farther than the tolerance, and a
+        distance within which all of them are.
 
     Raises:
-        MeshingError: there is no surface, there are too many cells, or values are not finite.
+        EmptySurfaceError: there is no surface.
+        MeshingError: there are too many cells, or values are not finite.
     """
     level_points = PointsOnLevel.of(function, tolerance).within(*box, volume)
     while True:
         report(f"cells of {spacing:.3g}")
+        # Two more layers of cells around the box, in which a closed surface may be coarse.
         layers = 2 if closed else 0
         lattice = BccLattice.covering_box(*box, spacing, layers=layers)
         try:
             mesh = extract_from_signs(function, lattice, 0.8 * tolerance, report, closed=closed)
         except EmptySurfaceError as error:
-            nothing = TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64))
-            lost = LostParts.of(function, level_points, nothing, tolerance, spacing)
+            empty_mesh = TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64))
+            # A level set that is known to have points is lost, not empty.
+            lost = LostParts.of(function, level_points, empty_mesh, tolerance, spacing)
             if not lost.far:
                 raise
             raise EmptySurfaceError(f"the mesh is empty: {lost}; {lost.advice}") from error
         report("measuring distances to the level")
-        far_count, count, within = _distances(function, mesh.surface, tolerance, lattice, closed)
+        far_count, measured_count, within = _distances(
+            function, mesh.surface, tolerance, lattice, closed
+        )
         report("looking for parts that were lost")
         lost = LostParts.of(function, level_points, mesh.surface, tolerance, spacing)
         attempts -= 1
-        may_help = far_count > MAX_OFF_LEVEL_FRACTION * count or (
+        may_help = far_count > MAX_OFF_LEVEL_FRACTION * measured_count or (
             lost.matter and lost.are_mended_by(CELL_REFINEMENT_FACTOR)
         )
         if attempts <= 0 or not may_help or len(mesh.surface.faces) > _MOST_REMADE:
             break
-        report(f"{far_count:,} of {count:,} vertices and centers are beyond the tolerance")
+        report(f"{far_count:,} of {measured_count:,} vertices and centers are beyond the tolerance")
         if lost.matter:
             report(str(lost))
         spacing *= CELL_REFINEMENT_FACTOR
@@ -192,7 +201,7 @@ def mesh_from_signs(
         "undecided": mesh.undecided,
         "flat": mesh.unfitted,
         "far": far_count,
-        "looked_at": count,
+        "looked_at": measured_count,
         "within": within,
         "lost": lost.far,
         "sought": lost.looked_at,
@@ -209,30 +218,36 @@ def _distances(
 ) -> tuple[int, int, float]:
     """Measure how far the vertices and the centers of faces of a mesh are from the level set.
 
-    Of large meshes only every second face is tested, or every third and so on. If the mesh is
-    `closed` at the box of the lattice, faces in the two outermost layers of cells are not tested,
-    because they will be cut away.
+    tolerance: a length.
+    lattice, closed: the lattice of the mesh, and whether parts of the box's faces close the mesh.
+        If they do, faces in the two outermost layers of cells are not measured, because they will
+        be cut away.
+
+    Of meshes with more than 20,000 faces only every second face is measured, or every third and so
+    on.
 
     Returns:
-        The number of these points that are farther than `tolerance` from the level set; the number
-        of points that were tested; and a distance within which all of them are, too large by up to
-        a factor of 2, or inf if some are farther than 4 cells.
+        The number of points that are farther than `tolerance` from the level set; the number of
+        points that were measured; and a distance within which all of them are, too large by up to a
+        factor of 2, or inf if some are farther than 4 cells.
     """
     x, faces = surface.vertices, surface.faces
     if closed:
         lower, upper = lattice.lower + 2 * lattice.size, lattice.upper - 2 * lattice.size
         faces = faces[((x[faces] > lower) & (x[faces] < upper)).all(axis=(1, 2))]
+    # Every k-th face, with the smallest k for which at most 20,000 are left.
     surface = TriangleMesh.without_unused_vertices(
         x, faces[:: -(-len(faces) // _MOST_MEASURED) or 1]
     )
     x, faces = surface.vertices, surface.faces
-    off_level, count = points_off_level(function, x, faces, tolerance, None)
+    off_level, measured_count = points_off_level(function, x, faces, tolerance, None)
+    # Double the distance until no point is farther.
     within, farther = tolerance, off_level
     while len(farther) and within < _MAX_DISTANCE_CELLS * float(lattice.size.max()):
         within *= 2
         no_faces = np.zeros((0, 3), np.int64)
         farther, _ = points_off_level(function, farther, no_faces, within, None)
-    return len(off_level), count, within if not len(farther) else math.inf
+    return len(off_level), measured_count, within if not len(farther) else math.inf
 
 
 def extract_from_signs(
@@ -243,54 +258,68 @@ def extract_from_signs(
     *,
     closed: bool = False,
 ) -> SignIsosurface:
-    """Extract the boundary of the set of points, in the box of a lattice, at which a function is
-    not positive.
+    """Extract the surface where a function changes its sign, in the box of a lattice: the boundary
+    of the set of points at which it is not positive.
+
+    Tetrahedra are cut by the level set, slivers removed, and then edges and faces are split along
+    creases in up to two rounds. If triangles of the result intersect and that cannot be mended, the
+    triangles as cut from the tetrahedra are returned.
 
     tolerance: a length. An edge is split if it is farther than this from the surface, estimated
         from the normals at its ends.
-    closed: whether the function counts as positive outside of the box. Then the surface is closed
-        by parts of the box's faces; otherwise it ends there.
+    report: called with messages about progress.
+    closed: whether the function counts as positive outside of the box. Then parts of the box's
+        faces close the surface; otherwise it ends there.
 
     Raises:
-        MeshingError: there is no surface, there are too many cells, or values are not finite.
+        EmptySurfaceError: there is no surface.
+        MeshingError: there are too many cells, or values are not finite.
     """
-    first = _march(function, lattice, closed, report)
-    x, faces, normals, is_apart = _collapse_slivers(
-        first,
+    raw = _march(function, lattice, closed, report)
+    x, faces, normals, is_intersection_free = _collapse_slivers(
+        raw,
         min(_SIMPLIFY_TOLERANCE * tolerance, _SIMPLIFY_CELL_FRACTION * float(lattice.size.min())),
     )
-    report(f"{len(first.faces):,} triangles, {len(faces):,} without slivers")
+    report(f"{len(raw.faces):,} triangles, {len(faces):,} without slivers")
     check_triangle_limit(len(faces), function.most_faces)
-    flat = x
+    # For each vertex its position on the unrefined triangles, to which it can be moved back.
+    unmoved = x
     on_crease = np.zeros(len(x), np.bool_)
-    before = len(faces)
+    last_split_count = len(faces)
     for round_number in range(_ROUNDS):
         report(f"refining, round {round_number + 1}: {len(faces):,} triangles")
-        cut = _CreaseRefinement.of(function, x, normals, on_crease, faces, tolerance)
-        if not len(cut.points) or len(cut.points) > _MAX_CUT_FRACTION * before:
+        refinement = _CreaseRefinement.of(function, x, normals, on_crease, faces, tolerance)
+        if (
+            not len(refinement.points)
+            or len(refinement.points) > _MAX_CUT_FRACTION * last_split_count
+        ):
             break
-        before = len(cut.points)
-        check_triangle_limit(len(faces) + 2 * len(cut.points), function.most_faces)
-        start, end = (flat[cut.ends[:, k]] for k in (0, 1))
-        feet = start + cut.share[:, None] * (end - start)
-        corner_feet = feet[cut.vertex_of_edge[cut.edges[cut.rows]] - len(x)]
-        flat = np.concatenate([flat, feet, corner_feet.mean(axis=1)])
-        x, faces = cut.applied(x, faces)
-        normals = np.concatenate([normals, cut.normals])
-        on_crease = np.concatenate([on_crease, cut.is_on_crease])
+        last_split_count = len(refinement.points)
+        check_triangle_limit(len(faces) + 2 * len(refinement.points), function.most_faces)
+        # Unmoved positions of new vertices: on edges, and the mean of three of these in faces.
+        start, end = (unmoved[refinement.ends[:, k]] for k in (0, 1))
+        unmoved_on_edges = start + refinement.share[:, None] * (end - start)
+        unmoved_in_faces = unmoved_on_edges[
+            refinement.vertex_of_edge[refinement.edges[refinement.rows]] - len(x)
+        ]
+        unmoved = np.concatenate([unmoved, unmoved_on_edges, unmoved_in_faces.mean(axis=1)])
+        x, faces = refinement.applied(x, faces)
+        normals = np.concatenate([normals, refinement.normals])
+        on_crease = np.concatenate([on_crease, refinement.is_on_crease])
     report("looking for triangles that pass through each other")
     try:
-        x, count = _undo_until_valid(x, flat, faces)
-    except LocalizedMeshingError:  # as the tetrahedra cut it
-        x, faces, count = first.vertices, first.faces, len(first.faces)
-        is_apart = False
-    return SignIsosurface(TriangleMesh(x, faces), first.points, first.undecided, count, is_apart)
+        x, unfitted_count = _undo_until_valid(x, unmoved, faces)
+    except LocalizedMeshingError:  # as cut from the tetrahedra
+        x, faces, unfitted_count = raw.vertices, raw.faces, len(raw.faces)
+        is_intersection_free = False
+    return SignIsosurface(
+        TriangleMesh(x, faces), raw.points, raw.undecided, unfitted_count, is_intersection_free
+    )
 
 
 @dataclass(frozen=True)
 class _RawIsosurface:
-    """The mesh that consists of the triangles in which the level set cuts tetrahedra, before it is
-    improved.
+    """The mesh of the triangles in which the level set cuts tetrahedra, before it is improved.
 
     vertices: (n, 3), on the level set. normals: (n, 3) unit normals of the level set there.
     faces: (m, 3).
@@ -307,22 +336,25 @@ class _RawIsosurface:
 def _march(
     function: SignFunction, lattice: BccLattice, closed: bool, report: Callable[[str], None]
 ) -> _RawIsosurface:
-    """Cut all tetrahedra of a lattice that have corners of both signs, by marching tetrahedra.
+    """Cut the level set from the tetrahedra of a lattice: all tetrahedra that have corners of both
+    signs (marching tetrahedra).
 
     closed: whether the function counts as positive on the box's faces, so that the mesh is closed.
 
     Cells that are proved to contain no level are left out. Values and proofs are subject to
     rounding, so signs may nevertheless differ at the corners of such a cell. Then the surface has
-    open edges there; the cells around these are added, until the surface ends only on the box.
+    open edges inside of the box; the cells around these edges are added, until the surface ends
+    only on the box.
 
     Raises:
         EmptySurfaceError: there is no surface.
-        MeshingError: too many cells, values that are not finite, or a surface that still ends after
-            20 rounds.
+        MeshingError: too many cells, values that are not finite, or a surface that still has open
+            edges inside of the box after 20 rounds.
     """
     cells = lattice.nonempty_cells(function.clearance, function.most_faces)
     if closed:
         outer = lattice.outer_cells()
+        # Outermost cells that are inside belong to the solid as a whole.
         outer = outer[function.values(lattice.points(2 * outer + 1)) <= 0]
         cells = distinct_rows(np.concatenate([cells, outer]))
     open_middles = np.zeros((0, 3))
@@ -335,13 +367,14 @@ def _march(
         value = _finite_values(function, points, lattice.size)
         is_wall = lattice.is_on_box(coordinates)
         if closed:
+            # A positive value on the box, of the size of the others.
             value[is_wall] = np.abs(value).max(initial=1.0)
         normals: list[FloatArray] = []
 
         def roots(low: FloatArray, high: FloatArray, normals: Any = normals) -> FloatArray:
             """(k, 3) the points where the edges from `low` to `high` (k, 3) meet the level set,
-            moved a little if they are too near to an end. The unit normals (k, 3) there are
-            appended to the list `normals`."""
+            moved a little if they are too near to an end. As a side effect, the unit normals (k, 3)
+            there are appended to the list `normals`."""
             x, normal = function.crossings(low, high)
             normals.append(normal)
             edge = high - low
@@ -352,15 +385,16 @@ def _march(
         x, faces = _triangles(function, points, value, corners, roots)
         if not len(faces):
             raise EmptySurfaceError("the level set is empty: no cell of the box holds the level")
-        ends = boundary_edges(faces)
-        middle = x[ends].mean(axis=1)
+        open_edges = boundary_edges(faces)
+        middles = x[open_edges].mean(axis=1)
         margin = 1e-9 * lattice.size
-        is_inside = (middle > lattice.lower + margin) & (middle < lattice.upper - margin)
-        open_middles = middle[is_inside.all(axis=1)]
+        is_inside = (middles > lattice.lower + margin) & (middles < lattice.upper - margin)
+        open_middles = middles[is_inside.all(axis=1)]
         if not len(open_middles):
             return _RawIsosurface(
                 x, normals[0], faces, len(points), function.count_undecided(points, value)
             )
+        # Add the 27 cells around each open edge.
         cell_index = np.floor((open_middles - lattice.lower) / lattice.size).astype(np.int64)
         offsets = np.array(list(itertools.product((-1, 0, 1), repeat=3)))
         neighbors = np.clip((cell_index[:, None] + offsets).reshape(-1, 3), 0, lattice.counts - 1)
@@ -375,8 +409,8 @@ def _march(
 def _collapse_slivers(
     raw: _RawIsosurface, tolerance: float
 ) -> tuple[FloatArray, IntArray, FloatArray, bool]:
-    """Simplify a mesh: contract short edges, and remove vertices whose faces lie in a plane, so
-    that the surface moves by at most `tolerance` (a length).
+    """Simplify a mesh: contract short edges, and remove vertices whose faces lie in a plane. The
+    surface moves by at most `tolerance` (a length).
 
     The mesh stays unchanged if it is open, or if triangles of the simplified mesh would intersect.
 
@@ -391,18 +425,20 @@ def _collapse_slivers(
     x, faces = raw.vertices, raw.faces
     if len(boundary_edges(faces)):
         return x, faces, raw.normals, False
-    simpler = from_manifold(without_short_edges(to_manifold(TriangleMesh(x, faces)), tolerance))
-    away, nearest = searching.cKDTree(x).query(simpler.vertices)
-    if not len(simpler.faces) or away.any():
+    simplified = from_manifold(without_short_edges(to_manifold(TriangleMesh(x, faces)), tolerance))
+    # Vertices are only removed, never moved: each is one of the given ones, with its normal.
+    distances, nearest = searching.cKDTree(x).query(simplified.vertices)
+    if not len(simplified.faces) or distances.any():
         return x, faces, raw.normals, False
-    if len(intersecting_faces(simpler.vertices, simpler.faces)):
+    if len(intersecting_faces(simplified.vertices, simplified.faces)):
         return x, faces, raw.normals, False
-    return simpler.vertices, simpler.faces, raw.normals[nearest], True
+    return simplified.vertices, simplified.faces, raw.normals[nearest], True
 
 
 def _finite_values(function: SignFunction, points: FloatArray, size: FloatArray) -> FloatArray:
-    """The values (n,) of the function at points (n, 3). If a value is not finite, as at a dipole,
-    the function is evaluated a small fraction of a cell beside the point instead.
+    """Evaluate the function at points (n, 3). Returns its values (n,). If a value is not finite, as
+    at a dipole, the function is evaluated beside the point instead, a small fraction of a cell
+    away.
 
     size: (3,) the edge lengths of a cell.
 
@@ -410,16 +446,17 @@ def _finite_values(function: SignFunction, points: FloatArray, size: FloatArray)
         MeshingError: some values are still not finite.
     """
     value = function.values(points)
+    # Try two points beside each of these, along the diagonal of a cell.
     for k in (1, 2):
-        fails = np.flatnonzero(~np.isfinite(value))
-        if not len(fails):
+        rows = np.flatnonzero(~np.isfinite(value))
+        if not len(rows):
             return value
-        value[fails] = function.values(points[fails] + k * _SINGULAR_POINT_SHIFT * size)
-    fails = ~np.isfinite(value)
-    if fails.any():
-        x, y, z = points[fails][0]
+        value[rows] = function.values(points[rows] + k * _SINGULAR_POINT_SHIFT * size)
+    rows = ~np.isfinite(value)
+    if rows.any():
+        x, y, z = points[rows][0]
         raise MeshingError(
-            f"{type(function.field).__name__} has no finite value at {fails.sum():,} points, such "
+            f"{type(function.field).__name__} has no finite value at {rows.sum():,} points, such "
             f"as ({x:.4g}, {y:.4g}, {z:.4g}): choose a `clip` where it has"
         )
     return value
@@ -432,8 +469,8 @@ def _triangles(
     corners: IntArray,
     roots: Callable[[FloatArray, FloatArray], FloatArray],
 ) -> tuple[FloatArray, IntArray]:
-    """The triangles in which the level set cuts tetrahedra: one triangle or two in each tetrahedron
-    whose corners have both signs.
+    """The triangles in which the level set cuts tetrahedra: one or two in each tetrahedron whose
+    corners have both signs.
 
     points, value: (n, 3), (n,) points, and the values of the function there; 0 counts as negative.
     corners: (m, 4) the corners of the tetrahedra, as indices of points.
@@ -443,24 +480,28 @@ def _triangles(
     Returns:
         The vertices (k, 3), which lie within edges of tetrahedra, and the faces (j, 3).
     """
-    above = value > 0
-    up = above[corners].sum(axis=1)
-    tets = Tetrahedra.of(points, corners[(up > 0) & (up < 4)])
-    if not len(tets.corners):
+    is_positive = value > 0
+    positive_count = is_positive[corners].sum(axis=1)
+    tetrahedra = Tetrahedra.of(points, corners[(positive_count > 0) & (positive_count < 4)])
+    if not len(tetrahedra.corners):
         return points[:0], np.zeros((0, 3), np.int64)
     # A value of 0 counts as below; no point is on the level.
-    nowhere = np.zeros(len(points), np.bool_)
-    sampled = TetrahedronPoints(points, nowhere, LevelSamples(value, np.zeros_like(points), value))
-    vertices, faces = extract_triangles(
-        function, sampled, tets, count_crossings(function, sampled, tets), roots
+    is_on_level = np.zeros(len(points), np.bool_)
+    sampled = TetrahedronPoints(
+        points, is_on_level, LevelSamples(value, np.zeros_like(points), value)
     )
+    vertices, faces = extract_triangles(
+        function, sampled, tetrahedra, count_crossings(function, sampled, tetrahedra), roots
+    )
+    # The first vertices are the lattice points, which no face uses here.
     return vertices[len(points) :], faces - len(points)
 
 
 @dataclass(frozen=True)
 class _CreaseRefinement:
-    """The new vertices of a mesh whose edges and faces are split, so that it follows creases. The
-    mesh has m faces and k edges; c edges are split, and d faces get a vertex in their interior.
+    """A plan for splitting the edges and faces of a mesh, so that it follows creases of the level
+    set: which are split, and where the new vertices are. The mesh has m faces and k edges; c edges
+    are split, and d faces get a vertex in their interior.
 
     edges: (m, 3) the indices of the edges of each face.
     vertex_of_edge: (k,) the index of the new vertex of each edge; -1 for edges that are not split.
@@ -492,7 +533,7 @@ class _CreaseRefinement:
         faces: IntArray,
         tolerance: float,
     ) -> _CreaseRefinement:
-        """Choose the edges and faces of a mesh to be split, and find their new vertices.
+        """Choose the edges and faces of a mesh that are to be split, and find their new vertices.
 
         x, normals: (n, 3) the vertices, and the unit normals of the level set there.
         bent: (n,) the mask of the vertices that lie on a crease. Since the surface has two tangent
@@ -500,59 +541,78 @@ class _CreaseRefinement:
         faces: (m, 3). tolerance: a length.
 
         An edge is split if it is farther than `tolerance` from the line in which the tangent planes
-        at both ends meet, and if the level set is found between the edge and that line. A face gets
-        a vertex in its interior if all of its edges are split at a crease."""
-        every = Edges.of(half_edges(faces))
-        edges = every.edge_of_pair.reshape(3, -1).T
-        rows = np.flatnonzero((every.multiplicity == 2) & ~bent[every.vertices].any(axis=1))
-        ends = every.vertices[rows]
+        at both ends meet, and if the level set is found between the edge and that line. The new
+        vertex lies on a crease if the normal there differs from the normal at one end of the edge
+        by nearly the angle between both ends; on a smooth surface it differs by about half of that.
+        A face gets a vertex in its interior if all of its edges are split at a crease."""
+        all_edges = Edges.of(half_edges(faces))
+        edges = all_edges.edge_of_pair.reshape(3, -1).T
+        # Candidates: interior edges without an end on a crease.
+        rows = np.flatnonzero((all_edges.multiplicity == 2) & ~bent[all_edges.vertices].any(axis=1))
+        ends = all_edges.vertices[rows]
         one, other = normals[ends[:, 0]], normals[ends[:, 1]]
         a, b = x[ends[:, 0]], x[ends[:, 1]]
-        t, along, sine2 = _toward_tangent_planes(a, b, one, other)
-        long = row_norms(b - a)
+        fraction, to_line, sine2 = _toward_tangent_planes(a, b, one, other)
+        edge_length = row_norms(b - a)
+        # Of these, the edges that are far from the line between the tangent planes.
         is_far = (
-            (sine2 > _MIN_SQUARE) & (row_norms(along) > tolerance) & (long > _SHORTEST * tolerance)
+            (sine2 > _MIN_SQUARE)
+            & (row_norms(to_line) > tolerance)
+            & (edge_length > _SHORTEST * tolerance)
         )
-        rows, along, t = rows[is_far], along[is_far], t[is_far]
-        foot, span = a[is_far] + t[:, None] * (b - a)[is_far], long[is_far]
-        points, normal, passed = _level_along(function, foot, along, _OFFSET * span)
-        rows, points, normal, t = rows[passed], points[passed], normal[passed], t[passed]
-        ends = every.vertices[rows]
-        vertex = np.full(len(every.vertices), -1, np.int64)
-        vertex[rows] = len(x) + np.arange(len(rows))
-        total, angle = (
+        rows, to_line, fraction = rows[is_far], to_line[is_far], fraction[is_far]
+        # Of these, the edges beside which the level set is found.
+        foot, far_length = a[is_far] + fraction[:, None] * (b - a)[is_far], edge_length[is_far]
+        points, normal, is_found = _level_along(function, foot, to_line, _OFFSET * far_length)
+        rows, points, normal, fraction = (
+            rows[is_found],
+            points[is_found],
+            normal[is_found],
+            fraction[is_found],
+        )
+        ends = all_edges.vertices[rows]
+        vertex_of_edge = np.full(len(all_edges.vertices), -1, np.int64)
+        vertex_of_edge[rows] = len(x) + np.arange(len(rows))
+        # Two angles for each split edge: between the normals at its ends; and the larger one
+        # between the normal at the new vertex and that at an end.
+        angle_of_ends, angle_to_end = (
             np.arccos(np.clip(one, -1, 1))
             for one in (
                 row_dots(normals[ends[:, 0]], normals[ends[:, 1]]),
                 np.minimum(*(row_dots(normals[ends[:, k]], normal) for k in (0, 1))),
             )
         )
-        on_crease = (total > _MIN_CREASE_ANGLE) & (angle > _CREASE_ANGLE_SHARE * total)
-        is_bent = np.concatenate([bent, on_crease])
-        new = vertex[edges]
-        corner = np.flatnonzero((new >= 0).all(axis=1) & is_bent[np.maximum(new, 0)].all(axis=1))
+        is_on_crease = (angle_of_ends > _MIN_CREASE_ANGLE) & (
+            angle_to_end > _CREASE_ANGLE_SHARE * angle_of_ends
+        )
+        is_bent = np.concatenate([bent, is_on_crease])
+        new_vertices_of_face = vertex_of_edge[edges]
+        # Faces whose three new vertices all lie on creases.
+        corner = np.flatnonzero(
+            (new_vertices_of_face >= 0).all(axis=1)
+            & is_bent[np.maximum(new_vertices_of_face, 0)].all(axis=1)
+        )
         inner, inner_normal, corner = _crease_corners(function, x, normals, faces, corner)
         return cls(
-            edges, vertex, ends, t, faces[corner], corner, np.concatenate([points, inner]),
-            np.concatenate([normal, inner_normal]),
-            np.concatenate([on_crease, np.ones(len(inner), np.bool_)]),
+            edges, vertex_of_edge, ends, fraction, faces[corner], corner,
+            np.concatenate([points, inner]), np.concatenate([normal, inner_normal]),
+            np.concatenate([is_on_crease, np.ones(len(inner), np.bool_)]),
         )  # fmt: skip
 
     def applied(self, x: FloatArray, faces: IntArray) -> tuple[FloatArray, IntArray]:
-        """Split the edges and faces. Returns the vertices, those of the mesh first, and the faces
-        of the finer mesh.
-
-        x, faces: (n, 3), (m, 3) the mesh."""
+        """Split the edges and faces of the mesh `x` (n, 3), `faces` (m, 3). Returns the vertices of
+        the finer mesh, the given ones first, and its faces."""
         vertices = np.concatenate([x, self.points])
         middle = self.vertex_of_edge[self.edges]
-        is_other = np.ones(len(faces), np.bool_)
-        is_other[self.rows] = False
-        parts = [split_faces(vertices, faces[is_other], middle[is_other])]
+        is_without_inner = np.ones(len(faces), np.bool_)
+        is_without_inner[self.rows] = False
+        parts = [split_faces(vertices, faces[is_without_inner], middle[is_without_inner])]
         a, b, c = self.corner_faces.T
         u, v, w = middle[self.rows].T  # on the edges ab, bc and ca
-        inner = len(vertices) - len(self.rows) + np.arange(len(self.rows))
+        inner_vertices = len(vertices) - len(self.rows) + np.arange(len(self.rows))
+        # A face with an inner vertex becomes six: one at each corner, three around the new vertex.
         parts += [np.stack(t, axis=1) for t in ((a, u, w), (u, b, v), (w, v, c))]
-        parts += [np.stack([*t, inner], axis=1) for t in ((u, v), (v, w), (w, u))]
+        parts += [np.stack([*t, inner_vertices], axis=1) for t in ((u, v), (v, w), (w, u))]
         return vertices, np.concatenate(parts)
 
 
@@ -569,10 +629,11 @@ def _toward_tangent_planes(
         The point of the edge that is nearest to the line, as a fraction (k,) of the edge, kept away
         from both ends; the displacement (k, 3) from this point to the line; and the squared sine
         (k,) of the angle between the two normals. If the planes are parallel, the point is the
-        middle of the edge, and the displacement 0.
+        middle of the edge, and the displacement is 0.
 
-    If many edges of a flat triangulation cross the same line, then the points of the line that
-    belong to them come in the order in which the edges cross it. So the new triangles do not fold.
+    The new vertex of the edge is searched for along this segment. If many edges of a flat
+    triangulation cross the same line, their nearest points on it are in the order in which they
+    cross it. So the new triangles do not fold.
     """
     edge, line = b - a, np.cross(n_a, n_b)
     cosine, sine2 = row_dots(n_a, n_b), row_dots(line, line)
@@ -581,6 +642,7 @@ def _toward_tangent_planes(
         factor = row_dots(edge, n_b) / sine2
         point = factor[:, None] * (n_b - cosine[:, None] * n_a)
         axis = line / np.sqrt(sine2)[:, None]
+        # The part of the edge across the line decides where it is nearest to the line.
         across = edge - row_dots(edge, axis)[:, None] * axis
         fraction = row_dots(point, across) / row_dots(across, across)
         fraction = np.clip(fraction, _FROM_CORNERS, 1 - _FROM_CORNERS)
@@ -609,8 +671,12 @@ def _level_along(
     is_positive = function.values(begin) > 0
     changes_sign = is_positive != (function.values(end) > 0)
     rows = np.flatnonzero(changes_sign)
-    upwards = ~is_positive[rows, None]
-    low, high = np.where(upwards, begin[rows], end[rows]), np.where(upwards, end[rows], begin[rows])
+    # `SignFunction.crossings` expects the end with the lower value first.
+    is_rising = ~is_positive[rows, None]
+    low, high = (
+        np.where(is_rising, begin[rows], end[rows]),
+        np.where(is_rising, end[rows], begin[rows]),
+    )
     points, normal = start.copy(), np.zeros_like(start)
     points[rows], normal[rows] = function.crossings(low, high)
     return points, normal, changes_sign
@@ -619,15 +685,16 @@ def _level_along(
 def _crease_corners(
     function: SignFunction, x: FloatArray, normals: FloatArray, faces: IntArray, rows: IntArray
 ) -> tuple[FloatArray, FloatArray, IntArray]:
-    """New vertices in the interior of faces that cut off a corner of the level set.
+    """New vertices in the interior of faces that cut off a corner of the level set, where creases
+    meet.
 
     x, normals: (n, 3) the vertices of the mesh, and the unit normals there. faces: (m, 3).
     rows: (k,) the indices of the faces that may get a new vertex.
 
     If the three normals at the corners of a face are linearly independent, the tangent planes there
-    meet in a point. The line from the face's center to this point is followed, and the new vertex
-    is where it passes the level set. A face has no new vertex if the normals are dependent, or if
-    the line does not pass the level set near the face.
+    meet in a point. The new vertex is where the line from the face's center to this point passes
+    the level set. A face has no new vertex if the normals are dependent, or if the line does not
+    pass the level set near the face.
 
     Returns:
         The new vertices (j, 3); the normals (j, 3) there; and the indices (j,) of the faces that
@@ -639,19 +706,24 @@ def _crease_corners(
     rows, corner, normal = rows[independent], corner[independent], normal[independent]
     center = corner.mean(axis=1)
     longest = np.stack([row_norms(corner[:, k] - corner[:, k - 1]) for k in range(3)]).max(axis=0)
+    # The common point p of the planes n_k . (p - corner_k) = 0, relative to the center.
     offsets = np.einsum("kij,kij->ki", normal, corner - center[:, None])
     solve: Any = np.linalg.solve
     direction: FloatArray = solve(normal, offsets[:, :, None])[:, :, 0]
-    points, normal, passed = _level_along(function, center, direction, _OFFSET * longest)
-    return points[passed], normal[passed], rows[passed]
+    points, normal, is_found = _level_along(function, center, direction, _OFFSET * longest)
+    return points[is_found], normal[is_found], rows[is_found]
 
 
-def _undo_until_valid(x: FloatArray, flat: FloatArray, faces: IntArray) -> tuple[FloatArray, int]:
+def _undo_until_valid(
+    x: FloatArray, unmoved: FloatArray, faces: IntArray
+) -> tuple[FloatArray, int]:
     """Undo moves of vertices onto creases, until no face is folded over and no two faces intersect.
     Pairs of faces that have no moved vertex are not tested.
 
     x: (n, 3) the vertices after the moves.
-    flat: (n, 3) the vertices before, on the triangles in which the level set cuts tetrahedra.
+    unmoved: (n, 3) the vertices before the moves, on the triangles in which the level set cuts
+        tetrahedra.
+    faces: (m, 3).
 
     Returns:
         The vertices (n, 3), and the number of faces whose vertices were moved back.
@@ -660,41 +732,47 @@ def _undo_until_valid(x: FloatArray, flat: FloatArray, faces: IntArray) -> tuple
         LocalizedMeshingError: triangles still intersect.
     """
     x = x.copy()
-    total = 0
-    flat_normals = area_normals(flat[faces])
+    undone_count = 0
+    unmoved_normals = area_normals(unmoved[faces])
     for _ in range(_MOST_REPAIRS):
-        moved = (x != flat).any(axis=1)
-        turned = moved[faces].any(axis=1)
-        turned[turned] = row_dots(area_normals(x[faces[turned]]), flat_normals[turned]) <= 0
-        if not turned.any():
+        is_moved = (x != unmoved).any(axis=1)
+        is_turned = is_moved[faces].any(axis=1)
+        # Of the faces with moved vertices, those whose normal turned by 90 degrees or more.
+        is_turned[is_turned] = (
+            row_dots(area_normals(x[faces[is_turned]]), unmoved_normals[is_turned]) <= 0
+        )
+        if not is_turned.any():
             break
-        x[faces[turned]] = flat[faces[turned]]
-        total += int(turned.sum())
-    among: BoolArray = np.asarray((x != flat).any(axis=1)[faces].any(axis=1))
+        x[faces[is_turned]] = unmoved[faces[is_turned]]
+        undone_count += int(is_turned.sum())
+    is_tested: BoolArray = np.asarray((x != unmoved).any(axis=1)[faces].any(axis=1))
     failing = faces[:0, 0]
     for _ in range(_MOST_REPAIRS):
-        failing = np.union1d(intersecting_faces(x, faces, among), _folded_faces(x, faces, among))
+        failing = np.union1d(
+            intersecting_faces(x, faces, is_tested), _folded_faces(x, faces, is_tested)
+        )
         if not len(failing):
-            return x, total
-        total += len(failing)
-        near = np.zeros(len(x), np.bool_)
-        near[faces[failing]] = True
-        among = np.asarray(near[faces].any(axis=1))
-        if not (x[near] != flat[near]).any():  # together with neighbors, so that the loop ends
-            near[faces[among]] = True
-            among = np.asarray(near[faces].any(axis=1))
-        x[near] = flat[near]
+            return x, undone_count
+        undone_count += len(failing)
+        is_reset = np.zeros(len(x), np.bool_)
+        is_reset[faces[failing]] = True
+        is_tested = np.asarray(is_reset[faces].any(axis=1))
+        if not (x[is_reset] != unmoved[is_reset]).any():  # none moved: undo at neighbors, too
+            is_reset[faces[is_tested]] = True
+            is_tested = np.asarray(is_reset[faces].any(axis=1))
+        x[is_reset] = unmoved[is_reset]
     raise LocalizedMeshingError(
         f"{len(failing):,} triangles pass through each other still", x[faces[failing]].mean(axis=1)
     )
 
 
 def _folded_faces(x: FloatArray, faces: IntArray, among: BoolArray) -> IntArray:
-    """The indices of the faces that are folded onto a neighbor, up to rounding. A pair of neighbors
-    is tested if the mask `among` (m,) is set for at least one of the two."""
+    """The indices of the faces that are folded onto a neighbor (a face with a common edge), up to
+    rounding: the normals of both are opposite. A pair of neighbors is tested if the mask `among`
+    (m,) is set for at least one of the two."""
     normal = area_normals(x[faces])
     normal /= np.maximum(row_norms(normal), 1e-300)[:, None]
     pairs = Edges.of(half_edges(faces)).paired_half_edges() % len(faces)
     first, second = pairs.T
-    on_other = (row_dots(normal[first], normal[second]) < _FOLDED) & (among[first] | among[second])
-    return np.unique(pairs[on_other])
+    is_folded = (row_dots(normal[first], normal[second]) < _FOLDED) & (among[first] | among[second])
+    return np.unique(pairs[is_folded])

@@ -1,4 +1,7 @@
-"""The thickness of closed meshes: the extent of the material behind each face."""
+"""The thickness of the walls of a closed mesh: how much material is behind each of its faces. It is
+measured at the center of each face, by the largest ball inside of the material that touches the
+face there.
+"""
 
 from __future__ import annotations
 
@@ -46,12 +49,12 @@ class WallThickness:
 
     @property
     def thinnest(self) -> float:
-        """The smallest thickness of all faces."""
+        """The smallest thickness of all faces, a length."""
         return float(np.nanmin(self.values))
 
     def thin_locations(self, less_than: float) -> FloatArray:
-        """(k, 3) the centers of the faces at which the wall is thinner than `less_than`, the
-        thinnest first."""
+        """(k, 3) the centers of the faces at which the wall is thinner than `less_than`, a length;
+        the thinnest first."""
         rows = np.flatnonzero(self.is_thinner(less_than))
         rows = rows[np.argsort(self.values[rows])]
         return self.vertices[self.faces[rows]].mean(axis=1)
@@ -79,24 +82,26 @@ class WallThickness:
 
 
 def wall_thickness(part: Any, **options: Any) -> WallThickness:
-    """The thickness of a part behind each of its faces.
+    """Measure the thickness of a part behind each of its faces.
 
     part: a closed mesh (a trimesh.Trimesh, (vertices, faces), or the name of a file); or a solid,
         which is meshed first.
     options: for a solid, the options of `mesh`.
 
     At the center of a face a ray goes into the part, against the normal, and ends at the other
-    side, at a distance t. A ball of diameter t touches the center from inside. It shrinks as long
-    as the surface point nearest to the ball's center lies inside of the ball and on an opposite
-    wall: the normals there and at the face differ by more than 120 degrees. In each round it is
-    replaced by the ball that touches the face and that point (Ma, Bae and Choi 2012, 3D medial axis
-    point approximation using nearest neighbors and the normal field). Its diameter is the
-    thickness. Where walls are parallel it is their distance, and it is never more than the length
-    of the ray. Beside an edge of the part the adjacent wall is near, but not opposite. It does not
-    count: the ball stops shrinking there, and the value is an upper bound of the thickness. The
-    value of a face without an area is NaN.
+    side, at a distance t. A ball of diameter t touches the center from inside. Now the point of the
+    surface that is nearest to the ball's center is computed. If it lies inside of the ball and on
+    an opposite wall, the ball is replaced by the smaller ball that touches the face and that point.
+    A wall is opposite if its normal differs from that of the face by more than 120 degrees. This is
+    repeated until it does not hold (Ma, Bae and Choi 2012, 3D medial axis point approximation using
+    nearest neighbors and the normal field). The thickness is the diameter of the last ball. Where
+    walls are parallel it is their distance, and it is never more than t.
 
-    Error: distances are those of the triangles, up to 1e-6 of the mesh's size. The thickness is
+    Near an edge of the part the adjacent wall is near, but not opposite. It does not count, so
+    edges are not reported as thin: the ball stops shrinking there, and the value is an upper bound
+    of the thickness. The value of a face without an area is NaN.
+
+    Distances from the triangles are computed up to 1e-6 of the mesh's size. The thickness is
     measured only at the centers of faces: divide large faces first to measure it more densely
     (`mesh.subdivide_to_size`).
 
@@ -129,35 +134,41 @@ def _medial_diameters(solid: MeshSolid, start: FloatArray, normal: FloatArray) -
 
     A ball's first diameter is the length of the ray from the point into the solid, up to the
     surface. Then the point of the surface nearest to the ball's center is computed. If it is inside
-    of the ball and faces the start, the ball is replaced by the smaller one that touches both. This
-    is repeated until it is not."""
+    of the ball and its normal differs from the start's by more than 120 degrees, the ball is
+    replaced by the smaller one that touches both. This is repeated for each ball until its nearest
+    point is no longer like that, and at most 30 times."""
     size = solid.surface.size
-    below = _START_DEPTH * size
-    # Not a fixed tolerance: rays into a small mesh would end where they start.
+    start_depth = _START_DEPTH * size
+    # The tolerance is relative to the mesh: with a fixed one, rays into a small mesh would end
+    # where they start.
     hits: Any = trace(
-        solid, start - below * normal, -normal,
-        t_min=below, tolerance=0.1 * below, precision="double",
+        solid, start - start_depth * normal, -normal,
+        t_min=start_depth, tolerance=0.1 * start_depth, precision="double",
     )  # fmt: skip
-    t = np.asarray(hits.t, np.float64) + below
-    diameter = np.where(np.isfinite(t), t, 2 * size)
+    ray_length = np.asarray(hits.t, np.float64) + start_depth
+    diameter = np.where(np.isfinite(ray_length), ray_length, 2 * size)
     # Where that is already beyond the other side, the part is no thicker than the skipped length.
-    diameter[~_is_within(solid, start - 2 * below * normal)] = 2 * below
-    shrinking = np.arange(len(diameter))
+    diameter[~_is_within(solid, start - 2 * start_depth * normal)] = 2 * start_depth
+    active_rows = np.arange(len(diameter))
     for _ in range(_MOST_ROUNDS):
-        if not len(shrinking):
+        if not len(active_rows):
             break
-        p, n, r = start[shrinking], normal[shrinking], 0.5 * diameter[shrinking]
+        p, n, r = start[active_rows], normal[active_rows], 0.5 * diameter[active_rows]
         center = p - r[:, None] * n
         distance, nearest, direction = _nearest(solid, center)
-        # The ball is empty, or touches points that do not face the center.
-        inside = distance < r * (1 - _TOUCHING)
-        shrinks = inside & (row_dots(direction, n) < _OPPOSITE)
+        # Balls that are empty, or whose nearest point is on no opposite wall, shrink no further.
+        is_inside = distance < r * (1 - _TOUCHING)
+        is_shrinking = is_inside & (row_dots(direction, n) < _OPPOSITE)
         to_start = p - nearest
         depth = row_dots(to_start, n)
-        shrinks &= depth > 0
-        radius = row_dots(to_start, to_start)[shrinks] / (2 * depth[shrinks])
-        diameter[shrinking[shrinks]] = np.minimum(diameter[shrinking[shrinks]], 2 * radius)
-        shrinking = shrinking[shrinks]
+        is_shrinking &= depth > 0
+        # The ball that touches the start and the nearest point y has the radius |start - y|^2 / (2
+        # (start - y) . normal).
+        radius = row_dots(to_start, to_start)[is_shrinking] / (2 * depth[is_shrinking])
+        diameter[active_rows[is_shrinking]] = np.minimum(
+            diameter[active_rows[is_shrinking]], 2 * radius
+        )
+        active_rows = active_rows[is_shrinking]
     return diameter
 
 
@@ -172,11 +183,12 @@ def _nearest(solid: MeshSolid, points: FloatArray) -> tuple[FloatArray, FloatArr
     """For points (k, 3) inside of a solid, the nearest points of its surface.
 
     Returns:
-        The distances (k,) of these; the nearest points (k, 3) themselves; and the unit vectors
-        (k, 3) towards them.
+        The distances (k,) of these; the nearest points (k, 3) themselves; and the unit vectors (k,
+        3) towards them.
     """
     backend = choose_backend("double")
     sample = solid.prepare(backend).evaluate(to_vector3(backend, points))
     value, gradient = to_numpy(sample.value), to_numpy(sample.gradient)
+    # The value is the signed distance, negative inside; the gradient points to the surface.
     distance = np.abs(value)
     return distance, points - value[:, None] * gradient, gradient

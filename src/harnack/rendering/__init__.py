@@ -1,5 +1,5 @@
-"""Renders pictures: level sets in Mitsuba scenes, and in a studio that sets up lights, ground and
-camera by itself."""
+"""Renders pictures of surfaces, which are level sets of fields: inside Mitsuba scenes, or in a
+studio that sets up lights, ground and camera by itself."""
 
 from __future__ import annotations
 

@@ -1,5 +1,6 @@
-"""Films: each picture is drawn by `render`, and the camera is chosen such that all pictures fit
-together."""
+"""Films: `animate` draws pictures by `render` and writes them to a GIF or MP4 file. The time s goes
+from 0 in the first picture to 1 in the last, and options of a film may be functions of s. The
+cameras of all pictures are chosen together such that everything stays in view and nothing jumps."""
 
 from __future__ import annotations
 
@@ -50,7 +51,7 @@ Pixels = npt.NDArray[np.uint8]
 class Animation:
     """A film that was written to a file; notebooks show it.
 
-    path: of the file.
+    path: the file.
     size: (width, height) of its pictures in pixels.
     """
 
@@ -58,7 +59,7 @@ class Animation:
     size: tuple[int, int]
 
     def _repr_html_(self) -> str:
-        """HTML that shows the film in a notebook; it contains the film itself."""
+        """Return HTML that shows the film in a notebook. It contains the film itself."""
         data = base64.b64encode(self.path.read_bytes()).decode()
         width, height = self.size
         size = f'width="{width}" height="{height}"'
@@ -83,19 +84,20 @@ def animate(
         hk.animate(lambda s: hk.fields.Morph(a, b, gap=0.2, w=0.2 * s), "morph.mp4")
         hk.animate(field, "levels.gif", level=lambda s: 1 + 4 * s)
 
-    surfaces: as `render` draws them in its studio. They, the camera and options that may change
-        from picture to picture may be functions of s, which goes from 0 in the first picture to 1
-        in the last; with an orbit of 360 degrees, to just before 1, so that the film can be
-        repeated.
+    surfaces: as `render` draws them in its studio. The surfaces, the camera and options that may
+        change from picture to picture may be functions of the time s. It goes from 0 in the first
+        picture to 1 in the last; with an orbit of 360 degrees, to just before 1, so that the film
+        can be repeated.
     path: .gif (Pillow) or .mp4 (PyAV: `pip install harnack[film]`).
     frames: the number of pictures.
     fps: pictures a second. In a GIF each picture lasts a whole number of hundredths of a second.
     orbit: degrees that the camera goes around its target during the film; None is 360 if nothing
         else moves, else 0.
     camera: as `render` takes it. Properties that it does not set (target, distance, angle of view)
-        are the same for all pictures, and such that everything is always in view.
-    client, checkpoint: as `render` takes them. Workers draw whole pictures; a film with more
-        pictures, or at another speed, draws only the pictures that the folder does not have.
+        are the same for all pictures, and chosen such that everything is always in view.
+    client, checkpoint: as `render` takes them. Each process of the cluster draws whole pictures. A
+        film with more pictures, or at another speed, draws only the pictures that the folder does
+        not have.
     options, keywords: as `render` takes them, but for `chunks`; `show` is "shaded" by default.
 
     Raises the errors of `render`; ValueError for no or too many frames, and for another file type;
@@ -108,6 +110,7 @@ def animate(
     if not 1 <= count <= _MAX_FRAMES:
         raise ValueError(f"frames must be from 1 to {_MAX_FRAMES:,}, not {count}")
     fps, orbit = as_finite(arguments.pop("fps"), "fps"), arguments.pop("orbit")
+    # By default the camera moves only if nothing else does.
     if orbit is None:
         is_moving = any(map(_is_function_of_s, (surfaces, *arguments.values())))
         orbit = 0.0 if is_moving else 360.0
@@ -126,9 +129,11 @@ def animate(
     )
     size = check_image_size(arguments.pop("size") or DEFAULT_SIZE)
     with write_atomically(target) as partial, _encoder(partial, size, fps) as add:
+        # A full turn leaves out s = 1, which would show the first picture twice.
         repeats = orbit != 0 and orbit % 360 == 0
         steps = np.arange(count) / max(count if repeats else count - 1, 1)
         changing = {"surfaces": surfaces, "options": options, **arguments}
+        # The values of all arguments at each time.
         moments = [
             {name: _value_at(value, s) for name, value in changing.items()} for s in steps.tolist()
         ]
@@ -136,6 +141,7 @@ def animate(
         frames = [
             {**moment, "camera": camera} for moment, camera in zip(moments, cameras, strict=True)
         ]
+        # Pictures are drawn by `render`, in this process or on a cluster, and added in order.
         job, parts = _job(frames, {"size": size, "progress": False})
         with (
             progress_bar("film", progress) as advance,
@@ -149,35 +155,45 @@ def animate(
 
 @dataclass(frozen=True)
 class _FilmJob:
-    """The arguments of `render` that all pictures of a film have in common, and the Mitsuba
-    variant. It can be sent to other processes, which draw single pictures."""
+    """Draws single pictures of a film, and can be sent to other processes.
+
+    arguments: the arguments of `render` that all pictures of the film have in common.
+    variant: the Mitsuba variant.
+    """
 
     arguments: dict[str, Any]
     variant: str
 
     def frame(self, changes: dict[str, Any]) -> TaskResult:
-        """The pixels of one picture, as an array by name. changes: the arguments that differ
-        between pictures."""
+        """Draw one picture. Returns its pixels as {"shown": array}, 8-bit sRGB.
+
+        changes: the arguments of `render` that differ between pictures.
+        """
         set_variant(self.variant)
         arguments = {**self.arguments, **changes}
         return {"shown": render(arguments.pop("surfaces"), **arguments).srgb}
 
 
 def _job(
-    frames: list[dict[str, Any]], same: dict[str, Any]
+    frames: list[dict[str, Any]], shared: dict[str, Any]
 ) -> tuple[_FilmJob, list[tuple[dict[str, Any]]]]:
-    """The job with the arguments that all pictures of a film share, and for each picture a tuple
-    with its other arguments. same: further shared arguments."""
+    """Separate the arguments that all pictures of a film share from those that change. Returns the
+    job with the shared ones, and for each picture a tuple that holds its other arguments.
+
+    frames: for each picture, the arguments of `render` by name.
+    shared: further shared arguments.
+    """
     first = frames[0]
+    # Arguments are compared by identity: equal arrays or fields could be expensive to compare.
     varying = [name for name in first if any(frame[name] is not first[name] for frame in frames)]
-    same = {**same, **{name: first[name] for name in first if name not in varying}}
-    return _FilmJob(same, register().variant()), [
+    shared = {**shared, **{name: first[name] for name in first if name not in varying}}
+    return _FilmJob(shared, register().variant()), [
         ({name: frame[name] for name in varying},) for frame in frames
     ]
 
 
 def check_film_path(path: str | os.PathLike[str]) -> Path:
-    """The path of a film to write, checked.
+    """Return the path of a film to write, checked.
 
     Raises:
         ValueError: its extension is neither .gif nor .mp4.
@@ -191,20 +207,22 @@ def check_film_path(path: str | os.PathLike[str]) -> Path:
 
 
 def _value_at(value: Any, s: float) -> Any:
-    """The value of an option in the picture at the time s. Functions of s are called; all other
-    values are constant."""
+    """Return the value of an option in the picture at the time s. Functions of s are called; all
+    other values are constant."""
     return value(s) if _is_function_of_s(value) else value
 
 
 def _is_function_of_s(value: Any) -> bool:
-    """Whether an option is a function of s, the time in a film: whether it can be called with one
-    number. A function of three coordinates, by which a surface is colored, cannot."""
+    """Return whether an option is a function of s, the time in a film: whether it can be called
+    with one number. A function of three coordinates, by which a surface is colored, cannot. A class
+    is not taken for a function."""
     if not callable(value) or isinstance(value, type):
         return False
     try:
         parameters = inspect.signature(value).parameters.values()
     except ValueError:  # a function of C
         return True
+    # Keyword arguments such as **options need not be passed.
     required = [p for p in parameters if p.default is p.empty and p.kind is not p.VAR_KEYWORD]
     return len(required) <= 1
 
@@ -212,52 +230,72 @@ def _is_function_of_s(value: Any) -> bool:
 def _cameras(
     moments: list[dict[str, Any]], steps: FloatArray, orbit: float, size: tuple[int, int]
 ) -> list[Camera]:
-    """The camera of each picture, such that the surfaces of all pictures are always in view. All
-    cameras have the same box, target, distance and angle of view, unless an option sets them.
+    """Choose the camera of each picture of a film such that the surfaces of all pictures are always
+    in view. All cameras have the same box, target, distance and angle of view, unless an option
+    sets them.
 
-    moments: the arguments of each picture. steps: (n,) the time s of each. orbit: degrees from s =
-        0 to 1.
+    moments: the arguments of each picture.
+    steps: (n,) the time s of each picture.
+    orbit: degrees that the camera goes around its target from s = 0 to s = 1.
     size: (width, height) in pixels.
+
+    What is in view are the corners of all boxes that cameras have or, if none has a box, the
+    visible points of all surfaces. Each camera is first framed by itself. Then cameras that choose
+    their distance get the largest of these distances, and cameras at a given position or distance
+    get the widest angle of view.
     """
     given = [moment.get("camera") for moment in moments]
     cameras = [Camera() if camera is None else check_camera(camera) for camera in given]
     ups = [moment.get("up") for moment in moments]
-    turns = [rotation_to_z_up("z" if up is None else up) for up in ups]
+    rotations = [rotation_to_z_up("z" if up is None else up) for up in ups]
     boxes = [np.array(camera.box.bounds()) for camera in cameras if camera.box is not None]
+    # Tracing rays for visible points is needed only without boxes.
     points = np.concatenate(boxes or [_points(moments, steps)])
-    ends = np.array([points.min(axis=0), points.max(axis=0)])
+    corners = np.array([points.min(axis=0), points.max(axis=0)])
     if boxes:
-        points = np.array(np.meshgrid(*ends.T)).reshape(3, -1).T
-    box, middle = Box(*map(_as_point, ends)), _as_point(ends.mean(axis=0))
+        points = np.array(np.meshgrid(*corners.T)).reshape(3, -1).T
+    box, center = Box(*map(_as_point, corners)), _as_point(corners.mean(axis=0))
     framed = [
-        _orbited(replace(camera, box=box, target=camera.target or middle), orbit * s, turn)
-        for camera, s, turn in zip(cameras, steps.tolist(), turns, strict=True)
+        _orbited(replace(camera, box=box, target=camera.target or center), orbit * s, turn)
+        for camera, s, turn in zip(cameras, steps.tolist(), rotations, strict=True)
     ]
-    free = [camera.position is None and camera.distance is None for camera in framed]
+    chooses_distance = [camera.position is None and camera.distance is None for camera in framed]
     poses = [
         replace(camera, zoom=1.0).pose(
             points @ turn.T, size, lambda local, turn=turn: local @ turn.T
         )
-        for camera, turn in zip(framed, turns, strict=True)
+        for camera, turn in zip(framed, rotations, strict=True)
     ]
     distances = [float(np.linalg.norm(pose.origin - pose.target)) for pose in poses]
     farthest = max(
-        (length for length, is_free in zip(distances, free, strict=True) if is_free), default=1.0
+        (
+            length
+            for length, is_chosen in zip(distances, chooses_distance, strict=True)
+            if is_chosen
+        ),
+        default=1.0,
     )
     widest = max(
-        (p.fov for p, is_free in zip(poses, free, strict=True) if not is_free), default=1.0
+        (p.fov for p, is_chosen in zip(poses, chooses_distance, strict=True) if not is_chosen),
+        default=1.0,
     )
     return [
+        # The zoom is now part of the distance.
         replace(camera, distance=farthest / camera.zoom, fov=camera.fov_or_default, zoom=1.0)
-        if is_free
+        if is_chosen
         else replace(camera, fov=widest if camera.fov is None else camera.fov)
-        for camera, is_free in zip(framed, free, strict=True)
+        for camera, is_chosen in zip(framed, chooses_distance, strict=True)
     ]
 
 
 def _orbited(camera: Camera, orbit: float, upright: FloatArray) -> Camera:
-    """The camera after it has gone around its target by `orbit` degrees. upright: (3, 3) the
-    rotation that turns the direction up to z."""
+    """Return the camera after it has gone around its target by `orbit` degrees.
+
+    upright: (3, 3) the rotation that turns the direction up to z.
+
+    A camera that stands at a position is rotated about the vertical through its target; for other
+    cameras the azimuth changes.
+    """
     if camera.position is None:
         return replace(camera, azimuth=camera.azimuth_elevation[0] + orbit)
     c, s = math.cos(math.radians(orbit)), math.sin(math.radians(orbit))
@@ -268,16 +306,24 @@ def _orbited(camera: Camera, orbit: float, upright: FloatArray) -> Camera:
 
 
 def _points(moments: list[dict[str, Any]], steps: FloatArray) -> FloatArray:
-    """Points (n, 3) of the visible parts of all surfaces in a film. moments: the arguments of each
-    picture. steps: (n,) the time s of each."""
+    """Find points (n, 3) of the visible parts of all surfaces in a film.
+
+    moments: the arguments of each picture.
+    steps: (n,) the time s of each picture, for messages.
+
+    Raises:
+        ValueError: a surface is unbounded; the message names its time.
+    """
     backend = mitsuba_backend(register())
     points: list[FloatArray] = []
-    last: Any = None
+    last_settings: Any = None
     for moment, s in zip(moments, steps.tolist(), strict=True):
         settings = {name: value for name, value in moment.items() if name in _MOVING}
-        if last is not None and all(settings[name] is last[name] for name in settings):
+        if last_settings is not None and all(
+            settings[name] is last_settings[name] for name in settings
+        ):
             continue  # the same surfaces
-        last = settings
+        last_settings = settings
         try:
             points += [visible_points(surface, backend) for surface in drawn_surfaces(**settings)]
         except UnboundedSurfaceError as error:
@@ -286,15 +332,20 @@ def _points(moments: list[dict[str, Any]], steps: FloatArray) -> FloatArray:
 
 
 def _as_point(point: FloatArray) -> tuple[float, float, float]:
-    """A point (3,) as a tuple of floats."""
+    """Return a point (3,) as a tuple of floats."""
     x, y, z = (float(c) for c in point)
     return x, y, z
 
 
 @contextmanager
 def _encoder(path: Path, size: tuple[int, int], fps: float) -> Generator[Callable[[Pixels], None]]:
-    """A context whose value is a function that adds a picture (h, w, 3 or 4) to the film. The film
-    is in the file when the block ends."""
+    """Open a film for writing. The context's value is a function that adds a picture (h, w, 3 or 4)
+    to the film. The film is in the file when the block ends.
+
+    path: .gif or .mp4.
+    size: (width, height) in pixels.
+    fps: pictures a second.
+    """
     if path.suffix.lower() == ".gif":
         with _gif(path, fps) as add:
             yield add
@@ -305,7 +356,8 @@ def _encoder(path: Path, size: tuple[int, int], fps: float) -> Generator[Callabl
 
 @contextmanager
 def _gif(path: Path, fps: float) -> Generator[Callable[[Pixels], None]]:
-    """A context whose value is a function that adds a picture (h, w, 3 or 4) to a GIF file."""
+    """Open a GIF file for writing. The context's value is a function that adds a picture (h, w, 3
+    or 4). The file is written when the block ends."""
     try:
         from PIL import Image
     except ModuleNotFoundError:
@@ -315,8 +367,10 @@ def _gif(path: Path, fps: float) -> Generator[Callable[[Pixels], None]]:
     pictures: list[Any] = []
 
     def add(pixels: Pixels) -> None:
-        """Add a picture (h, w, 3 or 4) to the film."""
+        """Add a picture (h, w, 3 or 4) to the film. A pixel that is less than half covered becomes
+        transparent."""
         opaque = Image.fromarray(np.ascontiguousarray(pixels[..., :3]))
+        # 255 colors; the last entry of the palette stands for transparent pixels.
         indexed = opaque.quantize(_CLEAR, method=Image.Quantize.MEDIANCUT)
         if pixels.shape[-1] == 4:  # a GIF has no partly transparent pixels
             mask = Image.fromarray(np.where(pixels[..., 3] < 128, np.uint8(255), np.uint8(0)))
@@ -325,6 +379,8 @@ def _gif(path: Path, fps: float) -> Generator[Callable[[Pixels], None]]:
         pictures.append(indexed)
 
     yield add
+    # Milliseconds: GIF files count hundredths of a second, and players slow down what is faster
+    # than 50 pictures a second.
     duration = 10 * max(2, round(100 / fps))
     pictures[0].save(
         path, save_all=True, append_images=pictures[1:], duration=duration, loop=0, disposal=2
@@ -333,7 +389,8 @@ def _gif(path: Path, fps: float) -> Generator[Callable[[Pixels], None]]:
 
 @contextmanager
 def _mp4(path: Path, size: tuple[int, int], fps: float) -> Generator[Callable[[Pixels], None]]:
-    """A context whose value is a function that adds a picture (h, w, 3) to an MP4 file."""
+    """Open an MP4 file for writing. The context's value is a function that adds a picture (h, w,
+    3). An odd row or column at the end is left out, as H.264 stores colors for pairs of pixels."""
     try:
         import av
     except ModuleNotFoundError:
@@ -341,7 +398,6 @@ def _mp4(path: Path, size: tuple[int, int], fps: float) -> Generator[Callable[[P
             "films in .mp4 files need PyAV: pip install 'harnack[film]', or write a .gif"
         ) from None
     library = cast("Any", av)
-    # H.264 stores colors for pairs of pixels.
     if min(size) < 2:
         raise ValueError(f"a film in .mp4 has sides of at least 2 pixels, not {size}")
     with library.open(str(path), "w") as container:
@@ -350,10 +406,15 @@ def _mp4(path: Path, size: tuple[int, int], fps: float) -> Generator[Callable[[P
         stream.options = {"crf": "16"}
 
         def add(pixels: Pixels) -> None:
-            """Add a picture (h, w, 3) to the film."""
+            """Add a picture (h, w, 3) to the film.
+
+            Raises:
+                ValueError: the picture has alpha.
+            """
             if pixels.shape[-1] == 4:
                 raise ValueError("films in .mp4 have no alpha: choose another backdrop, or a .gif")
             height, width = (side - side % 2 for side in pixels.shape[:2])
+            # The size is set by the first picture, which a color bar may have widened.
             if not stream.codec_context.is_open:
                 stream.width, stream.height = width, height
             height, width = stream.height, stream.width

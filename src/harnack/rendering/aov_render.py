@@ -1,5 +1,7 @@
-"""Renders arbitrary output variables (AOVs): normals, numbers of evaluations, status of rays,
-depth, and values of another function on the surface.
+"""Renders pictures of numbers, which renderers call arbitrary output variables (AOVs): normals,
+numbers of evaluations, status of rays, depth, and values of another function on the surface. `mi`
+is the Mitsuba module, and a ray that is neither proved free nor led to a hit is called lost. A
+color scale says which color each number has.
 
 The numbers of a pixel are those of the single ray through its middle; nothing is averaged. The
 pixels of pictures show these numbers, too, except for pictures of values: at edges, the colors of
@@ -52,8 +54,9 @@ _STATUS_COLORS = {
 
 @dataclass(frozen=True)
 class AovBuffers:
-    """Numbers of the first hits of the rays through the middles of all pixels: arrays of shape (h,
-    w) unless another shape is stated.
+    """The numbers that rays found at their first hits, with one ray for each pixel, through its
+    middle. Arrays have the shape (h, w) unless another shape is stated; for parts of a picture they
+    have the shape (n,) or (n, m) instead.
 
     depth: the distance from the camera in the coordinates of the surfaces; inf without a hit; for a
         ray that ran out of steps, the distance up to which no surface lies.
@@ -64,9 +67,9 @@ class AovBuffers:
     status: a `RayStatus`; hits of Mitsuba's own shapes count as hits.
     isoline_color: (h, w, 3) sRGB color of the isoline that is hit; NaN if no isoline is hit.
     is_near_isoline: whether the edge of an isoline may pass through the pixel.
-    value: the function that colors the surface, at hits; NaN without a hit; None if there is no
-        such function.
-    period: the period of this function if it is angle-valued, else None.
+    value: at hits, the value of the function that colors the surface; NaN without a hit; None if
+        there is no such function.
+    period: the period of this function if its values are angles, else None.
     background: the sRGB color, in [0, 1], of pixels without a hit.
     """
 
@@ -83,11 +86,13 @@ class AovBuffers:
 
 @dataclass(frozen=True)
 class AovTask:
-    """The rendering of the arrays of `AovBuffers` for a sensor in a scene, by ranges of pixels.
+    """Renders a picture of numbers for a sensor in a scene, one range of pixels at a time. The
+    results are `AovBuffers`.
 
     world: the Mitsuba scene with the level sets in it.
-    placement: the map from the coordinates of the surfaces to the world. Depths are in the former.
-    function: the function, in the coordinates of the surfaces, that is evaluated at hits; None for
+    placement: the map from the coordinates of the surfaces to the world. Depths are in the
+        coordinates of the surfaces.
+    function: the function that is evaluated at hits, in the coordinates of the surfaces; None for
         none.
     background: the sRGB color, in [0, 1], of pixels without a hit.
     """
@@ -109,12 +114,13 @@ class AovTask:
         function: Field | None = None,
         background: Color = _BACKGROUND,
     ) -> AovTask:
-        """The task for a loaded Mitsuba scene. The parameters are the attributes of the class."""
+        """Return the task for a loaded Mitsuba scene. The parameters are the attributes of the
+        class."""
         return cls(mi, HybridScene.of(mi, scene), sensor, placement, function, background)
 
     @property
     def size(self) -> tuple[int, int]:
-        """Width and height in pixels."""
+        """Width and height of the picture in pixels."""
         width, height = (int(n) for n in self.sensor.film().crop_size())
         return width, height
 
@@ -125,8 +131,8 @@ class AovTask:
         return tiled_pixel_order(self.size)
 
     def render_range(self, start: int, stop: int) -> AovBuffers:
-        """The `AovBuffers`, with arrays (n,), of the pixels from `start` to `stop` in the order of
-        `order`."""
+        """Trace the pixels from `start` to `stop` in the list `order`. Returns their `AovBuffers`,
+        with arrays (n,)."""
         return self._trace_pixels(
             upload_indices(self.mi, self.order[start:stop]), self.mi.Vector2f(0.5)
         )
@@ -134,7 +140,7 @@ class AovTask:
     def look(
         self, executor: RenderExecutor | None = None, advance: Callable[[float], None] | None = None
     ) -> AovBuffers:
-        """The `AovBuffers` of all pixels.
+        """Trace all pixels. Returns their `AovBuffers`, with arrays (h, w).
 
         executor: calls `render_range` of a copy of this task, for example on a cluster; None to
             call it in this process.
@@ -151,25 +157,29 @@ class AovTask:
             if advance is not None:
                 advance((stop - start) / (width * height))
 
-        def by_rows(*column: Any) -> Any:
-            """The image (h, w, ...) of arrays (n, ...) of ranges of pixels in the order of
-            `order`."""
-            image = np.empty((height, width, *column[0].shape[1:]), column[0].dtype)
-            image.reshape(height * width, *column[0].shape[1:])[order] = np.concatenate(column)
+        def by_rows(*parts: Any) -> Any:
+            """Put the arrays (n, ...) of all ranges of pixels together, from the order of tracing
+            into the rows of the image. Returns an array (h, w, ...)."""
+            image = np.empty((height, width, *parts[0].shape[1:]), parts[0].dtype)
+            image.reshape(height * width, *parts[0].shape[1:])[order] = np.concatenate(parts)
             return image
 
         return _map_arrays(by_rows, *buffers)
 
     def render_samples(self, pixels: IntArray, offsets: FloatArray) -> AovBuffers:
-        """The `AovBuffers`, with arrays (n, m), of rays through m points in each of n pixels.
+        """Trace rays through m points in each of n pixels. Returns their `AovBuffers`, with arrays
+        (n, m).
 
         pixels: (n,) indices of the pixels, counted by rows.
         offsets: (m, 2) coordinates in [0, 1) of the points in each pixel.
         """
         mi, count = self.mi, len(offsets)
+        # All m points of the first pixel, then those of the next.
         pixel = upload_indices(mi, np.repeat(pixels, count))
-        table = np.tile(offsets, (len(pixels), 1)).T
-        positions = mi.Vector2f(*(upload_floats(mitsuba_backend(mi), array) for array in table))
+        coordinates = np.tile(offsets, (len(pixels), 1)).T
+        positions = mi.Vector2f(
+            *(upload_floats(mitsuba_backend(mi), array) for array in coordinates)
+        )
 
         def by_pixels(array: Any) -> Any:
             return array.reshape(len(pixels), count, *array.shape[1:])
@@ -177,68 +187,78 @@ class AovTask:
         return _map_arrays(by_pixels, self._trace_pixels(pixel, positions))
 
     def _trace_pixels(self, pixel: Any, offset: Any) -> AovBuffers:
-        """The `AovBuffers`, with arrays (n,), of rays through one point in each of n pixels.
+        """Trace a ray through one point in each of n pixels. Returns their `AovBuffers`, with
+        arrays (n,).
 
         pixel: (n,) indices of the pixels, counted by rows.
-        offset: the coordinates in [0, 1) of the point in its pixel.
+        offset: (2,) the coordinates in [0, 1) of the point in its pixel.
         """
         mi, count = self.mi, dr.width(pixel)
         position = film_positions(mi, pixel, offset, self.size)
         ray, _ = self.sensor.sample_ray_differential(
             self.sensor.shutter_open(), 0.5, position, mi.Point2f(0.5)
         )
-        none = dr.zeros(mi.SurfaceInteraction3f)
-        si, first = self.world.intersect(mi.Ray3f(ray), none, mi.Bool(True))
-        near, color = mi.Bool(False), mi.Vector3f(dr.nan)
+        camera = dr.zeros(mi.SurfaceInteraction3f)
+        si, first = self.world.intersect(mi.Ray3f(ray), camera, mi.Bool(True))
+        # Isolines are looked for only in pictures of values: other pictures do not show them.
+        is_near_isoline, color = mi.Bool(False), mi.Vector3f(dr.nan)
         if self.function is not None:
-            near = first.is_hit & self.world.has_line_near(si, ray, ray.d, first.t)
+            is_near_isoline = first.is_hit & self.world.has_line_near(si, ray, ray.d, first.t)
             color = self._line_color(si, first)
-        dr.eval(first, near, color)
+        dr.eval(first, is_near_isoline, color)
 
-        def numbers(values: Any) -> Any:
-            """A Dr.Jit array as a NumPy array with one row for each ray."""
+        def rows_of(values: Any) -> Any:
+            """Return a Dr.Jit array as a NumPy array with one row for each ray. A single entry
+            stands for all rays."""
             flat = to_numpy(values)
             return np.broadcast_to(flat, (count, *flat.shape[1:]))
 
-        is_hit, is_lost = numbers(first.is_hit), numbers(first.is_out_of_steps)
+        is_hit, is_lost = rows_of(first.is_hit), rows_of(first.is_out_of_steps)
         status = np.where(is_hit, int(RayStatus.HIT), int(RayStatus.MISS))
-        view = AovBuffers(
-            depth=numbers(first.t) / self.placement.scale,
-            normal=np.where(is_hit[:, None], numbers(first.normal), 0),
-            evaluations=numbers(first.evaluations).astype(np.int64),
+        buffers = AovBuffers(
+            depth=rows_of(first.t) / self.placement.scale,
+            normal=np.where(is_hit[:, None], rows_of(first.normal), 0),
+            evaluations=rows_of(first.evaluations).astype(np.int64),
             status=np.where(is_lost, int(RayStatus.OUT_OF_STEPS), status),
-            isoline_color=numbers(color),
-            is_near_isoline=numbers(near),
+            isoline_color=rows_of(color),
+            is_near_isoline=rows_of(is_near_isoline),
             background=self.background,
         )
         if self.function is None:
-            return view
+            return buffers
         value = np.full(count, np.nan, dtype=np.float32)
         if is_hit.any():
+            # The function takes coordinates of the surfaces, and hits are in the world.
             value[is_hit] = _values(
-                self.function, self.placement.apply_inverse(numbers(first.position)[is_hit])
+                self.function, self.placement.apply_inverse(rows_of(first.position)[is_hit])
             )
-        return replace(view, value=value, period=self.function.period)
+        return replace(buffers, value=value, period=self.function.period)
 
     def _line_color(self, si: Any, first: Any) -> Any:
-        """The sRGB color of the isoline that each ray hits; NaN if it hits no isoline. si, first:
-        the hit, as an interaction and as a `SurfaceHit`."""
+        """Return the sRGB color of the isoline that each ray hits; NaN if it hits no isoline.
+
+        si, first: the hit of each ray, as an interaction and as a `SurfaceHit`.
+        """
         mi = self.mi
         line_color = mi.Vector3f(dr.nan)
+        # A proxy is the Mitsuba mesh that stands for a level set; the faces on its section have a
+        # proxy of their own.
         for proxy in self.world.proxies:
-            is_there = first.is_hit & (si.shape == mi.ShapePtr(proxy))
+            is_on_proxy = first.is_hit & (si.shape == mi.ShapePtr(proxy))
             if proxy.section_proxy is not None:
-                is_there |= first.is_hit & (si.shape == mi.ShapePtr(proxy.section_proxy))
+                is_on_proxy |= first.is_hit & (si.shape == mi.ShapePtr(proxy.section_proxy))
+            # The hit tells the number of the isoline, counted from 1 for each surface.
             for number, color in enumerate(proxy.line_colors, start=1):
                 line_color = dr.select(
-                    is_there & (first.isoline_index == number), mi.Vector3f(*color), line_color
+                    is_on_proxy & (first.isoline_index == number), mi.Vector3f(*color), line_color
                 )
         return line_color
 
 
 def _map_arrays(change: Callable[..., Any], *views: AovBuffers) -> AovBuffers:
-    """The `AovBuffers` in which each array is `change(...)` of the arrays of the same name in all
-    `views`. Other entries are those of the first view."""
+    """Combine the arrays of several `AovBuffers`. Returns `AovBuffers` in which each array is
+    `change(...)` of the arrays of the same name in all `views`. Entries that are no arrays are
+    those of the first view."""
     arrays = {
         name: change(*(getattr(view, name) for view in views))
         for name, value in vars(views[0]).items()
@@ -248,21 +268,24 @@ def _map_arrays(change: Callable[..., Any], *views: AovBuffers) -> AovBuffers:
 
 
 def _values(function: Field, points: FloatArray) -> FloatArray:
-    """The function at points (n, 3); NaN outside the volume in which the function is defined."""
+    """Return the values of a function at points (n, 3), which is NaN outside the volume in which
+    the function is defined."""
     values: FloatArray = function.value(points)
+    # The volume is enlarged a little, relative to the size of the points, as hits on its boundary
+    # are rounded.
     volume = padded_domain(function, float(np.ptp(points, axis=0).max()))
     return values if volume is None else np.where(volume.contains_points(points), values, np.nan)
 
 
 def normal_picture(view: AovBuffers) -> npt.NDArray[np.uint8]:
-    """The picture (h, w, 3) whose red, green and blue are the x, y and z of the normals, from [-1,
-    1]."""
+    """Draw the normals as a picture (h, w, 3). Red, green and blue are the x, y and z of the
+    normals, with [-1, 1] mapped to [0, 1]."""
     return _of_surfaces(view, 0.5 + 0.5 * view.normal)
 
 
 def status_picture(view: AovBuffers) -> npt.NDArray[np.uint8]:
-    """The picture (h, w, 3) in which misses are dark, hits are white, and rays out of steps are
-    magenta."""
+    """Draw the status of rays as a picture (h, w, 3), in which misses are dark, hits are white, and
+    rays out of steps are magenta."""
     picture = np.zeros((*view.status.shape, 3))
     for status, color in {RayStatus.MISS: view.background, **_STATUS_COLORS}.items():
         picture[view.status == int(status)] = color
@@ -270,78 +293,86 @@ def status_picture(view: AovBuffers) -> npt.NDArray[np.uint8]:
 
 
 def depth_picture(view: AovBuffers, scale: ColorScale) -> npt.NDArray[np.uint8]:
-    """The picture (h, w, 3) of the depths of hits in the colors of a scale."""
+    """Draw the depths of hits as a picture (h, w, 3), in the colors of a scale."""
     return _of_surfaces(view, scale.colors(view.depth))
 
 
 def value_picture(view: AovBuffers, scale: ColorScale) -> npt.NDArray[np.uint8]:
-    """The picture (h, w, 3) of the values at hits in the colors of a scale; gray where a hit has no
-    value. Isolines have their own colors."""
+    """Draw the values at hits as a picture (h, w, 3), in the colors of a scale; gray where a hit
+    has no value. Isolines have their own colors."""
     value = value_of(view)
     picture = np.where(np.isnan(value)[..., None], _UNKNOWN, scale.colors(value))
     return _of_surfaces(view, np.where(np.isnan(view.isoline_color), picture, view.isoline_color))
 
 
 def evaluations_picture(view: AovBuffers, scale: ColorScale) -> npt.NDArray[np.uint8]:
-    """The picture (h, w, 3) of the numbers of evaluations in the colors of a scale; rays that miss
-    are colored, too."""
+    """Draw the numbers of evaluations as a picture (h, w, 3), in the colors of a scale. Rays that
+    miss are colored, too."""
     return _with_lost(view, scale.colors(view.evaluations.astype(np.float64)))
 
 
 def depth_scale(view: AovBuffers) -> ColorScale:
-    """The gray scale from the smallest depth that is seen, which is bright, to the largest, which
-    is dark."""
+    """Return the gray scale for depths, from the smallest that is seen, which is bright, to the
+    largest, which is dark."""
     return ColorScale(*_range(view, view.depth), "depth", gray_colormap)
 
 
 def evaluations_scale(view: AovBuffers) -> ColorScale:
-    """The color scale from zero, which is dark blue, to the 99.5th percentile, which is yellow as
-    are all larger numbers."""
+    """Return the color scale for numbers of evaluations, from zero, which is dark blue, to the
+    99.5th percentile, which is yellow, like all larger numbers."""
     top = max(float(np.percentile(view.evaluations, 99.5)), 1.0)
     return ColorScale(0.0, top, "evaluations")
 
 
 def value_scale(view: AovBuffers) -> ColorScale:
-    """The color scale from the smallest value that is seen, dark blue, to the largest, yellow.
-    Values of an angle-valued function have a circle of hues instead."""
+    """Return the color scale for values, from the smallest that is seen, dark blue, to the largest,
+    yellow. If the values are angles, it is a circle of hues instead."""
     if view.period is not None:
         return ColorScale.cyclic(view.period, "value")
     return ColorScale(*_range(view, value_of(view)), "value")
 
 
 def value_of(view: AovBuffers) -> FloatArray:
-    """The values of the function at hits. Raises ValueError if there was no function."""
+    """Return the values of the function at hits.
+
+    Raises:
+        ValueError: there was no function.
+    """
     if view.value is None:
         raise ValueError("values of no function were looked at")
     return view.value
 
 
 def _range(view: AovBuffers, numbers: FloatArray) -> tuple[float, float]:
-    """The smallest and the largest finite number at hits; (0, 1) if there is no such number."""
+    """Return the smallest and the largest finite number at hits; (0, 1) if there is no such number.
+
+    numbers: an array with an entry for each pixel of `view`.
+    """
     finite = numbers[(view.status == int(RayStatus.HIT)) & np.isfinite(numbers)]
     return (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
 
 
 def _of_surfaces(view: AovBuffers, picture: FloatArray) -> npt.NDArray[np.uint8]:
-    """The picture (h, w, 3) with the colors of `picture` at hits, magenta for rays out of steps,
-    and the background elsewhere."""
+    """Return a picture (h, w, 3) with the colors of `picture` at hits, magenta for rays out of
+    steps, and the background elsewhere."""
     is_hit = (view.status == int(RayStatus.HIT))[..., None]
     return _with_lost(view, np.where(is_hit, picture, view.background))
 
 
 def _with_lost(view: AovBuffers, picture: FloatArray) -> npt.NDArray[np.uint8]:
-    """The picture (h, w, 3) with magenta for rays out of steps."""
+    """Return the picture (h, w, 3) with magenta for rays out of steps."""
     is_lost = (view.status == int(RayStatus.OUT_OF_STEPS))[..., None]
     return to_uint8(np.where(is_lost, OUT_OF_STEPS_COLOR, picture))
 
 
 @dataclass(frozen=True)
 class AovMode:
-    """How one kind of picture is made from `AovBuffers`.
+    """How one kind of picture, such as "depth", is made from `AovBuffers`.
 
-    numbers: gives the array that `render` returns.
-    picture: gives the pixels (h, w, 3), from the buffers and the color scale.
-    scale: gives the color scale of the numbers; None for a kind of picture without a scale.
+    numbers: returns the array that `render` returns, from the buffers.
+    picture: returns the pixels (h, w, 3), from the buffers and the color scale.
+    scale: returns the color scale of the numbers, from the buffers; None for a kind of picture
+        without a scale.
     is_averaged: whether the colors, not the numbers, of several rays are averaged at edges.
     """
 
@@ -380,8 +411,8 @@ def aov_picture(
     spp: int,
     executor: RenderExecutor | None = None,
 ) -> npt.NDArray[np.uint8]:
-    """The pixels (h, w, 3) of a picture of normals, depths, values or other numbers, with a color
-    bar if requested.
+    """Draw the pixels (h, w, 3) of a picture of normals, depths, values or other numbers, with a
+    color bar if requested.
 
     show: the kind of picture, a key of `AOV_MODES`.
     viewer, view: the task, and its result for all pixels.
@@ -396,6 +427,7 @@ def aov_picture(
     if scale is None:
         return mode.picture(view, None)
     if value_range is not None:
+        # A range that is given is not cyclic, even for angles.
         colormap = viridis if scale.period is not None else scale.colors_of
         scale = ColorScale(*value_range, scale.name, colormap)
     if isinstance(bar, str):
@@ -408,7 +440,7 @@ def aov_picture(
     if not bar:
         return picture
     numbers = np.asarray(mode.numbers(view), dtype=np.float64)
-    if show != "evaluations":  # which rays that miss have, too
+    if show != "evaluations":  # rays that miss have evaluations, but none of the other numbers
         numbers = numbers[view.status == int(RayStatus.HIT)]
     scale = scale.with_exceeded(numbers[np.isfinite(numbers)])
     return add_color_bar(picture, scale, view.background)
@@ -422,10 +454,13 @@ def _antialias(
     spp: int,
     executor: RenderExecutor | None,
 ) -> None:
-    """Change `picture` (h, w, 3) in place: pixels that differ visibly from a neighbor, or through
-    which the edge of an isoline may pass, get the mean light of a grid of `spp` rays.
+    """Draw pixels at edges again, each as the mean light of a grid of rays. This changes `picture`
+    (h, w, 3) in place. A pixel is at an edge if it differs visibly from a neighbor, or if the edge
+    of an isoline may pass through it.
 
-    colors: gives the pixels of an `AovBuffers`.
+    viewer, view: the task, and its result for all pixels.
+    colors: returns the pixels of an `AovBuffers`.
+    spp: the least number of rays of a pixel.
     executor: calls methods of `viewer`; None to call them in this process.
     """
     order = tiled_pixel_order(viewer.size)

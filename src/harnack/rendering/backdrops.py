@@ -1,5 +1,6 @@
-"""The surroundings of a picture in the studio: the ground and the lights, or a color or an image
-behind the surfaces.
+"""The surroundings of a picture in the studio, the stage on which surfaces are drawn: the ground
+and the lights, or a color or an image behind the surfaces. What is seen behind the surfaces is
+called the backdrop.
 
 Ground and lights are placed relative to the camera. A color or an image takes the place of the
 studio's wall behind the surfaces.
@@ -42,22 +43,31 @@ _ENVIRONMENT_SIZE = (64, 128)
 
 
 def reflectance_of(backdrop: str) -> FloatArray:
-    """Reflectance (3,) of the ground, in linear sRGB. backdrop: "light" or "dark"."""
+    """Return the reflectance (3,) of the ground, in linear sRGB. backdrop: "light" or "dark"."""
     return np.array(GROUNDS[backdrop])
 
 
 def distant_ground_radiance(backdrop: str, azimuth: float) -> FloatArray:
-    """Radiance (3,) of the ground far from the stage, which only the environment lights. backdrop:
-    "light" or "dark". azimuth: of the camera, in degrees."""
+    """Compute the radiance (3,) of the ground far from the stage, which only the environment
+    lights.
+
+    backdrop: "light" or "dark".
+    azimuth: of the camera, in degrees.
+
+    The radiance of a diffuse ground is its reflectance times the mean of the environment over the
+    upper hemisphere, weighted by the cosine to the vertical.
+    """
     image = environment(azimuth)
     z = np.cos(math.pi * (np.arange(len(image)) + 0.5) / len(image))
-    weight = np.clip(z, 0, None) * np.sqrt(1 - z * z)  # of rows, by the cosine
+    # The weight of a row: the cosine to the vertical, times the row's solid angle.
+    weight = np.clip(z, 0, None) * np.sqrt(1 - z * z)
     mean = np.average(image.mean(axis=1), axis=0, weights=weight)
     return reflectance_of(backdrop) * mean
 
 
 def ground(mi: Any, backdrop: str) -> dict[str, Any]:
-    """A wide floor as an entry of a Mitsuba scene dictionary. backdrop: "light" or "dark"."""
+    """Return a wide floor as an entry of a Mitsuba scene dictionary. backdrop: "light" or
+    "dark"."""
     floor = mi.ScalarTransform4f().translate([0, 0, FLOOR_HEIGHT]).scale(100)
     color = {"type": "rgb", "value": list(GROUNDS[backdrop])}
     return {
@@ -70,21 +80,23 @@ def ground(mi: Any, backdrop: str) -> dict[str, Any]:
 
 
 def lights(mi: Any, azimuth: float) -> dict[str, Any]:
-    """The lights of the studio as entries of a Mitsuba scene dictionary: a large key light to the
-    left of the camera and above it, and an environment as fill light.
+    """Return the lights of the studio as entries of a Mitsuba scene dictionary: a large key light
+    to the left of the camera and above it, and an environment as fill light.
 
     azimuth: of the camera, in degrees.
 
     The environment is smooth: light paths that reach it by sampling BSDFs are less noisy than paths
-        that sample the environment. So it is not sampled as a light.
+    that sample the environment. So it is not sampled as a light.
     """
-    key = 4.9 * _direction(azimuth - 52, 55)
-    look = mi.ScalarTransform4f().look_at(origin=key.tolist(), target=[0, 0, 0.3], up=[0, 0, 1])
+    key_position = 4.9 * _direction(azimuth - 52, 55)
+    key_to_world = mi.ScalarTransform4f().look_at(
+        origin=key_position.tolist(), target=[0, 0, 0.3], up=[0, 0, 1]
+    )
     y_to_z = mi.ScalarTransform4f().rotate([1, 0, 0], 90)
     return {
         "key": {
             "type": "disk",
-            "to_world": look.scale(2.2),
+            "to_world": key_to_world.scale(2.2),
             "emitter": {"type": "area", "radiance": {"type": "rgb", "value": list(_KEY)}},
         },
         "fill": {
@@ -97,24 +109,30 @@ def lights(mi: Any, azimuth: float) -> dict[str, Any]:
 
 
 def environment(azimuth: float) -> Any:
-    """Radiance of the environment as an equirectangular image (h, w, 3) of float32 with z up.
-    azimuth: of the camera, in degrees."""
+    """Compute the radiance of the environment as an equirectangular image (h, w, 3) of float32 with
+    z up: gray at the horizon, brighter and bluer overhead, with a soft strip of light behind the
+    stage.
+
+    azimuth: of the camera, in degrees.
+    """
     height, width = _ENVIRONMENT_SIZE
     theta = math.pi * (np.arange(height) + 0.5) / height
     phi = 2 * math.pi * (np.arange(width) + 0.5) / width
     theta, phi = np.meshgrid(theta, phi, indexing="ij")
     # Mitsuba's direction at these angles, after its y axis has been turned up to z.
     x, y, z = np.sin(phi) * np.sin(theta), np.cos(phi) * np.sin(theta), np.cos(theta)
-    d = np.stack([x, y, z], axis=-1)
-    rise = np.clip(z, 0, 1)[..., None] ** 0.7
-    image = _HORIZON + (_ZENITH - _HORIZON) * rise
-    strip = _direction(azimuth + 125, 28)
-    image += _STRIP * np.exp((d @ strip - 1) / 0.14)[..., None]
+    direction = np.stack([x, y, z], axis=-1)
+    height_fraction = np.clip(z, 0, 1)[..., None] ** 0.7
+    image = _HORIZON + (_ZENITH - _HORIZON) * height_fraction
+    strip_direction = _direction(azimuth + 125, 28)
+    # The strip's light falls off with the angle to its middle.
+    image += _STRIP * np.exp((direction @ strip_direction - 1) / 0.14)[..., None]
     return image.astype(np.float32)
 
 
 def _direction(azimuth: float, elevation: float) -> FloatArray:
-    """The unit vector (3,) of an azimuth, from the x axis, and an elevation, both in degrees."""
+    """Return the unit vector (3,) with an azimuth, counted from the x axis, and an elevation, both
+    in degrees."""
     a, e = math.radians(azimuth), math.radians(elevation)
     return np.array([math.cos(e) * math.cos(a), math.cos(e) * math.sin(a), math.sin(e)])
 
@@ -131,15 +149,15 @@ IMAGE_FILES = (".png", ".jpg", ".jpeg", ".exr")
 
 @dataclass(frozen=True)
 class GroundBackdrop:
-    """The studio's floor, which turns into a wall far away. name: "light" or "dark"."""
+    """A backdrop: the studio's floor, which turns into a wall far away. name: "light" or "dark"."""
 
     name: str
 
 
 @dataclass(frozen=True)
 class GradientBackdrop:
-    """A color at the bottom of a picture that changes gradually to another one at its top, both in
-    sRGB. They may be the same."""
+    """A backdrop: a color at the bottom of a picture that changes gradually to another one at its
+    top, both in sRGB. They may be the same."""
 
     bottom: Color
     top: Color
@@ -147,8 +165,8 @@ class GradientBackdrop:
 
 @dataclass(frozen=True, eq=False)
 class ImageBackdrop:
-    """An image behind the surfaces, scaled to fill the picture. pixels: (h, w, 3) linear sRGB,
-    first row at the top."""
+    """A backdrop: an image behind the surfaces, scaled to fill the picture. pixels: (h, w, 3)
+    linear sRGB, first row at the top."""
 
     pixels: FloatImage
 
@@ -158,8 +176,10 @@ Backdrop = GroundBackdrop | GradientBackdrop | ImageBackdrop | None
 
 
 def parse_backdrop(backdrop: Any) -> Backdrop:
-    """The backdrop that the value of an option describes: a name, a color, two colors, an image, or
-    its file.
+    """Return the backdrop that the value of an option describes.
+
+    backdrop: a name of `BACKDROPS`, a color, two colors (bottom, top), an image (h, w, 3), or the
+        file of an image.
 
     Raises:
         TypeError, ValueError: it is no backdrop; the message lists the backdrops.
@@ -187,8 +207,11 @@ _BACKDROP_HELP = (
 
 
 def _backdrop_from_text(name: str) -> Backdrop:
-    """The backdrop of a text: its name, the name of an image file, or a color. Raises ValueError
-    for other texts."""
+    """Return the backdrop that a text describes: its name, the name of an image file, or a color.
+
+    Raises:
+        ValueError: the text is none of these.
+    """
     if name in GROUNDS:
         return GroundBackdrop(name)
     if name == TRANSPARENT:
@@ -206,8 +229,13 @@ def _backdrop_from_text(name: str) -> Backdrop:
 
 
 def _pixels(image: npt.NDArray[Any]) -> FloatImage:
-    """An array (h, w, 3) as an image in linear sRGB. Bytes are sRGB and are converted; other
-    numbers are linear."""
+    """Return an array (h, w, 3) as an image in linear sRGB. Bytes are sRGB and are converted;
+    floats are linear light.
+
+    Raises:
+        ValueError: another shape, or numbers that are negative or not finite.
+        TypeError: not numbers, or integers above 1 that are no bytes.
+    """
     wrong = f"a backdrop's image must have the shape (h, w, 3), not {image.shape}"
     if image.ndim != 3 or image.shape[-1] != 3 or not image.size:
         raise ValueError(wrong)
@@ -224,7 +252,11 @@ def _pixels(image: npt.NDArray[Any]) -> FloatImage:
 
 
 def _read(path: Path) -> FloatImage:
-    """The image (h, w, 3) in a file, in linear sRGB, laid over white if it is transparent."""
+    """Read the image (h, w, 3) in a file, in linear sRGB, laid over white if it is transparent.
+
+    Raises:
+        FileFormatError: it is no image of a known type, or cannot be read.
+    """
     if path.suffix.lower() not in IMAGE_FILES:
         raise FileLocation(path).error(f"a backdrop is an image: {', '.join(IMAGE_FILES)}")
     data = read_bytes(path)
@@ -237,7 +269,7 @@ def _read(path: Path) -> FloatImage:
 
 
 def _read_bitmap(data: bytes) -> FloatImage:
-    """The image (h, w, 3) of the bytes of a PNG or JPEG file, in linear sRGB."""
+    """Decode the bytes of a PNG or JPEG file. Returns the image (h, w, 3) in linear sRGB."""
     mi = load_mitsuba()
     stream = mi.MemoryStream()
     stream.write(data)
@@ -246,7 +278,7 @@ def _read_bitmap(data: bytes) -> FloatImage:
 
 
 def _decoded(bitmap: Any) -> FloatImage:
-    """The pixels (h, w, 3) of one of Mitsuba's bitmaps, in linear sRGB, laid over white if it is
+    """Return the pixels (h, w, 3) of a Mitsuba bitmap, in linear sRGB, laid over white if it is
     transparent."""
     mi = load_mitsuba()
     has_alpha = bitmap.has_alpha()
@@ -258,8 +290,11 @@ def _decoded(bitmap: Any) -> FloatImage:
 
 
 def _read_exr(data: bytes) -> FloatImage:
-    """The image (h, w, 3) of the bytes of an EXR file, laid over white if it is transparent. It is
-    read by the package OpenEXR: Mitsuba's reader never returns if Dr.Jit has one thread."""
+    """Decode the bytes of an EXR file. Returns the image (h, w, 3), laid over white if it is
+    transparent.
+
+    It is read by the package OpenEXR: Mitsuba's reader never returns if Dr.Jit has one thread.
+    """
     import OpenEXR  # here, since most pictures do without
 
     library = cast("Any", OpenEXR)
@@ -276,6 +311,7 @@ def _read_exr(data: bytes) -> FloatImage:
         pixels = rgba[..., :3] + (1 - np.clip(rgba[..., 3:], 0, 1))
     elif "RGB" in channels:
         pixels = channels["RGB"]
-    else:  # KeyError: no colors at all
+    else:  # luminance alone; KeyError if there are no colors at all
         pixels = np.repeat(channels["Y"][..., None], 3, axis=-1)
+    # The backdrop's light must be finite and not negative.
     return np.maximum(np.nan_to_num(pixels, posinf=1e6), 0)

@@ -1,4 +1,5 @@
-"""`Camera`, which chooses from where a picture is seen such that the surfaces fill it."""
+"""`Camera`, which chooses from where a picture is seen such that the surfaces fill it, and
+`CameraPose`, the position and orientation that result. In the world z is up."""
 
 from __future__ import annotations
 
@@ -97,8 +98,8 @@ class Camera:
         )
 
     def axes(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Unit vectors (3,) in the world that point to the right, up, and back to the camera, for a
-        camera with azimuth and elevation."""
+        """Return unit vectors (3,) in the world that point to the right, up, and back to the
+        camera, for a camera with azimuth and elevation."""
         a, e = map(math.radians, self.azimuth_elevation)
         back = np.array([math.cos(e) * math.cos(a), math.cos(e) * math.sin(a), math.sin(e)])
         right = np.array([-math.sin(a), math.cos(a), 0.0])
@@ -107,8 +108,9 @@ class Camera:
     def frame_points(
         self, points: FloatArray, size: tuple[int, int]
     ) -> tuple[FloatArray, FloatArray]:
-        """Origin (3,) and target (3,) of the camera that keeps all points (n, 3) within a picture
-        of `size` (width, height), as close as its angle of view allows.
+        """Place the camera such that it keeps all points (n, 3) within a picture of `size` (width,
+        height), as close as its angle of view allows. Returns its origin (3,) and a target (3,) in
+        front of it.
 
         Let x, y, z be the coordinates of a point to the right, up, and back to the camera. A point
         is in the picture if |x - cx| <= slope (h - z), and likewise for y; (cx, cy, h) are the
@@ -119,14 +121,17 @@ class Camera:
         right, up, back = self.axes()
         x, y, z = points @ right, points @ up, points @ back
         origin = np.zeros(3)
-        distance = -math.inf
+        height = -math.inf
         for coordinate, axis, slope in zip((x, y), (right, up), self._slopes(size), strict=True):
-            # |across - c| <= slope (distance - z) for all points.
-            high, low = (coordinate + slope * z).max(), (coordinate - slope * z).min()
-            origin = origin + (high + low) / 2 * axis
-            distance = max(distance, (high - low) / (2 * slope))
+            # |coordinate - c| <= slope (height - z) for all points.
+            largest_sum, smallest_difference = (
+                (coordinate + slope * z).max(),
+                (coordinate - slope * z).min(),
+            )
+            origin = origin + (largest_sum + smallest_difference) / 2 * axis
+            height = max(height, (largest_sum - smallest_difference) / (2 * slope))
         middle = float(z.max() + z.min()) / 2
-        origin = origin + (middle + (distance - middle) / self.zoom) * back
+        origin = origin + (middle + (height - middle) / self.zoom) * back
         return origin, origin - back
 
     def pose(
@@ -135,12 +140,17 @@ class Camera:
         size: tuple[int, int],
         to_world: Callable[[FloatArray], FloatArray],
     ) -> CameraPose:
-        """The camera as a `CameraPose` in the world, placed such that it sees points (n, 3) of the
-        world.
+        """Place the camera in the world such that it sees the given points. Returns its
+        `CameraPose`.
 
+        points: (n, 3) points of the world that are to be in the picture.
         size: (width, height) of the picture in pixels.
         to_world: maps points (n, 3) from the coordinates of the surfaces to the world, with one
             scale for all axes.
+
+        A camera that has neither position, target nor distance is placed by `frame_points`.
+        Otherwise it looks at its target, by default the middle of the points. Then, of distance and
+        angle of view, the one that is not given is chosen such that the points fill the picture.
         """
         if self.position is None and self.target is None and self.distance is None:
             origin, target = self.frame_points(points, size)
@@ -152,45 +162,52 @@ class Camera:
         if self.position is not None:
             origin = to_world(np.array([self.position]))[0]
             to_camera = origin - target
-            length = float(np.linalg.norm(to_camera))
-            if not length > 0:
+            distance = float(np.linalg.norm(to_camera))
+            if not distance > 0:
                 raise ValueError(
                     f"position {self.position} is in the middle of what is seen: say where to look "
                     "with a target (x, y, z)"
                 )
             azimuth = math.degrees(math.atan2(to_camera[1], to_camera[0]))
-            elevation = math.degrees(math.asin(max(-1.0, min(1.0, to_camera[2] / length))))
-            oriented = replace(self, azimuth=azimuth, elevation=elevation, position=None)
+            elevation = math.degrees(math.asin(max(-1.0, min(1.0, to_camera[2] / distance))))
+            oriented_camera = replace(self, azimuth=azimuth, elevation=elevation, position=None)
         else:
-            oriented, length = self, None
+            oriented_camera, distance = self, None
             if self.distance is not None:
+                # One unit of the surfaces' coordinates, as a vector of the world.
                 unit = np.diff(to_world(np.array([[0.0, 0, 0], [1, 0, 0]])), axis=0)
-                length = self.distance * float(np.linalg.norm(unit))
-        right, up, back = oriented.axes()
+                distance = self.distance * float(np.linalg.norm(unit))
+        # The coordinates of the points relative to the target, along the axes of the camera.
+        right, up, back = oriented_camera.axes()
         relative = points - target
         x, y, z = np.abs(relative @ right), np.abs(relative @ up), relative @ back
         fov = self.fov_or_default
-        if length is None:  # |across| <= slope (length - z) for all points
+        # Choose the distance: |x| <= slope (distance - z) for all points, and likewise for y.
+        if distance is None:
             slopes = self._slopes(size)
-            length = max(float((a / s + z).max()) for a, s in zip((x, y), slopes, strict=True))
-            length = max(length / self.zoom, 1e-3)
+            distance = max(float((a / s + z).max()) for a, s in zip((x, y), slopes, strict=True))
+            distance = max(distance / self.zoom, 1e-3)
         elif self.fov is None:
-            fov = self._fov_to_frame(np.array([x, y]), length - z, size)
+            fov = self._fov_to_frame(np.array([x, y]), distance - z, size)
         else:
+            # The distance and the angle of view are given: zoom narrows the angle.
             fov = 2 * math.degrees(math.atan(math.tan(math.radians(fov) / 2) / self.zoom))
-        return CameraPose(target + length * back, target, up, fov, oriented.azimuth_elevation[0])
+        return CameraPose(
+            target + distance * back, target, up, fov, oriented_camera.azimuth_elevation[0]
+        )
 
     def _fov_to_frame(self, across: FloatArray, depth: FloatArray, size: tuple[int, int]) -> float:
-        """The angle of view, in degrees, of a camera at a given position that sees n points; at
-        most 120, and 60 if a point lies beside or behind the camera.
+        """Choose the angle of view, in degrees, of a camera at a given position such that n points
+        fill the picture. It is at most 120, and 60 if a point lies beside or behind the camera.
 
-        across: (2, n) horizontal and vertical distances of the points from the axis of the view.
+        across: (2, n) absolute horizontal and vertical distances of the points from the axis of the
+            view.
         depth: (n,) their distances from the camera along this axis.
         """
         if depth.min() <= 0:
             return _FOV_INSIDE
-        shape = max(size) / np.array(size)
-        slopes = (across / depth).max(axis=1) * shape
+        side_ratios = max(size) / np.array(size)
+        slopes = (across / depth).max(axis=1) * side_ratios
         fov = 2 * math.degrees(
             math.atan(max(float(slopes.max()), 1e-4) / _FILL_FRACTION / self.zoom)
         )
@@ -203,14 +220,14 @@ class Camera:
         return _DEFAULT_FOV if self.fov is None else self.fov
 
     def _slopes(self, size: tuple[int, int]) -> tuple[float, float]:
-        """Tangents of half the angle of view, to the right and upwards, of the part of the picture
-        that surfaces are to fill (86 percent)."""
+        """Return the tangents of half the angle of view, to the right and upwards, of the part of
+        the picture that surfaces are to fill (86 percent)."""
         slope = math.tan(math.radians(self.fov_or_default) / 2) * _FILL_FRACTION / max(size)
         return slope * size[0], slope * size[1]
 
 
 def _is_number(value: Any) -> bool:
-    """Whether `float` accepts a value."""
+    """Return whether `float` accepts a value."""
     try:
         float(value)
     except (TypeError, ValueError):

@@ -39,8 +39,8 @@ UP_AXES: tuple[str, ...] = (*_UPRIGHT, *("-" + axis for axis in _UPRIGHT))
 
 
 def rotation_to_z_up(up: Any) -> FloatArray:
-    """The rotation matrix (3, 3) that turns an axis ("x", "-y", ...) or a vector to z. For y it
-    turns z, the front of a glTF model, to -y, where the studio's camera stands.
+    """Return the rotation matrix (3, 3) that turns an axis ("x", "-y", ...) or a vector to z. For y
+    it also turns z, the front of a glTF model, to -y, where the studio's camera stands.
 
     Raises:
         TypeError, ValueError: `up` is neither an axis nor a vector that is not zero.
@@ -52,30 +52,33 @@ def rotation_to_z_up(up: Any) -> FloatArray:
                 f"{did_you_mean(up, UP_AXES)}"
             )
         axis = up.removeprefix("-")
-        flip = np.diag([1.0, -1.0, -1.0]) if up.startswith("-") else np.eye(3)
-        return flip @ _UPRIGHT[axis]
+        half_turn = np.diag([1.0, -1.0, -1.0]) if up.startswith("-") else np.eye(3)
+        return half_turn @ _UPRIGHT[axis]
     vector = np.array(as_point(up, "up"))
     if not vector.any():
         raise ValueError("up must be a vector that is not zero")
+    # Dividing by the largest coordinate first avoids overflow in the norm.
     vector, z = vector / float(np.abs(vector).max()), np.array([0.0, 0.0, 1.0])
     vector = vector / float(np.linalg.norm(vector))
     # The shortest rotation is about the axis at right angles to both.
     normal = np.cross(vector, z)
     if float(np.linalg.norm(normal)) < 1e-12:
         return rotation_to_z_up("z" if vector[2] > 0 else "-z")
-    u = normal / np.linalg.norm(normal)
-    before, after = (
-        np.stack([u, np.cross(vector, u), vector]),
-        np.stack([u, np.cross(z, u), z]),
+    axis_of_rotation = normal / np.linalg.norm(normal)
+    # Two orthonormal frames with the same axis u, one that contains the vector and one that
+    # contains z. The rotation maps one frame to the other.
+    vector_frame, z_frame = (
+        np.stack([axis_of_rotation, np.cross(vector, axis_of_rotation), vector]),
+        np.stack([axis_of_rotation, np.cross(z, axis_of_rotation), z]),
     )
-    return after.T @ before
+    return z_frame.T @ vector_frame
 
 
 class UnboundedSurfaceError(ValueError):
-    """The error for a surface that cannot be drawn, as no box around it is known.
+    """The error for a surface that cannot be drawn, as no bounded box that contains it is known.
 
     reason: the text of the error.
-    bounded_level: a level of the same field whose surface has a box; None if no such level is
+    bounded_level: a level of the same field whose surface has such a box; None if no such level is
         known.
     """
 
@@ -93,7 +96,7 @@ class NothingVisibleError(ValueError):
 
 
 def bounding_box(surface: TracedSurface) -> FloatArray:
-    """Lower and upper corner (2, 3) of a box that holds the surface.
+    """Return the lower and upper corner (2, 3) of a box that contains the surface.
 
     Raises:
         UnboundedSurfaceError: no finite box is known.
@@ -106,11 +109,12 @@ def bounding_box(surface: TracedSurface) -> FloatArray:
 
 
 def _unbounded(surface: TracedSurface) -> UnboundedSurfaceError:
-    """The error for a surface without a box, with a hint on the reason and on another level."""
+    """Return the error for a surface without a box. Its message explains the reason, if it is one
+    of two known ones, and suggests the field's default level if that one has a box."""
     field = surface.field
     levels = surface.level_values
-    shown = ", ".join(f"{level:g}" for level in levels)
-    reason = f"the surface of level {shown} reaches to infinity, as far as is known"
+    levels_text = ", ".join(f"{level:g}" for level in levels)
+    reason = f"the surface of level {levels_text} reaches to infinity, as far as is known"
     if field.period is not None and any(
         abs(math.remainder(level, field.period)) < 1e-6 * field.period for level in levels
     ):
@@ -120,9 +124,9 @@ def _unbounded(surface: TracedSurface) -> UnboundedSurfaceError:
         )
     if isinstance(field, Solid):
         reason += " (a solid made of a field does not end at that field's domain)"
-    usual = field.default_level
-    is_other = usual not in levels and field.extent((usual,)) is not None
-    return UnboundedSurfaceError(reason, usual if is_other else None)
+    default = field.default_level
+    is_other = default not in levels and field.extent((default,)) is not None
+    return UnboundedSurfaceError(reason, default if is_other else None)
 
 
 # The number of rays along a side of the grid on each of the six faces: of the box, and of the box
@@ -140,21 +144,23 @@ _VISIBLE_POINTS_CACHE: FieldCache[FloatArray] = FieldCache()
 
 
 def visible_points(surface: TracedSurface, backend: Backend) -> FloatArray:
-    """Points (n, 3) of the surface that are seen from the six sides of the box in which it lies.
+    """Find points (n, 3) of the surface that are seen from the six sides of the box in which it
+    lies. Returns them in the surface's coordinates.
 
     They are cached for a field that is prepared once for all calls, as long as the other settings
     are the same. So if only the camera moves, no ray is traced for the framing.
 
     Raises:
-        ValueError: the surface has no bounds, or a size that single precision cannot draw; a
-            NothingVisibleError if no ray hits it.
+        UnboundedSurfaceError: no box around the surface is known.
+        ValueError: the surface has a size that single precision cannot draw.
+        NothingVisibleError: no ray hits it.
     """
     ends = bounding_box(surface)
     check_drawable_size(ends)
     prepared = surface.evaluator(backend)
 
     def find() -> FloatArray:
-        """The points, found anew."""
+        """Find the points anew, without the cache."""
         return _find_visible_points(surface, backend, ends)
 
     if prepared is surface.field:  # it may have changed in place
@@ -183,9 +189,14 @@ def check_drawable_size(ends: FloatArray) -> None:
 
 
 def check_offset(points: FloatArray) -> None:
-    """Warn if surfaces are so far from the origin for their size that rounding of coordinates blurs
-    them, as surfaces of maps are; raise ValueError if rounding loses them. points: (n, 3) points of
-    the surfaces."""
+    """Check that surfaces are not too far from the origin for their size, as surfaces of maps are.
+    Warn if rounding of coordinates blurs their edges.
+
+    points: (n, 3) points of the surfaces.
+
+    Raises:
+        ValueError: rounding loses the surfaces.
+    """
     size, distance = float(np.ptp(points, axis=0).max()), float(np.abs(points).max())
     if distance <= _MAX_SHARP_OFFSET * size or size == 0:
         return
@@ -200,9 +211,12 @@ def check_offset(points: FloatArray) -> None:
 
 
 def _find_visible_points(surface: TracedSurface, backend: Backend, ends: FloatArray) -> FloatArray:
-    """Points (n, 3) at which rays hit the surface: rays of a coarse grid on the box with corners
-    `ends` (2, 3), and of a finer grid on the box of these hits. Raises NothingVisibleError if there
-    is none."""
+    """Trace rays to find points (n, 3) of a surface: rays of a coarse grid on the box with corners
+    `ends` (2, 3), and of a finer grid on the box of the points that were hit.
+
+    Raises:
+        NothingVisibleError: no ray hits the surface.
+    """
     lower, upper = ends
     points = _probe(surface, backend, lower, upper, _GRID)
     if len(points) == 0:
@@ -217,6 +231,7 @@ def _find_visible_points(surface: TracedSurface, backend: Backend, ends: FloatAr
             f"{_point(ends[0])} to {_point(ends[1])} meets it; "
             "try another level or clip"
         )
+    # The surface may go on for more than half the distance between rays of the coarse grid.
     margin = 0.6 * float((ends[1] - ends[0]).max()) / _GRID
     lower = np.maximum(points.min(axis=0) - margin, ends[0])
     upper = np.minimum(points.max(axis=0) + margin, ends[1])
@@ -225,19 +240,19 @@ def _find_visible_points(surface: TracedSurface, backend: Backend, ends: FloatAr
 
 
 def _point(corner: FloatArray) -> str:
-    """A point (3,) as text, for messages."""
+    """Write a point (3,) as text, for messages."""
     return "(" + ", ".join(f"{c:.4g}" for c in corner) + ")"
 
 
 def _probe(
     surface: TracedSurface, backend: Backend, lower: FloatArray, upper: FloatArray, grid: int
 ) -> FloatArray:
-    """The first hits (n, 3) of parallel rays with a surface: grid x grid rays from each of the six
-    sides of the box from `lower` to `upper`."""
+    """Trace parallel rays to a surface: grid x grid rays from each of the six sides of the box from
+    `lower` to `upper`. Returns their first hits (n, 3)."""
     size = float(np.linalg.norm(upper - lower))
     # A twentieth of the distance between rays; smaller tolerances are slow for sums over trees.
-    coarse = replace(surface, tolerance=HitTolerance(1e-3 * size))
-    placed = PlacedSurface.of(coarse, Placement.identity(), backend)
+    rough_surface = replace(surface, tolerance=HitTolerance(1e-3 * size))
+    placed = PlacedSurface.of(rough_surface, Placement.identity(), backend)
     o, d, length = _rays(lower, upper, 0.01 * size, grid)
     hits = placed.intersect(
         to_vector3(backend, o),
@@ -253,26 +268,30 @@ def _probe(
 def _rays(
     lower: FloatArray, upper: FloatArray, gap: float, grid: int
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Origins (n, 3), directions (n, 3) and lengths (n,) of parallel rays through a box, from each
-    of its six sides. Rays that follow each other are close together.
+    """Return origins (n, 3), directions (n, 3) and lengths (n,) of parallel rays through a box,
+    from each of its six sides. Rays that follow each other are close together.
 
     lower, upper: (3,) corners of the box.
     gap: the distance from the box at which rays begin and end.
     grid: the number of rays along a side of the grid, a multiple of 8.
     """
-    rows = grid // _TILE
+    tile_count = grid // _TILE
     # Axes: tiles down and across, and rays down and across a tile.
-    index = np.indices((rows, rows, _TILE, _TILE), dtype=np.float64)
+    # u and v are the coordinates of the rays on a side of the box, in (0, 1), tile by tile of 8 x 8
+    # rays.
+    index = np.indices((tile_count, tile_count, _TILE, _TILE), dtype=np.float64)
     u = ((_TILE * index[1] + index[3] + 0.5) / grid).ravel()
     v = ((_TILE * index[0] + index[2] + 0.5) / grid).ravel()
     origins: list[FloatArray] = []
     directions: list[FloatArray] = []
     lengths: list[FloatArray] = []
     for axis in range(3):
-        across = [(axis + 1) % 3, (axis + 2) % 3]
+        other_axes = [(axis + 1) % 3, (axis + 2) % 3]
         for sign in (1.0, -1.0):
             o = np.empty((len(u), 3))
-            o[:, across] = lower[across] + np.column_stack([u, v]) * (upper - lower)[across]
+            o[:, other_axes] = (
+                lower[other_axes] + np.column_stack([u, v]) * (upper - lower)[other_axes]
+            )
             o[:, axis] = lower[axis] - gap if sign > 0 else upper[axis] + gap
             origins.append(o)
             directions.append(np.tile(sign * np.eye(3)[axis], (len(u), 1)))

@@ -1,5 +1,5 @@
-"""Pictures as arrays and as files: the array that `render` returns, tone mapping, and PNG and EXR
-files."""
+"""Pictures as arrays and as files: the array that `render` returns, tone mapping from linear light
+to 8-bit sRGB, and PNG and EXR files."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _ROWS_AT_ONCE = 64
 
 
 def check_picture_path(path: Any) -> Path:
-    """The path of a picture to write, checked.
+    """Return the path of a picture to write, checked.
 
     Raises:
         TypeError: it is no path.
@@ -43,17 +43,18 @@ def check_picture_path(path: Any) -> Path:
 
 
 def tone_map(image: FloatImage, behind: FloatImage | None = None) -> npt.NDArray[np.uint8]:
-    """The 8-bit sRGB of an image of linear sRGB radiance: bright light is compressed smoothly, then
-    the transfer function of sRGB is applied.
+    """Convert an image of linear sRGB radiance to 8-bit sRGB. Bright light is compressed smoothly,
+    then the transfer function of sRGB is applied.
 
     image: (h, w) or (h, w, 3); or (h, w, 4) with alpha, by which the other channels are multiplied.
         In the result they are divided by alpha, as PNG files need it.
-    behind: (h, w, 3) linear sRGB to lay the image over, which is not compressed; then the result
-        has three channels.
+    behind: (h, w, 3) linear sRGB to lay the image over, which is not compressed. It needs an image
+        with alpha, and then the result has three channels.
     """
     shape = image.shape if behind is None else behind.shape
     shown = np.empty(shape, dtype=np.uint8)
-    for start in range(0, len(image), _ROWS_AT_ONCE):  # float64 is many times the picture
+    # By groups of rows, as the picture in float64 would take much memory.
+    for start in range(0, len(image), _ROWS_AT_ONCE):
         rows = slice(start, start + _ROWS_AT_ONCE)
         shown[rows] = _tone_mapped(
             image[rows].astype(np.float64), None if behind is None else behind[rows]
@@ -62,10 +63,11 @@ def tone_map(image: FloatImage, behind: FloatImage | None = None) -> npt.NDArray
 
 
 def _tone_mapped(image: FloatArray, behind: FloatImage | None) -> npt.NDArray[np.uint8]:
-    """`tone_map` of some rows of an image."""
+    """Apply `tone_map` to some rows of an image."""
     if image.ndim < 3 or image.shape[-1] < 4:
         return to_uint8(linear_to_srgb(_apply_shoulder(image)))
     alpha = np.clip(image[..., 3:], 0.0, 1.0)
+    # Light is compressed as it is without alpha: it is divided by alpha first.
     light = _apply_shoulder(image[..., :3] / np.where(alpha > 0, alpha, 1.0))
     if behind is not None:
         return to_uint8(linear_to_srgb(alpha * light + (1.0 - alpha) * behind))
@@ -73,24 +75,24 @@ def _tone_mapped(image: FloatArray, behind: FloatImage | None) -> npt.NDArray[np
 
 
 def _apply_shoulder(radiance: FloatArray) -> FloatArray:
-    """Radiance with values above 0.8 compressed smoothly to at most 1."""
+    """Compress radiance above 0.8 smoothly to at most 1. Negative numbers and NaN become 0."""
     x = np.clip(np.nan_to_num(radiance, nan=0.0, posinf=1e6), 0.0, None)
     room = 1.0 - SHOULDER_START
     return np.where(x <= SHOULDER_START, x, 1.0 - room * np.exp(-(x - SHOULDER_START) / room))
 
 
 def linear_to_srgb(x: FloatArray) -> FloatArray:
-    """Linear sRGB in [0, 1] as sRGB, by its transfer function."""
+    """Convert linear sRGB in [0, 1] to sRGB, by its transfer function."""
     return np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
 
 
 def srgb_to_linear(x: FloatArray) -> FloatArray:
-    """sRGB in [0, 1] as linear sRGB: the inverse of `linear_to_srgb`."""
+    """Convert sRGB in [0, 1] to linear sRGB: the inverse of `linear_to_srgb`."""
     return np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4)
 
 
 def to_uint8(image: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.uint8]:
-    """Numbers in [0, 1] as bytes."""
+    """Convert numbers in [0, 1] to bytes. Other numbers are clipped."""
     return (np.clip(image, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
 
 
@@ -99,7 +101,8 @@ def write_image(
 ) -> None:
     """Write an image to a file. The file is replaced only if all of it was written.
 
-    path: .exr or .png. image: (h, w), (h, w, 3) or (h, w, 4), floats for EXR and bytes for PNG.
+    path: .exr or .png.
+    image: (h, w), (h, w, 3) or (h, w, 4), floats for EXR and bytes for PNG.
     names: of the channels of an EXR file, if they are other than Y, RGB or RGBA.
     """
     with write_atomically(path) as partial:
@@ -110,7 +113,7 @@ def write_image(
 
 
 def png_bytes(mi: Any, image: npt.NDArray[np.uint8]) -> bytes:
-    """A PNG file of bytes (h, w), (h, w, 3) or (h, w, 4) with alpha."""
+    """Return the bytes of a PNG file. image: bytes (h, w), (h, w, 3) or (h, w, 4) with alpha."""
     # Through memory: Mitsuba's own files do not say why they cannot be written.
     packed = mi.MemoryStream()
     mi.Bitmap(np.ascontiguousarray(image)).write(packed, mi.Bitmap.FileFormat.PNG)
@@ -118,9 +121,12 @@ def png_bytes(mi: Any, image: npt.NDArray[np.uint8]) -> bytes:
 
 
 def exr_bytes(image: npt.NDArray[np.floating[Any]], names: Sequence[str] | None = None) -> bytes:
-    """The bytes of an OpenEXR file of an image: (h, w) with channel Y, (h, w, 3) with R, G and B,
-    (h, w, 4) with A as well, by which the others are multiplied; or with channels of the given
-    names."""
+    """Return the bytes of an OpenEXR file of an image.
+
+    image: (h, w) has the channel Y; (h, w, 3) has R, G and B; (h, w, 4) has A as well, by which the
+        others are multiplied. With `names`, (h, w, n).
+    names: the names of the n channels, if they are others.
+    """
     # Mitsuba writes them too, but waits for ever where Dr.Jit has one thread (OpenEXR 2.5 hands
     # its work to a pool without threads).
     import OpenEXR  # here, since most pictures do without
@@ -149,8 +155,8 @@ class Picture(np.ndarray[Any, np.dtype[Any]]):
 
     @classmethod
     def of(cls, numbers: npt.NDArray[Any], pixels: npt.NDArray[np.uint8]) -> Picture:
-        """A picture with these numbers, which notebooks show by the pixels (h, w), (h, w, 3) or (h,
-        w, 4)."""
+        """Return a picture with these numbers, which notebooks show by the pixels (h, w), (h, w, 3)
+        or (h, w, 4)."""
         picture = numbers.view(cls)
         picture._srgb = pixels
         return picture
@@ -185,7 +191,7 @@ class Picture(np.ndarray[Any, np.dtype[Any]]):
         return self._srgb
 
     def to_pil(self) -> Any:
-        """The picture as an image of the package Pillow.
+        """Return the picture as an image of the package Pillow.
 
         Raises:
             ModuleNotFoundError: Pillow is not installed.
@@ -199,11 +205,11 @@ class Picture(np.ndarray[Any, np.dtype[Any]]):
         return Image.fromarray(self.srgb)
 
     def _repr_png_(self) -> bytes | None:
-        """The bytes of a PNG file, which notebooks show; None for an array that was computed from a
-        picture."""
+        """Return the bytes of a PNG file, which notebooks show; None for an array that was computed
+        from a picture."""
         return None if self._srgb is None else png_bytes(load_mitsuba(), self._srgb)
 
 
 def _restored(numbers: npt.NDArray[Any], shown: npt.NDArray[np.uint8] | None) -> Picture:
-    """A picture from its pickled numbers and pixels."""
+    """Return the picture that was pickled as its numbers and its pixels."""
     return numbers.view(Picture) if shown is None else Picture.of(numbers, shown)

@@ -1,12 +1,16 @@
 """A path tracer that sees both Mitsuba's shapes and level sets, and the sampler of its light paths.
+A light path begins at the camera, and each of its vertices is a hit of a ray with a surface, where
+the next direction is sampled. `mi` is the Mitsuba module, `si` is a surface interaction of
+Mitsuba's at a vertex, and a lane is the entry of one path in Dr.Jit arrays. A path whose ray runs
+out of steps, neither proved free nor led to a hit, is called lost.
 
 All light paths advance together, one vertex at a time, and the rays of a vertex are traced from a
-    queue: a lane that has finished a ray takes the next one. In a recorded loop over whole paths,
-    each packet of lanes would wait for its slowest ray at each vertex, and three quarters of the
-    lanes were idle. Paths that have ended are left out after each vertex. Fields whose samples take
-    less time than taking a ray from the queue are traced without it (`Field.is_cheap`). The queue
-    only changes the order of lanes, not the results. Intermediate results are written to memory, so
-    that kernels do not depend on the number of paths that are left.
+queue: a lane that has finished a ray takes the next one. In a recorded loop over whole paths, each
+packet of lanes would wait for its slowest ray at each vertex, and three quarters of the lanes were
+idle. Paths that have ended are left out after each vertex. Fields whose samples take less time than
+taking a ray from the queue are traced without it (`Field.is_cheap`). The queue only changes the
+order of lanes, not the results. Intermediate results are written to memory, so that kernels do not
+depend on the number of paths that are left.
 
 Paths change lanes. So the random numbers of a path are computed from its pixel and index, and not
 from a state of its lane.
@@ -40,18 +44,19 @@ _HASH = (0x21F0AAAD, 0xD35A2D97)
 
 @dataclass
 class SobolSampler:
-    """Points of Sobol' for light paths, scrambled after Owen, computed from their index alone.
+    """Computes the random numbers of light paths: Sobol' points, scrambled after Owen. Each number
+    depends only on the path's pixel, the index of the path in this pixel, and the dimension, which
+    counts how many numbers the path has used.
 
-    A sampler with a state would have to be carried along with each path. This one needs only the
-    path's pixel, the index of its sample and the dimension. So paths can be moved to other lanes,
-    and a path has the same numbers whatever else is drawn. Each pair of dimensions consists of the
-    first two dimensions of Sobol' in an order of its own (Burley 2020, Practical Hash-based Owen
-    Scrambling). This stratifies the samples of a pixel as well as multi-jittering does, for any
-    number of samples.
+    A sampler with a state would have to be carried along with each path. This one has none. So
+    paths can be moved to other lanes, and a path has the same numbers whatever else is drawn. Each
+    pair of dimensions consists of the first two dimensions of Sobol' in an order of its own (Burley
+    2020, Practical Hash-based Owen Scrambling). This stratifies the samples of a pixel as well as
+    multi-jittering does, for any number of samples.
 
     Methods are called as those of Mitsuba's samplers. Each call takes the next dimension.
 
-    pixel, index: UInt32, for each path its pixel, and the index of its sample in the pixel.
+    pixel, index: UInt32, for each path its pixel, and the index of the path in the pixel.
     seed: UInt32; another seed gives other points.
     dimension: UInt32, the dimension that the next call takes.
     """
@@ -63,36 +68,48 @@ class SobolSampler:
     dimension: Any
 
     def at_vertex(self, depth: Any, rows: Any) -> SobolSampler:
-        """The sampler of a subset of the paths at the vertex `depth`, counted from 0. rows: the
-        indices of these paths."""
+        """Return the sampler for some of the paths at one of their vertices. Each vertex has its
+        own eight dimensions, after those of the camera.
+
+        depth: the number of the vertex, counted from 0.
+        rows: the indices of the paths among all paths of this sampler.
+        """
         uint = self.mi.UInt32
         pixel, index = dr.gather(uint, self.pixel, rows), dr.gather(uint, self.index, rows)
         return SobolSampler(self.mi, pixel, index, self.seed, _CAMERA + _VERTEX * uint(depth))
 
     def next_2d(self, active: Any = True) -> Any:
-        """The next random point in [0, 1)^2 of each path."""
+        """Return the next random point in [0, 1)^2 of each path. `active` is accepted for Mitsuba's
+        interface, and ignored."""
         del active
         uint, mi = self.mi.UInt32, self.mi
         key = _hashed(uint, self.pixel + _hashed(uint, self.dimension + _hashed(uint, self.seed)))
         self.dimension = self.dimension + 1
-        shuffled = _owen(uint, self.index, key)
-        x, y = dr.brev(shuffled), shuffled
+        # Scrambling the index visits the points of each pixel and dimension in another order.
+        shuffled_index = _owen(uint, self.index, key)
+        # The first dimension of Sobol' is the index with its bits in reverse order. The second one,
+        # y, multiplies the index by Pascal's triangle modulo 2, with its bits in reverse order too.
+        x, y = dr.brev(shuffled_index), shuffled_index
         for mask, shift in _PASCAL:
             y = y ^ ((y & uint(mask)) >> shift)
-        pair = (
+        scrambled_bits = (
             _owen(uint, x, _hashed(uint, key + 1)),
             _owen(uint, dr.brev(y), _hashed(uint, key + 2)),
         )
+        # Rounding could give 1.
         largest = 1 - dr.epsilon(mi.Float)
-        return mi.Point2f(*(dr.minimum(mi.Float(bits) * 2.0**-32, largest) for bits in pair))
+        return mi.Point2f(
+            *(dr.minimum(mi.Float(bits) * 2.0**-32, largest) for bits in scrambled_bits)
+        )
 
     def next_1d(self, active: Any = True) -> Any:
-        """The next random number in [0, 1) of each path."""
+        """Return the next random number in [0, 1) of each path. `active` is ignored."""
         return self.next_2d(active).x
 
 
 def _hashed(uint: Any, x: Any) -> Any:
-    """A hash of 32-bit integers (Wellons 2018). uint: the array type."""
+    """Return a hash of 32-bit integers x (Wellons 2018). uint: the array type of unsigned
+    integers."""
     x = uint(x)
     for multiplier, shift in zip(_HASH, (16, 15), strict=True):
         x = (x ^ (x >> shift)) * uint(multiplier)
@@ -100,8 +117,13 @@ def _hashed(uint: Any, x: Any) -> Any:
 
 
 def _owen(uint: Any, x: Any, seed: Any) -> Any:
-    """Owen's scrambling of 32-bit integers: whether a bit is flipped depends on the bits above it
-    and on the seed. uint: the array type."""
+    """Apply Owen's scrambling to 32-bit integers x: whether a bit is flipped depends only on the
+    bits above it and on the seed.
+
+    uint: the array type of unsigned integers.
+
+    Multiplication carries from low bits to high ones, so it is done with the bits in reverse order.
+    """
     x = dr.brev(x) + seed
     for multiplier in _OWEN:
         x ^= x * uint(multiplier)
@@ -118,8 +140,9 @@ _UNLIMITED = 2**32 - 1
 
 @dataclass(frozen=True)
 class _Vertex:
-    """The last vertex of each path: its position (3,) and normal (3,), the shape on which it lies,
-    and whether there is one (before the first vertex there is none)."""
+    """The last vertex of each path, at which its next ray begins: the position (3,) and normal (3,)
+    of the surface, the shape on which it lies, and whether there is one. A path that comes from the
+    camera has no vertex yet."""
 
     position: Any
     normal: Any
@@ -128,18 +151,19 @@ class _Vertex:
 
     @classmethod
     def none(cls, mi: Any) -> _Vertex:
-        """The vertex of paths that have none yet, as they come from the camera; it is not valid."""
+        """Return the vertex of paths that have none yet, as they come from the camera. It is not
+        valid."""
         zero = dr.zeros(mi.SurfaceInteraction3f)
         return cls(zero.p, zero.n, zero.shape, mi.Bool(False))
 
     @classmethod
     def of(cls, si: Any) -> _Vertex:
-        """The vertex at a surface interaction of Mitsuba's."""
+        """Return the vertex at a surface interaction of Mitsuba's."""
         return cls(si.p, si.n, si.shape, si.is_valid())
 
     def interaction(self, mi: Any) -> Any:
-        """The vertex as a surface interaction of Mitsuba's, which has only position, normal and
-        shape."""
+        """Return the vertex as a surface interaction of Mitsuba's, which has only position, normal
+        and shape. Its t is infinite if there is no vertex, which makes it invalid."""
         si = dr.zeros(mi.SurfaceInteraction3f)
         si.p, si.n, si.shape = self.position, self.normal, self.shape
         si.t = dr.select(self.is_valid, mi.Float(0), dr.inf)
@@ -148,7 +172,7 @@ class _Vertex:
 
 @dataclass(frozen=True)
 class _PathState:
-    """The state of light paths between two vertices.
+    """The state of light paths on the ray between two vertices, with one entry for each path.
 
     number: the index of the path among all paths.
     ray: from the last vertex to the next one.
@@ -156,10 +180,11 @@ class _PathState:
     eta: the product of the relative refractive indices so far. It keeps Russian roulette from
         ending paths in glass.
     previous: the last vertex.
-    pdf, delta: the probability density with which the last vertex sampled the ray, and whether it
-        could sample no other direction. They give the weight of a light that the ray finds.
-    is_diffused, was_diffused: whether a rough surface has scattered the path up to the last vertex,
-        and up to the vertex before that.
+    pdf: the probability density with which the last vertex sampled the ray.
+    delta: whether the last vertex could sample no other direction, like a mirror. Both give the
+        weight of a light that the ray finds.
+    is_diffused: whether a rough surface has scattered the path at or before the last vertex.
+    was_diffused: the same, without the last vertex.
     """
 
     number: Any
@@ -175,10 +200,12 @@ class _PathState:
 
 @dataclass(frozen=True)
 class _LightConnection:
-    """The light that comes from an emitter to a vertex and is scattered there along the path, if
-    nothing lies on the ray to the emitter.
+    """The light of an emitter that a vertex would scatter along the path to the camera, if nothing
+    lies between the vertex and the emitter. One entry for each path.
 
-    ray: from the vertex to a point of the emitter. active: whether there is such light.
+    ray: from the vertex to a sampled point of the emitter.
+    light: the light that reaches the camera this way.
+    active: whether there is such light.
     """
 
     ray: Any
@@ -188,19 +215,26 @@ class _LightConnection:
 
 @dataclass
 class DenoisingFeatures:
-    """What the denoiser needs of the first hits of paths: albedo, in (0, 1), and unit normal. Both
-    are 0 for paths that hit nothing."""
+    """The albedo, in (0, 1], and the unit normal at the first hit of each path, which the denoiser
+    needs. Both are 0 for paths that hit nothing."""
 
     albedo: Any
     normal: Any
 
     def record(self, mi: Any, si: Any, numbers: Any, active: Mask) -> None:
-        """Store the albedo and normal at surface interactions `si`, at the indices `numbers` of
-        their paths."""
-        bsdf, straight = si.bsdf(), mi.SurfaceInteraction3f(si)
-        straight.wi = mi.Vector3f(0, 0, dr.mulsign(mi.Float(1), si.wi.z))
-        albedo = bsdf.eval_diffuse_reflectance(straight, active)
-        # Mirrors may give more than 1 straight on: their hue stays. Clear matter counts as white.
+        """Store the albedo and the normal of some paths.
+
+        si: the first hits of these paths, as surface interactions.
+        numbers: the indices of these paths among all paths.
+        active: mask of the entries to store.
+
+        The albedo is the diffuse reflectance for light that arrives along the normal. Shapes
+        without a smooth BSDF, such as clear glass, count as white.
+        """
+        bsdf, along_normal = si.bsdf(), mi.SurfaceInteraction3f(si)
+        along_normal.wi = mi.Vector3f(0, 0, dr.mulsign(mi.Float(1), si.wi.z))
+        albedo = bsdf.eval_diffuse_reflectance(along_normal, active)
+        # Mirrors may give more than 1 straight on: they are darkened, and keep their hue.
         albedo = albedo / dr.maximum(1, dr.max(albedo))
         albedo = dr.select(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth), albedo, 1)
         dr.scatter(self.albedo, mi.Spectrum(albedo), numbers, active)
@@ -209,10 +243,10 @@ class DenoisingFeatures:
 
 @dataclass
 class PathResults:
-    """The results of light paths, with one entry for each path.
+    """What light paths bring back, with one entry for each path.
 
     light: the radiance that reaches the camera.
-    valid: whether the path hits a surface.
+    valid: whether the path hits a surface, or is lost at its first ray.
     lost: whether one of its rays ran out of steps.
     features: albedo and normal at the first hit, if requested; else None.
     """
@@ -224,7 +258,8 @@ class PathResults:
 
 
 class PathTracer:
-    """Path tracing with multiple importance sampling of lights and BSDFs (Veach 1997).
+    """Path tracing with multiple importance sampling of lights and BSDFs (Veach 1997). A path ends
+    after `max_depth` edges, by Russian roulette, or where it hits nothing.
 
     max_depth: the length of the longest path in edges, -1 for no limit.
     rr_depth: the vertex, counted from 1, at which Russian roulette begins.
@@ -261,16 +296,18 @@ class PathTracer:
         )
 
     def with_depth(self, max_depth: int) -> PathTracer:
-        """The same path tracer with another length of the longest path in edges, -1 for no
+        """Return the same path tracer with another length of the longest path, in edges; -1 for no
         limit."""
         return PathTracer(self.mi, max_depth, self.rr_depth, self.hide_emitters, self.clamp)
 
     def trace(
         self, scene: Any, sampler: SobolSampler, ray: Any, active: Mask, features: bool = False
     ) -> PathResults:
-        """Trace the light paths that begin with the given camera rays, one for each lane of the
-        sampler, and return their `PathResults`.
+        """Trace light paths that begin with the given camera rays, one for each path of the
+        sampler. Returns their `PathResults`.
 
+        scene: the Mitsuba scene, with level sets in it.
+        active: mask of the paths to trace.
         features: whether albedo and normal at first hits are stored, too.
 
         All paths advance together, vertex by vertex. Paths that have ended are left out, and each
@@ -297,16 +334,17 @@ class PathTracer:
             is_diffused=mi.Bool(False),
             was_diffused=mi.Bool(False),
         )
+        # Give every entry its full width, so that single paths can be picked.
         paths = broadcast_copy(paths, width, mi.UInt32)
         dr.make_opaque(results.light, results.valid, results.lost)
         goes_on, depth = mi.Bool(active) & dr.full(mi.Bool, True, width), 0
         while True:
-            rows, count = active_lanes(goes_on)
-            if not count:
+            remaining, remaining_count = active_lanes(goes_on)
+            if not remaining_count:
                 return results
-            paths = gather_record(paths, rows)
-            # `rows` lists a single path twice; the second entry is not active.
-            active = dr.arange(mi.UInt32, len(rows)) < dr.opaque(mi.UInt32, count)
+            paths = gather_record(paths, remaining)
+            # `remaining` lists a single path twice; the second entry is not active.
+            active = dr.arange(mi.UInt32, len(remaining)) < dr.opaque(mi.UInt32, remaining_count)
             # No number is a literal, so that all vertices run the same kernels.
             dr.make_opaque(active, *array_leaves(paths))
             paths, goes_on = self._vertex(world, paths, active, sampler, depth, results)
@@ -316,41 +354,51 @@ class PathTracer:
         self, world: HybridScene, paths: _PathState, exist: Mask, sampler: SobolSampler, depth: int,
         results: PathResults,
     ) -> tuple[_PathState, Mask]:  # fmt: skip
-        """Find the next vertex of paths, add its light to `results`, and sample the next direction.
-        Returns the state of the paths behind the vertex, and the mask of paths that go on.
+        """Advance paths by one vertex: trace their rays to it, add its light to `results`, and
+        sample the next direction. Returns the state of the paths behind the vertex, and the mask of
+        paths that go on.
 
+        world: the scene that is traced.
         exist: mask of lanes that hold a path.
+        sampler: the random numbers of all paths.
         depth: the number of the vertex, counted from 0.
+        results: receives the light and the first hits, at the indices of the paths.
+
+        Light is added in two ways, weighted such that none counts twice: what the surface at the
+        vertex emits, and what a sampled point of an emitter sends to the vertex (`_connection`). A
+        ray out of steps adds magenta.
         """
         mi, vertex = self.mi, dr.opaque(self.mi.UInt32, depth)
         previous = paths.previous.interaction(mi)
-        hidden = (vertex == 0) if self.hide_emitters else None
-        si, hit = world.intersect(paths.ray, previous, exist, hidden)
-        numbers = sampler.at_vertex(vertex, paths.number)
-        remaining = transmittance(mi, world.proxies, previous, si, paths.ray.d)
-        paths = replace(paths, throughput=paths.throughput * remaining)
-        shows = exist & ~hit.is_out_of_steps & (vertex < self._deepest)
-        if hidden is not None:
-            shows &= ~hidden
-        light = self._emitted(world.scene, paths, si, shows)
+        sees_no_emitter = (vertex == 0) if self.hide_emitters else None
+        si, hit = world.intersect(paths.ray, previous, exist, sees_no_emitter)
+        vertex_sampler = sampler.at_vertex(vertex, paths.number)
+        # Glass between the last vertex and this one absorbs light.
+        transmitted = transmittance(mi, world.proxies, previous, si, paths.ray.d)
+        paths = replace(paths, throughput=paths.throughput * transmitted)
+        counts_emission = exist & ~hit.is_out_of_steps & (vertex < self._deepest)
+        if sees_no_emitter is not None:
+            counts_emission &= ~sees_no_emitter
+        light = self._emitted(world.scene, paths, si, counts_emission)
         lost_light = paths.throughput * mi.Spectrum(self.lost_color.eval(si, hit.is_out_of_steps))
         light += dr.select(hit.is_out_of_steps, lost_light, 0)
+        # The path may only go on if it is not at its last vertex.
         active = si.is_valid() & (vertex + 1 < self._deepest)
         bsdf = si.bsdf()
-        connection = self._connection(world, paths, si, hit.ray_offset, numbers, active)
+        connection = self._connection(world, paths, si, hit.ray_offset, vertex_sampler, active)
 
         sample, weight = bsdf.sample(
-            mi.BSDFContext(), si, numbers.next_1d(), numbers.next_2d(), active
+            mi.BSDFContext(), si, vertex_sampler.next_1d(), vertex_sampler.next_2d(), active
         )
         delta = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
         throughput = paths.throughput * weight
         eta = paths.eta * sample.eta
-        brightest = dr.max(throughput)
-        active &= brightest > 0
+        largest_throughput = dr.max(throughput)
+        active &= largest_throughput > 0
         # Russian roulette, without the factor eta^-2 that radiance takes on in glass.
-        survival = dr.minimum(brightest * eta * eta, 0.95)
+        survival = dr.minimum(largest_throughput * eta * eta, 0.95)
         in_roulette = vertex + 1 >= self._first_roulette
-        active &= ~in_roulette | (numbers.next_1d() < survival)
+        active &= ~in_roulette | (vertex_sampler.next_1d() < survival)
         next_paths = _PathState(
             number=paths.number,
             ray=spawn_ray(mi, si, hit.ray_offset, si.to_world(sample.wo)),
@@ -362,6 +410,7 @@ class PathTracer:
             is_diffused=paths.is_diffused | ~delta,
             was_diffused=paths.is_diffused,
         )
+        # Write the results: paths of this vertex are scattered to their indices.
         is_first = (vertex == 0) & (si.is_valid() | hit.is_out_of_steps)
         dr.scatter(results.valid, mi.Bool(True), paths.number, is_first)
         dr.scatter(results.lost, mi.Bool(True), paths.number, hit.is_out_of_steps)
@@ -378,20 +427,26 @@ class PathTracer:
         return next_paths, active
 
     def _emitted(self, scene: Any, paths: _PathState, si: Any, active: Mask) -> Any:
-        """The light that the surface at a vertex emits along the path. If a ray has hit nothing, it
-        is the light of the environment.
+        """Return the light that the surface at a vertex emits along the path, weighted against
+        sampling this light from the last vertex. For a ray that has hit nothing it is the light of
+        the environment.
 
+        paths: the rays that led to the vertex.
         si: the interaction at the vertex.
+        active: mask of vertices whose light counts; it is 0 elsewhere.
         """
         mi, previous = self.mi, paths.previous.interaction(self.mi)
         direction = mi.DirectionSample3f(scene, si, previous)
+        # A mirror cannot be sampled by choosing a point of a light: the density is 0 and the weight
+        # 1.
         emitter_pdf = scene.pdf_emitter_direction(previous, direction, active & ~paths.delta)
         weight = _power_heuristic(paths.pdf, emitter_pdf)
         light = paths.throughput * weight * direction.emitter.eval(si, active)
         return dr.select(active, self._clamped(light, paths.was_diffused), 0)
 
     def _clamped(self, light: Any, indirect: Mask) -> Any:
-        """The light; on lanes of `indirect` it is dimmed such that no channel exceeds `clamp`."""
+        """Return the light; on lanes of the mask `indirect` it is dimmed such that no channel
+        exceeds `clamp`."""
         if self.clamp == math.inf:
             return light
         excess = dr.max(light) / self._brightest
@@ -403,55 +458,65 @@ class PathTracer:
         paths: _PathState,
         si: Any,
         clearance: Real,
-        numbers: SobolSampler,
+        vertex_sampler: SobolSampler,
         active: Mask,
     ) -> _LightConnection:
-        """The light from a sampled point of an emitter that each vertex scatters along its path,
-        and the ray to that point, which has to be free.
+        """Sample a point of an emitter for each vertex. Returns the light from there that the
+        vertex scatters along its path, weighted against finding the emitter by the BSDF, and the
+        ray to the point. The light counts only if this ray is free, which is not tested here.
 
         si: the interaction at the vertex.
         clearance: the distance from the surface at which a ray has to start.
-        numbers: the sampler.
+        vertex_sampler: the random numbers of the paths at this vertex.
+        active: mask of vertices to connect. Of these, only those with a BSDF that scatters into a
+            range of directions are connected.
         """
         mi, bsdf = self.mi, si.bsdf()
         active = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-        light, weight = world.scene.sample_emitter_direction(si, numbers.next_2d(), False, active)
+        light, weight = world.scene.sample_emitter_direction(
+            si, vertex_sampler.next_2d(), False, active
+        )
         active &= light.pdf > 0
         scattered, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(light.d), active)
         active &= dr.max(scattered) > 0
-        fraction = dr.select(light.delta, 1, _power_heuristic(light.pdf, pdf))
-        sent = self._clamped(paths.throughput * scattered * weight * fraction, paths.is_diffused)
+        mis_weight = dr.select(light.delta, 1, _power_heuristic(light.pdf, pdf))
+        sent = self._clamped(paths.throughput * scattered * weight * mis_weight, paths.is_diffused)
         return _LightConnection(spawn_ray_to(mi, si, clearance, light.p), sent, active)
 
 
 def _power_heuristic(a: Real, b: Real) -> Real:
-    """The weight a^2/(a^2 + b^2) of a sample with probability density a, if another technique gives
-    it with density b: Veach's power heuristic. It is 0 if it is not finite."""
+    """Return the weight a^2/(a^2 + b^2) of a sample with probability density a, if another
+    technique finds it with density b: Veach's power heuristic. It is 0 if it is not finite."""
     a, b = a * a, b * b
     weight = a / (a + b)
     return dr.select(dr.isfinite(weight), weight, 0)
 
 
 def _sobol_from(mi: Any, sampler: Any) -> SobolSampler:
-    """A `SobolSampler` with a seed from one of Mitsuba's samplers, whose lanes are the samples of
-    pixel after pixel."""
+    """Turn one of Mitsuba's samplers into a `SobolSampler`. Its seed is taken from Mitsuba's
+    sampler, whose lanes are the samples of one pixel after the other."""
     width, spp = sampler.wavefront_size(), max(int(sampler.sample_count()), 1)
     lane = dr.arange(mi.UInt32, width)
     seed = mi.UInt32(dr.gather(mi.Float, sampler.next_1d(), mi.UInt32(0)) * 2.0**24)
-    samples = dr.opaque(mi.UInt32, spp)
-    return SobolSampler(mi, lane // samples, lane % samples, seed, dr.opaque(mi.UInt32, 0))
+    opaque_spp = dr.opaque(mi.UInt32, spp)
+    return SobolSampler(mi, lane // opaque_spp, lane % opaque_spp, seed, dr.opaque(mi.UInt32, 0))
 
 
 @functools.cache
 def integrator_class(variant: str) -> Any:
-    """The class of the plug-in `harnack_path` for a Mitsuba variant, as Mitsuba's base classes
-    differ from variant to variant."""
+    """Return the class of the Mitsuba plug-in `harnack_path`. There is one class for each variant
+    of Mitsuba, as Mitsuba's base classes differ.
+
+    Raises:
+        RuntimeError: `variant` is not the one that is set now.
+    """
     mi = load_mitsuba()
     if mi.variant() != variant:
         raise RuntimeError(f"the variant changed from {variant} to {mi.variant()}")
 
     class HarnackPath(mi.SamplingIntegrator):
-        """Mitsuba's interface to `PathTracer`. Its properties are the arguments of `PathTracer`."""
+        """Lets Mitsuba call the `PathTracer`. The plug-in's properties are the arguments of
+        `PathTracer`."""
 
         def __init__(self, props: Any) -> None:
             mi.SamplingIntegrator.__init__(self, props)
@@ -467,15 +532,16 @@ def integrator_class(variant: str) -> Any:
         def sample(
             self, scene: Any, sampler: Any, ray: Any, medium: Any = None, active: Mask = True
         ) -> tuple[Any, Mask, list[Any]]:
-            """The light of camera rays, whether they hit a surface, and no further channels, as
-            Mitsuba asks for them."""
+            """Return what Mitsuba's interface asks for: the light of camera rays, whether they hit
+            a surface, and no further channels. `medium` is ignored. Lost paths are counted."""
             del medium
             results = self.tracer.trace(scene, _sobol_from(mi, sampler), ray, active)
             self.lost = self.lost + dr.count(results.lost)
             return results.light, results.valid, []
 
         def take_lost(self) -> int:
-            """The number of paths that ran out of steps since the last call of this method."""
+            """Return the number of paths that ran out of steps since the last call of this
+            method."""
             count = int(self.lost[0])
             self.lost = mi.UInt32(0)
             return count

@@ -1,4 +1,5 @@
-"""Isolines: lines of constant width on a surface, where another function g takes given values.
+"""Isolines: lines of constant width on a surface, where another function g takes given values, its
+levels.
 
 A point of the surface belongs to a line if its distance from the curve {g = level} on the surface
 is less than width/2. To first order this distance is |g - level| / |grad_T g|, where grad_T g is
@@ -48,12 +49,15 @@ _PADDING = 1e-5
 
 
 def as_field(function: Any, name: str = "color_by") -> Field:
-    """A function on space as a `Field`. function: a field, which is returned; or what
-    `harnack.expression` takes, a Python function of three coordinates or a text such as "z". name:
-    of the argument, for messages.
+    """Return a function on space as a `Field`.
+
+    function: a field, which is returned; or what `harnack.expression` takes, a Python function of
+        three coordinates or a text such as "z".
+    name: of the argument, for messages.
 
     Raises:
-        TypeError, ValueError: another argument, or a field with patches.
+        TypeError, ValueError: another argument, or a field that has a function of its own for each
+            part of space.
     """
     if isinstance(function, str):
         try:
@@ -76,8 +80,8 @@ def as_field(function: Any, name: str = "color_by") -> Field:
 
 
 def padded_domain(function: Field, size: float) -> Volume | None:
-    """The volume in which a function is defined, with a margin for rounding; None if that is all of
-    space.
+    """Return the volume in which a function is defined, with a margin for rounding; None if that is
+    all of space.
 
     size: the length of the surface on which the function is evaluated; the margin is 1e-5 of it.
     """
@@ -106,14 +110,14 @@ class Isolines:
         hk.render(field, "b.png", isolines=[hk.Isolines(other, [0, 1], color="white"), ...])
 
     function: the function: "x", "y" or "z", which gives contour lines of height; a `Field`; or a
-        Python function of x, y and z as `harnack.expression` takes it. Its coordinates are those of
-        the surface, wherever that is placed. There are no lines outside the `domain` of a field,
-        unless the field is defined everywhere (`is_global`).
-    levels: the value, or several, at which there are lines. For an angle-valued field they are
-        taken modulo its period.
+        Python function of x, y and z as `harnack.expression` takes it. Its coordinates are the
+        coordinates of the surface, wherever the surface is placed. There are no lines outside the
+        `domain` of a field, unless the field is defined everywhere (`is_global`).
+    levels: the value, or several, at which there are lines. If the values of the field are angles,
+        levels are taken modulo its period.
     interval: in place of levels: there are lines at all whole multiples of this number. It must
-        divide the period of an angle-valued field. Such a field has 12 lines if neither levels nor
-        interval is given.
+        divide the period of a field whose values are angles. Such a field has 12 lines if neither
+        levels nor interval is given.
     width: of the lines, along the surface, in the unit of its coordinates; by default 0.4 percent
         of the diagonal of the surface's box.
     color: a name of CSS, "#rrggbb", or three numbers of sRGB.
@@ -148,24 +152,31 @@ class Isolines:
         self._exact_interval()
 
     def _exact_interval(self) -> float | None:
-        """The difference of neighboring levels; None if the levels are listed. For a periodic
-        function it is exactly a fraction of the period. Raises ValueError if the interval does not
-        divide the period."""
+        """Return the difference of neighboring levels; None if the levels are listed. For a
+        periodic function it is exactly a fraction of the period.
+
+        Raises:
+            ValueError: the interval does not divide the period.
+        """
         period = self.function_field.period
         if self.levels is not None or period is None:
             return self.interval
-        count = _DEFAULT_LINE_COUNT if self.interval is None else round(period / self.interval)
-        if self.interval is not None and abs(count * self.interval - period) > 1e-4 * period:
+        line_count = _DEFAULT_LINE_COUNT if self.interval is None else round(period / self.interval)
+        if self.interval is not None and abs(line_count * self.interval - period) > 1e-4 * period:
             raise ValueError(
                 f"the function has the period {period:.6g}, and an interval of {self.interval:g} "
                 "does not divide it: lines would end where it is passed. "
                 "Give period / n, or levels"
             )
-        return period / count
+        return period / line_count
 
     def prepare(self, backend: Backend, size: float) -> PreparedIsolines:
-        """The isolines on a backend. size: the diagonal of the surface's box, 0.4 percent of which
-        is the default width of a line."""
+        """Return the isolines with their numbers uploaded to a backend (the device that traces
+        rays).
+
+        size: the diagonal of the surface's box, 0.4 percent of which is the default width of a
+            line.
+        """
         width = _DEFAULT_WIDTH * size if self.width is None else self.width
         step, period = self._exact_interval(), self.function_field.period
         volume = padded_domain(self.function_field, size)
@@ -180,23 +191,28 @@ class Isolines:
 
 
 def _table(levels: tuple[float, ...], period: float | None) -> FloatArray:
-    """A table of 2^k - 1 numbers in ascending order: the levels, then inf as filler. The level
-    nearest to a value is next to the place of the value in this order.
+    """Return a table of 2^k - 1 numbers in ascending order: the levels, then inf as filler.
+    `PreparedIsolines` searches it for the level nearest to a value.
 
-    period: of an angle-valued function, whose levels are reduced to [0, period). A copy of the last
-        level minus the period precedes them, and a copy of the first level plus the period follows
-        them. None for other functions.
+    period: of a function whose values are angles, else None. The levels of such a function are
+        reduced to [0, period). A copy of the last level minus the period precedes them, and a copy
+        of the first level plus the period follows them. So both neighbors of every value in [0,
+        period) are in the table.
     """
     ordered = np.unique(np.array(levels) if period is None else np.mod(levels, period))
     if period is not None:
         ordered = np.array([ordered[-1] - period, *ordered, ordered[0] + period])
-    entries = max(_MIN_TABLE_LENGTH, 2 ** len(ordered).bit_length()) - 1
-    return np.concatenate([ordered, np.full(entries - len(ordered), np.inf)])
+    # Kernels depend on the length, so short tables all have the same one.
+    table_length = max(_MIN_TABLE_LENGTH, 2 ** len(ordered).bit_length()) - 1
+    return np.concatenate([ordered, np.full(table_length - len(ordered), np.inf)])
 
 
 def _numbers(levels: Any) -> tuple[float, ...]:
-    """Levels, one number or several, as a tuple of finite floats; TypeError or ValueError for
-    anything else."""
+    """Return levels, one number or several, as a tuple of finite floats.
+
+    Raises:
+        TypeError, ValueError: anything else.
+    """
     try:
         numbers = np.atleast_1d(np.asarray("none" if isinstance(levels, str) else levels, float))
     except (TypeError, ValueError):
@@ -207,8 +223,8 @@ def _numbers(levels: Any) -> tuple[float, ...]:
 
 
 def parse_isolines(isolines: Any) -> tuple[Isolines, ...]:
-    """The value of the option `isolines`, None or an `Isolines` or a list of them, as a tuple of
-    `Isolines`.
+    """Return the value of the option `isolines` as a tuple of `Isolines`. The value is None, an
+    `Isolines`, or a list of them.
 
     Raises:
         TypeError: anything else.
@@ -228,15 +244,16 @@ def parse_isolines(isolines: Any) -> tuple[Isolines, ...]:
 
 @dataclass(frozen=True)
 class PreparedIsolines:
-    """Isolines on a backend. All of their numbers are kernel parameters, so other numbers compile
-    no other kernel.
+    """Isolines whose numbers are uploaded to a backend (the device that traces rays). The lines are
+    on a surface, where another function g takes given values, its levels. All numbers are kernel
+    parameters, so other numbers compile no other kernel.
 
     function: the function g.
     volume: the volume in which g is defined; None for all of space.
     half_width: half the width of a line, a length.
     spacing: if the lines are at all whole multiples of a number, this number; else None.
-    levels: if the lines are at listed levels, the table of `_table`; else None.
-    period: of an angle-valued g, else None.
+    levels: if the lines are at listed levels, the sorted table of `_table`; else None.
+    period: the period of g if its values are angles, else None.
     """
 
     function: Field
@@ -247,38 +264,48 @@ class PreparedIsolines:
     period: Real | None
 
     def contains(self, p: Vec3, normal: Vec3) -> Mask:
-        """Mask of points p (3,) of a surface that are on a line. normal: (3,) the surface's unit
-        normals."""
-        gap, along = self._gap_and_gradient(p, normal)
-        return gap < self.half_width * norm(along)
+        """Return the mask of points p (3,) of a surface that are on a line. normal: (3,) the
+        surface's unit normals there."""
+        distance_in_value, tangential_gradient = self._gap_and_gradient(p, normal)
+        return distance_in_value < self.half_width * norm(tangential_gradient)
 
     def edge_is_near(self, p: Vec3, normal: Vec3, across: Vec3, down: Vec3) -> Mask:
-        """Mask of pixels through which the edge of a line passes, to first order, or near which it
-        passes.
+        """Return the mask of pixels through which the edge of a line passes, to first order, or
+        near which it passes.
 
         p, normal: (3,) the point of the surface in the middle of the pixel, and the unit normal
             there.
         across, down: (3,) vectors from p to the points of the tangent plane in the middles of the
             neighboring pixels.
+
+        The edge is where |g - level| equals half_width |grad_T g|. To first order, g changes by at
+        most `reach` between p and any point of the pixel or of its neighbors' middles.
         """
-        gap, along = self._gap_and_gradient(p, normal)
-        reach = dr.abs(dr.dot(along, across)) + dr.abs(dr.dot(along, down))
-        return dr.abs(gap - self.half_width * norm(along)) < reach
+        distance_in_value, tangential_gradient = self._gap_and_gradient(p, normal)
+        reach = dr.abs(dr.dot(tangential_gradient, across)) + dr.abs(
+            dr.dot(tangential_gradient, down)
+        )
+        return dr.abs(distance_in_value - self.half_width * norm(tangential_gradient)) < reach
 
     def _gap_and_gradient(self, p: Vec3, normal: Vec3) -> tuple[Real, Vec3]:
-        """|g - nearest level| at points p, and the part (3,) of the gradient of g along the
-        surface. The latter is 0 outside the domain of g, and if it is so small that it is due to
-        rounding."""
+        """Return |g - nearest level| at points p, and the part (3,) of the gradient of g tangent to
+        the surface.
+
+        normal: (3,) the surface's unit normals.
+
+        The gradient is 0 outside the domain of g, and where its tangential part is so small that it
+        is due to rounding. So there is no line at such points.
+        """
         sample = self.function.evaluate(p)
         gradient = sample.gradient
-        along = gradient - dr.dot(gradient, normal) * normal
-        counts = norm(along) > _ROUNDING * norm(gradient)
+        tangential = gradient - dr.dot(gradient, normal) * normal
+        is_valid = norm(tangential) > _ROUNDING * norm(gradient)
         if self.volume is not None:
-            counts &= self.volume.contains(p)
-        return self._gap(sample.value), dr.select(counts, along, 0)
+            is_valid &= self.volume.contains(p)
+        return self._gap(sample.value), dr.select(is_valid, tangential, 0)
 
     def _gap(self, g: Real) -> Real:
-        """The difference between values g and the nearest level, for g modulo the period if there
+        """Return the distance of values g from the nearest level, for g modulo the period if there
         is one."""
         if self.spacing is not None:
             return dr.abs(g - self.spacing * dr.round(g / self.spacing))
@@ -286,21 +313,23 @@ class PreparedIsolines:
             g = g - self.period * dr.floor(g / self.period)
         table = cast("Any", self.levels)
         index = dr.uint32_array_t(type(g))
-        # The number of entries below g, digit by digit; the table has one less than a power of 2.
-        below, step = index(0), (len(table) + 1) // 2
-        while step:
-            entry = dr.gather(type(g), table, below + (step - 1))
-            below, step = dr.select(entry < g, below + step, below), step // 2
-        before = dr.gather(type(g), table, dr.select(below > 0, below - 1, 0))
-        after = dr.gather(type(g), table, dr.minimum(below, len(table) - 1))
+        # Binary search for the number of entries below g, from its highest bit to its lowest. The
+        # length of the table is a power of 2 minus 1.
+        entries_below, bit = index(0), (len(table) + 1) // 2
+        while bit:
+            entry = dr.gather(type(g), table, entries_below + (bit - 1))
+            entries_below, bit = dr.select(entry < g, entries_below + bit, entries_below), bit // 2
+        # The nearest level is one of the two neighbors of g in the table.
+        before = dr.gather(type(g), table, dr.select(entries_below > 0, entries_below - 1, 0))
+        after = dr.gather(type(g), table, dr.minimum(entries_below, len(table) - 1))
         return dr.minimum(dr.abs(g - before), dr.abs(g - after))
 
 
 def isoline_index_at(
     lines: tuple[PreparedIsolines, ...], p: Vec3, normal: Vec3, index: Any
 ) -> Index:
-    """The number of the isoline on which each point lies, counted from 1; 0 if it lies on none, and
-    the last one if several overlap.
+    """Return the number of the isoline on which each point lies, counted from 1; 0 if it lies on
+    none, and the last one if several overlap.
 
     p, normal: (3,) points of the surface and unit normals.
     index: the array type of the result.

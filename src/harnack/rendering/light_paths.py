@@ -1,6 +1,10 @@
-"""Renders pictures by light paths, and traces rays of shaded pictures through transparent solids.
+"""Renders pictures by path tracing: for each pixel of a sensor (a Mitsuba camera with its film),
+several random light paths are traced backward from the camera, and the light that they carry is
+averaged. `mi` is the Mitsuba module. A path that runs out of steps, because a ray was neither
+proved free nor led to a hit, is called lost.
 
-The time that a picture will take is estimated before it is begun, and noise can be removed from it.
+The module also estimates the time of a picture before it is begun, removes noise from it, and
+traces rays of shaded pictures through transparent solids.
 
 A ray that enters a solid leaves it before it enters anything else. So whether a segment of a ray
 lies in glass, which absorbs light, depends only on the hit at which the segment begins.
@@ -41,11 +45,12 @@ _FILTER_REACH = 2.0
 
 @dataclass(frozen=True)
 class PathRender:
-    """The light of all pixels of a sensor.
+    """A picture that was rendered by path tracing: the light of all pixels.
 
     image: (h, w, 4) linear sRGB radiance and, last, the fraction of the pixel that is covered.
     lost: the number of paths that ran out of steps.
-    albedo, normal: (h, w, 3) means of albedos and normals at first hits; None unless requested.
+    albedo, normal: (h, w, 3) means of albedos and normals at the first hits of the paths, for the
+        denoiser; None unless requested.
     """
 
     image: npt.NDArray[np.float32]
@@ -56,7 +61,8 @@ class PathRender:
 
 @dataclass(frozen=True)
 class PathRenderTask:
-    """The rendering of a picture by light paths for a sensor, by ranges of pixels.
+    """Renders a picture by path tracing, one range of pixels at a time. `mi` is the Mitsuba module,
+    `scene` and `sensor` are Mitsuba's, and `tracer` follows the paths.
 
     spp: the number of paths of a pixel.
     seed: another seed gives other noise.
@@ -75,28 +81,30 @@ class PathRenderTask:
 
     @property
     def size(self) -> tuple[int, int]:
-        """Width and height in pixels."""
+        """Width and height of the picture in pixels."""
         width, height = (int(n) for n in self.sensor.film().crop_size())
         return width, height
 
     def render_range(self, start: int, stop: int) -> tuple[npt.NDArray[np.float32], int]:
-        """The means of the paths of each pixel from `start` to `stop`, counted by rows, as an array
-        (n, 4), or (n, 10) with features; and the number of paths that ran out of steps. The columns
-        are radiance, covered fraction, albedo and normal.
+        """Render the pixels from `start` to `stop`, counted by rows. Returns the means of their
+        paths, an array (n, 4), or (n, 10) with features, and the number of paths that ran out of
+        steps. The columns are radiance (3), covered fraction, albedo (3) and normal (3).
 
-        All samples of a pixel are traced at once, so that samplers can stratify them. Every pixel
-        averages only its own samples. So there are no sums whose order threads could change: the
-        same seed gives the same picture, in whatever parts it is drawn.
+        All samples of a pixel are traced at once, so that the sampler can stratify them. Every
+        pixel averages only its own samples. So there are no sums whose order threads could change:
+        the same seed gives the same picture, in whatever parts it is drawn.
         """
         mi, spp = self.mi, self.spp
-        rows: list[npt.NDArray[np.float32]] = []
+        bands: list[npt.NDArray[np.float32]] = []
         lost = 0
         for first, last in pixel_ranges(stop - start, max(1, self.paths_a_band // spp)):
-            lane = dr.arange(mi.UInt32, (last - first) * spp)
-            samples = dr.opaque(mi.UInt32, spp)
-            pixel = lane // samples + dr.opaque(mi.UInt32, start + first)
+            # Successive lanes are the samples of one pixel, then those of the next pixel.
+            path = dr.arange(mi.UInt32, (last - first) * spp)
+            # Opaque numbers are kernel parameters: another number compiles no other kernel.
+            opaque_spp = dr.opaque(mi.UInt32, spp)
+            pixel = path // opaque_spp + dr.opaque(mi.UInt32, start + first)
             results, wavelengths = trace_samples(
-                mi, self.scene, self.sensor, self.tracer, pixel, lane % samples, self.seed,
+                mi, self.scene, self.sensor, self.tracer, pixel, path % opaque_spp, self.seed,
                 self.features,
             )  # fmt: skip
             covered = dr.select(results.valid, mi.Float(1), 0)
@@ -104,15 +112,15 @@ class PathRenderTask:
             if results.features is not None:
                 means += [as_rgb(mi, results.features.albedo, wavelengths), results.features.normal]
             means = [to_numpy(mean_of_blocks(mean, spp)) for mean in means]
-            rows.append(np.concatenate(means, axis=1))
+            bands.append(np.concatenate(means, axis=1))
             lost += int(dr.count(results.lost)[0])
-        return np.concatenate(rows), lost
+        return np.concatenate(bands), lost
 
 
 def render_paths(
     task: PathRenderTask, advance: Callable[[float], None], executor: RenderExecutor | None = None
 ) -> PathRender:
-    """The light of all pixels, as a `PathRender`.
+    """Render all pixels of a task. Returns a `PathRender`.
 
     advance: called with the fraction of the picture that has been finished since the last call.
     executor: calls `render_range` of a copy of the task, for example on a cluster; None to call it
@@ -140,16 +148,17 @@ def trace_samples(
     mi: Any, scene: Any, sensor: Any, tracer: PathTracer, pixel: Any, sample: Any, seed: int,
     features: bool,
 ) -> tuple[PathResults, Any]:  # fmt: skip
-    """Trace light paths through samples of pixels. Returns their `PathResults`, with light weighted
-    by the sensor, and their wavelengths.
+    """Trace one light path through a random point of each given pixel. Returns the `PathResults` of
+    the paths, with light weighted by the sensor, and the wavelengths that they carry.
 
-    pixel, sample: (n,) for each path, the index of its pixel, counted by rows, and of its sample in
-        the pixel.
+    pixel, sample: (n,) for each path, the index of its pixel, counted by rows, and the index of the
+        path among those of its pixel.
+    seed: another seed gives other random numbers.
     features: whether to store albedo and normal at first hits, too.
     """
     width, height = (int(n) for n in sensor.film().crop_size())
-    zero, hashed = dr.opaque(mi.UInt32, 0), dr.opaque(mi.UInt32, _mixed(seed))
-    sampler = SobolSampler(mi, pixel, sample, hashed, zero)
+    first_dimension, hashed_seed = dr.opaque(mi.UInt32, 0), dr.opaque(mi.UInt32, _mixed(seed))
+    sampler = SobolSampler(mi, pixel, sample, hashed_seed, first_dimension)
     position = film_positions(mi, pixel, _in_pixel(mi, sampler.next_2d()), (width, height))
     ray, weight = _camera_ray(mi, sensor, sampler, position)
     dr.eval(ray, weight)
@@ -158,22 +167,33 @@ def trace_samples(
 
 
 def _mixed(seed: int) -> int:
-    """A hash of 32 bits of an integer, so that pictures with neighboring seeds have independent
+    """Return a 32-bit hash of the seed, so that pictures with neighboring seeds have independent
     noise."""
     return int(np.random.SeedSequence(seed % 2**63).generate_state(1)[0])
 
 
 def _in_pixel(mi: Any, sample: Any) -> Any:
-    """Offsets (2,) of a point in a pixel or near it, distributed as the pixel's filter, from
-    uniform numbers in [0, 1)^2."""
+    """Turn uniform random numbers into sample points of a pixel. Returns coordinates (2,) in units
+    of a pixel, from its corner. They are distributed as a Gaussian around the pixel's middle, cut
+    off at two pixels from it, so they may lie outside the pixel. This replaces a reconstruction
+    filter.
+
+    sample: (2,) uniform numbers in [0, 1).
+
+    The Gaussian is sampled by inverting its distribution function. `edge` limits the argument to
+    the part that is not cut off.
+    """
     edge = float(dr.erf(_FILTER_REACH / _FILTER_DEVIATION / np.sqrt(2)))
-    gauss = dr.erfinv(edge * (2 * sample - 1)) * (np.sqrt(2) * _FILTER_DEVIATION)
-    return mi.Vector2f(gauss) + 0.5
+    offset = dr.erfinv(edge * (2 * sample - 1)) * (np.sqrt(2) * _FILTER_DEVIATION)
+    return mi.Vector2f(offset) + 0.5
 
 
 def _camera_ray(mi: Any, sensor: Any, sampler: Any, position: Any) -> tuple[Any, Any]:
-    """The ray of a sensor through a point of the film in [0, 1]^2, and the weight of its light.
-    Time, wavelength and lens are sampled if the sensor has them."""
+    """Sample a ray of the camera through a point of the film. Returns the ray and the weight of its
+    light. Time, wavelength and the point on the lens are sampled if the sensor has them.
+
+    position: (2,) the point, in [0, 1]^2 across the whole film.
+    """
     time = sensor.shutter_open()
     if sensor.shutter_open_time() > 0:
         time = time + sampler.next_1d() * sensor.shutter_open_time()
@@ -183,17 +203,22 @@ def _camera_ray(mi: Any, sensor: Any, sampler: Any, position: Any) -> tuple[Any,
 
 
 def as_rgb(mi: Any, radiance: Any, wavelengths: Any) -> Any:
-    """The radiance of a Mitsuba variant, which may be spectral or monochromatic, in linear sRGB."""
+    """Convert radiance to linear sRGB. Mitsuba's variants represent it as samples of a spectrum, as
+    a single luminance, or as RGB already.
+
+    radiance: one number for each wavelength, or for each channel.
+    wavelengths: the wavelengths of spectral radiance, in nm; not used otherwise.
+    """
     if mi.is_spectral:
-        matching = [mi.cie1931_xyz(wavelength) for wavelength in wavelengths]
-        xyz = sum(value * weights for value, weights in zip(radiance, matching, strict=True))
-        return mi.xyz_to_srgb(xyz * (mi.MI_CIE_Y_NORMALIZATION / len(matching)))
+        color_matching = [mi.cie1931_xyz(wavelength) for wavelength in wavelengths]
+        xyz = sum(value * weights for value, weights in zip(radiance, color_matching, strict=True))
+        return mi.xyz_to_srgb(xyz * (mi.MI_CIE_Y_NORMALIZATION / len(color_matching)))
     return mi.Color3f(radiance[0]) if mi.is_monochromatic else mi.Color3f(radiance)
 
 
 def mean_of_blocks(color: Any, spp: int) -> Any:
-    """The means of colors over blocks of `spp` successive lanes, which are the samples of one
-    pixel."""
+    """Average the colors of the samples of each pixel. The samples of a pixel are `spp` successive
+    lanes. Returns one color for each pixel."""
     return type(color)(*(dr.block_sum(channel, spp) / spp for channel in color))
 
 
@@ -212,14 +237,15 @@ _SECONDS_PER_BAND, _MIN_BAND_PATHS = 4.0, 2**14
 
 @dataclass(frozen=True)
 class TimeEstimate:
-    """Seconds for one light path, and for all paths of a picture."""
+    """The estimated time in seconds: `path` for one light path, `picture` for all paths of a
+    picture."""
 
     path: float
     picture: float
 
     @property
     def paths_a_band(self) -> int:
-        """The number of paths to trace at once such that a progress bar moves about every four
+        """How many paths to trace at once such that a progress bar moves about every four
         seconds."""
         return round(
             min(max(_SECONDS_PER_BAND / max(self.path, 1e-9), _MIN_BAND_PATHS), MAX_PATHS_PER_BATCH)
@@ -239,9 +265,11 @@ class TimeEstimate:
 def estimate_time(
     mi: Any, scene: Any, sensor: Any, tracer: PathTracer, *, spp: int, features: bool
 ) -> TimeEstimate:
-    """The time for a picture, measured on a few paths all over it.
+    """Estimate how long a picture takes, by timing a few paths all over it. Returns a
+    `TimeEstimate`.
 
-    spp: the number of paths of a pixel. features: whether albedo and normal are stored, too.
+    spp: the number of paths of a pixel.
+    features: whether albedo and normal are stored, too.
 
     A run takes some time to start, whatever the number of its paths. So the time of a path is
     computed from the additional time that four times as many paths take. A picture of few paths is
@@ -252,33 +280,38 @@ def estimate_time(
     path_count = pixels * spp
 
     def seconds(count: int) -> float:
-        """The time of a run of `count` paths."""
+        """Return the time of a run of `count` paths."""
         # The golden ratio spreads any number of pixels evenly.
         indices = (np.arange(count) * 0.6180339887498949 % 1 * pixels).astype(np.int64)
         pixel = upload_indices(mi, np.minimum(indices, pixels - 1))
         sample = dr.opaque(mi.UInt32, 0, count)
         began = time.perf_counter()
+        # One path in each of these pixels.
         results, _ = trace_samples(mi, scene, sensor, tracer, pixel, sample, 0, features)
         dr.eval(results.light)
         dr.sync_thread()
         return time.perf_counter() - began
 
-    count, path = _FIRST_TRIAL_PATHS, 0.0
+    count, seconds_a_path = _FIRST_TRIAL_PATHS, 0.0
     if _TRIAL_GROWTH * count <= _MAX_TRIAL_FRACTION * path_count:
-        seconds(count)  # compiles
-        first = shorter = seconds(count)
+        seconds(count)  # not measured: this run compiles the kernels
+        first_time = time_of_run = seconds(count)
+        # Runs grow until one is long enough to be measured, or they take too much of the whole
+        # time.
         while (
             _TRIAL_GROWTH * count <= _MAX_TRIAL_FRACTION * path_count
-            and shorter < _MIN_TIME_RATIO * first
+            and time_of_run < _MIN_TIME_RATIO * first_time
         ):
-            longer = seconds(_TRIAL_GROWTH * count)
-            path = max(longer - shorter, 0.0) / ((_TRIAL_GROWTH - 1) * count)
-            count, shorter = _TRIAL_GROWTH * count, longer
-    return TimeEstimate(path, path_count * path)
+            time_of_longer_run = seconds(_TRIAL_GROWTH * count)
+            seconds_a_path = max(time_of_longer_run - time_of_run, 0.0) / (
+                (_TRIAL_GROWTH - 1) * count
+            )
+            count, time_of_run = _TRIAL_GROWTH * count, time_of_longer_run
+    return TimeEstimate(seconds_a_path, path_count * seconds_a_path)
 
 
 def load_denoiser() -> Any:
-    """The package `pyoidn`, which holds Open Image Denoise.
+    """Import the package `pyoidn`, which holds Open Image Denoise, and return the module.
 
     Raises:
         ModuleNotFoundError: it is not installed, or its library cannot be loaded.
@@ -294,11 +327,12 @@ def load_denoiser() -> Any:
 
 
 def denoise_image(render: PathRender) -> npt.NDArray[np.float32]:
-    """The image (h, w, 4) of a render with features (albedo and normal), without noise.
+    """Remove the noise of a rendered picture. Returns the image (h, w, 4).
 
     Open Image Denoise, a neural network that runs on CPUs, removes the noise. It guesses: the
     result looks clean and is close to a picture with more samples, but its numbers are no means of
-    samples. The covered fraction of each pixel is not changed.
+    samples. It needs the features of the render (albedo and normal). The covered fraction of each
+    pixel is not changed.
 
     Raises:
         ValueError: the render has no features.
@@ -322,15 +356,20 @@ _DEFAULT_REFLECTANCE = 0.04
 
 @dataclass
 class RefractedHits:
-    """The first opaque hits of rays through transparent solids, with one entry for each ray.
+    """Rays on their way through transparent solids, with one entry for each ray. When all have
+    ended, it holds their first opaque hits.
 
-    ray: the last segment of the ray's path.
+    A ray is bent at each boundary of a transparent solid, so its path consists of several segments.
+    A segment is traced by `intersect`, which returns an interaction of Mitsuba's and a
+    `SurfaceHit`.
+
+    ray: the current segment; at the end, the last one.
     si, first: the hit of this segment, as an interaction and as a `SurfaceHit`.
     throughput: the fraction of the light from there that reaches the eye.
-    reflected_light: the light that the crossed boundaries of transparent solids reflect to the eye.
-    path_length: the length of the path before the last segment.
-    interface_count: the number of boundaries that the path has crossed, and the last hit.
-    active: rays that are still being traced.
+    reflected_light: the light that the crossed boundaries reflect to the eye.
+    path_length: the length of the path before the current segment.
+    interface_count: the number of hits so far: the boundaries crossed, and the last hit.
+    active: mask of rays that are still being traced.
     """
 
     ray: Any
@@ -344,15 +383,16 @@ class RefractedHits:
 
 
 class RefractionTracer:
-    """Traces rays through transparent solids for shaded pictures, with refraction.
+    """Traces rays through transparent solids for shaded pictures, with refraction, until they hit
+    something opaque.
 
     Only one ray is followed behind a boundary: the transmitted ray, or the reflected one for total
-        reflection. Reflection of other light is approximated: sky light and a highlight. So there
-        is no noise, and there are no caustics.
+    reflection. The light that a boundary reflects is approximated by the sky and a highlight of the
+    key light. So there is no noise, and there are no caustics.
 
-    indices: pairs of a proxy, the mesh that stands for a transparent solid, and its index of
-        refraction.
-    hides_lights: whether shapes that emit light are not seen.
+    indices: pairs of a proxy, the Mitsuba mesh that stands for a transparent solid, and its index
+        of refraction.
+    hides_lights: whether shapes that emit light are invisible.
     """
 
     def __init__(
@@ -365,16 +405,19 @@ class RefractionTracer:
         self.indices = tuple((carrier, index) for carrier, index in pairs if index is not None)
 
     def trace(self, ray: Any) -> RefractedHits:
-        """The first opaque hits of camera rays, behind transparent solids, as `RefractedHits`."""
+        """Find the first opaque hits of camera rays, behind transparent solids. Returns
+        `RefractedHits`."""
         mi, world = self.world.mi, self.world
         nothing = dr.zeros(mi.SurfaceInteraction3f, dr.width(ray.d))
+        # At first there is no hit, all light would reach the eye, and none is reflected.
         hits = RefractedHits(
             ray, nothing, world.no_hit(nothing), mi.Spectrum(1), mi.Spectrum(0), mi.Float(0),
             mi.UInt32(0), dr.full(mi.Bool, True, dr.width(ray.d)),
         )  # fmt: skip
+        # Without transparent solids a single trace suffices.
         if not self.indices:
-            start = dr.zeros(mi.SurfaceInteraction3f)
-            hits.si, hits.first = world.intersect(ray, start, mi.Bool(True), self.hidden)
+            camera = dr.zeros(mi.SurfaceInteraction3f)
+            hits.si, hits.first = world.intersect(ray, camera, mi.Bool(True), self.hidden)
             return hits
 
         def is_running(hits: RefractedHits) -> Mask:
@@ -387,60 +430,71 @@ class RefractionTracer:
         return hits
 
     def _is_clear(self, si: Any) -> Mask:
-        """Mask of interactions with the boundary of a transparent solid."""
-        clear = self.world.mi.Bool(False)
+        """Return the mask of interactions `si` that lie on the boundary of a transparent solid."""
+        is_clear = self.world.mi.Bool(False)
         for proxy, _ in self.indices:
-            clear |= si.shape == self.world.mi.ShapePtr(proxy)
-        return clear
+            is_clear |= si.shape == self.world.mi.ShapePtr(proxy)
+        return is_clear
 
     def _through_boundary(self, hits: RefractedHits) -> RefractedHits:
-        """The state of rays at their next hit. A ray that hits a transparent solid is refracted
-        there and goes on; another ray ends."""
+        """Trace the current segment of each ray and return the new `RefractedHits`. A ray that hits
+        a transparent solid is refracted there and goes on; any other ray ends. A ray also ends
+        where it hits an isoline, and at the 33rd boundary."""
         mi, world, d = self.world.mi, self.world, hits.ray.d
         si, first = world.intersect(hits.ray, hits.si, hits.active, self.hidden)
         throughput = hits.throughput * transmittance(mi, world.proxies, hits.si, si, d)
-        boundaries = hits.interface_count + 1
-        clear = (
+        interface_count = hits.interface_count + 1
+        is_crossed = (
             self._is_clear(si)
             & (first.isoline_index == 0)
             & first.is_hit
-            & (boundaries <= _MAX_INTERFACES)
+            & (interface_count <= _MAX_INTERFACES)
         )
         index = mi.Float(1)
         for proxy, value in self.indices:
             index = dr.select(si.shape == mi.ShapePtr(proxy), value, index)
         normal = mi.Vector3f(si.n)
-        direction, reflected = refract(normal, d, index)
-        outside = clear & (dr.dot(normal, d) < 0)
-        gathered = dr.select(outside, throughput * self._reflected(si, d, index, reflected), 0)
-        transmitted = dr.select(clear & (reflected < 1), 1 - reflected, 1)
+        direction, reflected_fraction = refract(normal, d, index)
+        enters_solid = is_crossed & (dr.dot(normal, d) < 0)
+        reflected_light = dr.select(
+            enters_solid, throughput * self._reflected(si, d, index, reflected_fraction), 0
+        )
+        # A fraction of 1 is total reflection: then the reflected ray is followed, and nothing is
+        # lost.
+        transmitted_fraction = dr.select(
+            is_crossed & (reflected_fraction < 1), 1 - reflected_fraction, 1
+        )
         onward_ray = spawn_ray(mi, si, first.ray_offset, direction)
         return RefractedHits(
-            ray=dr.select(clear, onward_ray, hits.ray),
+            ray=dr.select(is_crossed, onward_ray, hits.ray),
             si=si,
             first=first,
-            throughput=throughput * transmitted,
-            reflected_light=hits.reflected_light + gathered,
-            path_length=hits.path_length + dr.select(clear, first.t, 0),
-            interface_count=boundaries,
-            active=hits.active & clear,
+            throughput=throughput * transmitted_fraction,
+            reflected_light=hits.reflected_light + reflected_light,
+            path_length=hits.path_length + dr.select(is_crossed, first.t, 0),
+            interface_count=interface_count,
+            active=hits.active & is_crossed,
         )
 
     def _reflected(self, si: Any, d: Any, index: Any, fraction: Real) -> Any:
-        """The light of the sky, and of the key light in a highlight, that a boundary of a
-        transparent solid reflects towards the eye.
+        """Approximate the light that a boundary of a transparent solid reflects toward the eye:
+        light of the sky from the mirrored direction, and a highlight of the key light. Returns a
+        spectrum.
 
-        si, d: the interaction at the boundary, and the unit direction of the ray.
-        index: of refraction, of the inside relative to the outside.
+        si, d: the interaction at the boundary, and the unit direction of the ray that arrives
+            there.
+        index: the refractive index of the inside relative to the outside.
         fraction: the reflected fraction of the sky's light.
         """
         mi = self.world.mi
         normal = mi.Vector3f(si.n)
         mirrored = d - 2 * dr.dot(normal, d) * normal
-        straight = dr.square((index - 1) / (index + 1))
+        reflectance_straight_on = dr.square((index - 1) / (index + 1))
         black, one = dr.zeros(mi.Color3f), mi.Float(1)
+        # Without diffuse color, only the highlight remains. It is scaled from the usual
+        # reflectance.
         gloss = self.light.shade(black, normal, -d, mi.Bool(True), one) * (
-            straight / _DEFAULT_REFLECTANCE
+            reflectance_straight_on / _DEFAULT_REFLECTANCE
         )
         light = mi.Spectrum(gloss) if not mi.is_monochromatic else mi.Spectrum(mi.luminance(gloss))
         sky = self.world.scene.environment()

@@ -1,5 +1,8 @@
 """Imports Mitsuba with a variant that can draw surfaces, loads scene files, and computes refraction
-and absorption in transparent solids.
+and absorption in transparent solids. `mi` is the Mitsuba module. A variant of Mitsuba fixes the
+device, the representation of colors and the precision, such as llvm_ad_rgb. A proxy is the Mitsuba
+mesh that stands for a surface of harnack in a scene and carries its BSDF; no ray of Mitsuba hits
+it.
 
 Scene files in XML are checked before Mitsuba reads them, and Mitsuba's error messages are
 shortened.
@@ -27,8 +30,8 @@ _USABLE = re.compile(r"(llvm|cuda|metal)_ad_(mono|rgb|spectral)(_double)?")
 
 
 def load_mitsuba() -> Any:
-    """The `mitsuba` module, imported when it is first needed, with a variant in which surfaces can
-    be drawn.
+    """Return the `mitsuba` module, with a variant in which surfaces can be drawn. It is imported
+    when it is first needed.
 
     A variant that was set before stays. If none was set, it becomes cuda_ad_rgb, metal_ad_rgb or
     llvm_ad_rgb, after the device that `harnack.backend.choose_backend` finds.
@@ -57,8 +60,8 @@ def load_mitsuba() -> Any:
 
 
 def set_variant(variant: str) -> None:
-    """Set a Mitsuba variant, if another or none is set. A worker calls it with the variant of the
-    process for which it works.
+    """Set a Mitsuba variant, if another or none is set. A process of a cluster calls it with the
+    variant of the process for which it works.
 
     Raises:
         ImportError: this Mitsuba does not have the variant, or cannot use it here.
@@ -69,7 +72,7 @@ def set_variant(variant: str) -> None:
 
 
 def mitsuba_backend(mi: Any) -> Backend:
-    """The backend with the array types of the Mitsuba variant that is set."""
+    """Return the backend with the array types of the Mitsuba variant that is set."""
     return backend_of(mi.Float(0))
 
 
@@ -90,7 +93,7 @@ _REPEATED = re.compile(r"(?m)^(.*\n)(?:\1)+")
 
 
 def load_scene_file(mi: Any, path: str | os.PathLike[str]) -> Any:
-    """The scene in an XML file, loaded by Mitsuba.
+    """Load the scene in an XML file by Mitsuba, and return it.
 
     Raises:
         FileFormatError: the file, or one that it includes, is missing, no ordinary file,
@@ -106,7 +109,7 @@ def load_scene_file(mi: Any, path: str | os.PathLike[str]) -> Any:
 
 
 def load_dict(mi: Any, description: Mapping[str, Any]) -> Any:
-    """The scene, or another object of Mitsuba's, that a dictionary describes, loaded by Mitsuba.
+    """Load the scene, or another object of Mitsuba's, that a dictionary describes, and return it.
 
     Raises:
         RuntimeError: Mitsuba cannot make it; the message says which entry is wrong.
@@ -118,11 +121,14 @@ def load_dict(mi: Any, description: Mapping[str, Any]) -> Any:
 
 
 def check_scene_file(path: Path) -> None:
-    """Check a scene file and the files that it names before Mitsuba reads them. Raises
-    FileFormatError.
+    """Check a scene file and the files that it names before Mitsuba reads them.
 
     Mitsuba's parser checks neither kind nor size of a file: it waits forever at a pipe, and takes
     all memory for a file of many gigabytes.
+
+    Raises:
+        FileFormatError: a file is of another kind or too large. If the path names a surface file, a
+            formula or no file at all, the message says what to do instead.
     """
     if path.suffix.lower() in GEOMETRY_SUFFIXES:
         raise FileLocation(path).error(
@@ -138,6 +144,7 @@ def check_scene_file(path: Path) -> None:
             "there is no such file; Mitsuba scenes are .xml files, and scenes of the gallery are "
             "drawn by harnack.gallery.SCENES[name].render()"
         )
+    # Included files are read in turn; other files that are named must only be ordinary ones.
     checked = {path}
     waiting = [path]
     total = 0
@@ -161,10 +168,21 @@ def check_scene_file(path: Path) -> None:
 
 
 def _scene_text(path: Path) -> str:
-    """The text of a file, which may be XML. Raises FileFormatError if it is not."""
+    """Read the text of a file that may be XML.
+
+    Raises:
+        FileFormatError: it does not look like XML.
+    """
     data = read_bytes(path)
-    mark = next((mark for mark in _BYTE_ORDER_MARKS if data.startswith(mark)), b"")
-    text = data.decode(_BYTE_ORDER_MARKS.get(mark, "latin-1"), "replace")
+    byte_order_mark = next(
+        (
+            byte_order_mark
+            for byte_order_mark in _BYTE_ORDER_MARKS
+            if data.startswith(byte_order_mark)
+        ),
+        b"",
+    )
+    text = data.decode(_BYTE_ORDER_MARKS.get(byte_order_mark, "latin-1"), "replace")
     if not text.lstrip("\ufeff \t\r\n").startswith("<"):
         raise FileLocation(path).error("this is no XML file: it does not begin with '<'")
     if "\0" in text:
@@ -175,8 +193,8 @@ def _scene_text(path: Path) -> str:
 
 
 def _files_named(text: str) -> list[tuple[str, str]]:
-    """The files that the text of a scene may name, as pairs (element, name), such as ("include",
-    "lights.xml")."""
+    """Find the files that the text of a scene may name. Returns pairs (element, name), such as
+    ("include", "lights.xml")."""
     return [
         (element[1], attribute[2] or attribute[3])
         for element in _NAMES_A_FILE.finditer(text)
@@ -186,7 +204,7 @@ def _files_named(text: str) -> list[tuple[str, str]]:
 
 
 def _exists(path: Path) -> bool:
-    """Whether a path exists; False for a path that the system cannot handle."""
+    """Return whether a path exists; False for a path that the system cannot handle."""
     try:
         return path.exists()
     except (OSError, ValueError):
@@ -194,7 +212,8 @@ def _exists(path: Path) -> bool:
 
 
 def without_traceback(message: str) -> str:
-    """The message of an error of Mitsuba, without Python's traceback and source lines."""
+    """Return the message of an error of Mitsuba, without Python's traceback and locations in source
+    files."""
     message = _SOURCE_PLACE.sub("", _TRACEBACK.sub("", message))
     return _REPEATED.sub(r"\1", message).strip()
 
@@ -206,8 +225,11 @@ _MIN_INDEX_DIFFERENCE = 1e-6
 
 
 def transmittance_texture(mi: Any, tint: Any) -> Any:
-    """A Mitsuba texture of the fraction of light that is left after one unit of length in a solid;
-    None if no light is absorbed. tint: these fractions of red, green and blue, or None.
+    """Return a Mitsuba texture that holds how much light is left after one unit of length in a
+    solid; None if no light is absorbed.
+
+    tint: the remaining fractions of red, green and blue light, in (0, 1]; None for all of the
+        light.
 
     Raises:
         TypeError, ValueError: not three numbers in (0, 1].
@@ -227,15 +249,18 @@ def transmittance_texture(mi: Any, tint: Any) -> Any:
 
 
 def refractive_index(mi: Any, carrier: Any) -> Any:
-    """The index of refraction of a transparent solid, relative to its surroundings, as a kernel
-    parameter; None for opaque shapes and for surfaces that bound no solid. carrier: the proxy, the
-    mesh that stands for the solid in Mitsuba."""
+    """Return the index of refraction of a transparent solid, relative to its surroundings, as a
+    kernel parameter. None for opaque shapes and for surfaces that bound no solid.
+
+    carrier: the proxy, the mesh that stands for the solid in Mitsuba.
+    """
     bsdf = carrier.bsdf()
-    flags = (mi.BSDFFlags.DeltaTransmission, mi.BSDFFlags.GlossyTransmission)
+    transmissions = (mi.BSDFFlags.DeltaTransmission, mi.BSDFFlags.GlossyTransmission)
     if carrier.surface.solid_range is None or not any(
-        mi.has_flag(bsdf.flags(), flag) for flag in flags
+        mi.has_flag(bsdf.flags(), transmission) for transmission in transmissions
     ):
         return None
+    # Mitsuba's BSDFs of glass name their index "eta".
     parameters = mi.traverse(bsdf)
     for name, _ in parameters:
         if name == "eta":
@@ -244,17 +269,21 @@ def refractive_index(mi: Any, carrier: Any) -> Any:
 
 
 def is_inside(mi: Any, carrier: Any, start: Any, d: Any) -> Any:
-    """Mask of rays that leave interactions `start` in directions d and run inside a solid. carrier:
-    the proxy, the mesh that stands for the solid in Mitsuba."""
-    leaves = start.is_valid() & (start.shape == mi.ShapePtr(carrier))
-    return leaves & (dr.dot(start.n, d) < 0)
+    """Return the mask of rays that start on the boundary of a solid and run inside it.
+
+    carrier: the proxy, the mesh that stands for the solid in Mitsuba.
+    start, d: the surface interactions at which rays start, and their directions (3,).
+    """
+    starts_on_it = start.is_valid() & (start.shape == mi.ShapePtr(carrier))
+    return starts_on_it & (dr.dot(start.n, d) < 0)
 
 
 def transmittance(mi: Any, carriers: Any, start: Any, si: Any, d: Any) -> Any:
-    """The fraction of light that transparent solids let through on the way from interactions
-    `start`, in directions d, to interactions `si`.
+    """Return the fraction of light that transparent solids let through along rays.
 
     carriers: the proxies, meshes that stand for surfaces of harnack in Mitsuba.
+    start, d: the surface interactions at which rays start, and their directions (3,).
+    si: the next hits of the rays.
 
     By Beer and Lambert's law the fraction tint^t of the light is left after a length t in a solid.
     Going in and out of a solid alternate (`CappedSolid.intersect`). So a ray that leaves a point of
@@ -272,24 +301,32 @@ def transmittance(mi: Any, carriers: Any, start: Any, si: Any, d: Any) -> Any:
 
 
 def refract(normal: Any, d: Any, index: Any) -> tuple[Any, Any]:
-    """Refract rays in unit directions d at a boundary with outward unit normals. Returns the unit
-    directions behind it, and the fraction of unpolarized light that is reflected (Fresnel). If this
-    fraction is 1 (total reflection), the direction is that of the mirrored ray.
+    """Refract rays at a boundary of a transparent solid. Returns the unit directions behind it, and
+    the fraction of unpolarized light that is reflected (Fresnel). If this fraction is 1 (total
+    reflection), the direction is that of the mirrored ray.
 
-    index: of refraction, of the inside relative to the outside.
+    normal, d: (3,) outward unit normals of the solid, and unit directions of the rays.
+    index: the refractive index of the inside relative to the outside.
     """
-    along = dr.dot(normal, d)
-    entering = along < 0
-    eta = dr.select(entering, 1 / index, index)
-    facing = dr.select(entering, 1, -1) * normal
-    cosine = dr.clip(dr.abs(along), 0, 1)
-    inner = 1 - eta * eta * (1 - cosine * cosine)
-    passes = inner > 0
-    inner = dr.sqrt(dr.maximum(inner, 0))
-    perpendicular = (eta * cosine - inner) / dr.maximum(eta * cosine + inner, 1e-9)
-    parallel = (cosine - eta * inner) / dr.maximum(cosine + eta * inner, 1e-9)
-    reflected = dr.select(passes, 0.5 * (perpendicular * perpendicular + parallel * parallel), 1)
-    reflected = dr.select(dr.abs(index - 1) < _MIN_INDEX_DIFFERENCE, 0, reflected)
-    refracted = eta * d + (eta * cosine - inner) * facing
-    mirrored = d + 2 * cosine * facing
-    return dr.normalize(dr.select(passes, refracted, mirrored)), reflected
+    normal_dot_d = dr.dot(normal, d)
+    enters = normal_dot_d < 0
+    eta = dr.select(enters, 1 / index, index)
+    normal_to_ray = dr.select(enters, 1, -1) * normal
+    cosine = dr.clip(dr.abs(normal_dot_d), 0, 1)
+    # Snell's law: the square of the refracted ray's cosine; negative for total reflection.
+    refracted_cosine = 1 - eta * eta * (1 - cosine * cosine)
+    is_refracted = refracted_cosine > 0
+    refracted_cosine = dr.sqrt(dr.maximum(refracted_cosine, 0))
+    # Fresnel's amplitudes for light that is polarized perpendicular and parallel to the plane of
+    # incidence.
+    perpendicular = (eta * cosine - refracted_cosine) / dr.maximum(
+        eta * cosine + refracted_cosine, 1e-9
+    )
+    parallel = (cosine - eta * refracted_cosine) / dr.maximum(cosine + eta * refracted_cosine, 1e-9)
+    reflected_fraction = dr.select(
+        is_refracted, 0.5 * (perpendicular * perpendicular + parallel * parallel), 1
+    )
+    reflected_fraction = dr.select(dr.abs(index - 1) < _MIN_INDEX_DIFFERENCE, 0, reflected_fraction)
+    refracted = eta * d + (eta * cosine - refracted_cosine) * normal_to_ray
+    mirrored = d + 2 * cosine * normal_to_ray
+    return dr.normalize(dr.select(is_refracted, refracted, mirrored)), reflected_fraction

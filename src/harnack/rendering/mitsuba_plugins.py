@@ -1,4 +1,7 @@
-"""Plug-ins for Mitsuba: a shape, an integrator, and replacements for Mitsuba's own integrators.
+"""Plug-ins for Mitsuba: a shape that is a surface of harnack (a level set of a field, or the
+boundary of a solid), an integrator that sees such surfaces, and a replacement of `mitsuba.render`
+that warns if another integrator cannot see them. `mi` is the Mitsuba module, and `props` are the
+properties that a scene gives to a shape.
 
 Scene files can name them once they are registered (`register`); `mitsuba_shape` makes surfaces for
 scenes that are put together in Python.
@@ -67,14 +70,16 @@ _DIRECT, _CHANNELS = "DirectIntegrator", "AOVIntegrator"
 
 def patch_mitsuba_render(mi: Any) -> None:
     """Replace `mitsuba.render` by a function that warns of level sets of harnack that will not be
-    drawn, and then renders as before."""
+    drawn, and then renders as before. If it has been replaced before, nothing changes."""
     original = mi.render
     if _MARK in vars(original):
         return
 
     @functools.wraps(original)
     def render(scene: Any, *args: Any, **settings: Any) -> Any:
-        """`mitsuba.render`, with a warning of level sets of harnack that it will not draw."""
+        """Call the original `mitsuba.render`, after a warning of level sets of harnack that it will
+        not draw."""
+        # The third argument after the scene is the integrator.
         chosen = settings.get("integrator") or (args[2] if len(args) > 2 else None)
         if isinstance(scene, mi.Scene):
             warn_unsupported_integrator(scene, chosen or scene.integrator())
@@ -89,23 +94,23 @@ def warn_unsupported_integrator(scene: Any, integrator: Any) -> None:
     which it cannot see."""
     if not type(integrator).__module__.startswith("mitsuba") or _sees_ours(integrator):
         return
-    unseen = sum(is_proxy(shape) for shape in scene.shapes())
-    if unseen:
-        kind = _kind(integrator)
+    unseen_count = sum(is_proxy(shape) for shape in scene.shapes())
+    if unseen_count:
+        class_name = _kind(integrator)
         if INTEGRATOR in str(integrator):
-            kind = f"apart from {PLUGIN} inside it, {kind}"
+            class_name = f"apart from {PLUGIN} inside it, {class_name}"
         warnings.warn(
-            f"{unseen} of the scene's shapes are level sets of harnack, which Mitsuba's own "
-            f"integrators cannot see: {kind} draws nothing of them. Take the integrator "
+            f"{unseen_count} of the scene's shapes are level sets of harnack, which Mitsuba's own "
+            f"integrators cannot see: {class_name} draws nothing of them. Take the integrator "
             f'{{"type": "{PLUGIN}"}}, or draw the scene with harnack.render(scene)',
             stacklevel=3,
         )
 
 
 def equivalent_path_tracer(mi: Any, scene: Any) -> PathTracer | None:
-    """A path tracer of harnack that computes the same light as the scene's integrator. None if
-    Mitsuba has to draw the scene: its integrator follows no paths, and the scene has no level sets
-    of harnack or the integrator sees them.
+    """Return a path tracer of harnack that computes the same light as the scene's integrator. None
+    if Mitsuba has to draw the scene: its integrator follows no paths, and the scene has no level
+    sets of harnack or the integrator sees them.
 
     Raises:
         ValueError: the scene has level sets of harnack, and its integrator asks for something that
@@ -119,19 +124,23 @@ def equivalent_path_tracer(mi: Any, scene: Any) -> PathTracer | None:
     count = sum(is_proxy(shape) for shape in scene.shapes())
     has_medium = any(shape.is_medium_transition() for shape in scene.shapes())
     has_medium |= any(sensor.get_medium() is not None for sensor in scene.sensors())
+    # The integrator is this library's own.
     if isinstance(tracer, PathTracer):
         if has_medium:
             warnings.warn(f"{PLUGIN} follows no light in media: they are left out", stacklevel=5)
         return tracer
-    kind = _kind(integrator)
-    follows_paths = kind == _PATHS or (kind.startswith(_IN_MEDIA) and not has_medium)
+    class_name = _kind(integrator)
+    follows_paths = class_name == _PATHS or (class_name.startswith(_IN_MEDIA) and not has_medium)
+    # One of Mitsuba's path tracers: its settings are taken over.
     if follows_paths:
         return _with_settings(mi, integrator)
     if not count or _sees_ours(integrator):
         return None
-    if kind == _DIRECT:
+    if class_name == _DIRECT:
         return PathTracer(mi, 2, hide_emitters=bool(integrator.hide_emitters))
-    wrong = "light in its media" if kind.startswith(_IN_MEDIA) else f"what {kind} asks for"
+    wrong = (
+        "light in its media" if class_name.startswith(_IN_MEDIA) else f"what {class_name} asks for"
+    )
     raise ValueError(
         f"{count} of the scene's shapes are level sets of harnack, which Mitsuba's own integrators "
         f"cannot see, and {wrong} is not found by paths alone. Take the integrator "
@@ -141,10 +150,11 @@ def equivalent_path_tracer(mi: Any, scene: Any) -> PathTracer | None:
 
 
 def _with_settings(mi: Any, integrator: Any) -> PathTracer:
-    """A path tracer of harnack with the path lengths and other settings of one of Mitsuba's
+    """Return a path tracer of harnack with the path lengths and other settings of one of Mitsuba's
     integrators. They can only be read from the integrator's text."""
     words = str(integrator)
     depths = {name: int(n) for name, n in re.findall(r"(max_depth|rr_depth) = (\d+)", words)}
+    # A limit of 2^31 or more, or none, means no limit.
     depth = depths.get("max_depth", 2**32 - 1)
     return PathTracer(
         mi, -1 if depth >= 2**31 else depth, depths["rr_depth"], bool(integrator.hide_emitters)
@@ -152,17 +162,17 @@ def _with_settings(mi: Any, integrator: Any) -> PathTracer:
 
 
 def _sees_ours(integrator: Any) -> bool:
-    """Whether all light of an integrator comes from harnack's integrator inside it. That holds for
-    an integrator of moments, but not for `aov`, which adds channels of its own."""
+    """Return whether all light of an integrator comes from harnack's integrator inside it. That
+    holds for an integrator of moments, but not for `aov`, which adds channels of its own."""
     words = str(integrator)
     return INTEGRATOR in words and _CHANNELS not in words
 
 
 def _kind(integrator: Any) -> str:
-    """The name of the C++ class of a Mitsuba integrator."""
-    moments = "MomentIntegrator"  # says that it is a Scene
+    """Return the name of the C++ class of a Mitsuba integrator."""
+    moment_class = "MomentIntegrator"  # its text says that it is a Scene
     kind = str(integrator).partition("[")[0]
-    return moments if kind == "Scene" else kind
+    return moment_class if kind == "Scene" else kind
 
 
 _PERIODIC = {"gyroid": Gyroid, "schwarz_p": SchwarzP, "schwarz_d": SchwarzD}
@@ -193,7 +203,7 @@ def register_surfaces(plugin: str, surface: Callable[[Any], TracedSurface]) -> A
     mi = load_mitsuba()
 
     def make_shape(props: Any) -> Any:
-        """The shape for the properties in a scene."""
+        """Return the proxy shape for the properties that a scene gives."""
         return mitsuba_proxy.from_properties(mi, props, surface(props).with_call_cache())
 
     mi.register_shape(plugin, make_shape)
@@ -201,8 +211,9 @@ def register_surfaces(plugin: str, surface: Callable[[Any], TracedSurface]) -> A
 
 
 def surface_from_properties(props: Any) -> TracedSurface:
-    """The surface that the properties of a `harnack` shape describe. The properties "low" and
-    "high" are the ends of the values of the field on a closed solid; one of them may be missing.
+    """Return the surface that the properties of a `harnack` shape describe. The properties "low"
+    and "high" are the ends of the values of the field on a closed solid; one of them may be
+    missing.
 
     Raises:
         ValueError: the properties describe no surface, or contradict each other.
@@ -223,8 +234,12 @@ def surface_from_properties(props: Any) -> TracedSurface:
 
 
 def _field(props: Any) -> Field:
-    """The field that the properties of a `harnack` shape name: of a file of curves, or one of a few
-    formulas. Raises ValueError for unknown names."""
+    """Return the field that the properties of a `harnack` shape name: that of a file of curves, or
+    one of a few formulas.
+
+    Raises:
+        ValueError: unknown names, or not exactly one of file and field.
+    """
     if ("file" in props) == ("field" in props):
         raise ValueError("a harnack shape needs either a file of curves or a field")
     if "file" in props:
@@ -243,8 +258,8 @@ def _field(props: Any) -> Field:
 
 
 def _clip(props: Any) -> Volume | None:
-    """The volume that the clip properties of a `harnack` shape describe, a ball, a box or their
-    intersection; None without such properties."""
+    """Return the volume that the clip properties of a `harnack` shape describe, a ball, a box or
+    their intersection; None without such properties."""
     volumes: list[Volume] = []
     if "clip_radius" in props:
         center = props.get("clip_center", [0.0, 0.0, 0.0])
@@ -259,7 +274,7 @@ def _clip(props: Any) -> Volume | None:
 
 
 def _point(value: Any) -> tuple[float, float, float]:
-    """A vector of Mitsuba's as three floats."""
+    """Return a vector of Mitsuba's as three floats."""
     x, y, z = (float(component) for component in value)
     return x, y, z
 
@@ -275,7 +290,7 @@ def mitsuba_shape(
     options: TraceOptions | None = None,
     **keywords: Unpack[TraceKeywords],
 ) -> Any:
-    """A Mitsuba shape of a field's level set, for a scene dictionary or a scene.
+    """Return a Mitsuba shape of a field's level set, for a scene dictionary or a scene.
 
         scene = mitsuba.load_dict({
             "type": "scene",
@@ -314,13 +329,21 @@ def mitsuba_shape(
     props["bsdf"] = as_bsdf(mi, bsdf)
     if to_world is not None:
         props["to_world"] = mi.ScalarTransform4f(as_matrix(to_world))
+    # Faces on the section may have another material.
     of_cut = _section_bsdf(mi, surface, props["bsdf"], section_bsdf)
     return from_properties(mi, props, surface, tint, of_cut, parse_isolines(isolines))
 
 
 def _section_bsdf(mi: Any, surface: TracedSurface, bsdf: Any, section_bsdf: Any) -> Any:
-    """The BSDF of the faces at which a section cuts a solid; None if they have the BSDF of the
-    rest. Raises ValueError if there are no such faces, or light passes through them."""
+    """Return the BSDF of the faces at which a section cuts a solid; None if they have the BSDF of
+    the rest.
+
+    bsdf: the BSDF of the rest.
+    section_bsdf: what the caller set: a BSDF, its dictionary, or None.
+
+    Raises:
+        ValueError: there are no such faces, or light passes through the solid.
+    """
     if section_bsdf is None:
         return None
     if surface.solid_range is None or surface.section is None:
@@ -338,8 +361,8 @@ def _section_bsdf(mi: Any, surface: TracedSurface, bsdf: Any, section_bsdf: Any)
 
 
 def as_bsdf(mi: Any, bsdf: Any) -> Any:
-    """A BSDF object of Mitsuba's. bsdf: such an object, its dictionary, or None for gray diffuse on
-    both sides."""
+    """Return a BSDF object of Mitsuba's. bsdf: such an object, its dictionary, or None for gray
+    diffuse on both sides."""
     if bsdf is None:
         bsdf = {"type": "twosided", "nested": {"type": "diffuse"}}
     loaded: Any = bsdf

@@ -1,5 +1,5 @@
-"""Represents level sets in Mitsuba scenes: proxy meshes that stand for them, and BSDFs with
-isolines.
+"""Represents surfaces of harnack (level sets of fields, or boundaries of solids) in Mitsuba scenes:
+proxy meshes that stand for them, and BSDFs with isolines. `mi` is the Mitsuba module.
 
 Mitsuba 3.9 has no shapes written in Python, except meshes. So a level set is represented by a
 *proxy*: a mesh of two triangles, each of which is a single point, at opposite corners of the level
@@ -37,37 +37,39 @@ if TYPE_CHECKING:
 
 
 def isoline_bsdf(mi: Any, bsdf: Any, colors: Sequence[Color]) -> Any:
-    """A BSDF that has the color of the isoline on isolines, diffuse on both sides, and is `bsdf`
-    elsewhere.
+    """Return a BSDF that draws isolines on a surface: on an isoline it is diffuse on both sides and
+    has the line's color; elsewhere it is `bsdf`.
 
-    colors: of the isolines, in sRGB, in the order of their numbers.
+    colors: the sRGB colors of the isolines, in the order of their numbers.
     """
     paints = [load_dict(mi, _matte_bsdf(color)) for color in colors]
     return _lined_class(mi.variant())(bsdf, paints)
 
 
 def _matte_bsdf(color: Color) -> dict[str, Any]:
-    """The dictionary of a BSDF that is diffuse on both sides. color: sRGB."""
+    """Return the dictionary of a BSDF that is diffuse on both sides. color: sRGB."""
     reflectance = {"type": "rgb", "value": list(linear_from_srgb(color))}
     return {"type": "twosided", "nested": {"type": "diffuse", "reflectance": reflectance}}
 
 
 @functools.cache
 def _lined_class(variant: str) -> Any:
-    """The class of BSDFs that `isoline_bsdf` returns, for a Mitsuba variant, as Mitsuba's base
-    classes differ from variant to variant."""
+    """Return the class of the BSDFs that `isoline_bsdf` returns. There is one class for each
+    variant of Mitsuba, as Mitsuba's base classes differ."""
     mi = load_mitsuba()
     assert mi.variant() == variant
 
     class Lined(mi.BSDF):
-        """A BSDF that is `base` off the isolines, and on isoline k the k-th of `paints`.
-        `hybrid_scene.surface_interaction` gives the number of the isoline as the primitive index,
-        counted from 1."""
+        """A BSDF that is `base` off the isolines, and on isoline k the k-th of `paints`. The
+        surface interaction holds the number of the isoline, counted from 1, as its primitive index
+        (`hybrid_scene.surface_interaction`); 0 means no isoline."""
 
         def __init__(self, base: Any, paints: Sequence[Any]) -> None:
             mi.BSDF.__init__(self, mi.Properties())
             self.base, self.paints = base, tuple(paints)
             bsdfs = (base, *self.paints)
+            # The flags of a BSDF tell integrators what to expect: here everything that one of the
+            # BSDFs has.
             self.m_components = [
                 bsdf.flags(k) for bsdf in bsdfs for k in range(bsdf.component_count())
             ]
@@ -77,40 +79,46 @@ def _lined_class(variant: str) -> Any:
             self.m_flags = flags
 
         def _select_bsdf(self, call: Callable[[Any, Mask], Any], si: Any, active: Mask) -> Any:
-            """The result of `call(bsdf, mask)` on each lane, where bsdf is `base` or, on an
-            isoline, the BSDF of the isoline, and the mask holds the lanes of this BSDF."""
-            line = si.prim_index
-            result = call(self.base, active & (line == 0))
+            """Evaluate on each lane the BSDF that applies: `base` or, on an isoline, the BSDF of
+            this isoline. Returns the result of `call(bsdf, mask)`; the mask selects the active
+            lanes of the BSDF.
+
+            si: the surface interactions, which hold the numbers of the isolines.
+            """
+            line_number = si.prim_index
+            result = call(self.base, active & (line_number == 0))
             for number, paint in enumerate(self.paints, start=1):
-                on = line == number
-                result = dr.select(on, call(paint, active & on), result)
+                lanes = line_number == number
+                result = dr.select(lanes, call(paint, active & lanes), result)
             return result
 
         def sample(
             self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Mask = True
         ) -> tuple[Any, Any]:
-            def call(bsdf: Any, on: Mask) -> tuple[Any, Any]:
-                return bsdf.sample(ctx, si, sample1, sample2, on)
+            def call(bsdf: Any, lanes: Mask) -> tuple[Any, Any]:
+                return bsdf.sample(ctx, si, sample1, sample2, lanes)
 
             return self._select_bsdf(call, si, active)
 
         def eval(self, ctx: Any, si: Any, wo: Any, active: Mask = True) -> Any:
-            return self._select_bsdf(lambda bsdf, on: bsdf.eval(ctx, si, wo, on), si, active)
+            return self._select_bsdf(lambda bsdf, lanes: bsdf.eval(ctx, si, wo, lanes), si, active)
 
         def pdf(self, ctx: Any, si: Any, wo: Any, active: Mask = True) -> Any:
-            return self._select_bsdf(lambda bsdf, on: bsdf.pdf(ctx, si, wo, on), si, active)
+            return self._select_bsdf(lambda bsdf, lanes: bsdf.pdf(ctx, si, wo, lanes), si, active)
 
         def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Mask = True) -> tuple[Any, Any]:
-            return self._select_bsdf(lambda bsdf, on: bsdf.eval_pdf(ctx, si, wo, on), si, active)
+            return self._select_bsdf(
+                lambda bsdf, lanes: bsdf.eval_pdf(ctx, si, wo, lanes), si, active
+            )
 
         def eval_diffuse_reflectance(self, si: Any, active: Mask = True) -> Any:
             return self._select_bsdf(
-                lambda bsdf, on: bsdf.eval_diffuse_reflectance(si, on), si, active
+                lambda bsdf, lanes: bsdf.eval_diffuse_reflectance(si, lanes), si, active
             )
 
         def eval_null_transmission(self, si: Any, active: Mask = True) -> Any:
             return self._select_bsdf(
-                lambda bsdf, on: bsdf.eval_null_transmission(si, on), si, active
+                lambda bsdf, lanes: bsdf.eval_null_transmission(si, lanes), si, active
             )
 
         def traverse(self, callback: Any) -> None:
@@ -136,13 +144,15 @@ def from_properties(
     section_bsdf: Any = None,
     isolines: Sequence[Isolines] = (),
 ) -> Any:
-    """The proxy shape of a surface, with the `to_world` and the BSDF that a plug-in's properties
-    hold.
+    """Return the proxy shape of a surface. Its `to_world` and its BSDF are in a plug-in's
+    properties.
 
-    tint: of a transparent solid, the fractions of red, green and blue light that are left after one
-        unit of length in it, in the world; None for all of the light.
-    section_bsdf: of the faces at which a section cuts a solid; None for the BSDF of the rest.
-    isolines: to be drawn on the surface.
+    props: the properties, `mitsuba.Properties`.
+    tint: for a transparent solid, the fractions of red, green and blue light that are left after
+        one unit of length in it, in the world; None for all of the light.
+    section_bsdf: the BSDF of the faces at which a section cuts a solid; None for the BSDF of the
+        rest.
+    isolines: lines to be drawn on the surface.
 
     Raises:
         ValueError: the surface has no bounds, `to_world` does not scale all lengths alike, an
@@ -165,11 +175,13 @@ def from_properties(
         colors = [isoline.srgb for isoline in isolines]
         props["bsdf"] = isoline_bsdf(mi, props["bsdf"], colors)
         section_bsdf = None if section_bsdf is None else isoline_bsdf(mi, section_bsdf, colors)
+    # Textures with values at vertices do not work: the proxy's vertices are not on the surface.
     if any("MeshAttribute" in _bsdf_text(bsdf) for bsdf in (props.get("bsdf", None), section_bsdf)):
         raise ValueError(
             "a mesh_attribute belongs to vertices or faces, which a level set has not: take a "
             "texture of uv, which are x and y in the world, or draw the mesh of harnack.mesh(field)"
         )
+    # Light sources and media would need Mitsuba's own rays to hit the shape.
     shape = _carrier_class(mi.variant())(props, surface, placement, tint, section_bsdf, isolines)
     if shape.emitter() is not None or shape.is_medium_transition():
         raise ValueError("surfaces that are traced can neither emit light nor bound a medium")
@@ -177,7 +189,8 @@ def from_properties(
 
 
 def _bsdf_text(bsdf: Any) -> str:
-    """The text of a BSDF; empty for a BSDF that was written in Python without `to_string`."""
+    """Return the text of a BSDF; empty for a BSDF that was written in Python without
+    `to_string`."""
     try:
         return str(bsdf)
     except RuntimeError:
@@ -185,21 +198,21 @@ def _bsdf_text(bsdf: Any) -> str:
 
 
 def as_matrix(transform: Any) -> FloatArray:
-    """A Mitsuba transform or an array as a float64 matrix (4, 4)."""
+    """Return a Mitsuba transform or an array as a float64 matrix (4, 4)."""
     matrix = getattr(transform, "matrix", transform)
     return np.array(matrix, dtype=np.float64).reshape(4, 4)
 
 
 @functools.cache
 def _carrier_class(variant: str) -> Any:
-    """The class of proxies for a Mitsuba variant, as Mitsuba's base classes differ from variant to
-    variant."""
+    """Return the class of proxies. There is one class for each variant of Mitsuba, as Mitsuba's
+    base classes differ."""
     mi = load_mitsuba()
     assert mi.variant() == variant
 
     class Carrier(mi.Mesh):
         """A proxy: a mesh that no ray hits, which holds the BSDF and the surface for which it
-        stands."""
+        stands. The surface, placed in the world, is the attribute `placed`."""
 
         def __init__(
             self, props: Any, surface: TracedSurface, placement: Placement, tint: Any,
@@ -216,6 +229,7 @@ def _carrier_class(variant: str) -> Any:
             self.placed = PlacedSurface.of(surface, placement, backend, isolines, size)
             self.line_colors = tuple(isoline.srgb for isoline in isolines)
             params = mi.traverse(self)
+            # Two triangles, each a single point at a corner of the box in the world.
             corners = np.concatenate(placement.world_bounds(ends))
             params["vertex_positions"] = upload_floats(backend, corners)
             params["faces"] = mi.UInt32([0, 0, 0, 1, 1, 1])
@@ -228,12 +242,12 @@ def _carrier_class(variant: str) -> Any:
 
 
 def _bsdf_holder(mi: Any, bsdf: Any) -> Any:
-    """A mesh that belongs to no scene and only holds a BSDF."""
+    """Return a mesh that belongs to no scene and only holds a BSDF."""
     props = mi.Properties()
     props["bsdf"] = bsdf
     return mi.Mesh(PLUGIN, 1, 1, props=props)
 
 
 def is_proxy(shape: Any) -> bool:
-    """Whether a Mitsuba shape is a proxy, a mesh that stands for a level set of harnack."""
+    """Return whether a Mitsuba shape is a proxy, a mesh that stands for a level set of harnack."""
     return isinstance(getattr(shape, "placed", None), PlacedSurface)

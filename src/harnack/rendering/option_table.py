@@ -1,4 +1,7 @@
-"""The table `OPTIONS` of all options of all verbs (the functions `trace`, `render`, `mesh`, ...).
+"""Defines the table `OPTIONS` of all options (keyword arguments) of the library's functions
+`trace`, `render`, `mesh` and so on. These functions are called verbs here, and a verb is given by
+its name, such as "render". Each row of the table is an `Option`: its name, the verbs that take it,
+its check, its defaults and its help.
 
 The table determines the checks and signatures of calls in Python, the options of the command line,
 which options scene files hold and films and sliders may change, and a table of the documentation.
@@ -57,24 +60,27 @@ Parse = Callable[[str], Any]
 
 @dataclass(frozen=True)
 class Option:
-    """An option of some verbs (the functions `trace`, `render`, `mesh`, ...).
+    """One option (keyword argument) of some of the library's functions `trace`, `render`, `mesh`
+    and so on. These functions are called verbs.
 
     name: the keyword in Python and the name in scene files; on the command line "--name", with
         hyphens.
-    group: what it is about: surface, trace, image, style, color, quality, run, film, live, server,
-        mesh or repair.
-    verbs: the names of the verbs that honor it; all other verbs refuse it with an error that names
-        it.
+    group: what the option is about: surface, trace, image, style, color, quality, run, film, live,
+        server, mesh or repair.
+    verbs: the names of the functions that take it. All other functions of `VERBS` refuse it with an
+        error that names it.
     help: what it is, in a sentence without a period, and its default in brackets.
     value: what stands for its value in the help of the command line, such as "LENGTH" or "WxH"; ""
         for an option without a value.
-    parse: turns the text on a command line into the value. None for a switch (an option that is
-        False by default), and for an option that the command line does not have or makes of several
-        others.
-    check: a function of the value and of the option `show`, for pictures; it returns the value in
-        its final form.
-    default, default_of: the value if it is not set, and other defaults by verb.
-    varies: whether films and sliders may change it.
+    parse: turns the text on a command line into the value. It is None for a switch (an option that
+        is False by default), for an option that the command line does not have, and for one that
+        the command line builds from several others.
+    check: a function of the value and of the option `show`, the kind of picture. It returns the
+        value in its final form, or raises an error.
+    default: the value if a call does not set the option.
+    default_of: other defaults, by the name of the function.
+    varies: whether the option may differ between pictures of a film, and may have a slider on a
+        page.
     in_files: whether scene files hold it.
     """
 
@@ -92,32 +98,38 @@ class Option:
 
     @property
     def flag(self) -> str:
-        """The name of the option on the command line."""
+        """The name of the option on the command line, such as "--max-steps" for `max_steps`."""
         return f"--{self.name.replace('_', '-')}"
 
     @property
     def is_switch(self) -> bool:
-        """Whether the option has no value on the command line, and is True if it is given."""
+        """Whether the option has no value on the command line: it is True if it is given, and False
+        otherwise."""
         return self.parse is None and self.default is False
 
     @property
     def is_on_command_line(self) -> bool:
-        """Whether commands of the command line have this option."""
+        """Whether some command of the command line has this option."""
         return bool(self.verbs & COMMANDS) and (self.parse is not None or self.is_switch)
 
     def default_in(self, verb: str) -> Any:
-        """The value of the option in calls of a verb that do not set it."""
+        """Return the value that the option has in a call of the function `verb` that does not set
+        it."""
         return self.default_of.get(verb, self.default)
 
 
 def _checked(parse: Parse, check: Callable[[Any], Any]) -> Parse:
-    """A parser of texts that also checks the value, so that mistakes are found before any file is
-    read."""
+    """Return a parser of texts that also checks the value, so that mistakes are found before any
+    file is read.
+
+    parse: turns the text into the value.
+    check: returns the value in its final form, or raises an error.
+    """
     return lambda text: check(parse(text))
 
 
 def _of_trace(name: str) -> Any:
-    """The default of an option of `TraceOptions`."""
+    """Return the default of the option `name` of the class `TraceOptions`."""
     return TraceOptions.__dataclass_fields__[name].default
 
 
@@ -262,7 +274,8 @@ _OTHER_PROGRAMS_NAMES = {
 
 
 class RenderKeywords(TraceKeywords, total=False):
-    """The keywords of `render` with their types, for type checkers: all options of pictures."""
+    """The keywords of `render` with their types, for type checkers. They are all options of
+    pictures."""
 
     show: ShowMode | str
     camera: Camera | tuple[float, float, float] | None
@@ -293,21 +306,30 @@ ShowMode = Literal["path", "shaded", "normal", "evaluations", "status", "depth",
 
 
 def options_of(verb: str) -> tuple[Option, ...]:
-    """The options (rows of `OPTIONS`) that a verb honors."""
+    """Return the options (rows of `OPTIONS`) that a function of the library takes. verb: the name
+    of the function, such as "render"."""
     return tuple(option for option in OPTIONS if verb in option.verbs)
 
 
 def names_of(verb: str, *groups: str) -> tuple[str, ...]:
-    """The names of the options that a verb honors and that belong to one of the given groups."""
+    """Return the names of the options that a function of the library takes.
+
+    verb: the name of the function, such as "render".
+    groups: only options of these groups are returned (`Option.group`).
+    """
     return tuple(option.name for option in options_of(verb) if option.group in groups)
 
 
 def complete_options(verb: str, keywords: Mapping[str, Any]) -> dict[str, Any]:
-    """The options of a call of a verb, by name. Options that are not set have their defaults; but
-    options of surfaces and traces are left out if they are not set.
+    """Return all options of a call of a function, by name: those that the caller set, and the
+    defaults of the others. Options of `Surface` and `TraceOptions` that are not set are left out,
+    because those classes have the defaults.
+
+    verb: the name of the function, such as "render".
+    keywords: the options that the caller set.
 
     Raises:
-        TypeError: there is no such option, or the verb does not honor it.
+        TypeError: there is no such option, or it is an option of other functions only.
     """
     refuse_unknown(verb, keywords)
     unset = {
@@ -320,7 +342,8 @@ def complete_options(verb: str, keywords: Mapping[str, Any]) -> dict[str, Any]:
 
 def refuse_unknown(verb: str, keywords: Mapping[str, Any]) -> None:
     """Raise TypeError for keywords that are not options of a function of the library. The message
-    suggests the most similar name.
+    suggests a similar name, or the name that replaces one known from other programs; if there is
+    none, it lists the options of the function.
 
     verb: the name of the function, such as "render" or "trace".
     """
@@ -336,8 +359,11 @@ def refuse_unknown(verb: str, keywords: Mapping[str, Any]) -> None:
 
 
 def refuse_others(verb: str, keywords: Mapping[str, Any]) -> None:
-    """Raise TypeError for keywords that are options only of other verbs. The message names
-    these."""
+    """Raise TypeError for keywords that are options of other functions, but not of this one. The
+    message names the other functions. Keywords that are no options at all are not refused here.
+
+    verb: the name of the function, such as "render".
+    """
     for name in keywords:
         option = BY_NAME.get(name)
         if option is not None and verb not in option.verbs:
@@ -346,12 +372,18 @@ def refuse_others(verb: str, keywords: Mapping[str, Any]) -> None:
 
 
 def shows_options(verb: str) -> Callable[[_Function], _Function]:
-    """Return a decorator of a verb that takes `**keywords`. The signature of the decorated verb
-    shows its options by name, with their defaults. That of a live view still shows `**keywords`, as
-    it may take others."""
+    """Return a decorator for a function that takes its options as `**keywords`. Documentation and
+    editors then show the options in the function's signature, by name and with their defaults.
+
+    verb: the name of the function, such as "render".
+
+    `view` and `page` still show `**keywords` as well, as they take further keywords.
+    """
     shorthand, annotations = shorthand_parameters(), RenderKeywords.__annotations__
     kind = inspect.Parameter.KEYWORD_ONLY
     parameters = [
+        # Options of `Surface` and `TraceOptions` have their parameters, with types, from those
+        # classes.
         shorthand[option.name]
         if option.name in shorthand
         else inspect.Parameter(
@@ -372,15 +404,15 @@ SHORTHAND = frozenset((*SURFACE_OPTIONS, *TRACE_OPTIONS))
 
 
 def shorthand_among(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Those of the given options that belong to `Surface` and `TraceOptions`, by name."""
+    """Return those of the given options that belong to `Surface` and `TraceOptions`, by name."""
     return {name: value for name, value in options.items() if name in SHORTHAND}
 
 
 @dataclass(frozen=True)
 class RenderOptions:
-    """The checked options of a picture, as `render` describes them: sizes and counts are integers,
-    and an option that is not set is None. Options of surfaces and traces, and of where the work is
-    done, are not among them."""
+    """The checked options of one picture, as `render` describes them. Sizes and counts are
+    integers, and an option that is not set is None. The options of surfaces and traces are not
+    among them, nor the options that say where the work is done."""
 
     show: str
     size: tuple[int, int] | None
@@ -411,7 +443,7 @@ class RenderOptions:
 
     @classmethod
     def of(cls, options: Mapping[str, Any]) -> RenderOptions:
-        """The checked options, from values by name.
+        """Check the values of options, given by name, and return them as `RenderOptions`.
 
         Raises:
             TypeError, ValueError: a value is wrong; the message names the option and says what it

@@ -1,4 +1,5 @@
-"""Parsers of the values of options as people write them on a command line.
+"""Parsers of the values of options as people write them on a command line, such as "2pi" or
+"800x600".
 
 Each function raises ValueError, with a sentence that says how the value is written.
 """
@@ -25,15 +26,15 @@ _AXES = ("x", "y", "z", "-x", "-y", "-z")
 
 
 def quoted(text: str) -> str:
-    """The text in quotes, for messages; only its beginning if it is long."""
+    """Return the text in quotes, for messages; only its beginning if it is long."""
     return repr(text if len(text) <= _SHOWN else text[:_SHOWN] + "...")
 
 
 def parse_choice(*names: str) -> Callable[[str], str]:
-    """A parser that accepts one of several names and returns it."""
+    """Return a parser that accepts one of several names and returns it."""
 
     def choice(text: str) -> str:
-        """The text, if it is one of the names."""
+        """Return the text, if it is one of the names."""
         if text not in names:
             raise ValueError(
                 f"{quoted(text)} is none of {', '.join(names)}{did_you_mean(text, names)}"
@@ -48,7 +49,7 @@ parse_axis = parse_choice(*_AXES)
 
 
 def parse_number(text: str) -> float:
-    """The finite number that a text holds, as a float."""
+    """Return the finite number that a text holds, as a float."""
     try:
         number = float(text)
     except ValueError:
@@ -59,7 +60,7 @@ def parse_number(text: str) -> float:
 
 
 def parse_positive(text: str) -> float:
-    """The positive number that a text holds, as a float."""
+    """Return the positive number that a text holds, as a float."""
     try:
         number = float(text)
     except ValueError:
@@ -70,7 +71,7 @@ def parse_positive(text: str) -> float:
 
 
 def parse_count(text: str) -> int:
-    """The whole number from 1 to 999999999 that a text holds."""
+    """Return the whole number from 1 to 999999999 that a text holds."""
     number = int(text) if re.fullmatch(r"[0-9]{1,9}", text) else 0
     if number < 1:
         raise ValueError(f"{quoted(text)} must be a whole number from 1 to 999999999")
@@ -78,22 +79,23 @@ def parse_count(text: str) -> int:
 
 
 def parse_integer(text: str) -> int:
-    """The integer of at most 18 digits that a text holds."""
+    """Return the integer of at most 18 digits that a text holds."""
     if not re.fullmatch(r"[+-]?[0-9]{1,18}", text):
         raise ValueError(f"{quoted(text)} must be an integer of at most 18 digits")
     return int(text)
 
 
 def parse_port(text: str) -> int:
-    """The number of a network port, from 0 to 65535, that a text holds."""
+    """Return the number of a network port, from 0 to 65535, that a text holds."""
     if not re.fullmatch(r"[0-9]{1,5}", text) or int(text) > 65535:
         raise ValueError(f"{quoted(text)} must be a number from 0 to 65535")
     return int(text)
 
 
 def parse_level(text: str) -> float:
-    """The level that a text holds: a finite number, or a multiple of pi such as "2pi", "1.5*pi" or
-    "-pi/2"."""
+    """Return the level (value of the field) that a text holds: a finite number, or a multiple of pi
+    such as "2pi", "1.5*pi" or "-pi/2"."""
+    # A factor, pi and a divisor; each of them may be missing.
     match = re.fullmatch(
         r"([+-]?[\d.]*(?:e[+-]?\d+)?)\s*\*?\s*(pi)?\s*(?:/\s*([\d.]+))?", text.strip()
     )
@@ -104,6 +106,7 @@ def parse_level(text: str) -> float:
         if factor in ("", "+", "-"):
             if not has_pi:
                 raise ValueError
+            # "pi" and "-pi" have the factor 1 and -1.
             factor += "1"
         level = float(factor) * (math.pi if has_pi else 1.0) / float(divisor or 1.0)
         if not math.isfinite(level):
@@ -114,13 +117,15 @@ def parse_level(text: str) -> float:
 
 
 def parse_levels(text: str) -> float | list[float]:
-    """The level that a text holds, or a list of several levels separated by commas."""
+    """Return the level (value of the field) that a text holds, or a list of several levels
+    separated by commas."""
     levels = [parse_level(part) for part in text.split(",")]
     return levels if len(levels) > 1 else levels[0]
 
 
 def parse_range(text: str) -> tuple[float, float]:
-    """The ends of a range, such as (-0.3, 0.3) for "-0.3:0.3"."""
+    """Return the two ends of a range, such as (-0.3, 0.3) for "-0.3:0.3". Multiples of pi are
+    understood."""
     low, colon, high = text.partition(":")
     if not colon:
         raise ValueError(f"{quoted(text)}: write two values as -0.3:0.3")
@@ -131,7 +136,7 @@ def parse_range(text: str) -> tuple[float, float]:
 
 
 def parse_size(text: str) -> tuple[int, int]:
-    """The width and height in pixels, such as (800, 600) for "800x600"."""
+    """Return the width and height in pixels, such as (800, 600) for "800x600"."""
     match = re.fullmatch(r"([0-9]{1,9})[xX]([0-9]{1,9})", text)
     if not match:
         raise ValueError(f"{quoted(text)} is no size; write it as 800x600")
@@ -139,7 +144,7 @@ def parse_size(text: str) -> tuple[int, int]:
 
 
 def parse_numbers(text: str, count: int) -> tuple[float, ...]:
-    """A tuple of `count` finite numbers, which the text separates by commas."""
+    """Return a tuple of `count` finite numbers, which the text separates by commas."""
     try:
         numbers = tuple(float(part) for part in text.split(","))
     except ValueError:
@@ -150,12 +155,12 @@ def parse_numbers(text: str, count: int) -> tuple[float, ...]:
 
 
 def parse_point(text: str) -> tuple[float, ...]:
-    """The coordinates of a point, such as (1.0, 0.0, 2.0) for "1,0,2"."""
+    """Return the coordinates of a point, such as (1.0, 0.0, 2.0) for "1,0,2"."""
     return parse_numbers(text, 3)
 
 
 def parse_clip(text: str) -> Volume:
-    """The volume that a text such as "ball:0,0,0,1" or "box:-1,-1,-1,1,1,1" describes."""
+    """Return the volume that a text such as "ball:0,0,0,1" or "box:-1,-1,-1,1,1,1" describes."""
     kind, colon, rest = text.partition(":")
     if not colon or kind not in ("ball", "box"):
         raise ValueError(
@@ -170,9 +175,9 @@ def parse_clip(text: str) -> Volume:
 
 
 def parse_section(text: str) -> HalfSpace:
-    """The half-space that a text such as "0,0,1" or "0,0,1,0.2" describes: the side of a plane away
-    from the vector of the first three numbers. The fourth number is the distance of the plane from
-    the origin, by default 0."""
+    """Return the half-space that a text such as "0,0,1" or "0,0,1,0.2" describes: the side of a
+    plane away from the vector of the first three numbers. The fourth number is the distance of the
+    plane from the origin, by default 0."""
     plane = parse_numbers(text, 4 if text.count(",") == 3 else 3)
     x, y, z = plane[:3]
     if not any((x, y, z)):
@@ -181,13 +186,14 @@ def parse_section(text: str) -> HalfSpace:
 
 
 def parse_formula(text: str) -> str:
-    """The text itself, if it is a formula of x, y and z."""
+    """Return the text itself, if it is a formula of x, y and z."""
     TextFormula.parse(text)
     return text
 
 
 def parse_isolines_text(text: str) -> Isolines:
-    """The `Isolines` that a text such as "z:0.1" describes: those of z at all multiples of 0.1."""
+    """Return the isolines that a text such as "z:0.1" describes: those of z at all multiples of
+    0.1."""
     formula, colon, interval = text.rpartition(":")
     if not colon:
         raise ValueError(
@@ -197,20 +203,20 @@ def parse_isolines_text(text: str) -> Isolines:
 
 
 def parse_material_name(text: str) -> str:
-    """The text itself, if it is the name of a material, or a color."""
+    """Return the text itself, if it is the name of a material, or a color."""
     parse_material(text)
     return text
 
 
 def parse_color_name(text: str) -> str:
-    """The text itself, if it is the name of a color or "#rrggbb"."""
+    """Return the text itself, if it is the name of a color or "#rrggbb"."""
     parse_color(text, "a color")
     return text
 
 
 def parse_backdrop_text(text: str) -> Any:
-    """The value of the option `backdrop` of `render` that a text describes: a name, a color, two
-    colors separated by a comma, or the file of an image."""
+    """Return the value of the option `backdrop` of `render` that a text describes: a name, a color,
+    two colors separated by a comma, or the file of an image."""
     parts = [part.strip() for part in text.split(",")]
     is_file = text.lower().endswith(IMAGE_FILES)
     backdrop: Any = text if is_file or len(parts) != 2 else tuple(parts)

@@ -1,4 +1,7 @@
-"""`render`: draws a picture of fields, surfaces or Mitsuba scenes."""
+"""Contains `render`, which draws a picture of fields, surfaces or Mitsuba scenes. Fields and
+surfaces are drawn in the studio: a stage with lights, a camera and a backdrop. A picture is drawn
+by a task, which renders any range of its pixels. So its parts can be computed in this process or,
+by an executor, on a cluster."""
 
 from __future__ import annotations
 
@@ -71,29 +74,31 @@ def render(
     surfaces: a field, a `Surface` or a list of them, drawn in the studio; or a Mitsuba scene, its
         dictionary, or the path of its XML file.
     path: .png (8-bit sRGB, tone mapped) or .exr (the numbers).
-    options: a `TraceOptions` for all surfaces; `precision` and `backend` must not be set. Beside
-        bare fields the keywords of `Surface` may be given (level, clip, section, side, largest),
-        and those of `TraceOptions` in place of `options`. A `Solid` with a section, or of glass, is
-        drawn with its inside. The default tolerance is 1e-4 of half the diagonal of the box of what
-        is drawn.
-    show: "path" follows light paths; "shaded" lights first hits by a formula, in seconds and
-        without noise; or what one ray a pixel found: "normal", "evaluations" (of the fields),
-        "status" and "depth", or "value", which colors the surface by the function `color_by`.
-        Edges of pictures of values are antialiased, the numbers that are returned are not.
+    options: a `TraceOptions` for all surfaces; `precision` and `backend` must not be set. Its
+        attributes may be given as keywords instead. If fields are given, the keywords of `Surface`
+        (level, clip, section, side, largest) may be given too. A `Solid` with a section, or of
+        glass, is drawn with its inside. The default tolerance is 1e-4 of half the diagonal of the
+        box of what is drawn.
+    show: the kind of picture. "path" follows light paths; "shaded" lights first hits by a formula,
+        in seconds and without noise. The other kinds show what one ray a pixel found: "normal",
+        "evaluations" (of the fields), "status", "depth", or "value", which colors the surface by
+        the function `color_by`. Edges of pictures of values are antialiased, but the numbers that
+        are returned are not.
     size: (width, height) in pixels, by default (800, 600) or the scene's own.
-    spp: samples per pixel. With show="path" of each pixel, by default 64 or the number of the
-        scene. With "shaded" and "value" of pixels at edges, by default 9. Other pictures have one
-        ray per pixel.
-    antialias: which pixels of a shaded picture get all their samples: "edges", the default, those
-        that differ from a neighbor; "cones" also those that a surface covers in part, found by
-        a cone around each pixel. With cones, wires thinner than a pixel stay lines. Cones take
+    spp: samples per pixel. With show="path" each pixel has so many, by default 64 or the number of
+        the scene. With "shaded" and "value" pixels at edges have so many, by default 9. Other
+        pictures have one ray per pixel.
+    antialias: which pixels of a shaded picture get all their samples. With "edges", the default,
+        pixels that differ from a neighbor. With "cones", also pixels that a surface covers in part,
+        found by a cone around each pixel. So wires thinner than a pixel stay lines. Cones take
         about twice as many evaluations of fields, estimate distances by |f - level| / |grad f|,
         and raise an error for fields that jump, such as winding numbers of meshes.
     color_by: the function whose values show="value" shows on the surface: a field, "x", "y", "z",
         or a function of three coordinates. Coordinates are those of the surface; for a Mitsuba
         scene, those of the world.
-    color_range: (low, high) of the colors of values, depths or evaluations, by default what is
-        seen; the same for all pictures of a series.
+    color_range: (low, high), the numbers at the ends of the color scale of values, depths or
+        evaluations; by default the least and the greatest number in the picture. Give it to have
+        the same colors in all pictures of a series.
     color_bar: True, or the title, for a bar with numbers to the right of these pictures. It widens
         the picture that is written and displayed, not the array that is returned. Needs Pillow,
         which `pip install harnack[film]` brings.
@@ -119,11 +124,11 @@ def render(
     material: a name of `MATERIALS`, a color as for the backdrop, a `Material` or a BSDF dictionary;
         a list, one for each surface or, of one field, for each level.
     camera: where the stage is seen from, a `Camera`, or (x, y, z) in the surfaces' coordinates.
-    backdrop: "light" or "dark", with a floor. Or nothing but the surfaces before a color, by its
-        name in CSS such as "white", "#rrggbb" or as three numbers of sRGB; before (bottom, top),
-        two colors; before an image, by its file (.png, .jpg, .exr) or as an array (h, w, 3) of
-        bytes or of linear numbers, scaled to cover the picture. Or "transparent", the same with
-        alpha in PNG and EXR files and as a fourth number, by which the first three are multiplied.
+    backdrop: what is seen behind the surfaces. "light" or "dark" has a floor; all others have none.
+        A color is a name of CSS such as "white", "#rrggbb" or three numbers of sRGB. (bottom, top)
+        are two colors. An image is its file (.png, .jpg, .exr) or an array (h, w, 3) of bytes or
+        of linear numbers, scaled to cover the picture. "transparent" gives alpha in PNG and EXR
+        files and as a fourth number, by which the first three are multiplied.
     up: what is up, "x", "y", "z", "-x", ... or a direction in the surfaces' coordinates; by
         default z.
     boundary_radius: the radius, in the surfaces' coordinates, of a tube around the curves at which
@@ -131,8 +136,10 @@ def render(
     section_material: what the faces of opaque solids on their `section` are made of.
     isolines: lines on the surfaces, of heights or of another function, where `show` is "path",
         "shaded" or "value": an `Isolines` or several.
-    thickness: draws surfaces as walls so thick, in their own coordinates: the closed meshes that
-        `harnack.mesh` makes with this thickness, whose triangles are seen from close by.
+    thickness: the thickness, in the surfaces' coordinates, of walls that are drawn in place of the
+        surfaces: the closed meshes that `harnack.mesh` makes with this thickness, whose triangles
+        are seen from close by.
+
     In shaded pictures, the side of larger values of an open surface in one color is darker, and
     what spans the gaps of a mesh is amber, or teal on warm colors.
 
@@ -157,11 +164,13 @@ def render(
     picture_options = RenderOptions.of(arguments)
     is_divided = client is not None or checkpoint is not None
     chunks = check_chunks(arguments["chunks"], is_divided=is_divided)
+    # A missing package is reported before anything is drawn.
     if picture_options.denoise:
         load_denoiser()
     if target is not None and picture_options.color_bar and target.suffix.lower() == ".exr":
         raise ValueError(f"{target}: EXR files hold the numbers; a color bar is drawn in .png")
     shorthand = shorthand_among(arguments)
+    # A Mitsuba scene has its own camera, materials and lights.
     if not _is_for_studio(surfaces):
         of_studio = {name: arguments[name] for name in STUDIO_OPTIONS}
         refuse_studio_options({**of_studio, **shorthand, "options": options})
@@ -188,30 +197,39 @@ def _render_job(
     *,
     alone: bool,
 ) -> tuple[Image, npt.NDArray[np.uint8], list[str] | None]:
-    """The numbers of a picture (h, w) or (h, w, n), its pixels in 8-bit sRGB, and the names of its
-    channels, or None for the usual names.
+    """Draw a picture. Returns its numbers, an array (h, w) or (h, w, n); its pixels, (h, w, 3 or 4)
+    in 8-bit sRGB; and the names of the n channels, or None for the usual names.
 
-    executor: calls the methods of the job's task.
-    color_by: the option as it was set; if it is a text, it is the title of the color bar.
+    job: the scene, the options and the task of the picture.
+    executor: calls the methods of the job's task, in this process or on a cluster.
+    color_by: the option as the caller set it. If it is a text, it becomes the title of the color
+        bar.
+    progress: whether to show a progress bar, or a function that is called with each finished
+        fraction.
     alone: whether this process draws everything. Only then is the time estimated before.
     """
     mi, options, task, sensor = job.mi, job.options, job.task, job.scene.sensors()[0]
+    # A scene without level sets.
     if task is None:
         return _render_by_mitsuba(mi, job.scene, options)
     if isinstance(task, AovTask):
+        # A progress bar is shown only if an executor divides the work.
         with progress_bar(
             "rendering", progress and not isinstance(executor, LocalRenderExecutor)
         ) as advance:
             view = task.look(executor, advance)
-        bar = (
+        color_bar = (
             color_by
             if options.color_bar is True and isinstance(color_by, str)
             else options.color_bar
         )
         samples = options.spp or EDGE_SPP
-        shown = aov_picture(options.show, task, view, options.color_range, bar, samples, executor)
+        shown = aov_picture(
+            options.show, task, view, options.color_range, color_bar, samples, executor
+        )
         return AOV_MODES[options.show].numbers(view), shown, None
     if isinstance(task, PathRenderTask) and alone and progress:
+        # A picture on a cluster is not estimated: the estimate measures this process.
         task = _with_time_estimate(job, task, progress)
         executor = (
             LocalRenderExecutor(task) if isinstance(executor, LocalRenderExecutor) else executor
@@ -229,8 +247,12 @@ def _render_job(
 def _with_time_estimate(
     job: RenderJob, task: PathRenderTask, progress: bool | Advance
 ) -> PathRenderTask:
-    """The task with as many light paths at a time as let a progress bar move every few seconds. If
-    the picture will take long, a line with the estimated time is printed to stderr."""
+    """Estimate how long the picture takes. Returns the task with the number of light paths traced
+    at a time chosen such that a progress bar moves every few seconds. If the picture will take
+    long, a line with the estimated time is printed to stderr.
+
+    progress: True to print the line; a function that receives the progress prints nothing.
+    """
     estimate = estimate_time(
         job.mi, job.scene, task.sensor, task.tracer, spp=task.spp,
         features=task.features,
@@ -243,18 +265,22 @@ def _with_time_estimate(
 
 
 def _is_for_studio(surfaces: Any) -> bool:
-    """Whether the first argument of `render` is drawn in the studio: a field, a surface, or a list
-    of them. Otherwise it is a Mitsuba scene."""
+    """Return whether the first argument of `render` is drawn in the studio: a field, a surface, or
+    a list of them. Otherwise it is a Mitsuba scene."""
     return isinstance(surfaces, Field | Surface | TracedSurface | list | tuple)
 
 
 def _check_can_be_divided(surfaces: Any, task: Any) -> None:
-    """Raise an error if a picture cannot be divided into parts that are drawn on a cluster or kept
-    in a checkpoint. ValueError: Mitsuba's own integrator draws the scene, in one piece. TypeError:
-    the scene is given as a loaded scene or a file, and only a dictionary can be sent.
+    """Check that a picture can be divided into parts, which are drawn on a cluster or kept in a
+    checkpoint.
 
     surfaces: the first argument of `render`.
     task: the task that draws the picture part by part; None if Mitsuba draws it.
+
+    Raises:
+        ValueError: Mitsuba's own integrator draws the scene, in one piece.
+        TypeError: the scene is given as a loaded scene or a file, and only a dictionary can be
+            sent.
     """
     if task is None:
         raise ValueError(
@@ -270,22 +296,33 @@ def _check_can_be_divided(surfaces: Any, task: Any) -> None:
 def _render_by_mitsuba(
     mi: Any, scene: Any, options: RenderOptions
 ) -> tuple[Image, npt.NDArray[np.uint8], list[str]]:
-    """The picture of a scene without our surfaces, drawn by the scene's own integrator: the numbers
-    (h, w, n) of all n channels, the pixels of the color channels, and the names of all channels."""
-    for name, used in (("max_depth", options.max_depth is not None), ("denoise", options.denoise)):
-        if used:
+    """Draw a scene without level sets by the integrator that the scene asks for. Returns the
+    numbers (h, w, n) of all n channels, the 8-bit sRGB pixels of the color channels, and the names
+    of all channels.
+
+    Raises:
+        ValueError: the options `max_depth` or `denoise` are set, which only the path tracer of this
+            library honors.
+    """
+    for name, is_set in (
+        ("max_depth", options.max_depth is not None),
+        ("denoise", options.denoise),
+    ):
+        if is_set:
             raise ValueError(f"{name}: Mitsuba draws this scene, by an integrator of its own")
     image = np.array(mi.render(scene, spp=options.spp or 0, seed=options.seed))
-    # Pictures inside an `aov` are the first channels, and come once.
+    # An integrator `aov` names each channel of its nested pictures (NAME.R, ...). These pictures
+    # are also the first channels, so their names are left out here.
     names = [name for name in scene.integrator().aov_names() if name[-2:] not in _IN_AOV]
-    count = image.shape[-1] - len(names)
-    names = [*{1: "Y", 2: "YA"}.get(count, "RGBA"[:count]), *names]
-    return image, tone_map(image[..., :count] if count >= 3 else image[..., 0]), names
+    color_count = image.shape[-1] - len(names)
+    # A film has one (luminance), two, three or four color channels; further channels follow.
+    names = [*{1: "Y", 2: "YA"}.get(color_count, "RGBA"[:color_count]), *names]
+    return image, tone_map(image[..., :color_count] if color_count >= 3 else image[..., 0]), names
 
 
 def _warn_of(lost: int, kind: str) -> None:
-    """Warn that rays ran out of steps, if there are any. lost: their number. kind: what to call
-    them."""
+    """Warn that rays ran out of steps, if any did. lost: their number. kind: what to call them in
+    the message, such as "light paths"."""
     if lost:
         warnings.warn(
             f"{lost} {kind} ran out of steps and are drawn magenta; raise max_steps", stacklevel=3
@@ -304,6 +341,9 @@ def _composite_over_backdrop(
 
     Tone mapping compresses bright light in the pixels. A ground backdrop is tone mapped together
     with the surfaces; all other backdrops keep their colors.
+
+    A Mitsuba scene is returned with the covered fraction if its film has alpha, else without it. A
+    transparent picture is returned as it is.
     """
     if stage is None:
         has_alpha = mi.has_flag(sensor.film().flags(), mi.FilmFlags.Alpha)

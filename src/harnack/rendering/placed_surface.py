@@ -1,5 +1,6 @@
-"""A level set placed in the world: it is translated, rotated or mirrored, and scaled by one
-factor."""
+"""A surface placed in the world: it is rotated or mirrored, scaled by one factor, and translated. A
+surface, a level set of a field or the boundary of a solid, is traced in its own coordinates. Rays
+of the world are mapped to these coordinates, and hits are mapped back."""
 
 from __future__ import annotations
 
@@ -28,7 +29,7 @@ class Placement:
     """The map x -> scale * rotation @ x + translation from a surface's coordinates to the world's.
 
     rotation: (3, 3) orthogonal, possibly with a reflection.
-    translation: (3,).
+    translation: (3,) in the world.
     """
 
     scale: float
@@ -37,12 +38,12 @@ class Placement:
 
     @classmethod
     def identity(cls) -> Placement:
-        """The map that leaves all points where they are."""
+        """Return the map that leaves all points where they are."""
         return cls(1.0, np.eye(3), np.zeros(3))
 
     @classmethod
     def of(cls, world_from_local: npt.ArrayLike) -> Placement:
-        """The placement of a matrix (4, 4) of homogeneous coordinates.
+        """Return the placement of a matrix (4, 4) of homogeneous coordinates.
 
         Raises:
             ValueError: the matrix is not finite, or it does not scale all lengths alike. It has to,
@@ -54,6 +55,8 @@ class Placement:
             raise ValueError("to_world must be a finite matrix of shape (4, 4)")
         linear = matrix[:3, :3]
         scale = float(np.cbrt(abs(np.linalg.det(linear))))
+        # All lengths are scaled alike if the linear part times its transpose is scale^2 times the
+        # identity.
         gram: FloatArray = np.matmul(linear, np.transpose(linear))
         is_similar = scale > 0 and np.allclose(gram, scale**2 * np.eye(3), atol=1e-4 * scale**2)
         if not is_similar or not np.allclose(matrix[3], (0, 0, 0, 1)):
@@ -65,36 +68,37 @@ class Placement:
 
     @property
     def matrix(self) -> FloatArray:
-        """The map as a matrix (4, 4)."""
+        """The map as a matrix (4, 4) of homogeneous coordinates."""
         matrix = np.eye(4)
         matrix[:3, :3], matrix[:3, 3] = self.scale * self.rotation, self.translation
         return matrix
 
     def apply(self, points: npt.ArrayLike) -> FloatArray:
-        """The points of the world, (n, 3), to which points (n, 3) of the surface's coordinates are
-        mapped."""
+        """Map points (n, 3) from the surface's coordinates to the world."""
         local: FloatArray = np.asarray(points, dtype=np.float64)
         rotated: FloatArray = np.matmul(local, np.transpose(self.rotation))
         return self.scale * rotated + self.translation
 
     def apply_inverse(self, points: npt.ArrayLike) -> FloatArray:
-        """The points of the surface's coordinates, (n, 3), that are mapped to points (n, 3) of the
-        world."""
+        """Map points (n, 3) from the world to the surface's coordinates."""
         world: FloatArray = np.asarray(points, dtype=np.float64)
         local: FloatArray = np.matmul(world - self.translation, self.rotation)
         return local / self.scale
 
     def world_bounds(self, ends: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """The lower and the upper corner, (3,) each, of a box in the world that contains a box of
-        the surface's coordinates. ends: (2, 3) the corners of that box."""
+        """Return the lower and the upper corner, (3,) each, of a box in the world that contains a
+        box of the surface's coordinates.
+
+        ends: (2, 3) the lower and the upper corner of the box in the surface's coordinates.
+        """
         corners = self.apply(list(itertools.product(*ends.T.tolist())))
         return corners.min(axis=0), corners.max(axis=0)
 
 
 @dataclass(frozen=True)
 class _HitPoint:
-    """The point (3,) at which a ray hits a surface, and the unit normal (3,) there, for
-    `compute_on_active`."""
+    """The point (3,) at which a ray hits a surface, and the unit normal (3,) there. It is the
+    argument of `compute_on_active`."""
 
     position: Vec3
     normal: Vec3
@@ -102,7 +106,7 @@ class _HitPoint:
 
 @dataclass(frozen=True)
 class _IsolineIndex:
-    """The number of the isoline at a hit, counted from 1, or 0, as a record for
+    """The number of the isoline at a hit, counted from 1; 0 for no isoline. It is the result of
     `compute_on_active`."""
 
     isoline_index: Index
@@ -110,14 +114,14 @@ class _IsolineIndex:
 
 @dataclass(frozen=True)
 class PlacedSurface:
-    """A level set or the boundary of a solid on a backend, placed in the world, to be hit by rays
-    of the world.
+    """A level set or the boundary of a solid, placed in the world and prepared to be hit by rays of
+    the world. The map from the surface's own coordinates to the world is x -> scale R x +
+    translation.
 
-    prepared: the tracer of the level set, in the coordinates of the surface.
+    prepared: the tracer of the surface, in the surface's coordinates.
     solid: the solid whose boundary is drawn; None for a level set.
-    scale, rotation_rows, translation: the map from the surface's coordinates to the world's, x ->
-        scale R x + translation. rotation_rows holds the rows of R. All numbers are kernel
-        parameters.
+    scale, rotation_rows, translation: the map. rotation_rows holds the rows of R. All numbers are
+        kernel parameters.
     isolines: the isolines that are drawn on it.
     """
 
@@ -133,10 +137,10 @@ class PlacedSurface:
         cls, surface: TracedSurface, placement: Placement, backend: Backend,
         isolines: Sequence[Isolines] = (), size: float = 1.0,
     ) -> PlacedSurface:  # fmt: skip
-        """The surface on a backend, placed in the world.
+        """Prepare a surface on a backend, the device that traces rays, and place it in the world.
 
-        isolines: lines to draw on it. size: the diagonal of the surface's box, for their default
-            width.
+        isolines: lines to draw on it.
+        size: the diagonal of the surface's box, which determines the lines' default width.
         """
 
         def vector(numbers: FloatArray) -> Vec3:
@@ -150,10 +154,10 @@ class PlacedSurface:
         return cls(prepared, solid, scale, rows, vector(placement.translation), lines)
 
     def queued(self) -> PlacedSurface:
-        """This surface, traced in the way in which few lanes share a queue of rays: a lane that has
-        finished a ray takes the next one from the queue, so no lane waits for a longer ray. Such
-        rays are traced at once when the method is called, so it cannot be called while a kernel is
-        being recorded."""
+        """Return this surface with another way of tracing: few lanes share a queue of rays. A lane
+        that has finished a ray takes the next one from the queue, so no lane waits for a longer
+        ray. Such rays are traced at once when the method is called, so it cannot be called while a
+        kernel is being recorded."""
         prepared = replace(self.prepared, uses_ray_queue=True)
         solid = None if self.solid is None else replace(self.solid, prepared=prepared)
         return replace(self, prepared=prepared, solid=solid)
@@ -161,9 +165,10 @@ class PlacedSurface:
     def intersect(
         self, o: Vec3, d: Vec3, t_max: Real, active: Mask, leaves: Real = 0.0
     ) -> SurfaceHit:
-        """The first hits of rays o + t d, |d| = 1, 0 <= t <= t_max, as a `SurfaceHit`; rays and
-        hits are in the world.
+        """Find the first hits of rays o + t d, |d| = 1, 0 <= t <= t_max. Returns a `SurfaceHit`.
+        Rays and hits are in the world.
 
+        active: mask of the rays to trace.
         leaves: for a ray that starts on this very surface, 1 if it goes to the side to which the
             normal points, else -1; 0 for a ray that starts elsewhere.
         """
@@ -184,24 +189,27 @@ class PlacedSurface:
         )
 
     def _isoline_index(self, hit: SurfaceHit) -> Index:
-        """The number of the isoline on which each hit lies, counted from 1; 0 for no isoline and
-        for no hit. hit: in the coordinates of the surface, not of the world."""
+        """Return the number of the isoline on which each hit lies, counted from 1; 0 for no isoline
+        and for no hit.
+
+        hit: in the coordinates of the surface, not of the world.
+        """
         index = self.prepared.backend.UInt32
 
-        def numbers(point: _HitPoint) -> _IsolineIndex:
+        def find_index(point: _HitPoint) -> _IsolineIndex:
             """The number of the isoline at points, as a record."""
             return _IsolineIndex(
                 isoline_index_at(self.isolines, point.position, point.normal, index)
             )
 
-        point, none = _HitPoint(hit.position, hit.normal), _IsolineIndex(index(0))
+        point, no_isoline = _HitPoint(hit.position, hit.normal), _IsolineIndex(index(0))
         if self.prepared.uses_ray_queue:
-            return compute_on_active(hit.is_hit, numbers, point, none).isoline_index
-        return dr.select(hit.is_hit, numbers(point).isoline_index, 0)
+            return compute_on_active(hit.is_hit, find_index, point, no_isoline).isoline_index
+        return dr.select(hit.is_hit, find_index(point).isoline_index, 0)
 
     def has_line_near(self, position: Vec3, normal: Vec3, across: Vec3, down: Vec3) -> Mask:
-        """Mask of points of the surface, in the world, for which the edge of an isoline passes
-        through the pixel or near it.
+        """Return the mask of points for which the edge of an isoline passes through the pixel or
+        near it. The points lie on the surface and are given in the world.
 
         position, normal: (3,) the point in the middle of the pixel, and the unit normal there.
         across, down: (3,) vectors from it to the points of the tangent plane in the middles of the
@@ -211,14 +219,14 @@ class PlacedSurface:
         p = self._to_local(vector(position) - self.translation) / self.scale
         n = self._to_local(vector(normal))
         u, v = (self._to_local(vector(step)) / self.scale for step in (across, down))
-        near = self.prepared.backend.Bool(False)
+        is_near = self.prepared.backend.Bool(False)
         for isoline in self.isolines:
-            near |= isoline.edge_is_near(p, n, u, v)
-        return near
+            is_near |= isoline.edge_is_near(p, n, u, v)
+        return is_near
 
     def occludes(self, o: Vec3, d: Vec3, t_max: Real, active: Mask) -> Mask:
-        """Mask of rays o + t d, 0 <= t <= t_max, of the world that hit the surface. Rays that are
-        not proved to miss it count as hits."""
+        """Return the mask of rays o + t d, 0 <= t <= t_max, of the world that hit the surface. Rays
+        that are not proved to miss it count as hits."""
         o, d, t_max = self._local_ray(o, d, t_max)
         if self.solid is not None:
             return self.solid.occludes(o, d, t_max, active)
@@ -232,37 +240,39 @@ class PlacedSurface:
         t_max: Real,
         bounding_balls: tuple[Vec3, Real, Real] | None,
     ) -> Mask:
-        """Mask of the cones around rays o + t d of the world that this surface covers in part,
-        before t_max.
+        """Return the mask of cones that this surface covers in part, before t_max. The axes of the
+        cones are rays o + t d of the world.
 
         radius: of each cone, per unit of t.
-        bounding_balls: (middle, depth, size) in the surface's coordinates: the common center of a
-            ball of radius `depth` inside the extent of the surface and of a ball of radius `size`
-            around it; None for an unbounded extent.
+        bounding_balls: (center, inner_radius, outer_radius) in the surface's coordinates. The ball
+            with the inner radius lies inside the extent of the surface, and the ball with the outer
+            radius contains it. None for an unbounded extent.
 
         The surface must be prepared for crossings (`TracedSurface.prepare`).
         """
         o, d, t_max = self._local_ray(o, d, t_max)
-        solid = None if self.solid is None else (self.solid.low, self.solid.high)
+        solid_range = None if self.solid is None else (self.solid.low, self.solid.high)
         cones = PixelCones(
-            self.prepared, o, d, self.prepared.backend.Float(radius), bounding_balls, solid
+            self.prepared, o, d, self.prepared.backend.Float(radius), bounding_balls, solid_range
         )
         return cones.partially_covered(t_max, True)[0]
 
     def _local_ray(self, o: Vec3, d: Vec3, t_max: Real) -> tuple[Vec3, Vec3, Real]:
-        """Origins, directions and largest parameters of rays of the world in the coordinates of the
-        surface."""
+        """Map rays from the world to the coordinates of the surface. Returns their origins,
+        directions and largest parameters. Directions keep the length 1, so parameters are divided
+        by the scale."""
         backend = self.prepared.backend
-        local = self._to_local(backend.Array3f(o) - self.translation) / self.scale
-        return local, self._to_local(backend.Array3f(d)), backend.Float(t_max) / self.scale
+        local_origin = self._to_local(backend.Array3f(o) - self.translation) / self.scale
+        return local_origin, self._to_local(backend.Array3f(d)), backend.Float(t_max) / self.scale
 
     def _to_world(self, v: Vec3) -> Vec3:
-        """Vectors (3,) of the surface's coordinates, rotated as in the world; they are neither
+        """Rotate vectors (3,) from the surface's coordinates to the world's. They are neither
         scaled nor translated."""
         return self.prepared.backend.Array3f(*(dr.dot(row, v) for row in self.rotation_rows))
 
     def _to_local(self, v: Vec3) -> Vec3:
-        """Vectors (3,) of the world, rotated as in the surface's coordinates; they are neither
+        """Rotate vectors (3,) from the world's coordinates to the surface's. They are neither
         scaled nor translated."""
         x, y, z = v
+        # The transpose of R times v.
         return self.rotation_rows[0] * x + self.rotation_rows[1] * y + self.rotation_rows[2] * z

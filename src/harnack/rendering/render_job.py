@@ -1,4 +1,7 @@
-"""The job of a picture. It can be sent to other processes, which draw parts of the picture."""
+"""The job of a picture: everything that determines it, in an object that can be sent to other
+processes, which draw parts of the picture. A task is the object that draws any part of one picture:
+an `AovTask`, a `PathRenderTask` or a `ShadedTask`. A picture is drawn in the studio, a stage for
+fields and surfaces, or it is of a Mitsuba scene."""
 
 from __future__ import annotations
 
@@ -37,7 +40,8 @@ _RAYS_A_PATH = 3
 
 @dataclass(frozen=True)
 class RenderJob:
-    """Everything that determines a picture.
+    """Everything that determines a picture. It makes the scene and the task that draws the picture,
+    and other processes can make the same ones from a copy of it.
 
     surfaces: the first argument of `render`: fields or surfaces, or a Mitsuba scene.
     options: the options of the picture.
@@ -45,8 +49,8 @@ class RenderJob:
     shorthand: options of surfaces and traces that were set by keywords, by name.
     variant: the Mitsuba variant.
 
-    A picture is drawn by a task: an `AovTask`, a `PathRenderTask` or a `ShadedTask`. The methods
-        here that are named like methods of a task call these, and return plain arrays.
+    The task is an `AovTask`, a `PathRenderTask` or a `ShadedTask`. The methods here that are named
+    like methods of a task call these, and return their results as plain arrays by name.
     """
 
     surfaces: Any
@@ -68,20 +72,21 @@ class RenderJob:
             return None
         options, size = self.options, self.options.size or DEFAULT_SIZE
         check_memory(options.show, *size)
-        on_stage = studio_objects(
+        objects = studio_objects(
             self.surfaces, options.material, self.trace_options, self.shorthand,
             boundary_radius=options.boundary_radius, boundary_material=options.boundary_material,
             section_material=options.section_material, isolines=options.isolines,
             thickness=options.thickness,
         )  # fmt: skip
-        rays = size[0] * size[1]
+        # Fields are prepared more thoroughly if many rays are to be traced.
+        ray_count = size[0] * size[1]
         if options.show not in (*AOV_MODES, "shaded"):
-            rays *= _RAYS_A_PATH * (options.spp or STUDIO_SPP)
-        on_stage = [
-            replace(element, surface=element.surface.for_rays(rays)) for element in on_stage
+            ray_count *= _RAYS_A_PATH * (options.spp or STUDIO_SPP)
+        objects = [
+            replace(element, surface=element.surface.for_rays(ray_count)) for element in objects
         ]
         return build_studio(
-            self.mi, on_stage, size=size, camera=options.camera,
+            self.mi, objects, size=size, camera=options.camera,
             backdrop=options.backdrop, up="z" if options.up is None else options.up,
             surfaces_only=options.show in AOV_MODES, traced_light=options.show == "path",
         )  # fmt: skip
@@ -97,22 +102,23 @@ class RenderJob:
 
     @functools.cached_property
     def task(self) -> AovTask | PathRenderTask | ShadedTask | None:
-        """The task that draws the picture, and can draw it part by part; None for a scene that
-        Mitsuba's own integrator draws."""
+        """The task, which draws the picture part by part; None for a scene that Mitsuba's own
+        integrator draws."""
         mi, options, stage = self.mi, self.options, self.stage
         scene = self.scene
         sensor = scene.sensors()[0]
         if options.show in AOV_MODES:
             placement = Placement.identity() if stage is None else stage.placement
-            viewer = AovTask.of(mi, scene, sensor, placement, options.color_by)
+            aov_task = AovTask.of(mi, scene, sensor, placement, options.color_by)
             if isinstance(options.backdrop, GradientBackdrop):
-                viewer = replace(viewer, background=options.backdrop.bottom)
-            return viewer
+                aov_task = replace(aov_task, background=options.backdrop.bottom)
+            return aov_task
         if options.show == "shaded":
             return ShadedTask(
                 mi, scene, sensor, spp=options.spp or EDGE_SPP, cut_out=stage is not None,
                 on_floor=stage is not None and stage.has_ground, cones=options.antialias == "cones",
             )  # fmt: skip
+        # Path tracing, with the settings of the scene's integrator.
         tracer = equivalent_path_tracer(mi, scene)
         if tracer is None:
             return None
@@ -124,14 +130,14 @@ class RenderJob:
         return PathRenderTask(mi, scene, sensor, tracer, spp, options.seed, options.denoise)
 
     def _task_in_variant(self) -> Any:
-        """The task, after the Mitsuba variant was set again: a worker may have worked in another
-        one."""
+        """Set the Mitsuba variant of this job and return the task. A process may have drawn in
+        another variant meanwhile."""
         set_variant(self.variant)
         return self.task
 
     def render_range(self, start: int, stop: int) -> TaskResult:
-        """The result of `render_range` of the task, an `AovTask` or a `PathRenderTask`, for pixels
-        from `start` to `stop`, as arrays by name."""
+        """Draw the pixels from `start` to `stop` by `render_range` of the task, an `AovTask` or a
+        `PathRenderTask`. Returns its result as arrays by name."""
         task = self._task_in_variant()
         if isinstance(task, AovTask):
             return _arrays_of(task.render_range(start, stop))
@@ -139,38 +145,40 @@ class RenderJob:
         return _with_lost(task.render_range(start, stop))
 
     def render_samples(self, *part: Any) -> TaskResult:
-        """The result of `AovTask.render_samples` as arrays by name. part: its arguments."""
+        """Call `AovTask.render_samples`. Returns its result as arrays by name. part: its
+        arguments."""
         return _arrays_of(cast("AovTask", self._task_in_variant()).render_samples(*part))
 
     def render_gbuffer(self, start: int, stop: int) -> TaskResult:
-        """The result of `ShadedTask.render_gbuffer`, the first hits of a range of pixels, as arrays
-        by name."""
+        """Call `ShadedTask.render_gbuffer`, which finds the first hits of a range of pixels.
+        Returns its result as arrays by name."""
         return cast("ShadedTask", self._task_in_variant()).render_gbuffer(start, stop).to_numpy()
 
     def refine_pixels(self, *part: Any) -> TaskResult:
-        """The result of `ShadedTask.refine_pixels`, the means of samples in pixels, as arrays by
-        name. part: its arguments."""
+        """Call `ShadedTask.refine_pixels`, which averages samples in pixels. Returns its result as
+        arrays by name. part: its arguments."""
         return _with_lost(cast("ShadedTask", self._task_in_variant()).refine_pixels(*part))
 
 
 @dataclass(frozen=True)
 class ClusterRenderExecutor:
-    """Runs the tasks of a picture on a cluster, whose workers call the methods of a `RenderJob`.
+    """Runs the parts of a picture on a cluster, whose processes call the methods of a `RenderJob`.
     The results are those that the task itself would return."""
 
     executor: Executor
     job: RenderJob
 
     def split_range(self, count: int, max_size: int) -> list[tuple[int, int]]:
-        """Ranges (start, stop) of at most `max_size` elements that cover range(count), as many as
-        suit the workers."""
+        """Divide range(count) into ranges (start, stop) of at most `max_size` elements, as many as
+        suit the cluster."""
         return self.executor.split_range(count, max_size)
 
     def run_tasks(self, step: str, parts: Sequence[tuple[Any, ...]]) -> Iterator[Any]:
-        """The results, in order, of calls of the method named `step`; several calls run at the same
-        time. Each entry of `parts` holds the arguments of one call."""
+        """Call the method named `step` once for each entry of `parts`, which holds the arguments of
+        one call. Several calls run at the same time. Yields the results in order."""
         task = self.job.task
         for arrays in self.executor.run_tasks(self.job, step, parts):
+            # Turn the arrays by name into what the method of the task returns.
             if isinstance(task, AovTask):
                 period = None if task.function is None else task.function.period
                 yield AovBuffers(**arrays, period=period, background=task.background)
@@ -181,19 +189,25 @@ class ClusterRenderExecutor:
 
 
 def _with_lost(result: tuple[Any, int]) -> TaskResult:
-    """A mean color and a number of rays out of steps, as arrays by name."""
+    """Return means of colors and the number of rays that ran out of steps, as arrays by name."""
     return {"means": result[0], "lost": np.array(result[1])}
 
 
 def _arrays_of(view: AovBuffers) -> TaskResult:
-    """The arrays of an `AovBuffers`, by name."""
+    """Return the arrays of an `AovBuffers`, by name."""
     return {name: array for name, array in vars(view).items() if isinstance(array, np.ndarray)}
 
 
 def _loaded(mi: Any, source: Any, size: tuple[int, int] | None) -> Any:
-    """The Mitsuba scene of a loaded scene, a dictionary, or the path of an XML file, with a film of
-    `size` (width, height) pixels unless that is None. Raises TypeError or ValueError for anything
-    else."""
+    """Load the Mitsuba scene that is the first argument of `render`.
+
+    source: a loaded scene, a dictionary, or the path of an XML file.
+    size: (width, height) that the film gets, in pixels; None to keep its size.
+
+    Raises:
+        TypeError: another argument.
+        ValueError: the scene has no sensor, or a size is given for a loaded scene.
+    """
     if isinstance(source, mi.Scene):
         if size is not None:
             raise ValueError("size: a loaded scene has its own; set film.size of its sensor")
@@ -210,6 +224,7 @@ def _loaded(mi: Any, source: Any, size: tuple[int, int] | None) -> Any:
     if not scene.sensors():
         raise ValueError("the scene has no sensor to look through")
     if size is not None:
+        # Mitsuba changes the size of a film that is loaded already.
         params = mi.traverse(scene.sensors()[0])
         params["film.size"] = size
         params.update()

@@ -1,5 +1,6 @@
-"""Checks of the options of pictures, made before anything is drawn. `show` is the kind of the
-picture."""
+"""Checks of the options of pictures, made before anything is drawn. Each check returns the value in
+its final form, or raises an error that names the option. `show` is the kind of the picture, such as
+"path" for path tracing or "depth"."""
 
 from __future__ import annotations
 
@@ -35,8 +36,12 @@ _AOV_BYTES = 130
 
 
 def check_max_depth(max_depth: Any, show: str) -> int | None:
-    """The length of the longest light path in edges, or None. Raises ValueError for pictures
-    without light paths."""
+    """Return the length of the longest light path in edges, or None.
+
+    Raises:
+        ValueError: the picture has no light paths.
+        TypeError: not an integer.
+    """
     if max_depth is None:
         return None
     _check_has_paths("max_depth", show)
@@ -44,8 +49,12 @@ def check_max_depth(max_depth: Any, show: str) -> int | None:
 
 
 def check_denoise(denoise: Any, show: str) -> bool:
-    """Whether to take the noise out of a picture. Raises ValueError if that is requested for a
-    picture without noise."""
+    """Return whether to take the noise out of a picture.
+
+    Raises:
+        ValueError: that is requested for a picture without noise.
+        TypeError: neither True nor False.
+    """
     if not isinstance(denoise, bool):
         raise TypeError(f"denoise must be True or False, not {denoise!r}")
     if denoise:
@@ -54,14 +63,19 @@ def check_denoise(denoise: Any, show: str) -> bool:
 
 
 def _check_has_paths(setting: str, show: str) -> None:
-    """Raise ValueError for pictures without light paths. setting: the option that needs them."""
+    """Raise ValueError for pictures without light paths. setting: the name of the option that needs
+    them."""
     if show != "path":
         raise ValueError(f'{setting} needs a picture with show="path", not show="{show}"')
 
 
 def check_isolines(isolines: Any, show: str) -> tuple[Isolines, ...]:
-    """The value of the option `isolines` as a tuple of `Isolines`. Raises ValueError for pictures
-    that cannot show isolines."""
+    """Return the value of the option `isolines` as a tuple of `Isolines`.
+
+    Raises:
+        TypeError: it is no `Isolines` and no list of them.
+        ValueError: the picture cannot show isolines.
+    """
     lines = parse_isolines(isolines)
     if lines and show not in MODES_WITH_ISOLINES:
         raise ValueError(
@@ -71,8 +85,12 @@ def check_isolines(isolines: Any, show: str) -> tuple[Isolines, ...]:
 
 
 def check_color_by(color_by: Any, show: str) -> Field | None:
-    """The function whose values a picture shows, as a field; None for other pictures. Raises
-    ValueError if it is missing, or given for another kind of picture."""
+    """Return the function whose values a picture shows, as a field; None for other pictures.
+
+    Raises:
+        ValueError: it is missing, or given for another kind of picture.
+        TypeError: it is no function on space.
+    """
     if show != "value":
         if color_by is not None:
             raise ValueError(f'color_by needs a picture with show="value", not show="{show}"')
@@ -86,8 +104,12 @@ def check_color_by(color_by: Any, show: str) -> Field | None:
 
 
 def check_color_range(color_range: Any, show: str) -> tuple[float, float] | None:
-    """The ends (low, high) of the color scale, or None. Raises ValueError for pictures without a
-    color scale."""
+    """Return the ends (low, high) of the color scale, or None.
+
+    Raises:
+        ValueError: the picture has no color scale, or the ends are not in order.
+        TypeError: not two numbers.
+    """
     if color_range is None:
         return None
     _check_scaled("color_range", show)
@@ -102,8 +124,13 @@ def check_color_range(color_range: Any, show: str) -> tuple[float, float] | None
 
 
 def check_color_bar(color_bar: Any, show: str) -> bool | str:
-    """Whether to draw a color bar, or the title of the bar. Raises ValueError for pictures without
-    a color scale."""
+    """Return whether to draw a color bar, or the title of the bar.
+
+    Raises:
+        ValueError: the picture has no color scale, or the title cannot be written.
+        TypeError: neither a bool nor a text.
+        ModuleNotFoundError: Pillow is not installed.
+    """
     if not isinstance(color_bar, bool | str):
         raise TypeError(f"color_bar must be True, False or the bar's title, not {color_bar!r}")
     if color_bar:
@@ -117,7 +144,7 @@ def check_color_bar(color_bar: Any, show: str) -> bool | str:
 
 
 def check_backdrop(backdrop: Any, show: str) -> Backdrop:
-    """The backdrop of a picture, by default the studio's light floor. Pictures of numbers
+    """Return the backdrop of a picture, by default the studio's light floor. Pictures of numbers
     (`AOV_MODES`) have one color behind the surfaces.
 
     Raises:
@@ -139,7 +166,8 @@ def check_backdrop(backdrop: Any, show: str) -> Backdrop:
 
 
 def _check_scaled(setting: str, show: str) -> None:
-    """Raise ValueError for pictures without a color scale. setting: the option that needs one."""
+    """Raise ValueError for pictures without a color scale. setting: the name of the option that
+    needs one."""
     if show not in MODES_WITH_SCALE:
         raise ValueError(
             f'{setting} needs a picture with show={_join_or(MODES_WITH_SCALE)}, not "{show}"'
@@ -147,12 +175,16 @@ def _check_scaled(setting: str, show: str) -> None:
 
 
 def _join_or(names: Sequence[str]) -> str:
-    """Names in quotes, joined by "or"."""
+    """Return names in quotes, joined by "or"."""
     return " or ".join(f'"{name}"' for name in names)
 
 
 def check_show(show: Any) -> str:
-    """The kind of the picture, a name. Raises ValueError if it is unknown."""
+    """Return the kind of the picture, one of `SHOW_MODES`.
+
+    Raises:
+        ValueError: it is unknown.
+    """
     if not isinstance(show, str) or show not in SHOW_MODES:
         raise ValueError(
             f"show must be one of {', '.join(SHOW_MODES)}, not {show!r}"
@@ -162,8 +194,12 @@ def check_show(show: Any) -> str:
 
 
 def check_antialias(antialias: Any, show: str) -> str | None:
-    """How pixels of a shaded picture are chosen that get more samples: "edges", "cones", or None
-    for the default. Raises ValueError for other values, and for other pictures."""
+    """Return how pixels of a shaded picture are chosen that get more samples: "edges", "cones", or
+    None for the default.
+
+    Raises:
+        ValueError: another value, or another kind of picture.
+    """
     if antialias is None:
         return None
     if not isinstance(antialias, str) or antialias not in ANTIALIASING:
@@ -177,7 +213,7 @@ def check_antialias(antialias: Any, show: str) -> str | None:
 
 
 def check_image_size(size: Any) -> tuple[int, int]:
-    """The size of a picture in pixels, (width, height).
+    """Return the size of a picture in pixels, (width, height).
 
     Raises:
         TypeError: not two integers.
@@ -194,8 +230,14 @@ def check_image_size(size: Any) -> tuple[int, int]:
 
 
 def check_spp(spp: Any, *, source: str = "") -> int:
-    """The number of samples per pixel, from 1 to MAX_SPP. source: where the number is from, for
-    messages, if it is not from the call."""
+    """Return the number of samples per pixel, from 1 to MAX_SPP.
+
+    source: where the number is from, for messages, if it is not from the call.
+
+    Raises:
+        TypeError: not an integer.
+        ValueError: out of this range.
+    """
     number = check_integer("spp", spp)
     if not 1 <= number <= MAX_SPP:
         raise ValueError(f"spp must be at least 1 and at most {MAX_SPP}, not {number}{source}")
@@ -203,7 +245,7 @@ def check_spp(spp: Any, *, source: str = "") -> int:
 
 
 def check_integer(name: str, number: Any) -> int:
-    """An option's value as an int. name: of the option.
+    """Return the value of an option as an int. name: of the option.
 
     Raises:
         TypeError: it is no integer.
@@ -219,23 +261,37 @@ def check_integer(name: str, number: Any) -> int:
 
 
 def check_chunks(chunks: Any, *, is_divided: bool) -> int | None:
-    """The number of parts into which a task is divided, or None. is_divided: whether it is divided
-    at all; ValueError if it is not, and chunks is set."""
+    """Return the number of parts into which a picture is divided, or None.
+
+    is_divided: whether it is divided at all, as it is with a client or a checkpoint.
+
+    Raises:
+        ValueError: chunks is set for a picture that is not divided, or out of range.
+    """
     if chunks is not None and not is_divided:
         raise ValueError("chunks: parts are drawn one by one with a client or a checkpoint only")
     return None if chunks is None else as_integer_in_range(chunks, "chunks", 1, _MAX_CHUNKS)
 
 
 def _index(number: Any) -> int:
-    """A number as an int; TypeError if it is no integer. True and False are no integers here."""
+    """Return a number as an int. True and False are no integers here.
+
+    Raises:
+        TypeError: it is no integer.
+    """
     if isinstance(number, bool | np.bool_):
         raise TypeError
     return operator.index(number)
 
 
 def check_camera(camera: Any) -> Camera:
-    """The value of the option `camera` as a `Camera`: such an object, the (x, y, z) where a camera
-    stands, or None for the default camera."""
+    """Return the value of the option `camera` as a `Camera`.
+
+    camera: a `Camera`, the (x, y, z) where a camera stands, or None for the default camera.
+
+    Raises:
+        TypeError: anything else.
+    """
     if camera is None:
         return Camera()
     if isinstance(camera, Camera):
@@ -254,23 +310,25 @@ Check = Callable[[Any, str], Any]
 
 
 def ignoring_mode(check: Callable[[Any], Any]) -> Check:
-    """A check of an option's value that does not depend on the kind of the picture."""
+    """Turn a check of an option's value alone into a check of the value and the kind of the
+    picture, which it ignores."""
     return lambda value, show: check(value)
 
 
 def if_set(check: Callable[[Any], Any]) -> Check:
-    """A check of an option's value that leaves None unchanged."""
+    """Turn a check of an option's value into a check that leaves None unchanged and ignores the
+    kind of the picture."""
     return lambda value, show: None if value is None else check(value)
 
 
 def unchecked(value: Any, show: str) -> Any:
-    """The value unchanged: the code that uses the option checks it."""
+    """Return the value unchanged: the code that uses the option checks it."""
     del show
     return value
 
 
 def as_integer(name: str) -> Check:
-    """A check that the value of the option with this name is an integer."""
+    """Return a check that the value of the option with this name is an integer."""
     return lambda value, show: check_integer(name, value)
 
 
@@ -283,7 +341,8 @@ def refuse_studio_options(options: Mapping[str, Any]) -> None:
 
 
 def check_memory(show: str, width: int, height: int) -> None:
-    """Raise ValueError for a picture that does not fit into this machine's memory."""
+    """Raise ValueError for a picture that does not fit into this machine's memory. width, height:
+    in pixels."""
     needed = width * height * _BYTES.get(show, _AOV_BYTES)
     if width * height > 2**30 or needed > _memory():
         raise ValueError(
@@ -293,7 +352,7 @@ def check_memory(show: str, width: int, height: int) -> None:
 
 
 def _memory() -> float:
-    """Bytes of memory in this machine; infinite if unknown."""
+    """Return the bytes of memory in this machine; infinite if unknown."""
     try:
         return float(os.sysconf("SC_PAGE_SIZE")) * os.sysconf("SC_PHYS_PAGES")
     except (AttributeError, ValueError, OSError):

@@ -1,5 +1,7 @@
-"""Names of colors, color maps that turn numbers into colors, color scales with ticks, and color
-bars."""
+"""Colors by name, and colors for numbers. A color map turns numbers in [0, 1] into colors. A color
+scale maps an interval of numbers to a color map, and has ticks, which are numbers with their texts.
+A color bar shows the scale beside a picture. Colors are in sRGB with channels in [0, 1] unless
+stated otherwise."""
 
 from __future__ import annotations
 
@@ -62,10 +64,10 @@ _COLOR_HELP = 'a name of CSS such as "steelblue", "#4682b4", or three numbers fr
 
 
 def parse_color(color: Any, name: str) -> Color:
-    """A color in sRGB, as three numbers in [0, 1].
+    """Return a color in sRGB, as three numbers in [0, 1].
 
-    color: a name of CSS, "#rrggbb", or three numbers in [0, 1].
-    name: of the colored thing, for messages.
+    color: a name of CSS, "#rrggbb" or "#rgb", or three numbers in [0, 1].
+    name: what the color is for, to begin messages with.
 
     Raises:
         TypeError: neither text nor three numbers.
@@ -74,6 +76,7 @@ def parse_color(color: Any, name: str) -> Color:
     if isinstance(color, str):
         return _from_text(color, name)
     try:
+        # float("") raises ValueError, so texts and bools are refused.
         numbers = [float("" if isinstance(number, str | bool) else number) for number in color]
     except (TypeError, ValueError):
         raise TypeError(f"{name} must be {_COLOR_HELP}, not {color!r}") from None
@@ -85,8 +88,13 @@ def parse_color(color: Any, name: str) -> Color:
 
 
 def _from_text(text: str, name: str) -> Color:
-    """The sRGB color of a text, the name of a CSS color or "#rrggbb". name: of the colored thing,
-    for messages."""
+    """Return the sRGB color of a text: the name of a CSS color, "#rrggbb" or "#rgb".
+
+    name: what the color is for, to begin messages with.
+
+    Raises:
+        ValueError: the text is none of these.
+    """
     digits = NAMED_COLORS.get(text.strip().lower())
     if digits is None:
         match = re.fullmatch(r"#([0-9a-fA-F]{3}|[0-9a-fA-F]{6})", text.strip())
@@ -100,13 +108,14 @@ def _from_text(text: str, name: str) -> Color:
 
 
 def linear_from_srgb(color: Color) -> Color:
-    """A color in sRGB as linear sRGB, in which amounts of light can be added (IEC 61966-2-1)."""
+    """Convert a color from sRGB to linear sRGB, in which amounts of light can be added (IEC
+    61966-2-1)."""
     red, green, blue = (_linear(channel) for channel in color)
     return red, green, blue
 
 
 def _linear(channel: float) -> float:
-    """A channel of sRGB, in [0, 1], as linear sRGB."""
+    """Convert one channel, in [0, 1], from sRGB to linear sRGB."""
     return channel / 12.92 if channel <= 0.04045 else math.pow((channel + 0.055) / 1.055, 2.4)
 
 
@@ -128,7 +137,8 @@ _VIRIDIS = np.array(
 
 
 def viridis(x: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.float64]:
-    """Colors (..., 3) in sRGB, in [0, 1], of numbers (...) in [0, 1], from dark blue to yellow.
+    """Return the colors (..., 3) in sRGB of numbers (...) in [0, 1], from dark blue to yellow.
+    Other numbers have the color of the nearer end, and NaN counts as 0.
 
     Equal differences of numbers look equally large, also in gray and for the color-blind.
     """
@@ -159,9 +169,11 @@ _LIGHTNESS, _CHROMA = 0.72, 0.11
 
 
 def cyclic_colormap(x: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.float64]:
-    """Colors (..., 3) in sRGB of numbers (...) that count modulo 1, so that 0 and 1 have the same
-    color. They go through all hues, equally light and equally far from gray."""
+    """Return the colors (..., 3) in sRGB of numbers (...) that count modulo 1, such as angles: 0
+    and 1 have the same color. They go through all hues, equally light and equally far from gray.
+    NaN counts as 0."""
     angle = 2 * np.pi * np.nan_to_num(x).astype(np.float64)
+    # A circle around gray in the color space OKLab.
     lab = np.stack(
         [np.full_like(angle, _LIGHTNESS), _CHROMA * np.cos(angle), _CHROMA * np.sin(angle)], axis=-1
     )
@@ -170,7 +182,8 @@ def cyclic_colormap(x: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.float64]
 
 
 def gray_colormap(x: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.float64]:
-    """Grays (..., 3) in sRGB of numbers (...) in [0, 1]: 0 is white and 1 is dark."""
+    """Return grays (..., 3) in sRGB for numbers (...) in [0, 1]: 0 is white and 1 is dark. NaN
+    counts as 0."""
     gray = 0.25 + 0.75 * (1 - np.clip(np.nan_to_num(x), 0.0, 1.0).astype(np.float64))
     return np.repeat(gray[..., None], 3, axis=-1)
 
@@ -189,12 +202,13 @@ _MAX_PI_MULTIPLE = 16
 
 @dataclass(frozen=True)
 class ColorScale:
-    """A map from numbers to colors. Numbers outside of [low, high] have the color of the nearer
-    end.
+    """A map from numbers in an interval [low, high] to colors. Numbers outside have the color of
+    the nearer end. Numbers that count modulo a period, such as angles, have a cyclic scale from 0
+    to the period.
 
     name: what the numbers are, for color bars.
-    colors_of: gives the colors (..., 3) in sRGB of numbers (...) in [0, 1].
-    period: high - low for numbers that count modulo this period; None for other numbers.
+    colors_of: the color map: gives the colors (..., 3) in sRGB of numbers (...) in [0, 1].
+    period: high - low for a cyclic scale; else None.
     exceeded: whether a picture shows numbers below `low`, and above `high`.
     """
 
@@ -207,12 +221,13 @@ class ColorScale:
 
     @classmethod
     def cyclic(cls, period: float, name: str) -> ColorScale:
-        """The scale of numbers that count modulo a period, from 0 to the period. Its two ends have
-        the same color."""
+        """Return the scale of numbers that count modulo `period`, from 0 to the period. Its two
+        ends have the same color. name: what the numbers are."""
         return cls(0.0, period, name, cyclic_colormap, period)
 
     def with_exceeded(self, numbers: Numbers) -> ColorScale:
-        """This scale with `exceeded` set for a picture that shows the given numbers."""
+        """Return this scale with `exceeded` set for a picture that shows the given numbers. A
+        cyclic scale is never exceeded, nor is any scale by rounding alone."""
         if self.period is not None or not numbers.size:
             return self
         slack = 1e-6 * max(abs(self.low), abs(self.high))
@@ -220,73 +235,89 @@ class ColorScale:
         return replace(self, exceeded=(bool(below), bool(above)))
 
     def colors(self, numbers: Numbers) -> npt.NDArray[np.float64]:
-        """The colors (..., 3) in sRGB, in [0, 1], of numbers (...)."""
+        """Return the colors (..., 3) in sRGB, in [0, 1], of numbers (...)."""
         if self.period is not None:
             return self.colors_of(np.mod(numbers, self.period) / self.period)
-        # The range of equal numbers is their rounding.
+        # If low equals high, the division must not be by zero.
         span = max(self.high - self.low, 1e-6 * abs(self.high), 1e-30)
         return self.colors_of((numbers - self.low) / span)
 
     def ticks(self, max_count: int) -> list[tuple[float, str]]:
-        """The ticks of a color bar as pairs (number, text): at most `max_count`, but at least two
-        unless all numbers of the scale are equal."""
+        """Choose the ticks of a color bar. Returns pairs (number, text): at most `max_count`, but
+        at least two unless all numbers of the scale are equal.
+
+        A period that is a small multiple of pi has ticks at multiples of pi/2. Otherwise ticks are
+        at multiples of 1, 2 or 5 times a power of ten, or at the two ends if the interval has no
+        two such multiples.
+        """
         period = 0.0 if self.period is None else self.period
-        multiple = round(period / math.pi)
-        if 0 < multiple <= _MAX_PI_MULTIPLE and math.isclose(
-            period, multiple * math.pi, rel_tol=1e-6
+        # Scales of angles have ticks at fractions of pi.
+        pi_multiple = round(period / math.pi)
+        if 0 < pi_multiple <= _MAX_PI_MULTIPLE and math.isclose(
+            period, pi_multiple * math.pi, rel_tol=1e-6
         ):
-            return _ticks_at_parts_of_pi(multiple, max_count)
+            return _ticks_at_parts_of_pi(pi_multiple, max_count)
         if not self.high > self.low:
             return [(self.low, f"{self.low:.4g}")]
-        step = _step((self.high - self.low) / max(max_count - 1, 1))
-        first, last = self._multiples(step)
-        if last - first < 1:  # one tick more than requested, if that gives two
-            step = _step((self.high - self.low) / max(max_count + 1, 3))
-            first, last = self._multiples(step)
-        if last - first < 1:  # no room for two nice numbers
+        spacing = _step((self.high - self.low) / max(max_count - 1, 1))
+        first_multiple, last_multiple = self._multiples(spacing)
+        if last_multiple - first_multiple < 1:  # one tick more than requested, if that gives two
+            spacing = _step((self.high - self.low) / max(max_count + 1, 3))
+            first_multiple, last_multiple = self._multiples(spacing)
+        if last_multiple - first_multiple < 1:  # no room for two nice numbers
             largest = max(abs(self.low), abs(self.high))
             digits = 2 + max(2, math.ceil(math.log10(largest / (self.high - self.low))))
             return [(end, f"{end:.{digits}g}") for end in (self.low, self.high)]
-        largest = max(abs(first), abs(last)) * step
-        return [(k * step, _format_number(k * step, step, largest)) for k in range(first, last + 1)]
+        largest = max(abs(first_multiple), abs(last_multiple)) * spacing
+        return [
+            (k * spacing, _format_number(k * spacing, spacing, largest))
+            for k in range(first_multiple, last_multiple + 1)
+        ]
 
     def _multiples(self, step: float) -> tuple[int, int]:
-        """The integers k of the first and the last multiple k * step in [low, high]."""
+        """Return the integers k of the first and the last multiple k * step in [low, high]."""
         return math.ceil(self.low / step - 1e-9), math.floor(self.high / step + 1e-9)
 
 
 def _step(bound: float) -> float:
-    """The smallest number that is at least `bound` > 0 and 1, 2 or 5 times a power of ten."""
+    """Return the smallest number that is at least `bound` > 0 and is 1, 2 or 5 times a power of
+    ten."""
     power = 10.0 ** math.floor(math.log10(bound))
     return next(multiple * power for multiple in _NICE if multiple * power >= bound * (1 - 1e-9))
 
 
 def _format_number(number: float, step: float, largest: float) -> str:
-    """The text of a multiple of a step, with as many digits as it needs. step: 1, 2 or 5 times a
-    power of ten. largest: the largest of all numbers of the scale's ticks, which decides whether
-    exponents are written."""
+    """Write a tick's number, a multiple of `step`, with as many digits as it needs to differ from
+    its neighbors.
+
+    step: the distance between ticks, 1, 2 or 5 times a power of ten.
+    largest: the largest absolute number of all ticks. It decides, with `step`, whether all are
+        written with exponents.
+    """
     if number == 0:
         return "0"
     last_place = math.floor(math.log10(step) + 1e-9)  # the place of the last digit
     if step >= _MIN_PLAIN_STEP and largest < _MAX_PLAIN_NUMBER:
         return f"{number:.{max(0, -last_place)}f}"
+    # The number of digits between the number's first digit and the step's digit.
     digits = max(0, math.floor(math.log10(abs(number)) + 1e-9) - last_place)
     mantissa, exponent = f"{number:.{digits}e}".split("e")
     return f"{mantissa.rstrip('0').rstrip('.') if '.' in mantissa else mantissa}e{int(exponent)}"
 
 
 def _ticks_at_parts_of_pi(multiple: int, max_count: int) -> list[tuple[float, str]]:
-    """Ticks (number, text) from 0 to `multiple` pi: at multiples of pi/2, pi, 2 pi, ... such that
-    there are at most `max_count`, but at least two."""
-    halves = next(
+    """Choose ticks for a cyclic scale from 0 to `multiple` times pi. Returns pairs (number, text)
+    at multiples of pi/2, pi, 2 pi, ...: at the closest spacing with at most `max_count` ticks, but
+    at least two."""
+    spacing_in_halves = next(
         step for step in (1, 2, 4, 8, 16, 32)
         if (2 * multiple) // step + 1 <= max(max_count, 2) or step >= 2 * multiple
     )  # fmt: skip
-    return [(k * math.pi / 2, _as_pi(k)) for k in range(0, 2 * multiple + 1, halves)]
+    return [(k * math.pi / 2, _as_pi(k)) for k in range(0, 2 * multiple + 1, spacing_in_halves)]
 
 
 def _as_pi(halves: int) -> str:
-    """The text of halves * pi/2, such as "3 pi/2" for 3."""
+    """Write the number halves * pi/2 as text, such as "3 pi/2" for 3 and "2 pi" for 4."""
     if halves == 0:
         return "0"
     factor, divisor = (halves // 2, "") if halves % 2 == 0 else (halves, "/2")
@@ -310,7 +341,7 @@ _ON_DARK, _ON_LIGHT = (226, 226, 226), (26, 26, 28)
 
 
 def require_pillow() -> tuple[Any, Any, Any]:
-    """The modules Image, ImageDraw and ImageFont of the package Pillow.
+    """Return the modules Image, ImageDraw and ImageFont of the package Pillow.
 
     Raises:
         ModuleNotFoundError: Pillow is not installed.
@@ -325,8 +356,11 @@ def require_pillow() -> tuple[Any, Any, Any]:
 
 
 def typeface_for(text: str, size: int) -> Any:
-    """A typeface of Pillow with all letters of a text. It is Pillow's own for plain ASCII letters;
-    otherwise the first one of a list that is installed on this machine and has the letters.
+    """Return a typeface of Pillow that has all letters of a text. It is Pillow's own for plain
+    ASCII text; otherwise the first one of a list that is installed on this machine and has the
+    letters.
+
+    size: the height of letters in pixels.
 
     Raises:
         ValueError: no typeface has all letters.
@@ -340,8 +374,9 @@ def typeface_for(text: str, size: int) -> Any:
             typeface = typefaces.truetype(name, size)
         except OSError:  # it is not installed
             continue
-        no_letter = bytes(typeface.getmask(_NO_LETTER))
-        if all(letter == " " or bytes(typeface.getmask(letter)) != no_letter for letter in text):
+        # A typeface draws the same sign for every letter that it lacks.
+        missing_sign = bytes(typeface.getmask(_NO_LETTER))
+        if all(letter == " " or bytes(typeface.getmask(letter)) != missing_sign for letter in text):
             return typeface
     raise ValueError(
         f"no typeface that was found here has all letters of {text!r}: install DejaVu Sans "
@@ -350,53 +385,60 @@ def typeface_for(text: str, size: int) -> Any:
 
 
 def add_color_bar(pixels: Pixels, scale: ColorScale, background: Color) -> Pixels:
-    """A picture (h, w, 3) with the color bar of a scale to its right, (h, w + more, 3).
+    """Put the color bar of a scale to the right of a picture (h, w, 3). Returns the wider picture.
 
     background: the sRGB color, in [0, 1], behind the bar.
 
-    An end of the bar is pointed if the picture has numbers beyond it.
+    An end of the bar is pointed if the picture has numbers beyond it (`ColorScale.exceeded`).
     """
-    behind = tuple(round(255 * fraction) for fraction in background)
-    ink = _ON_LIGHT if sum(background) > 1.5 else _ON_DARK
+    background_bytes = tuple(round(255 * fraction) for fraction in background)
+    ink_color = _ON_LIGHT if sum(background) > 1.5 else _ON_DARK
     images, drawings, _ = require_pillow()
     height = len(pixels)
-    letters = max(_MIN_LETTER_HEIGHT, round(_LETTER_HEIGHT * height))
-    font = typeface_for(scale.name, letters)
-    length = max(2, min(round(_BAR_HEIGHT * height), height - 4 * letters))
-    thick, gap = max(3, round(_BAR_WIDTH * height)), max(2, letters // 2)
-    ticks = scale.ticks(max(2, min(6, length // (2 * letters))))
-    room = max(font.getlength(text) for _, text in ticks)
-    width = max(thick + gap + room, font.getlength(scale.name))
-    strip = images.new("RGB", (math.ceil(width) + 2 * letters, height), behind)
-    top = (height - length + letters) // 2
-    draw = drawings.Draw(strip)
-    tip = gap if any(scale.exceeded) else 0  # its height
-    title = max(0, top - gap - tip)
-    draw.text((letters, title), scale.name, font=font, fill=ink, anchor="ls")
-    values = scale.high - (np.arange(length) + 0.5) / length * (scale.high - scale.low)
+    letter_height = max(_MIN_LETTER_HEIGHT, round(_LETTER_HEIGHT * height))
+    font = typeface_for(scale.name, letter_height)
+    bar_length = max(2, min(round(_BAR_HEIGHT * height), height - 4 * letter_height))
+    bar_width, gap = max(3, round(_BAR_WIDTH * height)), max(2, letter_height // 2)
+    ticks = scale.ticks(max(2, min(6, bar_length // (2 * letter_height))))
+    tick_width = max(font.getlength(text) for _, text in ticks)
+    width = max(bar_width + gap + tick_width, font.getlength(scale.name))
+    strip = images.new("RGB", (math.ceil(width) + 2 * letter_height, height), background_bytes)
+    top = (height - bar_length + letter_height) // 2
+    strip_drawing = drawings.Draw(strip)
+    tip_height = gap if any(scale.exceeded) else 0
+    title_y = max(0, top - gap - tip_height)
+    # The title, above the bar.
+    strip_drawing.text((letter_height, title_y), scale.name, font=font, fill=ink_color, anchor="ls")
+    values = scale.high - (np.arange(bar_length) + 0.5) / bar_length * (scale.high - scale.low)
     if scale.period is not None:  # the upper end is the lower one
         values = np.minimum(values, np.nextafter(scale.high, scale.low))
     column = (scale.colors(values) * 255 + 0.5).astype(np.uint8)
+    # The bar, row by row from the top.
     for row, color in enumerate(column):
-        draw.line([(letters, top + row), (letters + thick - 1, top + row)], fill=tuple(color))
-    for is_passed, row, dy, color in zip(
+        strip_drawing.line(
+            [(letter_height, top + row), (letter_height + bar_width - 1, top + row)],
+            fill=tuple(color),
+        )
+    # The pointed ends, as triangles below and above the bar.
+    for is_passed, row, tip_offset, color in zip(
         scale.exceeded,
-        (top + length, top - 1),
-        (tip, -tip),
+        (top + bar_length, top - 1),
+        (tip_height, -tip_height),
         (column[-1], column[0]),
         strict=True,
     ):
         if is_passed:
             ends = [
-                (letters, row),
-                (letters + thick - 1, row),
-                (letters + thick // 2, row + dy),
+                (letter_height, row),
+                (letter_height + bar_width - 1, row),
+                (letter_height + bar_width // 2, row + tip_offset),
             ]
-            draw.polygon(ends, fill=tuple(color))
+            strip_drawing.polygon(ends, fill=tuple(color))
+    # The ticks to the right of the bar.
     for value, text in ticks:
         fraction = (value - scale.low) / (scale.high - scale.low) if scale.high > scale.low else 0.5
-        y = top + round((1 - fraction) * (length - 1))
-        right = letters + thick
-        draw.line([(right, y), (right + gap // 2, y)], fill=ink)
-        draw.text((right + gap, y), text, font=font, fill=ink, anchor="lm")
+        y = top + round((1 - fraction) * (bar_length - 1))
+        right = letter_height + bar_width
+        strip_drawing.line([(right, y), (right + gap // 2, y)], fill=ink_color)
+        strip_drawing.text((right + gap, y), text, font=font, fill=ink_color, anchor="lm")
     return np.concatenate([pixels, np.asarray(strip, dtype=np.uint8)], axis=1)

@@ -1,9 +1,12 @@
-"""Shaded pictures: one ray a pixel, more rays at edges, and no noise.
+"""Renders shaded pictures: one ray a pixel, more rays at edges, and no noise. The first hit of each
+ray is stored in a G-buffer and lit by formulas. `mi` is the Mitsuba module, and a ray that is
+neither proved free nor led to a hit is called lost. The hemisphere over a point is the set of
+directions above its tangent plane, from which light of the sky comes.
 
 The rays through the middles of all pixels are traced first. Two kinds of pixels are then drawn
 again, as the mean of a fixed grid of samples: pixels that differ visibly from a neighbor, and
 pixels through which the edge of an isoline may pass. So outlines are smooth, lines thinner than a
-pixel have no gaps, and the inside of a surface costs one ray a pixel. If requested, cones around
+pixel have no gaps, and the inside of a surface takes one ray a pixel. If requested, cones around
 the rays find more pixels to draw again: those that a surface covers in part although no ray through
 a middle hits it.
 """
@@ -54,7 +57,8 @@ class ConeCoverage:
 
     Raises:
         ValueError: the field of a surface jumps, such as the winding number of a mesh. It is nearly
-            constant on both sides of the surface, so its values tell no distance.
+            constant on both sides of the surface, so its values tell no distance. Or the surface
+            consists of level sets of several functions.
     """
 
     def __init__(self, mi: Any, world: HybridScene) -> None:
@@ -62,16 +66,21 @@ class ConeCoverage:
         self.placed = tuple(_prepared(mi, carrier) for carrier in world.proxies)
 
     def partly_covered(self, ray: Any, position: Any) -> Any:
-        """Mask of pixels whose cones are covered in part, before the points that their rays hit.
+        """Return the mask of pixels whose cones a surface covers in part, in front of the points
+        that their rays hit.
 
-        ray: the rays through the middles, with differentials.
-        position: (3,) the points that they hit; NaN for no hit.
+        ray: the rays through the middles, with differentials, that is with the rays through
+            neighboring pixels.
+        position: (3,) the points that the rays hit; NaN for no hit.
         """
         mi = self.mi
         distance = dr.norm(position - ray.o)
         t = dr.select(dr.isfinite(distance), distance, dr.largest(mi.Float))
-        x, y = ray.d_x - ray.d, ray.d_y - ray.d
-        radius = 0.5 * dr.maximum(dr.norm(x + y), dr.norm(x - y))  # half the longer diagonal
+        # The vectors to the neighboring pixels span one pixel at distance 1.
+        to_right, to_below = ray.d_x - ray.d, ray.d_y - ray.d
+        radius = 0.5 * dr.maximum(
+            dr.norm(to_right + to_below), dr.norm(to_right - to_below)
+        )  # half the longer diagonal
         is_covered = dr.zeros(mi.Bool, dr.width(ray.d))
         for placed, balls in self.placed:
             is_covered |= placed.covers_in_part(ray.o, ray.d, radius, t, balls)
@@ -79,8 +88,13 @@ class ConeCoverage:
 
 
 def _prepared(mi: Any, carrier: Any) -> tuple[PlacedSurface, Any]:
-    """The surface of a proxy (the mesh that stands for it in Mitsuba), prepared for cones; and a
-    ball inside its extent and a ball around its extent, as `inner_and_outer_ball` returns them."""
+    """Prepare the surface of a proxy (the mesh that stands for it in Mitsuba) for cones. Returns
+    the surface with a tracer of its own, and a ball inside its extent and a ball around its extent,
+    as `inner_and_outer_ball` returns them.
+
+    Raises:
+        ValueError: the surface consists of level sets of several functions, or its field jumps.
+    """
     surface, backend = carrier.surface, mitsuba_backend(mi)
     if surface.field.has_patches:
         raise ValueError(
@@ -97,23 +111,25 @@ def _prepared(mi: Any, carrier: Any) -> tuple[PlacedSurface, Any]:
 
 
 def inner_and_outer_ball(volume: Volume | None, backend: Backend) -> tuple[Vec3, Real, Real] | None:
-    """The middle (3,) of a volume's box, the radius of a ball about it that lies inside the volume,
-    and the radius of a ball about it that contains the volume. None if the volume is unbounded or
-    no inner ball was found."""
+    """Find two balls with the same center for a volume: one that lies inside it, and one that
+    contains it. Returns the center (3,), which is the middle of the volume's bounding box, the
+    inner radius and the outer radius. None if the volume is unbounded or no inner ball was
+    found."""
     if volume is None:
         return None
     lower, upper = (np.asarray(end, dtype=np.float64) for end in volume.bounds())
     if not np.isfinite(upper - lower).all():
         return None
     middle = (0.5 * (lower + upper)).tolist()
-    # Not half the box: other volumes have faces that lie nearer to its middle.
+    # The inner radius is the distance from the middle to the boundary, and not half the box's
+    # side: other volumes have faces that lie nearer. It is reduced by more than its rounding.
     center = choose_backend("double").Array3f(*middle)
-    depth = -float(to_numpy(volume.signed_distance(center))[0]) * (1 - 1e-6)
-    if not depth > 0:
+    inner_radius = -float(to_numpy(volume.signed_distance(center))[0]) * (1 - 1e-6)
+    if not inner_radius > 0:
         return None
-    size = 0.5 * float(np.linalg.norm(upper - lower))
-    numbers = [dr.opaque(backend.Float, x) for x in (*middle, depth, size)]
-    return backend.Array3f(*numbers[:3]), numbers[3], numbers[4]
+    outer_radius = 0.5 * float(np.linalg.norm(upper - lower))
+    parameters = [dr.opaque(backend.Float, x) for x in (*middle, inner_radius, outer_radius)]
+    return backend.Array3f(*parameters[:3]), parameters[3], parameters[4]
 
 
 # The number of directions across the picture, and of taps along each; and the length that they
@@ -126,11 +142,12 @@ _REACH = 0.16
 def ambient_visibility(
     mi: Any, position: Any, normal: Any, width: Any, size: tuple[int, int]
 ) -> Any:
-    """The fraction of the hemisphere over each pixel's point that nothing near it hides, in [0, 1].
+    """Estimate for each pixel's point which fraction of the hemisphere over it nothing near it
+    hides, in [0, 1].
 
     position: (3,) points seen by the pixels, counted by rows; NaN where nothing is seen.
-    normal: (3,) unit normals there, towards the eye.
-    width: the width of a pixel there.
+    normal: (3,) unit normals there, toward the eye.
+    width: the width of a pixel at the point.
     size: (width, height) of the picture in pixels.
 
     Along each of 16 directions across the picture, the points seen by a few pixels are examined.
@@ -142,25 +159,32 @@ def ambient_visibility(
     count = columns * rows
     index = dr.arange(mi.UInt32, count)
     x, y = mi.Float(index % columns), mi.Float(index // columns)
-    reach = _REACH * max(size)
-    radius = reach * width
+    reach_in_pixels = _REACH * max(size)
+    reach_in_space = reach_in_pixels * width
 
     def tap(k: int, direction: Any) -> Any:
-        """The sine of the elevation of the k-th point along a direction, multiplied by a factor
-        that falls with its distance; 0 if nothing is seen there."""
-        distance = 1.0 + reach * ((k + 0.5) / _TAPS) ** 2
+        """Look at the k-th pixel along a direction (2,) in the picture. Returns the sine of the
+        elevation of its point over the tangent plane, multiplied by a factor that falls with its
+        distance; 0 if nothing is seen there."""
+        # Points are denser near the pixel: their distances grow quadratically.
+        distance = 1.0 + reach_in_pixels * ((k + 0.5) / _TAPS) ** 2
+        # The pixel nearest to this point of the picture.
         u, v = x + distance * direction.x, y + distance * direction.y
-        inside = (u >= 0) & (v >= 0) & (u <= columns - 1) & (v <= rows - 1)
+        is_in_picture = (u >= 0) & (v >= 0) & (u <= columns - 1) & (v <= rows - 1)
         pixel = mi.UInt32(dr.round(v)) * columns + mi.UInt32(dr.round(u))
-        offset = dr.gather(mi.Vector3f, position, pixel, inside) - position
-        length = dr.norm(offset)
-        fade = dr.maximum(1 - dr.square(length / radius), 0)
-        height = dr.dot(offset, normal) / length - 0.06  # facets and rounding stay below that
-        return dr.select(inside & (height > 0), height * fade, 0)
+        offset = dr.gather(mi.Vector3f, position, pixel, is_in_picture) - position
+        point_distance = dr.norm(offset)
+        fade = dr.maximum(1 - dr.square(point_distance / reach_in_space), 0)
+        sine = dr.dot(offset, normal) / point_distance - 0.06  # facets and rounding stay below that
+        return dr.select(is_in_picture & (sine > 0), sine * fade, 0)
 
     def add_direction(turn: Any, hidden: Any) -> tuple[Any, Any]:
-        """The index of the next direction, and the sum of hidden fractions with this direction
-        added."""
+        """One step of the loop over directions. Returns the index of the next direction, and the
+        sum of hidden fractions with this direction added.
+
+        turn: the index of this direction.
+        hidden: the sum so far.
+        """
         s, c = dr.sincos((mi.Float(turn) + 0.5) * (dr.two_pi / _DIRECTIONS))
         highest = mi.Float(0)
         for k in range(_TAPS):
@@ -186,7 +210,8 @@ _FIRST_PASS_FRACTION = 0.6
 
 @dataclass
 class GBuffer:
-    """The first opaque hit of the ray of each pixel, seen through transparent solids.
+    """The first opaque hit of the ray of each pixel, seen through transparent solids. The hit is
+    lit later.
 
     position, normal, eye: (3,) the point, its unit normal toward the eye, and the unit direction to
         the eye.
@@ -194,7 +219,7 @@ class GBuffer:
     color: (3,) reflectance.
     light: (3,) the light that does not come from shading the point: emitted there, from the
         environment, or reflected by transparent solids; magenta for rays out of steps.
-    transmittance: (3,) of the transparent solids in front.
+    transmittance: (3,) the fraction of light that the transparent solids in front let through.
     glossy: whether the material is glossy.
     met, lost: whether there is a hit, and whether the ray ran out of steps.
     covered: whether anything but the environment is visible.
@@ -217,18 +242,19 @@ class GBuffer:
 
     @classmethod
     def nothing(cls, mi: Any, count: int) -> GBuffer:
-        """Arrays of zeros for `count` pixels, which parts are scattered to."""
+        """Return a buffer of zeros for `count` pixels. Buffers of parts of the picture are
+        scattered into it."""
         vectors, colors, masks = (mi.Vector3f,) * 3, (mi.Color3f,) * 3, (mi.Bool,) * 5
         kinds = (*vectors, mi.Float, *colors, *masks)
         return cls(*(dr.zeros(kind, count) for kind in kinds))
 
     def to_numpy(self) -> dict[str, npt.NDArray[Any]]:
-        """The arrays of this buffer as NumPy arrays, by name."""
+        """Return the arrays of this buffer as NumPy arrays, by name."""
         return {name: to_numpy(value) for name, value in vars(self).items()}
 
     @classmethod
     def from_numbers(cls, mi: Any, numbers: Mapping[str, npt.NDArray[Any]]) -> GBuffer:
-        """The buffer whose arrays `to_numpy` returned, in this process or another."""
+        """Return the buffer whose NumPy arrays `to_numpy` returned, in this process or another."""
         empty = vars(cls.nothing(mi, 0))
         return cls(
             **{name: _of_numbers(mi, type(kind), numbers[name]) for name, kind in empty.items()}
@@ -236,8 +262,8 @@ class GBuffer:
 
 
 def _of_numbers(mi: Any, kind: Any, numbers: npt.NDArray[Any]) -> Any:
-    """A Dr.Jit array of type `kind`, from numbers (n,) or (n, 3). It is uploaded such that kernels
-    do not depend on its alignment in memory."""
+    """Turn numbers (n,) or (n, 3) into a Dr.Jit array of type `kind`. It is uploaded such that
+    kernels do not depend on its alignment in memory."""
     if dr.is_mask_v(kind):
         return kind(np.ascontiguousarray(numbers))
     columns = numbers.reshape(len(numbers), -1).T
@@ -245,7 +271,10 @@ def _of_numbers(mi: Any, kind: Any, numbers: npt.NDArray[Any]) -> Any:
 
 
 class ShadedTask:
-    """The rendering of a shaded picture for a sensor, by ranges of pixels.
+    """Renders a shaded picture, one range of pixels at a time. Pixels are traced first
+    (`render_gbuffer`), lit (`shade`), and drawn again at edges (`refine_pixels`). `order` lists all
+    pixels in the order in which they are traced, and `offsets` the points of a pixel that is drawn
+    again.
 
     spp: at least this many rays are averaged for a pixel at an edge; with 1, every pixel has a
         single ray.
@@ -275,6 +304,7 @@ class ShadedTask:
         self.finder = ConeCoverage(mi, world) if cones else None
         offsets = multijitter_offsets(spp)
         traced = (offsets == _MIDDLE).all(axis=1)  # the offset of a pixel's first ray
+        # If the first ray is one of the grid's samples, it is not traced again.
         self.offsets, self.share_of_first = offsets[~traced], float(traced.mean())
         self.refines = spp > 1
         matrix = np.array(sensor.world_transform().matrix, dtype=np.float64).reshape(4, 4)
@@ -283,8 +313,8 @@ class ShadedTask:
         self.floor = FloorShadow.of(world, self.light) if on_floor else None
 
     def render_gbuffer(self, start: int, stop: int) -> GBuffer:
-        """The `GBuffer` of the pixels from `start` to `stop` in the order of the attribute `order`,
-        by rays through their middles."""
+        """Trace the rays through the middles of some pixels: those from `start` to `stop` in the
+        list `order`. Returns their `GBuffer`."""
         mi = self.mi
         pixel = upload_indices(mi, self.order[start:stop])
         gbuffer = self._trace_pixels(pixel, mi.Vector2f(_MIDDLE))
@@ -296,25 +326,30 @@ class ShadedTask:
         return gbuffer
 
     def _trace_pixels(self, pixel: Any, offset: Any) -> GBuffer:
-        """The `GBuffer` of rays through one point in each of n pixels.
+        """Trace a ray through one point in each of n pixels. Returns their `GBuffer`.
 
         pixel: (n,) indices of the pixels, counted by rows.
-        offset: the coordinates in [0, 1) of the point in its pixel.
+        offset: (2,) the coordinates in [0, 1) of the point in its pixel.
+
+        The color is the reflectance of the visible side of the surface. It is changed for metal and
+        clear matter, for the inner side of an open surface, and where a hole of a mesh is closed,
+        but not on isolines.
         """
         mi, scene = self.mi, self.world.scene
         ray, weight = self.ray(pixel, offset)
         hits = self.evaluate_with.trace(mi.Ray3f(ray))
         si, first = hits.si, hits.first
+        # Adding zeros gives the mask its full width.
         lost = first.is_out_of_steps | dr.zeros(mi.Bool, dr.width(pixel))
         hit = first.is_hit & ~lost
-        inside, is_open = si.wi.z > 0, self._is_open(si)
+        sees_inner_side, is_open = si.wi.z > 0, self._is_open(si)
         color, back = (self._reflectance(si, side) * weight for side in (1, -1))
         color, back = (as_rgb(mi, c, ray.wavelengths) for c in (color, back))
-        painted = first.isoline_index > 0
-        color, back = reflectance(color, painted), reflectance(back, painted)
-        plain = ~painted  # lines have their own color
-        color = two_sided_color(color, back, inside & is_open & plain)
-        color = hole_filling_tint(color, first.is_hole_filling & plain)
+        is_on_line = first.isoline_index > 0
+        color, back = reflectance(color, is_on_line), reflectance(back, is_on_line)
+        is_off_line = ~is_on_line  # lines have their own color
+        color = two_sided_color(color, back, sees_inner_side & is_open & is_off_line)
+        color = hole_filling_tint(color, first.is_hole_filling & is_off_line)
         emitted = si.emitter(scene).eval(si, ~lost) * weight
         light = as_rgb(
             mi, hits.throughput * emitted + weight * hits.reflected_light, ray.wavelengths
@@ -325,13 +360,15 @@ class ShadedTask:
             light = dr.select(covered, light, 0)
         transmittance = as_rgb(mi, hits.throughput, ray.wavelengths)
         d = hits.ray.d
+        # The normal on the side of the ray.
         normal = mi.Vector3f(dr.mulsign(mi.Vector3f(si.n), -dr.dot(si.n, d)))
         t = dr.select(hit, hits.path_length + first.t, 0)
+        # The width of a pixel at the hit: the distance of the neighboring pixel's ray there.
         width = dr.norm(ray.o_x + t * ray.d_x - ray.o - t * ray.d)
         flags = si.bsdf().flags()
         glossy = mi.has_flag(flags, mi.BSDFFlags.Glossy) | mi.has_flag(flags, mi.BSDFFlags.Delta)
-        glossy &= plain
-        near = hit & self.world.has_line_near(si, ray, d, t)
+        glossy &= is_off_line
+        may_have_line_edge = hit & self.world.has_line_near(si, ray, d, t)
         position = dr.select(hit, mi.Vector3f(si.p), dr.nan)
         return GBuffer(
             position,
@@ -345,12 +382,16 @@ class ShadedTask:
             hit,
             lost,
             covered,
-            near,
+            may_have_line_edge,
         )
 
     def ray(self, pixel: Any, offset: Any) -> tuple[Any, Any]:
-        """Rays with differentials through one point in each pixel, and the weights of their light.
-        pixel: indices, counted by rows. offset: coordinates in [0, 1) of the point in its pixel."""
+        """Return camera rays with differentials through one point in each pixel, and the weights of
+        their light.
+
+        pixel: indices of the pixels, counted by rows.
+        offset: (2,) coordinates in [0, 1) of the point in its pixel.
+        """
         mi = self.mi
         position = film_positions(mi, pixel, offset, self.size)
         return self.sensor.sample_ray_differential(
@@ -358,15 +399,15 @@ class ShadedTask:
         )
 
     def _reflectance(self, si: Any, side: int) -> Any:
-        """The reflectance at normal incidence of the visible side (1) or the other side (-1) of the
-        surface at interactions `si`."""
+        """Return the reflectance at normal incidence of the surface at interactions `si`. side: 1
+        for the visible side, -1 for the other one."""
         mi = self.mi
-        straight = mi.SurfaceInteraction3f(si)
-        straight.wi = mi.Vector3f(0, 0, dr.mulsign(mi.Float(side), si.wi.z))
-        return si.bsdf().eval_diffuse_reflectance(straight, si.is_valid())
+        along_normal = mi.SurfaceInteraction3f(si)
+        along_normal.wi = mi.Vector3f(0, 0, dr.mulsign(mi.Float(side), si.wi.z))
+        return si.bsdf().eval_diffuse_reflectance(along_normal, si.is_valid())
 
     def _is_open(self, si: Any) -> Any:
-        """Mask of interactions with a level set of harnack that bounds no solid, so that both of
+        """Return the mask of interactions with a level set that bounds no solid, so that both of
         its sides can be seen."""
         is_open = self.mi.Bool(False)
         for carrier in self.world.proxies:
@@ -376,48 +417,58 @@ class ShadedTask:
         return is_open
 
     def shade(self, buffer: GBuffer, sky: Any) -> Any:
-        """The radiance of each pixel towards the eye, and as fourth number 1 if anything but the
-        environment is visible, else 0.
+        """Light the points of a G-buffer. Returns four numbers for each pixel: the radiance toward
+        the eye, and 1 if anything but the environment is visible, else 0.
 
         sky: the fraction of the hemisphere over the pixel's point that nothing near it hides.
         """
-        key = 1.0
+        key_fraction = 1.0
         if self.floor is not None:
-            key, above = self.floor.at(buffer.position)
-            sky = dr.minimum(sky, above)
-        lit = self.light.shade(buffer.color, buffer.normal, buffer.eye, buffer.glossy, sky, key)
+            key_fraction, sky_fraction = self.floor.at(buffer.position)
+            # On the floor, its traced shadow counts if it is darker.
+            sky = dr.minimum(sky, sky_fraction)
+        lit = self.light.shade(
+            buffer.color, buffer.normal, buffer.eye, buffer.glossy, sky, key_fraction
+        )
         light = dr.select(buffer.met, buffer.transmittance * lit, 0) + buffer.light
         return self.mi.Vector4f(*light, dr.select(buffer.covered, self.mi.Float(1), 0))
 
     def refine_pixels(
         self, indices: IntArray, position: FloatArray, sky: FloatArray
     ) -> tuple[npt.NDArray[np.float32], int]:
-        """The mean colors (n, 4) of a grid of samples in each of n pixels, and the number of
-        samples that ran out of steps.
+        """Draw n pixels again, each with a grid of samples. Returns the mean colors (n, 4) of the
+        samples, and the number of samples that ran out of steps.
 
         indices: (n,) the pixels, counted by rows.
         position, sky: (n, 5, 3) and (n, 5), the points seen by each pixel and its four neighbors,
             and the fractions of the hemisphere there that nothing hides (`neighborhood`).
         """
         mi, spp = self.mi, len(self.offsets)
-        lane = dr.arange(mi.UInt32, len(indices) * spp)
-        per_pixel = dr.opaque(mi.UInt32, spp)
-        pixel = dr.gather(mi.UInt32, upload_indices(mi, indices), lane // per_pixel)
-        table = mi.Vector2f(*(upload_floats(mitsuba_backend(mi), axis) for axis in self.offsets.T))
-        gbuffer = self._trace_pixels(pixel, dr.gather(mi.Vector2f, table, lane % per_pixel))
-        color = self.shade(gbuffer, _nearest_sky(mi, gbuffer, lane // per_pixel, position, sky))
+        # Successive lanes are the samples of one pixel, then those of the next.
+        sample = dr.arange(mi.UInt32, len(indices) * spp)
+        opaque_spp = dr.opaque(mi.UInt32, spp)
+        pixel = dr.gather(mi.UInt32, upload_indices(mi, indices), sample // opaque_spp)
+        offset_table = mi.Vector2f(
+            *(upload_floats(mitsuba_backend(mi), axis) for axis in self.offsets.T)
+        )
+        gbuffer = self._trace_pixels(
+            pixel, dr.gather(mi.Vector2f, offset_table, sample % opaque_spp)
+        )
+        color = self.shade(gbuffer, _nearest_sky(mi, gbuffer, sample // opaque_spp, position, sky))
         dr.eval(color, gbuffer.lost)
         return to_numpy(mean_of_blocks(color, spp)), int(dr.count(gbuffer.lost)[0])
 
     def neighborhood(self, indices: IntArray, *arrays: Any) -> tuple[npt.NDArray[Any], ...]:
-        """The entries (n, 5, ...) of arrays at n pixels and their four neighbors. At the picture's
-        border, a pixel takes the place of a missing neighbor.
+        """Gather the entries of arrays at n pixels and their four neighbors. Returns an array (n,
+        5, ...) for each given array. At the picture's border, a pixel takes the place of a missing
+        neighbor.
 
-        indices: (n,) the pixels. The arrays have an entry for each pixel of the picture. Both are
-            counted by rows.
+        indices: (n,) the pixels, counted by rows.
+        arrays: Dr.Jit arrays with an entry for each pixel of the picture, counted by rows.
         """
         columns, rows = self.size
         x, y = indices % columns, indices // columns
+        # Columns and rows of the five pixels.
         u = np.clip(x[:, None] + np.array([0, 1, -1, 0, 0]), 0, columns - 1)
         v = np.clip(y[:, None] + np.array([0, 0, 0, 1, -1]), 0, rows - 1)
         rows_of_five = upload_indices(self.mi, (v * columns + u).ravel())
@@ -426,32 +477,36 @@ class ShadedTask:
 
 
 def _nearest_sky(mi: Any, samples: GBuffer, row: Any, position: FloatArray, sky: FloatArray) -> Any:
-    """For each sample, the fraction of the hemisphere that nothing hides. It is taken from that
-    pixel, of the sample's pixel and its neighbors, whose point lies nearest to the sample's point.
+    """Estimate for each sample which fraction of the hemisphere over its point nothing hides. This
+    fraction is known for the points that whole pixels show. Among the sample's pixel and its four
+    neighbors, the pixel is chosen whose point is nearest to the sample's point, and its fraction is
+    taken. If none of them shows a point, the fraction is 1.
 
-    row: the index of the sample's pixel among the n chosen pixels.
+    samples: the G-buffer of the samples.
+    row: for each sample, the index of its pixel among the n chosen pixels.
     position, sky: (n, 5, 3) and (n, 5), the points of the chosen pixels and their neighbors, and
         the fractions there.
     """
-    nearest, value = mi.Float(dr.inf), mi.Float(1)
+    least_distance, fraction = mi.Float(dr.inf), mi.Float(1)
     for k in range(position.shape[1]):
         point = dr.gather(mi.Vector3f, _of_numbers(mi, mi.Vector3f, position[:, k]), row)
-        length = dr.norm(point - samples.position)
-        closer = length < nearest  # not where NaN: nothing is there
-        nearest = dr.select(closer, length, nearest)
-        value = dr.select(
-            closer, dr.gather(mi.Float, _of_numbers(mi, mi.Float, sky[:, k]), row), value
+        distance = dr.norm(point - samples.position)
+        is_closer = distance < least_distance  # False for NaN, where nothing is seen
+        least_distance = dr.select(is_closer, distance, least_distance)
+        fraction = dr.select(
+            is_closer, dr.gather(mi.Float, _of_numbers(mi, mi.Float, sky[:, k]), row), fraction
         )
-    return value
+    return fraction
 
 
 def render_shaded(
     shading: ShadedTask, executor: RenderExecutor, advance: Callable[[float], None]
 ) -> tuple[npt.NDArray[np.float32], int]:
-    """The image (h, w, 4), linear sRGB radiance and last the covered fraction, and the number of
-    rays that ran out of steps.
+    """Render a shaded picture. Returns the image (h, w, 4), linear sRGB radiance and last the
+    covered fraction, and the number of rays that ran out of steps.
 
-    shading: the task. executor: calls its methods, here or on a cluster.
+    shading: the task.
+    executor: calls methods of the task, in this process or on a cluster.
     advance: called with the fraction of the picture that has been finished since the last call.
     """
     mi, order, size = shading.mi, shading.order, shading.size
@@ -465,20 +520,23 @@ def render_shaded(
         dr.eval(gbuffer)
         dr.sync_thread()
         advance(_FIRST_PASS_FRACTION * (stop - start) / count)
+    # All first hits are needed before the first pixel can be lit.
     sky = ambient_visibility(mi, gbuffer.position, gbuffer.normal, gbuffer.width, size)
     dr.eval(sky)
     image = to_numpy(shading.shade(gbuffer, sky)).reshape(*size[::-1], 4)
     lost = int(dr.count(gbuffer.lost)[0])
+    # Edges are those of the picture over white, as it is seen.
     is_edge = edge_pixels(tone_map(image[..., :3] + (1 - image[..., 3:]))).ravel()
     is_edge |= to_numpy(gbuffer.needs_refinement)
     edges = order[is_edge[order]] if shading.refines else order[:0]
     pixels = image.reshape(-1, 4)
-    limit = max(1, _RAYS_A_BAND // max(1, len(shading.offsets)))
-    batches = [edges[start:stop] for start, stop in executor.split_range(len(edges), limit)]
-    calls = ((batch, *shading.neighborhood(batch, gbuffer.position, sky)) for batch in batches)
+    batch_size = max(1, _RAYS_A_BAND // max(1, len(shading.offsets)))
+    batches = [edges[start:stop] for start, stop in executor.split_range(len(edges), batch_size)]
+    arguments = ((batch, *shading.neighborhood(batch, gbuffer.position, sky)) for batch in batches)
     for batch, (color, batch_lost) in zip(
-        batches, executor.run_tasks("refine_pixels", list(calls)), strict=True
+        batches, executor.run_tasks("refine_pixels", list(arguments)), strict=True
     ):
+        # The ray through the middle counts as one more sample if it is one of the grid's points.
         pixels[batch] = color + shading.share_of_first * (pixels[batch] - color)
         lost += int(batch_lost)
         advance((1 - _FIRST_PASS_FRACTION) * len(batch) / len(edges))

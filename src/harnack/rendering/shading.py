@@ -1,5 +1,8 @@
-"""Parts of shaded pictures: the order in which pixels are traced, the light, the shadow on the
-floor, and the studio's wall."""
+"""Parts of shaded pictures, which are computed by formulas from the first hit of each ray: the
+order in which pixels are traced, the light of the studio, the shadow on its floor, and the wall or
+backdrop behind everything. The studio is the stage on which surfaces are drawn, with a floor at z =
+0. `mi` is the Mitsuba module, and a hemisphere is the upper half of all directions over a surface,
+from which light of the sky comes."""
 
 from __future__ import annotations
 
@@ -33,7 +36,7 @@ _EDGE = 16
 
 
 def pixel_ranges(pixels: int, step: int) -> Iterator[tuple[int, int]]:
-    """Ranges (start, stop) of at most `step` pixels that cover range(pixels). Ctrl-C works between
+    """Divide range(pixels) into ranges (start, stop) of at most `step` pixels. Ctrl-C works between
     the ranges."""
     for start in range(0, pixels, step):
         yield start, min(start + step, pixels)
@@ -41,39 +44,39 @@ def pixel_ranges(pixels: int, step: int) -> Iterator[tuple[int, int]]:
 
 class RenderExecutor(Protocol):
     """Interface to what runs the tasks of a render: this process, or a Dask cluster. A task is a
-    call of a method of a fixed object."""
+    call of a method of one fixed object that draws the picture."""
 
     def split_range(self, count: int, max_size: int) -> list[tuple[int, int]]:
-        """Ranges (start, stop) that cover range(count), each of at most `max_size` elements."""
+        """Divide range(count) into ranges (start, stop) of at most `max_size` elements each."""
         ...
 
     def run_tasks(self, step: str, parts: Sequence[tuple[Any, ...]]) -> Iterator[Any]:
-        """The results, in order, of calls of the method named `step`. Each entry of `parts` holds
-        the arguments of one call."""
+        """Call the method named `step` once for each entry of `parts`, which holds the arguments of
+        one call. Yields the results in order."""
         ...
 
 
 @dataclass(frozen=True)
 class LocalRenderExecutor:
-    """Runs tasks in this process. drawing: the object whose methods are called."""
+    """Runs the tasks of a render in this process. drawing: the object whose methods are called."""
 
     drawing: Any
 
     def split_range(self, count: int, max_size: int) -> list[tuple[int, int]]:
-        """Ranges (start, stop) of at most `max_size` elements that cover range(count), as few as
+        """Divide range(count) into as few ranges (start, stop) of at most `max_size` elements as
         possible."""
         return list(pixel_ranges(count, max_size))
 
     def run_tasks(self, step: str, parts: Sequence[tuple[Any, ...]]) -> Iterator[Any]:
-        """The results of calls of the method named `step`, one after another. Each entry of `parts`
-        holds the arguments of one call."""
+        """Call the method named `step` once for each entry of `parts`, which holds the arguments of
+        one call. Yields the results, each computed when it is asked for."""
         method = getattr(self.drawing, step)
         return (method(*part) for part in parts)
 
 
 def tiled_pixel_order(size: tuple[int, int]) -> IntArray:
-    """The indices (n,) of all pixels of a picture of `size` (width, height), counted by rows,
-    ordered by squares of 4 x 4 pixels.
+    """Return the indices (n,) of all pixels of a picture of `size` (width, height), ordered by
+    squares of 4 x 4 pixels. An index counts pixels by rows.
 
     Rays that a processor follows together are then close to each other and have about the same
     length.
@@ -81,57 +84,67 @@ def tiled_pixel_order(size: tuple[int, int]) -> IntArray:
     width, height = size
     rows, columns = -(-height // _TILE), -(-width // _TILE)
     y, x = np.indices((rows * _TILE, columns * _TILE))
+    # Squares may go beyond the right and lower border; such places hold -1 and are left out.
     inside = (x < width) & (y < height)
-    tiles = np.where(inside, y * width + x, -1).reshape(rows, _TILE, columns, _TILE)
-    order = tiles.swapaxes(1, 2).ravel()
+    pixel_of_place = np.where(inside, y * width + x, -1).reshape(rows, _TILE, columns, _TILE)
+    order = pixel_of_place.swapaxes(1, 2).ravel()
     return order[order >= 0]
 
 
 def upload_indices(mi: Any, pixels: IntArray) -> Any:
-    """Indices of pixels as an array of the Mitsuba variant."""
+    """Return the indices of pixels as an array of the Mitsuba variant."""
     return upload_integers(mitsuba_backend(mi), pixels)
 
 
 def film_positions(mi: Any, pixel: Any, offset: Any, size: tuple[int, int]) -> Any:
-    """Points on the film, in [0, 1]^2. pixel: indices, counted by rows. offset: in [0, 1]^2 within
-    the pixel. size: (width, height) in pixels."""
+    """Return points on the film, in [0, 1]^2.
+
+    pixel: indices of pixels, counted by rows.
+    offset: (2,) the coordinates of the point in its pixel, from 0 to 1.
+    size: (width, height) of the film in pixels.
+    """
     position = mi.Vector2f(pixel % size[0], pixel // size[0]) + offset
     return mi.Point2f(position / mi.ScalarVector2f(*size))
 
 
 def grid_sample_count(spp: int) -> int:
-    """The smallest number of samples, at least `spp`, that fills a nearly square grid."""
+    """Return the smallest number of samples, at least `spp`, that fills a nearly square grid."""
     rows = max(1, math.isqrt(spp))
     return rows * -(-spp // rows)
 
 
 def multijitter_offsets(count: int) -> FloatArray:
-    """At least `count` points (n, 2) in the unit square, always the same for a count.
+    """Return at least `count` points (n, 2) in the unit square, always the same for a count.
 
-    It is the canonical arrangement of multi-jittering (Kensler 2013): one point in each cell of a
-    nearly square grid, and no two in the same row or column of a grid of n x n cells. So edges of
+    They are the canonical arrangement of multi-jittering (Kensler 2013): one point in each cell of
+    a nearly square grid, and no two in the same row or column of a grid of n x n cells. So edges of
     any slope look smooth.
     """
-    total = grid_sample_count(count)
-    rows = max(r for r in range(1, total + 1) if total % r == 0 and r * r <= total)
-    columns = total // rows
+    point_count = grid_sample_count(count)
+    # The grid with the most rows that is not higher than wide.
+    rows = max(
+        r for r in range(1, point_count + 1) if point_count % r == 0 and r * r <= point_count
+    )
+    columns = point_count // rows
     j, i = (index.ravel() for index in np.mgrid[:rows, :columns])
+    # In each cell, the point is shifted by an amount that depends on the cell's row or column.
     x = (i + (j + 0.5) / rows) / columns
     y = (j + (i + 0.5) / columns) / rows
     return np.column_stack([x, y])
 
 
 def edge_pixels(picture: npt.NDArray[np.uint8]) -> BoolArray:
-    """Mask (h, w) of the pixels of a picture (h, w, 3) that differ from one of their four neighbors
-    by more than 16 of 255 in a channel."""
+    """Return the mask (h, w) of the pixels of a picture (h, w, 3) that differ from one of their
+    four neighbors by more than 16 of 255 in a channel."""
     shown = picture.astype(np.int64)
     edge = np.zeros(shown.shape[:2], dtype=np.bool_)
-    across = (np.abs(np.diff(shown, axis=1)) > _EDGE).any(axis=-1)
-    down = (np.abs(np.diff(shown, axis=0)) > _EDGE).any(axis=-1)
-    edge[:, 1:] |= across
-    edge[:, :-1] |= across
-    edge[1:] |= down
-    edge[:-1] |= down
+    differs_from_right = (np.abs(np.diff(shown, axis=1)) > _EDGE).any(axis=-1)
+    differs_from_below = (np.abs(np.diff(shown, axis=0)) > _EDGE).any(axis=-1)
+    # Both pixels of a pair that differs are marked.
+    edge[:, 1:] |= differs_from_right
+    edge[:, :-1] |= differs_from_right
+    edge[1:] |= differs_from_below
+    edge[:-1] |= differs_from_below
     return edge
 
 
@@ -181,8 +194,10 @@ class StudioLight:
 
     @classmethod
     def of(cls, world_from_camera: FloatArray) -> StudioLight:
-        """The light for a camera. world_from_camera: its matrix (4, 4), whose axes point left, up
-        and forward."""
+        """Return the light for a camera, relative to which its key light stands.
+
+        world_from_camera: (4, 4) the camera's matrix, whose axes point left, up and forward.
+        """
         left, up, forward = (axis / np.linalg.norm(axis) for axis in world_from_camera[:3, :3].T)
         key = np.stack([-left, up, -forward], axis=1) @ _TO_KEY
         return cls(key.tolist(), up.tolist())
@@ -190,7 +205,8 @@ class StudioLight:
     def shade(
         self, color: Any, normal: Any, eye: Any, glossy: Any, visible: Any, reached: Any = 1.0
     ) -> Any:
-        """Radiance (3,) towards the eye; all parameters are Dr.Jit arrays.
+        """Compute the radiance (3,) of surface points toward the eye. All parameters are Dr.Jit
+        arrays.
 
         color: (3,) reflectance.
         normal, eye: (3,) the surface's unit normal and the unit direction to the eye, on the same
@@ -200,61 +216,72 @@ class StudioLight:
         reached: the fraction of the key light that is not in shadow.
         """
         key, up = _parameter(normal, self.key), _parameter(normal, self.up)
-        wrapped = dr.clip((dr.dot(normal, key) + _WRAP) / (1 + _WRAP), 0, 1)
-        shown = (1 - _KEY_HIDDEN * (1 - visible)) * reached
-        fraction = 0.5 + 0.5 * dr.dot(normal, up)
-        sky = dr.lerp(_like(color, _BELOW), _like(color, _ABOVE), fraction) * visible
-        radiance = color * (_like(color, _KEY) * (wrapped * shown) + sky)
-        half = dr.normalize(key + eye)
+        # The key light is large: it reaches a little around the terminator.
+        key_cosine = dr.clip((dr.dot(normal, key) + _WRAP) / (1 + _WRAP), 0, 1)
+        key_visible = (1 - _KEY_HIDDEN * (1 - visible)) * reached
+        upper_fraction = 0.5 + 0.5 * dr.dot(normal, up)
+        # Light of the hemisphere, between its color below and its color above.
+        sky = dr.lerp(_like(color, _BELOW), _like(color, _ABOVE), upper_fraction) * visible
+        radiance = color * (_like(color, _KEY) * (key_cosine * key_visible) + sky)
+        half_vector = dr.normalize(key + eye)
         # Where the light is below the horizon there is no highlight, and no edge to it either.
-        spot = _HIGHLIGHT * dr.power(dr.maximum(dr.dot(normal, half), 0), _SHARPNESS)
+        highlight = _HIGHLIGHT * dr.power(dr.maximum(dr.dot(normal, half_vector), 0), _SHARPNESS)
+        # Glossy matter reflects more sky at grazing angles (Schlick).
         rim = _RIM * dr.power(1 - dr.clip(dr.dot(normal, eye), 0, 1), 5)
-        gloss = _like(color, _KEY) * (spot * wrapped * shown) + sky * rim
+        gloss = _like(color, _KEY) * (highlight * key_cosine * key_visible) + sky * rim
         return radiance + dr.select(glossy, gloss, 0)
 
 
 def reflectance(color: Any, painted: Any) -> Any:
-    """The color (3,) in which a surface is drawn, from the reflectance `color` of its BSDF at
-    normal incidence. Metal is darkened, and matter without diffuse reflectance gets the color of
-    glass.
+    """Return the color (3,) in which a surface is drawn, from the reflectance of its BSDF at normal
+    incidence. Metal is darkened and keeps its hue. Matter without diffuse reflectance, such as
+    clear glass, gets the color of glass.
 
+    color: (3,) the reflectance; a channel above 1 marks metal.
     painted: mask of points on isolines, which keep their reflectance, even if it is 0.
     """
     painted_color = color
-    top = dr.max(color)
-    metal = dr.square(color / top) * _METAL  # light in a mirror is reflected more than once
-    color = dr.select(top > 1, metal, color)
-    return dr.select(painted, painted_color, dr.select(top > 0, color, _like(color, _CLEAR)))
+    largest_channel = dr.max(color)
+    metal = (
+        dr.square(color / largest_channel) * _METAL
+    )  # light in a mirror is reflected more than once
+    color = dr.select(largest_channel > 1, metal, color)
+    return dr.select(
+        painted, painted_color, dr.select(largest_channel > 0, color, _like(color, _CLEAR))
+    )
 
 
 def two_sided_color(color: Any, other: Any, inside: Any) -> Any:
-    """The color (3,) of the visible side of an open surface. If both sides have one color, the side
-    of larger values is drawn darker and cooler.
+    """Return the color (3,) of the visible side of an open surface. If both sides have one color,
+    the side of larger values of the field is drawn darker and cooler.
 
     color, other: the colors of the visible and of the hidden side.
     inside: mask of points that are seen from the side of larger values.
     """
-    same = dr.max(dr.abs(color - other)) < 1e-4
-    return dr.select(inside & same, color * _like(color, _INNER_TINT), color)
+    is_one_color = dr.max(dr.abs(color - other)) < 1e-4
+    return dr.select(inside & is_one_color, color * _like(color, _INNER_TINT), color)
 
 
 def hole_filling_tint(color: Any, is_filling: Any) -> Any:
-    """The color (3,), tinted amber, or teal if it is warm, on lanes of `is_filling`: points at
-    which a level set closes a hole of a mesh."""
+    """Tint colors (3,) amber, or teal if they are warm, where a level set closes a hole of a mesh.
+    Returns all colors.
+
+    is_filling: mask of such points.
+    """
     tint = dr.select(color[0] > 1.6 * color[2], _like(color, _TEAL), _like(color, _AMBER))
     return dr.select(is_filling, dr.lerp(color, tint, _FILLING_TINT), color)
 
 
 def _parameter(array: Any, numbers: Sequence[float]) -> Any:
-    """Numbers as an array of the type of `array`, as kernel parameters: other numbers compile no
-    other kernel."""
+    """Return numbers as an array of the type of `array`, as kernel parameters: other numbers
+    compile no other kernel."""
     vector = _like(array, numbers)
     dr.make_opaque(vector)
     return vector
 
 
 def _like(array: Any, numbers: Sequence[float]) -> Any:
-    """Numbers as an array of the type of `array`."""
+    """Return numbers as an array of the type of `array`."""
     return type(array)(*numbers)
 
 
@@ -276,13 +303,14 @@ _BLUR = (0.05, 0.2, 0.25, 0.25, 0.2, 0.05)
 
 
 class ShadowCaster(Protocol):
-    """Interface to objects that cast shadows, such as a `HybridScene`."""
+    """Interface to objects that cast shadows, such as a `HybridScene`. `mi` is the Mitsuba
+    module."""
 
     @property
     def mi(self) -> Any: ...
 
     def occluded(self, ray: Any, active: Any) -> Any:
-        """Mask of rays of Mitsuba's that hit an object."""
+        """Return the mask of rays of Mitsuba's that hit an object."""
         ...
 
 
@@ -299,10 +327,11 @@ class FloorShadow:
 
     @classmethod
     def of(cls, world: ShadowCaster, light: StudioLight) -> FloorShadow:
-        """The shadow of the objects of a scene, by tracing rays from the floor."""
+        """Compute the shadow of the objects of a scene on the floor, by tracing rays from the floor
+        to the key light and to the sky."""
         mi = world.mi
-        cell = (np.arange(_CELLS) + 0.5) / _CELLS * 2 * _REACH - _REACH
-        y, x = np.meshgrid(cell, cell, indexing="ij")
+        cell_centers = (np.arange(_CELLS) + 0.5) / _CELLS * 2 * _REACH - _REACH
+        y, x = np.meshgrid(cell_centers, cell_centers, indexing="ij")
         fractions = _visible_fractions(world, x, y, np.stack([_to_key(light.key), _to_sky()]))
         image = np.stack([_blurred(fraction) for fraction in fractions], axis=-1)
         numbers = mi.Float(upload_floats(mitsuba_backend(mi), image.ravel()))
@@ -310,45 +339,47 @@ class FloorShadow:
         return cls(mi, mi.Texture2f(tensor, wrap_mode=dr.WrapMode.Clamp))
 
     def at(self, position: Any) -> tuple[Any, Any]:
-        """The fractions of the key light and of the sky's light that reach points (3,) of the
-        floor; 1 for points that are not on the floor."""
+        """Return the fractions of the key light and of the sky's light that reach points (3,) of
+        the world. Both are 1 for points that are not on the floor."""
         mi = self.mi
+        # Everything on the stage stands above the floor, which is at a small negative height.
         on_floor = position.z < 0.5 * FLOOR_HEIGHT
-        place = mi.Point2f(position.x, position.y) / (2 * _REACH) + 0.5
-        key, sky = self.texture.eval(dr.select(on_floor, place, 0))
+        texture_position = mi.Point2f(position.x, position.y) / (2 * _REACH) + 0.5
+        key, sky = self.texture.eval(dr.select(on_floor, texture_position, 0))
         return dr.select(on_floor, key, 1), dr.select(on_floor, sky, 1)
 
 
 def _visible_fractions(
     world: ShadowCaster, x: FloatArray, y: FloatArray, towards: FloatArray
 ) -> FloatArray:
-    """The fractions (k, n, n) of rays from n x n points of the floor that hit nothing, for k sets
-    of directions.
+    """Trace rays from n x n points of the floor into k sets of directions. Returns for each set and
+    point the fraction of its rays that hit nothing, (k, n, n).
 
     x, y: (n, n) coordinates of the points.
     towards: (k, 16, rays, 3) unit directions. Each point of a block of 4 x 4 points takes one of
         the 16 groups of rays.
     """
     mi = world.mi
+    # The place of a point in its block of 4 x 4 points chooses its group of rays.
     j, i = np.indices(x.shape)
     d = towards[:, (j % _BLOCK) * _BLOCK + i % _BLOCK]
     o = np.stack([x, y, np.zeros_like(x)], axis=-1)[:, :, None]
     o = np.broadcast_to(o, d.shape)
     ray = mi.Ray3f(_vectors(mi.Point3f, o), _vectors(mi.Vector3f, d))
     ray.maxt = mi.Float(_SHADOW_RAY_LENGTH)
-    free = to_numpy(~world.occluded(ray, mi.Bool(True)))
-    fractions: FloatArray = free.reshape(d.shape[:-1]).mean(axis=-1)
+    is_free = to_numpy(~world.occluded(ray, mi.Bool(True)))
+    fractions: FloatArray = is_free.reshape(d.shape[:-1]).mean(axis=-1)
     return fractions
 
 
 def _vectors(kind: Any, rows: FloatArray) -> Any:
-    """Rows (..., 3) as a Dr.Jit array of vectors, of the type `kind`."""
+    """Return rows (..., 3) as a Dr.Jit array of vectors, of the type `kind`."""
     return kind(np.ascontiguousarray(rows.reshape(-1, 3).T, dtype=np.float32))
 
 
 def _square() -> FloatArray:
-    """16 groups of points in the unit square, (16, rays, 2); all of them together are spread evenly
-    (Roberts 2018)."""
+    """Return 16 groups of points in the unit square, (16, rays, 2). All of them together are spread
+    evenly (Roberts 2018)."""
     k = np.arange(_BLOCK * _BLOCK * _RAYS)
     plastic = 1.32471795724474602596  # the real root of x^3 = x + 1
     points = np.mod(0.5 + np.outer(k, [1 / plastic, 1 / plastic**2]), 1.0)
@@ -356,38 +387,39 @@ def _square() -> FloatArray:
 
 
 def _to_key(key: Any) -> FloatArray:
-    """16 groups of unit directions, (16, rays, 3), to points of the round key light. key: the
-    direction to its middle."""
+    """Return 16 groups of unit directions, (16, rays, 3), to points spread over the round key
+    light. key: (3,) the direction to its middle."""
     axis = np.asarray(key, dtype=np.float64)
-    u = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
-    u /= np.linalg.norm(u)
+    tangent = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
+    tangent /= np.linalg.norm(tangent)
     radius, angle = _SPREAD * np.sqrt(_square()[..., :1]), 2 * math.pi * _square()[..., 1:]
-    d = axis + radius * (np.cos(angle) * u + np.sin(angle) * np.cross(axis, u))
+    d = axis + radius * (np.cos(angle) * tangent + np.sin(angle) * np.cross(axis, tangent))
     d[..., 2] = np.maximum(d[..., 2], 0.05)  # the floor itself casts no shadow
     return d / np.linalg.norm(d, axis=-1, keepdims=True)
 
 
 def _to_sky() -> FloatArray:
-    """16 groups of unit directions, (16, rays, 3), to the sky, distributed with the cosine of their
-    angle to the vertical."""
-    s, angle = np.moveaxis(_square(), -1, 0)
-    across = np.sqrt(s)
-    return np.stack([across * np.cos(2 * math.pi * angle), across * np.sin(2 * math.pi * angle),
-                     np.sqrt(np.maximum(1 - s, 1e-3))], axis=-1)  # fmt: skip
+    """Return 16 groups of unit directions, (16, rays, 3), to the sky, distributed with the cosine
+    of their angle to the vertical."""
+    sine_squared, angle = np.moveaxis(_square(), -1, 0)
+    sine = np.sqrt(sine_squared)
+    return np.stack([sine * np.cos(2 * math.pi * angle), sine * np.sin(2 * math.pi * angle),
+                     np.sqrt(np.maximum(1 - sine_squared, 1e-3))], axis=-1)  # fmt: skip
 
 
 def _blurred(image: FloatArray) -> FloatArray:
-    """The image (n, n), blurred along both axes. Outside of the image its values are taken as 1:
-    nothing is hidden."""
+    """Blur an image (n, n) along both axes. Outside of the image its values are taken as 1: nothing
+    is hidden there."""
     kernel = np.convolve(_BLUR, [0.5, 0.5])  # of odd length: it stays in place
     for _ in range(2):
         rows = [np.convolve(row, kernel, mode="valid") for row in _framed(image, len(kernel) // 2)]
+        # Rows become columns, so the second pass blurs along the other axis.
         image = np.array(rows).T
     return image
 
 
 def _framed(image: FloatArray, width: int) -> FloatArray:
-    """The image with `width` columns of ones on the left and on the right."""
+    """Return the image with `width` columns of ones added on the left and on the right."""
     return np.pad(image, ((0, 0), (width, width)), constant_values=1.0)
 
 
@@ -401,10 +433,11 @@ FloatImage = npt.NDArray[np.float32]
 def studio_wall(
     mi: Any, sensor: Any, ground: GroundBackdrop, azimuth: float, show: str
 ) -> FloatImage:
-    """Radiance (h, w, 3) of the studio's ground and of the wall behind it, at the middle of each
-    pixel.
+    """Compute the radiance (h, w, 3) of the studio's ground and of the wall behind it, at the
+    middle of each pixel.
 
-    azimuth: of the camera, in degrees. show: "path" or "shaded".
+    azimuth: of the camera, in degrees.
+    show: the kind of picture, "path" or "shaded", whose ground looks differently bright.
 
     The camera does not see the environment that lights the stage. It sees the ground as far as the
     horizon, and above it a wall of the same color that is darker higher up. So the horizon is no
@@ -423,7 +456,8 @@ def studio_wall(
 
 
 def _far_shaded(mi: Any, sensor: Any, ground: GroundBackdrop) -> FloatArray:
-    """Radiance (3,) of the ground far from the stage, in the light of shaded pictures."""
+    """Compute the radiance (3,) of the ground far from the stage, in the light of shaded
+    pictures."""
     matrix = np.array(sensor.world_transform().matrix, dtype=np.float64).reshape(4, 4)
     color = mi.Color3f(*reflectance_of(ground.name).tolist())
     up, one = mi.Vector3f(0, 0, 1), mi.Float(1)
@@ -434,16 +468,18 @@ def _far_shaded(mi: Any, sensor: Any, ground: GroundBackdrop) -> FloatArray:
 def backdrop_image(
     mi: Any, backdrop: GradientBackdrop | ImageBackdrop, size: tuple[int, int]
 ) -> FloatImage:
-    """The linear sRGB (h, w, 3) of a color gradient or an image behind a picture of `size` (width,
-    height) pixels."""
+    """Return the linear sRGB image (h, w, 3) of a color gradient or an image behind a picture of
+    `size` (width, height) pixels."""
     if isinstance(backdrop, ImageBackdrop):
         return _covering(mi, backdrop.pixels, size)
     width, height = size
     if backdrop.bottom == backdrop.top:
         rows = np.array([[linear_from_srgb(backdrop.top)]], dtype=np.float32)
     else:  # even steps in sRGB look even
-        rise = (height - 0.5 - np.arange(height)[:, None]) / height
-        shown = (1 - rise) * np.array(backdrop.bottom) + rise * np.array(backdrop.top)
+        height_fraction = (height - 0.5 - np.arange(height)[:, None]) / height
+        shown = (1 - height_fraction) * np.array(backdrop.bottom) + height_fraction * np.array(
+            backdrop.top
+        )
         rows = np.array(
             [[linear_from_srgb(tuple(row))] for row in shown.tolist()], dtype=np.float32
         )
@@ -451,14 +487,14 @@ def backdrop_image(
 
 
 def _covering(mi: Any, image: FloatImage, size: tuple[int, int]) -> FloatImage:
-    """The image, cropped around its middle to the shape of a picture of `size` (width, height)
-    pixels and scaled to this size."""
+    """Scale an image so that it covers a picture of `size` (width, height) pixels. The image is
+    cropped around its middle to the shape of the picture first."""
     height, width = image.shape[:2]
     scale = max(size[0] / width, size[1] / height)
-    extent = [
+    cropped_size = [
         min(round(side / scale), full) for side, full in zip(size, (width, height), strict=True)
     ]
-    columns, rows = (max(length, 1) for length in extent)
+    columns, rows = (max(length, 1) for length in cropped_size)
     left, top = (width - columns) // 2, (height - rows) // 2
     cropped = np.ascontiguousarray(image[top : top + rows, left : left + columns])
     if (columns, rows) == size:

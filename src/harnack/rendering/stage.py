@@ -1,7 +1,9 @@
-"""A small photo studio: ground, lights, materials, and a camera that frames the surfaces.
+"""A small photo studio for surfaces: it chooses ground, lights, materials, and a camera that frames
+the surfaces, and makes a Mitsuba scene of them. A BSDF dictionary describes in Mitsuba how a
+surface scatters light. `mi` is the Mitsuba module.
 
 Surfaces are scaled to a radius of about 1 and stand on the ground z = 0, so that lights, shadows
-and the tolerances of Mitsuba's rays suit surfaces of every size.
+and the tolerances of Mitsuba's rays suit surfaces of every size. The stage is this scaled world.
 """
 
 from __future__ import annotations
@@ -38,12 +40,13 @@ _PAINT, _BLACK, _WHITE = 0.2, 0.005, 0.9
 
 
 def _rgb(color: Color) -> Dictionary:
-    """The dictionary of a linear sRGB color in Mitsuba."""
+    """Return the dictionary of a linear sRGB color in Mitsuba."""
     return {"type": "rgb", "value": list(color)}
 
 
 def _coated(color: Color, roughness: float) -> Dictionary:
-    """The BSDF dictionary of a colored base under a clear coat. color: linear sRGB reflectance."""
+    """Return the BSDF dictionary of a colored base under a clear coat. color: linear sRGB
+    reflectance."""
     return {
         "type": "roughplastic",
         "diffuse_reflectance": _rgb(color),
@@ -53,7 +56,7 @@ def _coated(color: Color, roughness: float) -> Dictionary:
 
 
 def _metal(name: str, roughness: float) -> Dictionary:
-    """The BSDF dictionary of a rough metal. name: its symbol in Mitsuba, such as "Au"."""
+    """Return the BSDF dictionary of a rough metal. name: its symbol in Mitsuba, such as "Au"."""
     return {"type": "roughconductor", "material": name, "alpha": roughness, "distribution": "ggx"}
 
 
@@ -84,8 +87,9 @@ class Material:
             )
 
     def bsdf(self, *, solid: bool, traced_light: bool = True) -> Dictionary:
-        """The BSDF dictionary for the boundary of a solid, or for an open surface.
+        """Return the BSDF dictionary for a surface of this material.
 
+        solid: whether the surface is the boundary of a solid; otherwise it is open.
         traced_light: whether light paths are to be traced at it. Otherwise only its diffuse
             reflectance and its kind are needed, and the dictionary may describe a similar BSDF that
             is made faster.
@@ -113,22 +117,26 @@ MaterialLike = str | Color | Material | Mapping[str, Any]
 
 
 def _without_table(bsdf: Dictionary) -> Dictionary:
-    """A BSDF dictionary with the same diffuse reflectance. A rough coat is replaced by a smooth
-    one, for which Mitsuba need not compute a table of transmittances (0.07 s)."""
+    """Return a BSDF dictionary with the same diffuse reflectance that Mitsuba loads faster. A rough
+    coat is replaced by a smooth one, for which Mitsuba need not compute a table of transmittances.
+    Other dictionaries are returned unchanged."""
     if bsdf.keys() != _coated((0, 0, 0), 0).keys() or bsdf["type"] != "roughplastic":
         return bsdf
     return {**{key: bsdf[key] for key in bsdf if key != "alpha"}, "type": "plastic"}
 
 
 def _tinted(tint: Color, index: float = 1.5) -> Material:
-    """Glass that absorbs some of the light. tint: the fractions that are left after one unit of
-    length. index: of refraction."""
+    """Return the material of glass that absorbs some of the light.
+
+    tint: the fractions of red, green and blue light that are left after one unit of length.
+    index: the index of refraction.
+    """
     glass: Dictionary = {"type": "dielectric", "int_ior": index, "ext_ior": 1.0}
     return Material(glass, transparent=True, tint=tint)
 
 
 def _painted(color: Color) -> Material:
-    """The material for a color in linear sRGB: paint under a clear coat."""
+    """Return the material for a color in linear sRGB: paint under a clear coat."""
     red, green, blue = (max(_WHITE * channel, _BLACK) for channel in color)
     return Material(_coated((red, green, blue), _PAINT))
 
@@ -154,8 +162,8 @@ MATERIALS: Mapping[str, Material] = {
 
 
 def parse_material(material: Any, option: str = "material") -> Material:
-    """The `Material` that the value of an option describes: None for the default, a name, a color,
-    a `Material`, or a BSDF dictionary, which is used unchanged.
+    """Return the `Material` that the value of an option describes: None for the default, a name, a
+    color, a `Material`, or a BSDF dictionary, which is used unchanged.
 
     option: the name of the option, for messages.
 
@@ -207,8 +215,8 @@ class StudioObject:
     """A surface in the studio, with its material.
 
     surface: if it has no tolerance, it gets one that suits the size of the drawn surfaces.
-    section_material: the material of the faces at which a section cuts a solid; None for that of
-        the rest.
+    section_material: the material of the faces at which a section cuts a solid; None for the
+        material of the rest.
     isolines: lines to draw on it.
     """
 
@@ -220,9 +228,9 @@ class StudioObject:
 
 @dataclass(frozen=True)
 class StudioScene:
-    """A scene of the studio.
+    """A scene of the studio, in which surfaces are scaled and stand on the ground.
 
-    scene: its dictionary for Mitsuba.
+    scene: the dictionary that describes it for Mitsuba.
     placement: the map from the coordinates of the surfaces to the world.
     backdrop: the backdrop that was passed to `build_studio`.
     azimuth: of the camera, in degrees.
@@ -247,17 +255,20 @@ def build_studio(
     surfaces_only: bool = False,
     traced_light: bool = True,
 ) -> StudioScene:
-    """The studio with surfaces, ground, lights and a camera, for a picture of `size` (width,
-    height) pixels.
+    """Put surfaces, ground, lights and a camera into a scene, for a picture of `size`
+    (width, height) pixels. Returns the `StudioScene`.
 
+    studio_objects: the surfaces with their materials.
     camera: from where the surfaces are seen; what it leaves open is chosen such that they fill the
         picture.
+    backdrop: what is seen behind the surfaces.
     up: the direction, in the coordinates of the surfaces, that is up in the studio, as
         `rotation_to_z_up` takes it.
     surfaces_only: whether to leave out ground and lights.
     traced_light: whether the picture follows light paths, and so needs complete materials.
     """
     backend = mitsuba_backend(mi)
+    # What fills the picture: the visible points of all surfaces, or the box that the camera names.
     if camera.box is None:
         points = np.concatenate(
             [visible_points(element.surface, backend) for element in studio_objects]
@@ -266,6 +277,7 @@ def build_studio(
         points = corners_of(np.array(camera.box.bounds()))
     placement = stage_placement(points, rotation_to_z_up(up))
     pose = camera.pose(placement.apply(points), size, placement.apply)
+    # The path tracer of this library, which sees level sets, draws the scene.
     scene: dict[str, Any] = {
         "type": "scene",
         "integrator": {
@@ -278,19 +290,21 @@ def build_studio(
     for k, element in enumerate(studio_objects):
         surface = element.surface
         if surface.tolerance is None:
+            # The default tolerance is a length on the stage; the surface needs it in its own
+            # coordinates.
             length = _PATCH_TOLERANCE if surface.field.has_patches else _TOLERANCE
             surface = replace(surface, tolerance=HitTolerance(length / placement.scale))
         bsdf = element.material.bsdf(
             solid=surface.solid_range is not None, traced_light=traced_light
         )
-        section = (
+        section_bsdf = (
             None
             if element.section_material is None
             else element.section_material.bsdf(solid=True, traced_light=traced_light)
         )
         scene[f"surface{k}"] = mitsuba_shape(
             surface, bsdf=bsdf, to_world=placement.matrix, tint=element.material.tint,
-            section_bsdf=section, isolines=element.isolines,
+            section_bsdf=section_bsdf, isolines=element.isolines,
         )  # fmt: skip
     has_ground = False
     if not surfaces_only:
@@ -302,15 +316,18 @@ def build_studio(
 
 
 def corners_of(ends: FloatArray) -> FloatArray:
-    """The corners (8, 3) of a box with opposite corners `ends` (2, 3). Raises ValueError for a box
-    of a size that pictures cannot show."""
+    """Return the corners (8, 3) of a box with opposite corners `ends` (2, 3).
+
+    Raises:
+        ValueError: the box has a size that pictures cannot show.
+    """
     check_drawable_size(ends)
     return np.array(list(itertools.product(*ends.T)))
 
 
 def stage_placement(points: FloatArray, turned: FloatArray | None = None) -> Placement:
-    """The placement of surfaces in the studio: they are rotated, scaled until half the diagonal of
-    their box is 1, and put on the ground.
+    """Return the placement of surfaces in the studio: they are rotated, scaled until half the
+    diagonal of their box is 1, and put on the ground.
 
     points: (n, 3) points of the surfaces, whose box counts.
     turned: the rotation (3, 3); None for no rotation.
@@ -323,13 +340,17 @@ def stage_placement(points: FloatArray, turned: FloatArray | None = None) -> Pla
     points = points @ turned.T
     lower, upper = points.min(axis=0), points.max(axis=0)
     scale = 2.0 / max(float(np.linalg.norm(upper - lower)), 1e-30)
+    # The middle of the box's base is placed at the origin of the world.
     base_point = np.array([*(lower + upper)[:2] / 2, lower[2]])
     return Placement(scale, turned, -scale * base_point)
 
 
 def _sensor(mi: Any, pose: CameraPose, size: tuple[int, int]) -> dict[str, Any]:
-    """The dictionary of the camera for Mitsuba. Raises ValueError if it is too far away for single
-    precision. size: (width, height) in pixels."""
+    """Return the dictionary of the camera for Mitsuba. size: (width, height) in pixels.
+
+    Raises:
+        ValueError: the camera is too far away for single precision.
+    """
     # Rays begin near the stage, however far the camera is: their origins are rounded.
     distance = float(np.linalg.norm(pose.origin))
     if distance > _MAX_CAMERA_DISTANCE:
@@ -344,6 +365,8 @@ def _sensor(mi: Any, pose: CameraPose, size: tuple[int, int]) -> dict[str, Any]:
         "type": "perspective",
         "fov": pose.fov,
         "fov_axis": "larger",
+        # Rays begin at a distance that is a whole multiple of a step, since it is a literal of
+        # kernels.
         "near_clip": max(1e-3, _NEAR_CLIP_STEP * (distance // _NEAR_CLIP_STEP - 1)),
         "far_clip": _FAR_CLIP,
         "to_world": to_world,

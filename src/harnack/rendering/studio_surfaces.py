@@ -1,4 +1,6 @@
-"""Turns the arguments of `render` into the objects that its studio shows."""
+"""Turns the arguments of `render` into the objects that its studio shows. A surface is a level set
+of a field or, with a `side`, the boundary of a closed solid. A section is a half-space that cuts a
+solid open. A `StudioObject` is a surface with its material and isolines."""
 
 from __future__ import annotations
 
@@ -29,7 +31,7 @@ _TUBE_MATERIAL = "gold"
 
 
 def _is_color(materials: Any) -> bool:
-    """Whether a list holds three numbers, a color, and not materials."""
+    """Return whether a list is a color, three numbers, and not a list of materials."""
     return len(materials) == 3 and all(isinstance(number, Real) for number in materials)
 
 
@@ -40,8 +42,8 @@ def drawn_surfaces(
     thickness: float | None = None,
     **shorthand: Any,
 ) -> list[TracedSurface]:
-    """The surfaces that `render` draws for its first argument. The other parameters are the options
-    of `render` that change the surfaces."""
+    """Return the surfaces that `render` draws for its first argument. The other parameters are the
+    options of `render` that change the surfaces."""
     drawn = studio_objects(
         surfaces, None, options, shorthand, boundary_radius=boundary_radius, thickness=thickness
     )
@@ -60,16 +62,21 @@ def studio_objects(
     isolines: tuple[Isolines, ...] = (),
     thickness: float | None = None,
 ) -> list[StudioObject]:
-    """The objects that the studio shows: fields and surfaces with materials and isolines, and tubes
-    around the curves at which surfaces end.
+    """Return the objects that the studio shows: fields and surfaces with materials and isolines,
+    and tubes around the curves at which surfaces end.
 
-    surfaces: the first argument of `render`. materials: its option `material`.
+    surfaces: the first argument of `render`.
+    materials: its option `material`.
     options, shorthand: the `TraceOptions` of all surfaces, and options given as keywords, by name.
-    boundary_radius: the radius of the tubes; None for no tubes. boundary_material: their material,
-        gold if None.
-    section_material: the material of the faces at which sections cut solids; None for that of the
-        rest.
+    boundary_radius: the radius of the tubes; None for no tubes.
+    boundary_material: the material of the tubes, gold if None.
+    section_material: the material of the faces at which sections cut solids; None for the material
+        of the rest.
+    isolines: lines to draw on all surfaces.
     thickness: if not None, closed walls of this thickness are drawn in place of the surfaces.
+
+    One field may have several levels and a material for each; then there is one object for each
+    level.
 
     Raises:
         TypeError, ValueError: there is nothing to draw, or an option is wrong.
@@ -82,25 +89,31 @@ def studio_objects(
             raise TypeError(
                 f"what is drawn are fields and surfaces, not what is {suggest_field(element)}"
             )
+    # One material for all surfaces, or a list with one for each.
     has_list = isinstance(materials, list | tuple) and not _is_color(materials)
-    names: list[Any] = [*materials] if has_list else [materials] * len(listed)
+    material_values: list[Any] = [*materials] if has_list else [materials] * len(listed)
     drawn: list[tuple[Any, Mapping[str, Any]]] = [(element, shorthand) for element in listed]
-    level: Any = shorthand.get("level")
-    levels: list[Any] = [*level] if isinstance(level, Sequence | np.ndarray) else []
-    if len(listed) == 1 and has_list and len(names) == len(levels) > 1:
-        drawn = [(listed[0], {**shorthand, "level": number}) for number in levels]
-    if len(names) != len(drawn):
+    level_option: Any = shorthand.get("level")
+    levels: list[Any] = [*level_option] if isinstance(level_option, Sequence | np.ndarray) else []
+    # One field with as many materials as levels: each level becomes an object.
+    if len(listed) == 1 and has_list and len(material_values) == len(levels) > 1:
+        drawn = [(listed[0], {**shorthand, "level": single_level}) for single_level in levels]
+    if len(material_values) != len(drawn):
         count = max(len(listed), len(levels))
         hint = f" or {count}, one for each {'surface' if len(listed) > 1 else 'level'}"
-        raise ValueError(f"give one material{hint if count > 1 else ''}, not {len(names)}")
+        raise ValueError(
+            f"give one material{hint if count > 1 else ''}, not {len(material_values)}"
+        )
     objects: list[StudioObject] = []
-    for (element, keywords), name in zip(drawn, names, strict=True):
-        material = parse_material(name)
+    for (element, keywords), material_value in zip(drawn, material_values, strict=True):
+        material = parse_material(material_value)
         surface = _surface(element, options, keywords, material.transparent)
         # Lines of a surface's own function are meant for the other surfaces.
-        is_open = surface.solid_range is None and len(listed) > 1
+        may_skip_lines = surface.solid_range is None and len(listed) > 1
         lines = tuple(
-            line for line in isolines if not (is_open and line.function_field is surface.field)
+            line
+            for line in isolines
+            if not (may_skip_lines and line.function_field is surface.field)
         )
         objects.append(StudioObject(surface, material, isolines=lines))
     _check_no_duplicates([element.surface for element in objects])
@@ -128,8 +141,12 @@ def studio_objects(
 
 
 def _thickened(surface: TracedSurface, thickness: float) -> TracedSurface:
-    """The surface of the closed mesh that `harnack.mesh` makes of a surface with a thickness.
-    Raises ValueError if there is no such mesh."""
+    """Return a surface as a wall: the closed mesh that `harnack.mesh` makes of it with a thickness,
+    as the level set of the mesh's winding number.
+
+    Raises:
+        ValueError: there is no such mesh.
+    """
     if surface.solid_range is not None or len(surface.levels) != 1:
         raise ValueError("thickness needs a surface of one level; a solid has an inside already")
     if surface.largest:
@@ -154,11 +171,15 @@ def _thickened(surface: TracedSurface, thickness: float) -> TracedSurface:
 
 
 def _with_section_material(objects: list[StudioObject], material: Material) -> list[StudioObject]:
-    """The objects; those that are solids cut by a section get this material on the faces of the
-    cut. Raises ValueError if there are none."""
+    """Return the objects; those that are solids cut by a section get this material on the faces of
+    the cut.
+
+    Raises:
+        ValueError: there are none.
+    """
 
     def has_faces(element: StudioObject) -> bool:
-        """Whether the object is a solid with a section."""
+        """Return whether the object is a solid with a section."""
         return element.surface.section is not None and element.surface.solid_range is not None
 
     if not any(map(has_faces, objects)):
@@ -178,8 +199,10 @@ def _check_no_duplicates(surfaces: list[TracedSurface]) -> None:
     seen."""
     for k, surface in enumerate(surfaces):
         for earlier in surfaces[:k]:
-            same = _is_cut_alike(surface, earlier) and surface.solid_range == earlier.solid_range
-            if same and _shared_levels(surface, earlier):
+            is_alike = (
+                _is_cut_alike(surface, earlier) and surface.solid_range == earlier.solid_range
+            )
+            if is_alike and _shared_levels(surface, earlier):
                 raise ValueError(
                     "a surface is drawn twice, and which is seen would be an accident. If levels "
                     "were meant for one field each: they are those of every field. Give one field "
@@ -188,26 +211,32 @@ def _check_no_duplicates(surfaces: list[TracedSurface]) -> None:
 
 
 def _shared_levels(first: TracedSurface, second: TracedSurface) -> bool:
-    """Whether two level sets of one field have a level in common, modulo the period of the
+    """Return whether two surfaces of one field have a level in common, modulo the period of the
     field."""
     period = first.field.period
-    gaps = np.subtract.outer(first.level_values, second.level_values)
+    differences = np.subtract.outer(first.level_values, second.level_values)
     if period is not None:
-        gaps -= period * np.round(gaps / period)
+        differences -= period * np.round(differences / period)
+    # Levels that differ by rounding are the same.
     largest = max(1.0, *(abs(level) for level in (*first.level_values, *second.level_values)))
-    return bool((np.abs(gaps) <= 1e-9 * largest).any())
+    return bool((np.abs(differences) <= 1e-9 * largest).any())
 
 
 def _is_cut_alike(first: TracedSurface, second: TracedSurface) -> bool:
-    """Whether two surfaces have the same field and the same clip and section."""
-    same = first.field is second.field
-    return same and first.clip == second.clip and first.section == second.section
+    """Return whether two surfaces have the same field and the same clip and section."""
+    is_same_field = first.field is second.field
+    return is_same_field and first.clip == second.clip and first.section == second.section
 
 
 def _boundary_tubes(
     objects: list[StudioObject], radius: Any, material: Material
 ) -> list[StudioObject]:
-    """Tubes of a radius around the curves at which the surfaces of the objects end."""
+    """Return objects that are tubes of a radius around the curves at which the given surfaces end.
+    Levels of the same field with the same clip end at the same curves, which get one tube.
+
+    Raises:
+        ValueError: the radius is no positive number, or no surface ends at a curve.
+    """
     if isinstance(radius, bool) or not isinstance(radius, Real) or not 0 < float(radius) < math.inf:
         raise ValueError(f"boundary_radius is a length, such as 0.03, not {radius!r}")
     tubes: list[StudioObject] = []
@@ -232,8 +261,14 @@ def _surface(
     shorthand: Mapping[str, Any],
     is_clear: bool,
 ) -> TracedSurface:
-    """A surface with the options of the call. A `Solid` is drawn as a solid if its inside can be
-    seen: if a section opens it, or its material is transparent."""
+    """Return the surface for one entry of the first argument of `render`, with the options of the
+    call. A `Solid` (a field that is negative inside of a closed body) is drawn as a solid if its
+    inside can be seen: if a section opens it, or its material is transparent.
+
+    options, shorthand: the `TraceOptions` of the call, and options given as keywords, by name.
+    is_clear: whether the material is transparent.
+    """
+    # Such a surface has all of its options already.
     if isinstance(element, TracedSurface):
         return element.with_call_cache(begins=True)
     honored = names_of("render", "surface", "trace")
@@ -243,8 +278,11 @@ def _surface(
 
 
 def with_visible_inside(surface: TracedSurface, *, is_clear: bool = False) -> TracedSurface:
-    """The surface; a `Solid` whose inside can be seen becomes the boundary of the solid, with faces
-    where volumes cut it.
+    """Return the surface as it is to be drawn if its inside can be seen. If its field is a `Solid`
+    (the points where f <= 0), it becomes the boundary of this solid, with faces where volumes cut
+    it. Other surfaces stay as they are.
+
+    is_clear: whether the material is transparent.
 
     Raises:
         ValueError: the boundary of a solid is requested for a field that has no closed solids

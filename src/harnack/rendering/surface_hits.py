@@ -1,5 +1,11 @@
-"""First hits of rays with level sets and with boundaries of solids: their positions, moved onto the
-surface, and normals that point to a known side.
+"""Computes where rays first hit a level set of a field, or the boundary of a solid, and which way
+the surface faces there.
+
+A field is a scalar function f of space, and its level set is the surface on which f equals a given
+number, the level. f may also jump across triangles, which are called facets; then they belong to
+the surface too. A `SurfaceTracer` (`prepared`) holds everything that tracing one surface needs. Its
+march moves along a ray by proved steps and ends near the surface, within a tolerance; the functions
+here move this end onto the surface and compute a normal that points to a known side.
 
 All coordinates are those of the surface, and nothing here depends on Mitsuba.
 `hybrid_scene.surface_interaction` turns a hit into the interaction that a BSDF takes.
@@ -45,11 +51,11 @@ class SurfaceHit:
     value: f close to the hit, or just before the jump if the hit is on a jump of f; undefined
         without a hit.
     evaluations: the number of evaluations of f along the ray.
-    is_hole_filling: whether f has jumps (such as the winding number of a mesh at its triangles) and
-        the hit is on none of them: it is on a smooth part of the level set, which closes a hole
-        between them.
-    is_on_section: whether the hit is on a flat face where the section, a volume that cuts a solid
-        open, cuts it.
+    is_hole_filling: whether f jumps somewhere (as the winding number of a mesh does at its
+        triangles) but not at this hit. Then the hit is on a smooth part of the level set, which
+        closes a hole between the triangles.
+    is_on_section: whether the hit is on the flat face along which a solid was cut open. The section
+        is the volume that cuts it.
     isoline_index: the number of the isoline at the hit, counted from 1; 0 if no isoline is there.
     """
 
@@ -69,20 +75,25 @@ class SurfaceHit:
 def intersect_surface(
     prepared: SurfaceTracer, o: Vec3, d: Vec3, t_max: Real, active: Mask
 ) -> SurfaceHit:
-    """The first hits of rays o + t d, |d| = 1, 0 <= t <= t_max, with the level set, as a
-    `SurfaceHit`.
+    """Find the first hits of rays o + t d, |d| = 1, 0 <= t <= t_max, with the level set. Returns
+    one `SurfaceHit`.
+
+    prepared: the tracer of the surface.
+    active: mask of the rays that are traced.
 
     The march ends within the tolerance of the surface. One Newton step along the ray, one
     evaluation of f there, and one step along the gradient then lead to the surface itself. The last
     value of the march tells from which side of the level the ray comes. If the normal contradicts
     that, because the Newton step along a grazing ray went too far, the normal is tilted to agree.
 
-    If hits require a crossing, the march itself gives the root and the side, and no Newton step is
-    made. A hit on a jump of f is not moved; its normal points to the side of larger values.
+    If hits require a crossing of the level, the march itself gives the root and the side, and no
+    Newton step is made. A hit on a jump of f is not moved; its normal points to the side of larger
+    values.
     """
     trace = prepared.first_hit(o, d, 0, t_max, active)
     if not prepared.uses_ray_queue:
         return _refine_hits(prepared, _MarchedRays(o, d, trace))
+    # With a queue of rays, the refinement is computed only for the rays that hit.
     return compute_on_active(
         trace.status == int(RayStatus.HIT),
         lambda rays: _refine_hits(prepared, rays),
@@ -93,7 +104,8 @@ def intersect_surface(
 
 @dataclass(frozen=True)
 class _MarchedRays:
-    """Origins and unit directions of rays, and the `MarchResult` of each."""
+    """Rays and how their march ended: origins o (3,), unit directions d (3,), and the
+    `MarchResult`."""
 
     o: Vec3
     d: Vec3
@@ -101,8 +113,8 @@ class _MarchedRays:
 
 
 def _no_hit(prepared: SurfaceTracer, trace: MarchResult) -> SurfaceHit:
-    """The `SurfaceHit` of rays without a hit: misses, and rays that are out of steps. trace: how
-    the rays ended."""
+    """Return the `SurfaceHit` of rays that hit nothing: of misses, and of rays that are out of
+    steps. trace: how the march of each ray ended."""
     backend = prepared.backend
     zero, vector, none = backend.Float(0), backend.Array3f(0), backend.Bool(False)
     return SurfaceHit(
@@ -121,40 +133,53 @@ def _no_hit(prepared: SurfaceTracer, trace: MarchResult) -> SurfaceHit:
 
 
 def _refine_hits(prepared: SurfaceTracer, rays: _MarchedRays) -> SurfaceHit:
-    """The `SurfaceHit` of marched rays, with hits moved onto the surface as `intersect_surface`
-    describes."""
+    """Return the `SurfaceHit` of marched rays. Hits are moved onto the surface as
+    `intersect_surface` describes; other rays keep the end of their march.
+
+    rays: the rays and the `MarchResult` of each.
+
+    Every movement is limited to `reach`, twice the distance from the level at which the march may
+    stop.
+    """
     vector, o, d, trace = prepared.backend.Array3f, rays.o, rays.d, rays.trace
     prepared = prepared.hit_surface(trace)
     is_hit = trace.status == int(RayStatus.HIT)
     is_smooth = is_hit & ~trace.at_jump if prepared.field.has_jumps else is_hit
-    gap = prepared.levels.offset_to_nearest(trace.value)
-    slope = dr.dot(trace.gradient, d)
+    # The difference between the nearest level and f at the end of the march.
+    value_to_level = prepared.levels.offset_to_nearest(trace.value)
+    slope_on_ray = dr.dot(trace.gradient, d)
     reach = _MAX_REFINEMENT * _uncertainty(prepared, trace.gradient, trace.t, trace.value)
-    step = dr.select(is_smooth & (slope != 0), dr.clip(gap / slope, -reach, reach), 0)
-    # gap > 0: the level is above, so the ray comes from the side of smaller values.
-    side = dr.select(gap > 0, prepared.backend.Float(1), -1)
+    newton_step = dr.select(
+        is_smooth & (slope_on_ray != 0), dr.clip(value_to_level / slope_on_ray, -reach, reach), 0
+    )
+    # value_to_level > 0: the level is above, so the ray comes from the side of smaller values.
+    side = dr.select(value_to_level > 0, prepared.backend.Float(1), -1)
     if trace.side is not None:  # hits at crossings are at a root
-        step, side = dr.zeros(type(step)), trace.side
-    t = dr.maximum(dr.select(is_hit, trace.t, 0) + step, 0)
-    p = dr.fma(vector(t), d, o)
+        newton_step, side = dr.zeros(type(newton_step)), trace.side
+    # Rays without a hit may have t = inf: they are evaluated at their origin.
+    t = dr.maximum(dr.select(is_hit, trace.t, 0) + newton_step, 0)
+    position = dr.fma(vector(t), d, o)
     if prepared.field.has_jumps:
-        sample = _sample_where(prepared, p, trace.value, d, is_smooth)
+        sample = _sample_where(prepared, position, trace.value, d, is_smooth)
     else:
-        sample = prepared.sample(p)
-    length = norm(sample.gradient)
-    normal = dr.select(length > 0, sample.gradient / length, -d)
-    shading = normal if sample.shading_normal is None else sample.shading_normal
+        sample = prepared.sample(position)
+    gradient_norm = norm(sample.gradient)
+    normal = dr.select(gradient_norm > 0, sample.gradient / gradient_norm, -d)
+    shading_normal = normal if sample.shading_normal is None else sample.shading_normal
     uncertainty = _uncertainty(prepared, sample.gradient, t, sample.value, sample.value_error)
-    correction = prepared.levels.offset_to_nearest(sample.value) / length
-    correction = dr.select(length > 0, dr.clip(correction, -reach, reach), 0)
+    # Second movement: along the gradient, by the distance to the level to first order.
+    correction = prepared.levels.offset_to_nearest(sample.value) / gradient_norm
+    correction = dr.select(gradient_norm > 0, dr.clip(correction, -reach, reach), 0)
     if prepared.field.has_jumps:  # behind a facet, the value does not concern this surface
-        correction = dr.select(dr.abs(correction) * length <= dr.abs(gap), correction, 0)
+        correction = dr.select(
+            dr.abs(correction) * gradient_norm <= dr.abs(value_to_level), correction, 0
+        )
     hit = SurfaceHit(
         t=dr.select(is_hit, t, trace.t),
         is_hit=is_hit,
         is_out_of_steps=trace.status == int(RayStatus.OUT_OF_STEPS),
-        position=dr.fma(vector(correction), normal, p),
-        normal=orient_normal(shading, d, side),
+        position=dr.fma(vector(correction), normal, position),
+        normal=orient_normal(shading_normal, d, side),
         ray_offset=RAY_OFFSET * uncertainty,
         value=sample.value,
         evaluations=trace.evaluations + dr.select(is_smooth, prepared.backend.UInt32(1), 0),
@@ -168,19 +193,21 @@ def _refine_hits(prepared: SurfaceTracer, rays: _MarchedRays) -> SurfaceHit:
 
 
 def _sample_where(prepared: SurfaceTracer, p: Vec3, value: Real, d: Vec3, active: Mask) -> Sample:
-    """The `Sample` of f at points p on active lanes: value, error, gradient and shading normal. It
-    is zero on other lanes and holds no promises (proved bounds of f near a point).
+    """Return the `Sample` of f at points p (3,) on active lanes: value, bound of its rounding
+    error, gradient and shading normal. All of these are 0 on other lanes. The sample has no bounds
+    of f in the neighborhood of p.
 
-    value: f near p, which selects the branch of a multivalued f.
-    d: the direction of the ray; a point with a zero gradient has the normal -d.
+    value: f near p. A multivalued f is evaluated on the branch whose value is closest to it.
+    d: (3,) the direction of the ray; a point with a zero gradient has the normal -d.
 
-    The evaluation is skipped if no lane is active. Evaluating a mesh with holes costs more than
+    The evaluation is skipped if no lane is active. Evaluating a mesh with holes takes longer than
     tracing a ray, and most rays hit a triangle or nothing.
     """
     real, vector = prepared.backend.Float, prepared.backend.Array3f
 
     def sample_all(_: tuple[Any, ...]) -> tuple[Any, ...]:
-        """Value, error, gradient and shading normal at all points p."""
+        """Return value, error bound, gradient and shading normal at all points p. The argument, the
+        state before, is not used."""
         sample = prepared.sample_with_branch(p, value)
         length = norm(sample.gradient)
         normal = dr.select(length > 0, sample.gradient / length, -d)
@@ -195,25 +222,27 @@ def _sample_where(prepared: SurfaceTracer, p: Vec3, value: Real, d: Vec3, active
 def _hit_on_facet(
     prepared: SurfaceTracer, o: Vec3, d: Vec3, trace: MarchResult, hit: SurfaceHit
 ) -> SurfaceHit:
-    """The `SurfaceHit` of rays that hit a facet (a flat piece of the surface at which f jumps). The
-    intersection with the facet's plane is exact up to rounding, so neither t nor the normal is
-    refined.
+    """Return the `SurfaceHit` of rays that hit a facet (a flat piece of the surface at which f
+    jumps). The intersection with the facet's plane is exact up to rounding, so neither t nor the
+    normal is refined.
 
-    hit: the result for smooth hits, whose other entries stay.
+    hit: the same rays' `SurfaceHit` as for smooth hits. Its entries that do not depend on the facet
+        are kept.
 
     f is larger on the side to which the normal points. So a ray that runs along the normal comes
     from the side of smaller values. The next ray starts as far off as from a level set, and at
     least several roundings of the position.
     """
     t = dr.select(trace.at_jump, trace.t, 0)
-    p = dr.fma(prepared.backend.Array3f(t), d, o)
+    position = dr.fma(prepared.backend.Array3f(t), d, o)
+    # 1 if the ray comes from the side of smaller values, else -1.
     side = dr.mulsign(prepared.backend.Float(1), dr.dot(trace.gradient, d))
     rounding = 4 * prepared.backend.machine_epsilon * (dr.max(dr.abs(o)) + t)
     tolerance = prepared.tolerance.value_tolerance(prepared.backend.Float(1), t)
     return replace(
         hit,
         t=t,
-        position=p,
+        position=position,
         normal=orient_normal(trace.gradient, d, side),
         ray_offset=RAY_OFFSET * dr.maximum(tolerance, rounding),
         value=trace.value,
@@ -224,17 +253,18 @@ def _hit_on_facet(
 def _uncertainty(
     prepared: SurfaceTracer, gradient: Vec3, t: Real, f: Real, error: Real = 0.0
 ) -> Real:
-    """The largest distance from the level, to first order, at which the march may accept a point as
-    a hit.
+    """Bound, to first order, how far from the level a point may be that the march accepts as a hit.
+    Returns this distance.
 
-    gradient, t, f, error: at the point, its gradient (3,), ray parameter, value, and the bound of
-        its rounding error.
+    gradient, t, f, error: at the point, the gradient (3,) of f, the ray parameter, the value of f,
+        and the bound of the rounding error of the value.
 
-    It is the tolerance, or the distance 2 error/|gradient| that corresponds to the rounding of f if
-    that is larger. Rounding of positions is left out: Mitsuba's rays start much farther off
-    surfaces anyway.
+    The bound is the tolerance, or the distance 2 error/|gradient| that corresponds to the rounding
+    of f if that is larger. Where the gradient is 0, it is the tolerance. Rounding of positions is
+    left out: Mitsuba's rays start much farther off surfaces anyway.
     """
     gradient_norm = norm(gradient)
+    # A miss has t = inf, which would make the tolerance infinite.
     t = dr.select(dr.isfinite(t), t, 0)
     rounding = 2 * (error + 8 * prepared.backend.machine_epsilon * dr.abs(f))
     value_tolerance = dr.maximum(prepared.tolerance.value_tolerance(gradient_norm, t), rounding)
@@ -244,8 +274,14 @@ def _uncertainty(
 
 
 def orient_normal(normal: Vec3, d: Vec3, side: Real) -> Vec3:
-    """The unit normal if side * (normal . d) > 0 by some margin; else the normal tilted in its
-    plane with d until that holds. d: (3,) unit direction of the ray. side: 1 or -1."""
+    """Return the unit normal, turned to the given side of the surface as the ray sees it.
+
+    If side * (normal . d) is at least a small positive margin, the normal is returned as it is.
+    Otherwise it is tilted, in the plane of normal and d, until this holds.
+
+    normal, d: (3,) unit normal, and unit direction of the ray.
+    side: 1 if the normal is to point along the ray, -1 if against it.
+    """
     cosine = dr.dot(normal, d)
     tilted = dr.normalize(normal + (side * _GRAZING - cosine) * d)
     return dr.select(side * cosine >= _GRAZING, normal, tilted)
@@ -253,18 +289,18 @@ def orient_normal(normal: Vec3, d: Vec3, side: Real) -> Vec3:
 
 @dataclass(frozen=True)
 class CappedSolid:
-    """A closed solid: the points of a volume at which low <= f <= high.
+    """A closed solid: the points of a volume at which low <= f <= high. The volume is convex, and
+    is what the surface is clipped to (box, ball, or their intersection with a section that cuts the
+    solid open).
 
-    Its boundary consists of level sets inside the volume and of caps, which are parts of the
-    volume's own boundary. A ray hits a cap where it enters the volume at a point of the solid, or
-    where it leaves the volume from inside the solid without having hit a level before. Volumes are
-    convex, so a ray enters and leaves a volume at most once. The volume may be an intersection that
-    includes the section (a volume that cuts the solid open). A cap lies on the section if the ray
+    The boundary of the solid consists of level sets inside the volume and of caps, which are parts
+    of the volume's own boundary. A ray hits a cap where it enters the volume at a point of the
+    solid, or where it leaves the volume from inside the solid without having hit a level before. A
+    ray enters and leaves the convex volume at most once. A cap lies on the section if the ray
     enters or leaves the section there.
 
-    prepared: the tracer of the level sets f = low and f = high. There is no level set for a bound
-        that is infinite.
-    low, high: the bounds of f, of which one may be infinite.
+    prepared: the tracer of the level sets f = low and f = high. An infinite bound has no level set.
+    low, high: the bounds of f; one of them may be infinite.
     """
 
     prepared: SurfaceTracer
@@ -273,25 +309,34 @@ class CappedSolid:
 
     @classmethod
     def of(cls, surface: TracedSurface, prepared: SurfaceTracer) -> CappedSolid:
-        """The solid of a surface whose `side` describes one. prepared: the tracer of the surface.
-        Raises ValueError if the surface is a level set."""
+        """Return the solid that a surface with the option `side` describes, such as all points
+        below its level.
+
+        prepared: the tracer of the same surface.
+
+        Raises:
+            ValueError: the surface is a level set, not the boundary of a solid.
+        """
         if surface.solid_range is None:
             raise ValueError("this surface is not the boundary of a solid: give it a side")
+        # The tracer's levels are the finite bounds, in increasing order, as the tracer computes
+        # with them.
         finite = iter(prepared.levels.values)
         low, high = (next(finite) if math.isfinite(end) else end for end in surface.solid_range)
         return cls(prepared, low, high)
 
     def _contains(self, p: Vec3) -> Mask:
-        """Mask of points (3,) of the volume that belong to the solid."""
-        f = self.prepared.sample(p).value
-        return (f >= self.low) & (f <= self.high) & self.prepared.level_counts(p)
+        """Return the mask of points p (3,) of the volume that belong to the solid."""
+        value = self.prepared.sample(p).value
+        return (value >= self.low) & (value <= self.high) & self.prepared.level_counts(p)
 
     def intersect(
         self, o: Vec3, d: Vec3, t_max: Real, active: Mask, side: Real = 0.0
     ) -> SurfaceHit:
-        """The first crossings of rays o + t d, |d| = 1, 0 <= t <= t_max, with the boundary, as a
-        `SurfaceHit`.
+        """Find the first crossings of rays o + t d, |d| = 1, 0 <= t <= t_max, with the boundary of
+        the solid. Returns a `SurfaceHit`.
 
+        active: mask of the rays that are traced.
         side: for a ray that starts at the boundary, 1 if it goes out of the solid there and -1 if
             it goes in; 0 for other rays.
 
@@ -301,64 +346,97 @@ class CappedSolid:
         So going in and going out always alternate, and no light is lost at the sharp edges of caps.
         """
         zero = self.prepared.backend.Float(0)
-        start, end = self.prepared.clip(o, d, zero, t_max)
-        enters = active & (start < end)
-        start = dr.select(enters, start, 0)
-        resolved = self.prepared.is_resolved(o, end)  # others run out of steps in `_meet_levels`
-        starts_inside = enters & resolved & self._contains(self._point_on_ray(o, d, start))
-        inside = starts_inside & (start <= 0)
-        slipped = active & resolved & (((side < 0) & ~inside) | ((side > 0) & inside))
-        entering = starts_inside & ~inside & ~slipped
-        hit = self._meet_levels(o, d, t_max, active & ~entering & ~slipped)
-        hit = replace(
-            hit, evaluations=hit.evaluations + type(hit.evaluations)(dr.select(enters, 1, 0))
+        t_enter, t_leave = self.prepared.clip(o, d, zero, t_max)
+        meets_volume = active & (t_enter < t_leave)
+        t_enter = dr.select(meets_volume, t_enter, 0)
+        # Other rays (see `SurfaceTracer.is_resolved`) run out of steps in `_meet_levels`.
+        is_resolved = self.prepared.is_resolved(o, t_leave)
+        starts_inside = (
+            meets_volume & is_resolved & self._contains(self._point_on_ray(o, d, t_enter))
         )
-        leaving = inside & ~slipped & ~hit.is_hit & ~hit.is_out_of_steps & (end < t_max)
-        capped = entering | leaving | slipped
-        t = dr.select(capped & ~slipped, dr.select(leaving, end, start), 0)
+        origin_is_inside = starts_inside & (t_enter <= 0)
+        is_on_wrong_side = (
+            active
+            & is_resolved
+            & (((side < 0) & ~origin_is_inside) | ((side > 0) & origin_is_inside))
+        )
+        hits_entry_cap = starts_inside & ~origin_is_inside & ~is_on_wrong_side
+        # Rays that hit a cap at once need not be traced to the level sets.
+        hit = self._meet_levels(o, d, t_max, active & ~hits_entry_cap & ~is_on_wrong_side)
+        # `_contains` has evaluated f once.
+        hit = replace(
+            hit, evaluations=hit.evaluations + type(hit.evaluations)(dr.select(meets_volume, 1, 0))
+        )
+        hits_exit_cap = (
+            origin_is_inside
+            & ~is_on_wrong_side
+            & ~hit.is_hit
+            & ~hit.is_out_of_steps
+            & (t_leave < t_max)
+        )
+        hits_cap = hits_entry_cap | hits_exit_cap | is_on_wrong_side
+        t = dr.select(hits_cap & ~is_on_wrong_side, dr.select(hits_exit_cap, t_leave, t_enter), 0)
         position = self._point_on_ray(o, d, t)
-        outwards = dr.select(leaving | (side < 0), zero + 1, -1)
-        normal = outwards * d
+        # 1 where the ray leaves the solid, so that the outward normal is along it; -1 where it
+        # enters.
+        out_along_ray = dr.select(hits_exit_cap | (side < 0), zero + 1, -1)
+        normal = out_along_ray * d
         if self.prepared.volume is not None:
-            cap_normal = orient_normal(self.prepared.volume.outward_normal(position), d, outwards)
-            normal = dr.select(slipped, normal, cap_normal)
-        clearance = zero + RAY_OFFSET * self.prepared.tolerance.distance
+            cap_normal = orient_normal(
+                self.prepared.volume.outward_normal(position), d, out_along_ray
+            )
+            normal = dr.select(is_on_wrong_side, normal, cap_normal)
+        ray_offset = zero + RAY_OFFSET * self.prepared.tolerance.distance
         on_section = hit.is_on_section
+        # The cap is on the section if the section, not another part of the volume, ends the ray
+        # there.
         if self.prepared.section is not None:
-            first, last = self.prepared.section.clip(o, d, zero, t_max)
-            on_section = dr.select(leaving, last <= end, entering & (first >= start))
+            t_section_enter, t_section_leave = self.prepared.section.clip(o, d, zero, t_max)
+            on_section = dr.select(
+                hits_exit_cap,
+                t_section_leave <= t_leave,
+                hits_entry_cap & (t_section_enter >= t_enter),
+            )
         cap_hit = replace(
             hit,
             t=t,
-            is_hit=capped,
+            is_hit=hits_cap,
             position=position,
             normal=normal,
-            ray_offset=clearance,
+            ray_offset=ray_offset,
             is_on_section=on_section,
         )
-        return dr.select(capped, cap_hit, hit)
+        return dr.select(hits_cap, cap_hit, hit)
 
     def occludes(self, o: Vec3, d: Vec3, t_max: Real, active: Mask) -> Mask:
-        """Mask of rays o + t d, 0 <= t <= t_max, that hit the boundary of the solid. Rays that are
-        not proved to miss it count as hits."""
-        start, end = self.prepared.clip(o, d, self.prepared.backend.Float(0), t_max)
-        enters = active & (start < end)
-        start = dr.select(enters, start, 0)
-        resolved = self.prepared.is_resolved(o, end)
-        starts_inside = enters & resolved & self._contains(self._point_on_ray(o, d, start))
-        capped = starts_inside & ((start > 0) | (end < t_max))
-        return capped | self.prepared.occluded(o, d, 0, t_max, active & ~capped)
+        """Return the mask of rays o + t d, 0 <= t <= t_max, that hit the boundary of the solid.
+        Rays that are not proved to miss it count as hits.
+
+        A ray hits a cap if it begins in the volume behind its origin and in the solid, or begins in
+        the solid and leaves the volume before t_max. All other active rays are tested against the
+        level sets.
+        """
+        t_enter, t_leave = self.prepared.clip(o, d, self.prepared.backend.Float(0), t_max)
+        meets_volume = active & (t_enter < t_leave)
+        t_enter = dr.select(meets_volume, t_enter, 0)
+        is_resolved = self.prepared.is_resolved(o, t_leave)
+        starts_inside = (
+            meets_volume & is_resolved & self._contains(self._point_on_ray(o, d, t_enter))
+        )
+        hits_cap = starts_inside & ((t_enter > 0) | (t_leave < t_max))
+        return hits_cap | self.prepared.occluded(o, d, 0, t_max, active & ~hits_cap)
 
     def _meet_levels(self, o: Vec3, d: Vec3, t_max: Real, active: Mask) -> SurfaceHit:
-        """The first hits of rays with the level sets inside the volume, as a `SurfaceHit` whose
-        normals point out of the solid."""
+        """Find the first hits of rays with the level sets inside the volume. Returns a `SurfaceHit`
+        whose normals point out of the solid: toward smaller f at the lower bound, and toward larger
+        f at the upper one."""
         hit = intersect_surface(self.prepared, o, d, t_max, active)
-        at_low = dr.abs(hit.value - self.low) < dr.abs(hit.value - self.high)
-        normal = dr.select(at_low, -hit.normal, hit.normal)
+        is_at_low = dr.abs(hit.value - self.low) < dr.abs(hit.value - self.high)
+        normal = dr.select(is_at_low, -hit.normal, hit.normal)
         return replace(hit, normal=normal)
 
     def _point_on_ray(self, o: Vec3, d: Vec3, t: Real) -> Vec3:
-        """The points o + t d (3,) of rays with the origins o and directions d; o if t is not
-        finite."""
+        """Return the points o + t d (3,) of rays with the origins o and directions d; o where t is
+        not finite."""
         t = dr.select(dr.isfinite(t), t, 0)
         return dr.fma(self.prepared.backend.Array3f(t), d, o)

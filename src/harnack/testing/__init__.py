@@ -1,10 +1,8 @@
-"""Tests of fields and enclosures, of the library and of users.
-
-A field promises (states as proved) bounds of its function near a point; an enclosure derives from a
-promise a length of a ray that contains no level. `check_field(MyField())` tests every promise of a
-field by samples. `check_enclosure(MyEnclosure)` tests an enclosure on random functions of every
-kind, including the extremal ones. Both raise `BrokenPromiseError` if a test fails.
-"""
+"""Tests of fields and enclosures, of the library and of users. A field with the function f promises
+(states as proved) bounds of f near each point. An enclosure derives from a promise a length of a
+ray on which f meets no level. `check_field(MyField())` tests every promise of a field by samples.
+`check_enclosure(MyEnclosure)` tests an enclosure on random functions of every kind, including the
+extremal ones. Both raise `BrokenPromiseError` if a test fails."""
 
 from __future__ import annotations
 

@@ -1,5 +1,8 @@
-"""Tests, by sampling, of the bounds that a field of a Riemann surface states near its branch
-points."""
+"""Tests, by sampling, of the bounds that a Riemann surface states near its branch points. A Riemann
+surface is a field made of a multivalued complex function of z; a branch is one of the values of
+this function. The field's function g is the real or imaginary part of a branch, possibly known
+modulo a period only. At a branch point several branches meet, and near it all branches are close to
+a single value."""
 
 from __future__ import annotations
 
@@ -18,7 +21,8 @@ if TYPE_CHECKING:
 
 __all__ = ["check_branch_points"]
 
-# Number of test points around each branch point, and their smallest distance from it, in radii.
+# The number of test points around each branch point, and their smallest distance from it, as a
+# fraction of the radius within which the bound is stated.
 _POINT_COUNT, _MIN_RADIUS_FRACTION = 4000, 1e-6
 # An upper bound of the rounding errors of branches and of their power.
 _ROUNDING = 1e-6
@@ -27,13 +31,14 @@ _ROUNDING = 1e-6
 def check_branch_points(field: RiemannSurface, size: float, rng: np.random.Generator) -> None:
     """Check the bounds that a Riemann surface states for its branch points.
 
-    The bound for a branch point with the attributes at, value, constant and power is
-    |g(z) - value| <= constant |z - at|^power for complex z within its radius. g is the real or
-    imaginary part of the multivalued function, on any branch, modulo its period. Bounds along rays
-    near a branch point are derived from this. It needs a test of its own, because few random rays
-    come so near.
+    field: the Riemann surface.
+    size: the size of the domain, which takes the place of an infinite radius.
+    rng: a generator of random numbers.
 
-    size: the size of the domain, to which an infinite radius is reduced.
+    The bound for a branch point with the attributes location, value, constant and power is |g(z) -
+    value| <= constant |z - location|^power for complex z within its radius, on every branch, modulo
+    the period. Bounds along rays near a branch point are derived from this. It needs a test of its
+    own, because few random rays come so near.
 
     Raises:
         BrokenPromiseError: the message names the branch point, and a point where the bound does not
@@ -60,14 +65,14 @@ def _check_branch_point(
     )
     angle = rng.uniform(-math.pi, math.pi, _POINT_COUNT)
     x, y = point.location.real + radii * np.cos(angle), point.location.imag + radii * np.sin(angle)
-    radii = np.hypot(
-        x - point.location.real, y - point.location.imag
-    )  # recomputed from the rounded points
+    # Computed again from the rounded points.
+    radii = np.hypot(x - point.location.real, y - point.location.imag)
     branches: Any = field.branches.prepare(backend)
     imaginary = field.part == "imag"
     period: float | None = branches.period(imaginary)
     value = point.value.imag if imaginary else point.value.real
     bound = point.constant * radii**point.power
+    # The largest difference of any branch from the stated value, at each point.
     errors = np.zeros(_POINT_COUNT)
     for branch in branches.evaluate(complex_type(backend)(backend.Float(x), backend.Float(y))):
         component = branch.value.imag if imaginary else branch.value.real

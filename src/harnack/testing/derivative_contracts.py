@@ -1,5 +1,14 @@
-"""Contracts of derivatives: the derivatives that a field returns, compared with finite
-differences."""
+"""Tests that the derivatives which a field returns (gradient, Laplacian, Hessian of its function f)
+agree with central differences. A central difference is a weighted sum of f, or of its gradient, at
+a few nodes: positions at multiples of a spacing h from a point, along a coordinate axis. For each
+point two differences are computed, with the spacings h and 2h; how much they differ tells the error
+of the first. The samples at the nodes are called the stencil. If it is not known over which length
+f is smooth, several spacings are tried, each with a stencil of its own.
+
+The allowed difference has two parts: the tolerance, a bound of the error of the differences
+themselves; and the allowance, which comes from the errors that the field states for its values and
+gradients.
+"""
 
 from __future__ import annotations
 
@@ -28,14 +37,14 @@ if TYPE_CHECKING:
 __all__ = ["check_derivatives"]
 
 # Fourth-order central differences with the spacings h and 2h: nodes in units of h, weights in units
-# of 1/h. The two differ by 15 times the leading error of the one with h, so a fifth of the
+# of 1/h. The two results differ by 15 times the leading error of the first. So a fifth of their
 # difference (_RICHARDSON_FRACTION) allows three times that error (Richardson extrapolation).
 _NODES = (-4.0, -2.0, -1.0, 1.0, 2.0, 4.0)
 _WEIGHTS = (0.0, 1 / 12, -8 / 12, 8 / 12, -1 / 12, 0.0)
 _WIDE_WEIGHTS = (1 / 24, -8 / 24, 0.0, 0.0, 8 / 24, -1 / 24)
 _RICHARDSON_FRACTION = 0.2
-# Where no promise says over which length f is smooth, spacings of these fractions of `_scale`
-# are tried, too.
+# Where no `HarmonicBall` says over which length f is smooth, spacings smaller by these factors are
+# tried, too.
 _SPACING_FACTORS = (1.0, 0.1, 0.01, 1e-3, 1e-4)
 # For a field with an error bound, the differences must agree at this fraction of the points even
 # without an allowance for it: between most neighboring points the approximation itself is smooth.
@@ -45,10 +54,11 @@ _MIN_FRACTION_OFF_CREASES = 0.9
 
 
 def check_derivatives(field: Field, points: FloatArray, look: FieldSamples) -> None:
-    """Check that the gradient, Laplacian and Hessian of a field at points (n, 3) agree with finite
+    """Check that the gradient, Laplacian and Hessian of a field at points (n, 3) agree with central
     differences.
 
-    look: the samples of the field at the points.
+    look: the samples of the field at the points: values, gradients, errors and proved bounds near
+        the points.
 
     Differences are taken within the field's domain; points too close to its border for that are
     left out.
@@ -61,10 +71,12 @@ def check_derivatives(field: Field, points: FloatArray, look: FieldSamples) -> N
         return
     points, look, h = points[is_inside], look.subset(is_inside), h[is_inside]
     has_ball = any(isinstance(promise, HarmonicBall) for promise in look.promises)
+    # If f is harmonic on a ball about each point, one spacing is enough.
     trials = [
         list(_stencil_samples(field, points, look, factor * h))
         for factor in (_SPACING_FACTORS[:1] if has_ball else _SPACING_FACTORS)
     ]
+    # At each point the gradient is tested with the spacing of the smallest allowed difference.
     limits = [np.add(*_limits(field, points, look, stencil)) for stencil in trials]
     stencil = _pick_spacing(trials, np.argmin(limits, axis=0))
     _check_gradient(field, points, look, stencil)
@@ -74,6 +86,7 @@ def check_derivatives(field: Field, points: FloatArray, look: FieldSamples) -> N
     except BrokenPromiseError:
         if not field.has_variable_accuracy:
             raise
+        # The Hessian may be the derivative of the exact gradient, without truncation error.
         exact_trials = [_without_truncation(field, points, promise) for promise in trials]
         _check_hessian(field, points, look, exact_trials)
 
@@ -81,15 +94,17 @@ def check_derivatives(field: Field, points: FloatArray, look: FieldSamples) -> N
 def _spacing_within(
     field: Field, points: FloatArray, h: FloatArray
 ) -> tuple[FloatArray, BoolArray]:
-    """Spacings of finite differences whose nodes lie in the field's domain. For each of the points
+    """Spacings of central differences whose nodes lie in the field's domain. For each of the points
     (n, 3), the spacing h (n,) is halved until that is so.
 
-    Returns the spacings (n,); and the mask (n,) of the points for which one was found."""
+    Returns the spacings (n,); and a mask (n,) of the points for which one was found.
+    """
     is_inside = np.ones(len(points), dtype=np.bool_)
     if field.domain is None:
         return h, is_inside
     for _ in range(24):
         is_inside[:] = True
+        # The domain is convex, so it is enough to test the outermost nodes.
         for axis in range(3):
             for node in (_NODES[0], _NODES[-1]):
                 is_inside &= field.domain.contains_points(
@@ -103,15 +118,15 @@ def _spacing_within(
 
 @dataclass(frozen=True)
 class _StencilSample:
-    """The samples of a field at one node of finite differences around n points: at the position
-    node * h along an axis from each point.
+    """The samples of a field at one node of central differences around n points: for each point,
+    the node is at the position node * h from it along a coordinate axis.
 
-    axis: 0, 1 or 2.
+    axis: the index of the axis, 0, 1 or 2.
     node: one of `_NODES`.
     h: (n,) the spacing.
-    weight: (n,) the weight of the node in the difference with the spacing h, divided by h.
-    wide: (n,) its weight in the difference with the spacing 2h, divided by h.
-    move: (n,) the value at the node less the value at the point, without jumps and periods.
+    weight: (n,) the weight of the node in the difference with the spacing h.
+    wide: (n,) its weight in the difference with the spacing 2h.
+    move: (n,) the value at the node minus the value at the point, without jumps and periods.
     gradient: (n, 3) the gradient at the node.
     error: (n,) a bound of the error of `move`: the errors of both values.
     gradient_error: (n,) the sum of the errors of both gradients.
@@ -131,7 +146,7 @@ class _StencilSample:
 def _stencil_samples(
     field: Field, points: FloatArray, samples: FieldSamples, h: FloatArray
 ) -> Iterator[_StencilSample]:
-    """The samples of the field at all nodes of finite differences around points (n, 3), one node
+    """The samples of the field at all nodes of central differences around points (n, 3), one node
     after the other.
 
     samples: the samples at the points themselves.
@@ -146,6 +161,7 @@ def _stencil_samples(
             if field.period is not None:
                 change -= field.period * np.round(change / field.period)
             ends = np.column_stack([0 * length, length])
+            # Subtract the jumps of f across facets between the point and the node.
             change -= accumulated_jumps(field, points, direction, ends)[:, 1]
             error = samples.error + node_samples.error
             yield _StencilSample(
@@ -157,14 +173,15 @@ def _stencil_samples(
 def _without_truncation(
     field: Field, points: FloatArray, stencil: list[_StencilSample]
 ) -> list[_StencilSample]:
-    """The same samples, but with gradients of the exact field, without the truncation error of a
-    treecode (`Field.exact`). It is needed because the Hessian that a treecode computes may be the
-    derivative of its own gradient or of the exact one."""
+    """The stencil (samples at the nodes) with the gradients of the exact field, without the
+    truncation error of a treecode (`Field.exact`). It is needed because the Hessian that a treecode
+    computes may be the derivative of its own gradient or of the exact one."""
     error = sample_field(field, points, closely=True).gradient_error
     exact: list[_StencilSample] = []
     for node_sample in stencil:
         nodes = points + (node_sample.node * node_sample.h)[:, None] * np.eye(3)[node_sample.axis]
         sample = sample_field(field, nodes, closely=True)
+        # The errors at the point and at the node.
         errors = error + sample.gradient_error
         exact.append(
             dataclasses.replace(node_sample, gradient=sample.gradient, gradient_error=errors)
@@ -175,15 +192,22 @@ def _without_truncation(
 def _pick_spacing(
     trials: list[list[_StencilSample]], choice: npt.NDArray[np.intp]
 ) -> list[_StencilSample]:
-    """For each of n points, the samples of finite differences with one of several spacings.
+    """For each of n points, the samples at the nodes of central differences with one of several
+    spacings.
 
     trials: for each spacing, the samples at all nodes.
-    choice: (n,) for each point, the index of the spacing in `trials`."""
+    choice: (n,) for each point, the index of its spacing in `trials`.
+    """
     if len(trials) == 1:
         return trials[0]
+    # Point k takes its numbers from the spacing choice[k].
     rows = np.arange(len(choice))
 
     def pick(nodes: tuple[_StencilSample, ...]) -> _StencilSample:
+        """The samples at one node, for each point from the chosen spacing.
+
+        nodes: the samples at this node for each of the spacings.
+        """
         arrays: dict[str, Any] = {
             name: np.stack([getattr(sample, name) for sample in nodes])[choice, rows]
             for name in ("h", "weight", "wide", "move", "gradient", "error", "gradient_error")
@@ -194,13 +218,15 @@ def _pick_spacing(
 
 
 def _first_spacing(points: FloatArray, samples: FieldSamples) -> FloatArray:
-    """The spacings (n,) of finite differences at points (n, 3) that are tried first, lengths."""
+    """The spacings (n,) of central differences at points (n, 3) that are tried first, as
+    lengths."""
     return 2e-3 * _scale(points, samples)
 
 
 def _scale(points: FloatArray, samples: FieldSamples) -> FloatArray:
-    """A length (n,) over which the field is smooth: the smallest radius of its `HarmonicBall`
-    promises, at most the extent of the points."""
+    """For each of the points, a length (n,) over which f is smooth: the smallest radius of the
+    balls on which f is promised to be harmonic, at most the extent of the points. Without such
+    balls it is the extent, which proves nothing."""
     size = float(np.ptp(points, axis=0).max()) or 1.0
     radii = [promise.radius for promise in samples.promises if isinstance(promise, HarmonicBall)]
     smooth_length = np.min([np.full(len(points), size), *radii], axis=0)
@@ -215,10 +241,12 @@ def _max_coordinates(points: FloatArray) -> FloatArray:
 def _check_gradient(
     field: Field, points: FloatArray, samples: FieldSamples, stencil: list[_StencilSample]
 ) -> None:
-    """Compare the gradients at points (n, 3) with central differences of the value.
+    """Compare the gradients at points (n, 3) with central differences of the value. Raises a
+    BrokenPromiseError where they do not agree.
 
-    samples: the samples at the points. stencil: those at the nodes of the differences.
-    Raises a BrokenPromiseError where they do not agree."""
+    samples: the samples at the points.
+    stencil: the samples at the nodes of the differences.
+    """
     tolerance, allowance = _limits(field, points, samples, stencil)
     error = np.linalg.norm(_difference(stencil)[0] - samples.gradient, axis=1)
     message = "the gradient is not that of the value"
@@ -226,8 +254,11 @@ def _check_gradient(
 
 
 def _difference(stencil: list[_StencilSample]) -> tuple[FloatArray, FloatArray]:
-    """Gradients (n, 3) from central differences of the value: those with the spacing h, and those
-    with the spacing 2h. stencil: the samples at the nodes."""
+    """Gradients (n, 3) from central differences of the value: a first array with the spacing h, and
+    a second with the spacing 2h.
+
+    stencil: the samples at the nodes.
+    """
     fine, wide = (np.zeros((len(stencil[0].h), 3)) for _ in range(2))
     for neighbor in stencil:
         fine[:, neighbor.axis] += neighbor.weight * neighbor.move
@@ -239,16 +270,21 @@ def _limits(
     field: Field, points: FloatArray, samples: FieldSamples, nodes: list[_StencilSample]
 ) -> tuple[FloatArray, FloatArray]:
     """The allowed difference between the gradient and central differences of the value, in two
-    parts (n,) and (n,): a bound of the truncation and rounding error of the differences; and the
-    contribution of the errors that the field states for value and gradient.
+    parts (n,) and (n,): a bound of the truncation and rounding error of the differences
+    (tolerance); and the contribution of the errors that the field states for value and gradient
+    (allowance).
 
-    nodes: the samples at the nodes of the differences."""
+    points: (n, 3).
+    samples: the samples at the points.
+    nodes: the samples at the nodes of the differences.
+    """
     h = nodes[0].h
     allowance = samples.gradient_error.copy()
     for neighbor in nodes:
         allowance += np.abs(neighbor.weight) * neighbor.error
     length = np.linalg.norm(samples.gradient, axis=1)
     magnitude = np.abs(samples.value) + (field.period or 0)
+    # Rounding errors of values and coordinates, divided by the spacing.
     tolerance = 1e-6 * length + (1e-12 * magnitude + 1e-12 * length * _max_coordinates(points)) / h
     fine, wide = _difference(nodes)
     tolerance += _RICHARDSON_FRACTION * np.linalg.norm(fine - wide, axis=1)
@@ -265,8 +301,12 @@ def _limits(
 
 
 def _second_derivatives(stencil: list[_StencilSample]) -> FloatArray:
-    """(n,) for each point, the sum of the absolute values of the three second derivatives along the
-    coordinate axes, from central differences of the value."""
+    """(n,) for each point, the sum of the absolute values of all terms in the central differences
+    of the gradient that give the second derivatives along the three axes. It is at least the sum of
+    the absolute values of these derivatives.
+
+    stencil: the samples at the nodes.
+    """
     return np.sum(
         [np.abs(neighbor.weight * neighbor.gradient[:, neighbor.axis]) for neighbor in stencil],
         axis=0,
@@ -276,20 +316,25 @@ def _second_derivatives(stencil: list[_StencilSample]) -> FloatArray:
 def _check_laplacian(
     points: FloatArray, samples: FieldSamples, trials: list[list[_StencilSample]]
 ) -> None:
-    """Compare the Laplacians at points (n, 3) with central differences of the gradient.
+    """Compare the Laplacians at points (n, 3) with central differences of the gradient: they must
+    be 0 where f is promised to be harmonic, and within their promised bounds. Raises a
+    BrokenPromiseError if they are not.
 
     samples: the samples at the points.
     trials: for each of several spacings, the samples at the nodes of the differences.
-    Raises a BrokenPromiseError where they do not agree."""
+    """
     bounds = [promise for promise in samples.promises if isinstance(promise, BoundedLaplacian)]
     if not _is_harmonic(samples) and not bounds:
         return
     length = np.linalg.norm(samples.gradient, axis=1)
 
     def compare(stencil: list[_StencilSample]) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """The difference between the field's Laplacian and the one by central differences with one
-        spacing, and the two parts of its allowance: a bound of the error of the differences, and
-        the contribution of the field's own errors; (n,) each."""
+        """The Laplacian by central differences with one spacing, and the two parts of the allowed
+        difference: a bound of the error of the differences, and the contribution of the field's own
+        errors; (n,) each.
+
+        stencil: the samples at the nodes.
+        """
         h = stencil[0].h
         laplacian = np.sum(
             [neighbor.weight * neighbor.gradient[:, neighbor.axis] for neighbor in stencil], axis=0
@@ -300,12 +345,15 @@ def _check_laplacian(
         wide = np.sum(
             [neighbor.wide * neighbor.gradient[:, neighbor.axis] for neighbor in stencil], axis=0
         )
+        # The estimated error of the difference; and rounding, of the gradients and of the
+        # coordinates.
         tolerance = 1e-6 * _second_derivatives(stencil) + _RICHARDSON_FRACTION * np.abs(
             laplacian - wide
         )
         tolerance += 1e-11 * length * (1 + _max_coordinates(points) / h) / h
         return laplacian, tolerance, allowance
 
+    # For each spacing: Laplacian, tolerance, allowance.
     tests = [compare(stencil) for stencil in trials]
     if _is_harmonic(samples):
         message = "HarmonicBall: f is not harmonic, its Laplacian is not 0"
@@ -316,6 +364,7 @@ def _check_laplacian(
         )
     for bound in bounds:
         lower, upper = bound.laplacian_lower, bound.laplacian_upper
+        # By how much the Laplacian is outside of its promised bounds.
         excesses = [
             (np.maximum(np.maximum(lower - laplacian, laplacian - upper), 0), *rest)
             for laplacian, *rest in tests
@@ -327,9 +376,9 @@ def _check_laplacian(
 def _best_agreement(
     results: list[tuple[FloatArray, ...]],
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Choose the spacing of finite differences by which each point is judged. Returns three arrays
-    (n,) at that spacing: how far the field's derivative is from the differences; the bound of the
-    error of the differences (tolerance); and the contribution of the field's own errors
+    """Choose the spacing of central differences by which each point is judged. Returns three arrays
+    (n,) at that spacing: how far the field's derivative is from the differences (error); the bound
+    of the error of the differences (tolerance); and the contribution of the field's own errors
     (allowance).
 
     results: these three arrays for each spacing.
@@ -350,7 +399,8 @@ def _best_agreement(
 
 
 def _is_harmonic(samples: FieldSamples) -> bool:
-    """Whether the promises say that f is harmonic."""
+    """Whether the field promises that f is harmonic in space, on balls about the points. (A ball of
+    dimension 4 says nothing about the Laplacian in space.)"""
     return any(isinstance(ball, HarmonicBall) and ball.dimension < 4 for ball in samples.promises)
 
 
@@ -364,14 +414,17 @@ def _require_agreement(
     has_creases: bool = False,
 ) -> None:
     """Raise a BrokenPromiseError unless `error` is at most tolerance + allowance at all points, and
-    at most `tolerance` at more than half of them.
+    at most `tolerance` at half of them or more.
 
-    error, tolerance, allowance: (n,) each.
-    message: the message of the error. points: (n, 3).
-    has_creases: whether the field has creases. Then the first condition may fail at a few points,
-        because finite differences are wrong if they cross a crease.
+    error: (n,) how far the field's derivative is from the differences.
+    tolerance, allowance: (n,) the two parts of the allowed difference.
+    message: the message of the error.
+    points: (n, 3).
+    has_creases: whether f may have creases. Then the first condition may fail at a few points,
+        because differences across a crease are wrong.
     """
     agrees = error <= tolerance + allowance
+    # A few differences across creases are allowed to be wrong.
     if has_creases and agrees.mean() >= _MIN_FRACTION_OFF_CREASES:
         return
     require(agrees, message, points, error)
@@ -382,7 +435,9 @@ def _require_agreement(
 def _check_hessian(
     field: Field, points: FloatArray, samples: FieldSamples, trials: list[list[_StencilSample]]
 ) -> None:
-    """Compare the Hessians at points (n, 3) with central differences of the gradient.
+    """Compare the Hessians at points (n, 3) with central differences of the gradient. They must
+    also be finite and symmetric, and without trace if f is harmonic. Raises a BrokenPromiseError if
+    they are not. A field without Hessians passes.
 
     samples: the samples at the points.
     trials: for each of several spacings, the samples at the nodes of the differences.
@@ -402,6 +457,7 @@ def _check_hessian(
     scale = _scale(points, samples)
     length = np.linalg.norm(samples.gradient, axis=1)
     size = np.abs(hessian).max(axis=(1, 2)) + length / scale
+    # A mixed derivative must not depend on the order.
     skew = np.abs(hessian - hessian.transpose(0, 2, 1)).max(axis=(1, 2))
     require(skew <= 1e-9 * size, "the Hessian is not symmetric", points, skew)
     if _is_harmonic(samples):
@@ -412,16 +468,21 @@ def _check_hessian(
         hessian_error = field.hessian_error_bound(points, precision="double")
 
     def compare(stencil: list[_StencilSample]) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """The largest difference between the field's Hessian and central differences of the
-        gradient with one spacing, and the two parts of its allowance: a bound of the error of the
-        differences, and the contribution of the field's own errors; (n,) each."""
+        """The largest difference between an entry of the field's Hessian and central differences of
+        the gradient with one spacing; and the two parts of the allowed difference: a bound of the
+        error of the differences, and the contribution of the field's own errors; (n,) each.
+
+        stencil: the samples at the nodes.
+        """
         h = stencil[0].h
         fine, coarse = np.zeros_like(hessian), np.zeros_like(hessian)
         for neighbor in stencil:
             fine[:, :, neighbor.axis] += neighbor.weight[:, None] * neighbor.gradient
+            # The second-order difference uses the nodes -1 and 1, with the weights -1/2 and 1/2.
             half = 0.5 * neighbor.node if abs(neighbor.node) == 1 else 0.0
             coarse[:, :, neighbor.axis] += half * neighbor.gradient / h[:, None]
         tolerance = 1e-7 * size + 0.1 * np.abs(fine - coarse).max(axis=(1, 2)) + hessian_error
+        # Rounding: of the gradients, and of the coordinates of the nodes.
         tolerance += 1e-11 * length * (1 + _max_coordinates(points) / h) / h
         allowance = np.sum(
             [np.abs(neighbor.weight) * neighbor.gradient_error for neighbor in stencil], axis=0

@@ -1,11 +1,14 @@
-"""`check_enclosure`: tests of enclosures on random functions that keep a promise and reach a level.
+"""`check_enclosure`: tests of enclosures on random functions. A promise is a proved bound of a
+function f near a point p, for example a Lipschitz constant on a ball about p. An enclosure (an
+interval that contains the change of f along a ray from p) is derived from a promise and the slope
+of f. For levels at given differences (gaps) above and below f(p), it proves a free length: a length
+of the ray within which f meets no level. The enclosure is right if no function that the promise
+allows meets a level within the free length. So random functions f(t) of the position t on a ray are
+drawn that satisfy a promise on the ball |t| < reach; sets of them are arrays with one function per
+row.
 
-A promise is a proved bound of a function f near a point. An enclosure (an interval that contains
-the change of f along a ray) is derived from it, and gives a free length: a length of the ray that
-contains no level. The enclosure is right if no function that the promise allows meets a level
-within the free length. The random functions include those for which the inequalities in the proofs
-of `harnack.enclosures` are equalities. So the test detects an enclosure whose lengths are too long
-by a thousandth.
+The random functions include those for which the inequalities in the proofs of `harnack.enclosures`
+are equalities. So the test detects an enclosure whose lengths are too long by a thousandth.
 """
 
 from __future__ import annotations
@@ -47,9 +50,12 @@ __all__ = [
 
 @dataclass(frozen=True)
 class PromiseCase:
-    """A promise (a proved bound) about a function f near a point p with f(p) = 0, together with
-    levels, by which an enclosure can be tested.
+    """A promise (a proved bound) about a function f near a point p with f(p) = 0, and the gaps to
+    the next levels, so that an enclosure can be made and tested. An enclosure proves a free length:
+    a length of a ray from p within which f meets no level. All numbers may be arrays, with one
+    function per row.
 
+    promise: the promise.
     gap_below, gap_above: the differences of f(p) to the next level below and above, both positive.
     """
 
@@ -58,15 +64,17 @@ class PromiseCase:
     gap_above: Real
 
     def map_numbers(self, change: Callable[[Any], Any]) -> PromiseCase:
-        """A copy of the case, in which each number x is replaced by change(x). The numbers may be
+        """A copy of the case in which each number x is replaced by change(x). The numbers may be
         Python numbers, or arrays of NumPy or Dr.Jit."""
         promise = self.promise.map_numbers(lambda number, _, __: change(number))
         return PromiseCase(promise, change(self.gap_below), change(self.gap_above))
 
     def enclosure(self, kind: type[Enclosure], slopes: SlopeRange) -> Enclosure | None:
         """The enclosure of the class `kind` that follows from the promise; None if the class does
-        not apply to such promises. slopes: an interval that contains the derivative of f along the
-        ray at p."""
+        not apply to such promises.
+
+        slopes: an interval that contains the derivative of f along the ray at p.
+        """
         promise: Any = self.promise
         # Without the allowance for rounding, so that steps can be compared exactly.
         if isinstance(promise, HarmonicBall) and issubclass(kind, HarmonicBallEnclosure):
@@ -82,7 +90,9 @@ class PromiseCase:
         return kind.from_promise(promise, type(slopes.lower)(0), 0.0, slopes)
 
     def accepts(self, kind: type[Enclosure]) -> bool:
-        """Whether an enclosure of the class `kind` can be made from this kind of promise."""
+        """Whether an enclosure of the class `kind` can be made from this kind of promise. It is
+        tried with numbers -1 and 1 in place of those of the promise; infinite ends stay
+        infinite."""
         lower_names = [lower for lower, _ in self.promise.interval_pairs]
         values = {
             name: -1.0 if name in lower_names else 1.0
@@ -93,22 +103,28 @@ class PromiseCase:
         return case.enclosure(kind, SlopeRange(0.0, 0.0)) is not None
 
     def step(self, kind: type[Enclosure], slope: Real, error: Real = 0.0) -> Real:
-        """The free length that an enclosure of the class `kind` proves: no level is met within it
-        along a ray from p. slope: the derivative of f along the ray at p, known up to `error`."""
+        """The free length that an enclosure of the class `kind` proves: a length of a ray from p
+        within which f meets no level.
+
+        slope: the derivative of f along the ray at p, known up to `error`.
+        """
         enclosure = self.enclosure(kind, SlopeRange.around(slope, error))
         assert enclosure is not None
         return enclosure.free_length(LevelGaps(self.gap_below, self.gap_above))
 
     def covers(self, kind: type[Enclosure], slope: Real, length: Real, error: Real = 0.0) -> Mask:
-        """Whether an enclosure of the class `kind` proves that no level is met within `length`
-        along a ray from p. slope: the derivative of f along the ray at p, known up to `error`."""
+        """Whether an enclosure of the class `kind` proves that f meets no level within `length`
+        along a ray from p.
+
+        slope: the derivative of f along the ray at p, known up to `error`.
+        """
         enclosure = self.enclosure(kind, SlopeRange.around(slope, error))
         assert enclosure is not None
         return enclosure.is_free(LevelGaps(self.gap_below, self.gap_above), length)
 
 
 def _is_infinite(end: Any) -> bool:
-    """Whether an end of a range is the Python number inf or -inf (an array counts as finite)."""
+    """Whether an end of a range is the Python number inf or -inf. An array counts as finite."""
     return isinstance(end, float) and math.isinf(end)
 
 
@@ -120,14 +136,14 @@ _SAMPLES = 48
 
 @dataclass(frozen=True)
 class RandomFunctions:
-    """Random functions f(t) of the position t on a ray, one function per row, all of which satisfy
-    a promise (a bound of f on a ball about t = 0).
+    """A set of random functions f(t) of the position t on a ray, one function per row, all of which
+    satisfy a promise (a proved bound of f on the ball |t| < reach).
 
     name: the name of the kind of functions, for messages.
     case: the promise, and levels such that most of the functions meet one.
     slope: (rows,) the derivatives f'(0).
-    reach: (rows,) the radius of the ball for which the promise is made.
-    movement: a function that returns f(t) - f(0) for t (rows, m) with 0 <= t < reach.
+    reach: (rows,) the radius of the ball on which the promise holds.
+    movement: a function that returns f(t) - f(0) for positions t (rows, m) with 0 <= t < reach.
     """
 
     name: str
@@ -144,19 +160,21 @@ def check_enclosure(
     rows: int = 400,
     precision: Precision = "double",
 ) -> None:
-    """Test a class of enclosures against random functions of every kind of promise that it applies
-    to.
+    """Test a class of enclosures against random functions for every kind of promise that it applies
+    to. (A promise is a proved bound of a function near a point, from which an enclosure of this
+    class derives a free length of a ray.)
 
     kind: the class to be tested.
     rng: a generator of random numbers, or a seed.
     rows: the number of functions of each kind.
+    precision: of the tested computation.
 
     Checked: free lengths are numbers from 0 to the radius of the promise; no level is met within a
     free length; `is_free` agrees with `free_length`; no level is met within any length that
     `is_free` accepts.
 
     Raises:
-        BrokenPromiseError: with the numbers of the first function that shows it.
+        BrokenPromiseError: with the numbers of the first function for which a check fails.
         ValueError: the class applies to no kind of promise that is drawn.
     """
     accepted = 0
@@ -174,9 +192,9 @@ def check_enclosure(
 
 
 def random_functions(rng: np.random.Generator, rows: int) -> Iterator[RandomFunctions]:
-    """Yield sets of `rows` random functions, one set for each kind of promise: functions that are
-    harmonic in 2, 3 or 4 dimensions, that have a bounded Laplacian, that are Lipschitz, or that
-    have a bounded second derivative."""
+    """Yield sets of `rows` random functions of different kinds: functions that are harmonic in 2, 3
+    or 4 dimensions, that have a bounded Laplacian, that are Lipschitz, or that have a bounded
+    second derivative. Each set satisfies a promise of that kind."""
     with np.errstate(all="ignore"):
         for dimension in (2, 3, 4):
             yield _positive_harmonic(rng, rows, dimension, mirrored=False)
@@ -191,11 +209,16 @@ def random_functions(rng: np.random.Generator, rows: int) -> Iterator[RandomFunc
 def _positive_harmonic(
     rng: np.random.Generator, rows: int, n: int, *, mirrored: bool
 ) -> RandomFunctions:
-    """Random harmonic functions f on a ball in n dimensions that are bounded on one side only:
-    f > lower or, if `mirrored`, f < upper. f - lower (or upper - f) is the Poisson integral of one,
-    two or three rings of mass on the sphere."""
+    """Random harmonic functions f on a ball in n dimensions that are bounded on one side only: f >
+    lower or, if `mirrored`, f < upper. f - lower (or upper - f) is the Poisson integral of one, two
+    or three rings of mass on the sphere. A ring is given by its latitude, the cosine of its angle
+    to the ray.
+
+    rows: the number of functions.
+    """
     radius, mass = _log_uniform(rng, rows, -3, 3), _log_uniform(rng, rows, -3, 3)
     latitudes = rng.uniform(-1, 1, (rows, 3))
+    # Three tenths of the rings are near a pole, where the bounds are sharp.
     near_poles = rng.choice([-1.0, 1.0], (rows, 3)) * (1 - 10 ** rng.uniform(-8, 0, (rows, 3)))
     latitudes = np.where(rng.random((rows, 3)) < 0.3, near_poles, latitudes)
     weights = rng.dirichlet([0.7] * 3, rows)
@@ -205,6 +228,7 @@ def _positive_harmonic(
     latitudes[is_at_poles, :2] = (1, -1)
     weights[is_at_poles, 2] = 0
     weights /= weights.sum(axis=1, keepdims=True)
+    # u is f - lower, or upper - f, up to a constant; its value at the center is `mass`.
     u = AxialFunctions("points", latitudes, weights * mass[:, None], radius, n)
     sign = -1.0 if mirrored else 1.0
     ends = (-math.inf, mass) if mirrored else (-mass, math.inf)
@@ -224,22 +248,27 @@ def _bounded_harmonic(rng: np.random.Generator, rows: int, n: int) -> RandomFunc
     values on the ball.
 
     rows: the number of functions.
+    n: the dimension.
 
     The ray runs from the center of the ball to a pole of its sphere. On the sphere a function is
     symmetric about this axis and constant on four zones, which end at random heights on the axis.
     The four values lie in the promised range, which has a random length; for two thirds of the
-    functions they are its two ends.
+    functions each value is one of its two ends.
     """
     radius, span = _log_uniform(rng, rows, -3, 3), _log_uniform(rng, rows, -3, 3)
     heights = np.sort(rng.uniform(0, 2, (rows, 3)), axis=1)
     is_thin = rng.random(rows) < 0.2
     heights[is_thin] *= 10 ** rng.uniform(-4, 0, is_thin.sum())[:, None]
-    values = rng.uniform(0, 1, (rows, 4))  # of the four zones, from the pole ahead
+    # The values in the four zones, as fractions of the range, from the pole in front.
+    values = rng.uniform(0, 1, (rows, 4))
     kind = rng.integers(0, 3, rows)
     values[kind == 0] = (1, 0, 0, 1)  # equality in the upper cap bound
     values[kind == 1] = (0, 1, 1, 0)  # and in the lower one
+    # Zones are differences of caps (a cap reaches from the pole to a height), so a cap's weight is
+    # the difference between neighboring zones.
     weights = values[:, :3] - values[:, 1:]
     u = AxialFunctions("caps", heights, weights * span[:, None], radius, n)
+    # The value at the center is the mean over the sphere.
     mean = values[:, 3] + (weights * cap_mass(heights, n)).sum(axis=1)
     gap_below, gap_above = span * mean, span * (1 - mean)
     return _with_random_levels(
@@ -255,13 +284,16 @@ def _bounded_harmonic(rng: np.random.Generator, rows: int, n: int) -> RandomFunc
 
 def _bounded_laplacian(rng: np.random.Generator, rows: int, *, mirrored: bool) -> RandomFunctions:
     """Random functions of bounded Laplacian on a ball, which are also bounded below or, if
-    `mirrored`, above. They are Poisson integrals of rings of mass on the sphere, plus potentials of
-    sources in the ball.
+    `mirrored`, above. Each is a Poisson integral of rings of mass on the sphere, minus the
+    potential of sources in the ball.
+
+    rows: the number of functions.
 
     The sources are a constant density in the unit ball, two balls of constant density, and a
-    multiple of the Legendre polynomial P_2 of the latitude. The latter has the potential
-    q^2 ln(q) P_2/5, and so the logarithm that occurs in the bound. The bound is attained if there
-    is only a constant density that is not negative, and mass only at the poles.
+    multiple of the Legendre polynomial P_2 of the latitude (the wave). The latter has the potential
+    q^2 ln(q) P_2/5 at the distance q from the center, and so the logarithm that occurs in the
+    bound. The bound is attained if there is only a constant density that is not negative, and mass
+    only at the poles.
     """
     radius, mass = _log_uniform(rng, rows, -3, 3), _log_uniform(rng, rows, -3, 3)
     latitudes, weights = rng.uniform(-1, 1, (rows, 3)), rng.dirichlet([0.7] * 3, rows)
@@ -271,6 +303,8 @@ def _bounded_laplacian(rng: np.random.Generator, rows: int, *, mirrored: bool) -
     centers = rng.uniform(-0.9, 0.9, (rows, 2))
     sizes = (1 - np.abs(centers)) * rng.uniform(0.1, 1, (rows, 2))
     density = rng.uniform(-0.18, 0.18, (rows, 4)) * 10 ** rng.uniform(-3, 0, (rows, 1))
+    # Half of the functions have mass at the poles only, and no small balls; of these, half have
+    # only a constant density, and half only a wave.
     kind = rng.integers(0, 4, rows)
     latitudes[kind < 2, :2], weights[kind < 2, 2], density[kind < 2, 1:3] = (1, -1), 0, 0
     density[kind == 0, 0], density[kind == 0, 3] = np.abs(density[kind == 0, 0]), 0
@@ -285,6 +319,7 @@ def _bounded_laplacian(rng: np.random.Generator, rows: int, *, mirrored: bool) -
     u = AxialFunctions("points", latitudes, weights * mass[:, None], radius, 3)
     potential, slope = balls.at_center(constant_density)
     wave_sources = np.stack([-0.5 * wave_density, wave_density])  # P_2 is between -1/2 and 1
+    # Bounds of the total density, which is the Laplacian, for the promise.
     min_density = (
         density[:, 0]
         + np.minimum(constant_density[:, 1:], 0).sum(axis=1)
@@ -298,7 +333,7 @@ def _bounded_laplacian(rng: np.random.Generator, rows: int, *, mirrored: bool) -
     sign = -1.0 if mirrored else 1.0
 
     def movement(t: FloatArray) -> FloatArray:
-        """f(t) - f(0)."""
+        """f(t) - f(0) at positions t (rows, m)."""
         q = t / radius[:, None]
         wave_part = wave_density[:, None] / 5 * q * q * np.log(np.maximum(q, 1e-300))
         return sign * (u.movement(t) - balls.movement(q, constant_density) + wave_part)
@@ -319,16 +354,22 @@ def _bounded_laplacian(rng: np.random.Generator, rows: int, *, mirrored: bool) -
 
 
 def _zigzag_lines(rng: np.random.Generator, rows: int) -> RandomFunctions:
-    """Random Lipschitz functions: straight lines and zigzag lines, the absolute values of whose
-    slopes are at most the Lipschitz constant."""
+    """Random functions with a Lipschitz constant: straight lines, and zigzag lines with two kinks.
+    The absolute values of their slopes are at most the constant.
+
+    rows: the number of functions.
+    """
     radius, constant = _log_uniform(rng, rows, -3, 3), _log_uniform(rng, rows, -3, 3)
     knots = np.sort(rng.uniform(0, 1, (rows, 2)), axis=1) * radius[:, None]
+    # The slopes on the three parts; two fifths of the functions are straight lines of the largest
+    # slope.
     slopes = rng.uniform(-1, 1, (rows, 3)) * constant[:, None]
     is_straight = rng.random(rows) < 0.4
     slopes[is_straight] = (rng.choice([-1.0, 1.0], rows) * constant)[is_straight, None]
 
     def movement(t: FloatArray) -> FloatArray:
-        """f(t) - f(0)."""
+        """f(t) - f(0) at positions t (rows, m)."""
+        # Behind each knot the slope differs by the difference of neighboring slopes.
         since_knot = np.maximum(t[:, :, None] - knots[:, None, :], 0)
         return slopes[:, :1] * t + (since_knot * np.diff(slopes, axis=1)[:, None, :]).sum(axis=2)
 
@@ -344,17 +385,24 @@ def _zigzag_lines(rng: np.random.Generator, rows: int) -> RandomFunctions:
 
 
 def _parabolas(rng: np.random.Generator, rows: int) -> RandomFunctions:
-    """Random functions of bounded second derivative: two parabolas joined with equal slopes. The
-    absolute value of the second derivative is at most the promised constant."""
+    """Random functions of bounded second derivative: two parabolas, joined at a knot with equal
+    slopes. The absolute value of the second derivative is at most the promised constant, and for
+    half of the functions equal to it.
+
+    rows: the number of functions.
+    """
     radius, constant = _log_uniform(rng, rows, -3, 3), _log_uniform(rng, rows, -3, 3)
     curvatures = rng.uniform(-1, 1, (rows, 2)) * constant[:, None]
+    # Half of the functions have the largest possible second derivative on both parts.
     is_extremal = rng.random(rows) < 0.5
     curvatures[is_extremal] = (rng.choice([-1.0, 1.0], rows) * constant)[is_extremal, None]
     knot = rng.uniform(0, 1, rows) * radius
+    # Slopes from small to ten times the change of the slope on the ball.
     slope = constant * radius * rng.choice([-1.0, 1.0], rows) * 10 ** rng.uniform(-4, 1, rows)
 
     def movement(t: FloatArray) -> FloatArray:
-        """f(t) - f(0)."""
+        """f(t) - f(0) at positions t (rows, m)."""
+        # Behind the knot the second derivative differs by `change`.
         since_knot = np.maximum(t - knot[:, None], 0)
         change = (curvatures[:, 1] - curvatures[:, 0])[:, None]
         return (
@@ -383,7 +431,8 @@ def _with_random_levels(
     movement: Callable[[FloatArray], FloatArray],
     promise: Promise,
 ) -> RandomFunctions:
-    """Choose random levels for random functions f(t) of the position t on a ray.
+    """Choose random levels for random functions f(t) of the position t on a ray, one function per
+    row.
 
     For most functions, one level is the value at a random point, so that it is met. For half of
     these functions it is the only level, since of two levels the other one is often met first. All
@@ -402,6 +451,7 @@ def _with_random_levels(
         scale * _log_uniform(rng, rows, -9, 2),
     )
     fraction = np.where(rng.random(rows) < 0.5, rng.random(rows), _log_uniform(rng, rows, -8, 0))
+    # f at the random point, minus f(0). If it is positive, the level is above, else below.
     difference = movement((fraction * reach)[:, None])[:, 0]
     is_reached = (rng.random(rows) < 0.8) & (difference != 0) & np.isfinite(difference)
     gap_above = np.where(is_reached & (difference > 0), difference, gap_above)
@@ -413,7 +463,7 @@ def _with_random_levels(
 
 
 def _log_uniform(rng: np.random.Generator, rows: int, lower: float, upper: float) -> FloatArray:
-    """(rows,) random numbers whose decimal logarithms are uniform in [lower, upper]."""
+    """(rows,) random numbers whose decimal logarithms are uniform between `lower` and `upper`."""
     return 10 ** rng.uniform(lower, upper, rows)
 
 
@@ -435,7 +485,9 @@ def _check_trial(
 ) -> None:
     """Check the enclosures of the class `kind` on a set of random functions, the trial.
 
-    case, slope: the promise with its levels, and the slopes, of the trial as Dr.Jit arrays.
+    trial: the random functions.
+    case: the trial's promise with its levels, as Dr.Jit arrays.
+    slope: the trial's slopes (rows,), as a Dr.Jit array.
 
     Raises:
         BrokenPromiseError: a free length is wrong for one of the functions.
@@ -443,6 +495,8 @@ def _check_trial(
     rows = len(trial.slope)
     real = cast("Any", type(slope))
     step = to_numpy(case.step(kind, slope)).astype(np.float64)
+    # No level may be met within the free length, and it may not be longer than the ball of the
+    # promise.
     is_met = _meets_level(trial, np.minimum(step, trial.reach), precision)
     _require(trial, ~is_met, kind, "a level is met within the step {length}", step)
     is_valid = (step >= 0) & (step <= trial.reach * (1 + 1e-6))
@@ -454,6 +508,7 @@ def _check_trial(
         length = step * fraction
         is_free = to_numpy(case.covers(kind, slope, real(length)))
         _require(trial, is_free, kind, "{length} is not covered, but lies within the step", length)
+    # Lengths above the free length, and any lengths: what `is_free` accepts must be free.
     lengths = [step * (1 + 10 ** rng.uniform(-4, 0, rows)), trial.reach * rng.random(rows)]
     for length in lengths:
         is_covered = to_numpy(case.covers(kind, slope, real(length)))
@@ -468,6 +523,7 @@ def _meets_level(trial: RandomFunctions, length: FloatArray, precision: Precisio
     """(rows,) for each function of the trial, whether it meets a level strictly within `length`
     (rows,), as far as samples of the function show."""
     tolerance = 1e-9 if precision == "double" else 1e-5
+    # Half of the samples are evenly spaced, the others dense towards the end of the length.
     fractions = np.concatenate([np.linspace(0, 1, _SAMPLES // 2), 1 - np.geomspace(1e-7, 0.5, 24)])
     t = (1 - tolerance) * length[:, None] * fractions
     with np.errstate(all="ignore"):
@@ -512,6 +568,7 @@ def _require(
     failures = np.flatnonzero(~holds)
     if not failures.size:
         return
+    # Describe the first function that fails.
     row = failures[0]
     numbers = trial.case.map_numbers(lambda n: float(n[row]) if np.ndim(n) else n)
     message = message_format.format(reach=float(trial.reach[row]), length=float(length[row]))

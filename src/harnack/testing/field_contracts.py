@@ -1,6 +1,10 @@
-"""`check_field` and `check_ray_samples`: tests of a field by sampling. They test its promises
-(proved bounds of the field's function f near a point), and its enclosures (intervals proved to
-contain the change of f along a ray)."""
+"""`check_field` and `check_ray_samples`: tests of a field by sampling it at random points. A field
+has a function f. It makes promises: proved bounds of f on a ball about each point, such as a
+Lipschitz constant. It also gives enclosures: intervals that are proved to contain the change of f
+along a ray, from which follows a free length, a length of the ray within which f meets no level. A
+test fails with a `BrokenPromiseError`, which names the point where f is not as promised. To compare
+values along a path, f is followed continuously: its jumps across facets, and by its period, are
+taken out."""
 
 from __future__ import annotations
 
@@ -62,7 +66,12 @@ def check_ray_samples(
 ) -> None:
     """Test the enclosures that a field gives along rays from points (n, 3) in random directions. An
     enclosure proves, for levels at given differences (gaps) above and below f, a free length: a
-    length of the ray within which f meets none of the levels.
+    length of the ray within which f meets none of the levels. Free lengths in front of the points
+    and behind them are tested.
+
+    rng: a generator of random numbers, or a seed.
+    enclosures: the kinds of enclosures to test; None for the default.
+    precision: of the tested computation.
 
     Rays have lengths from a thousandth of the extent of the points to twice that extent. Gaps range
     from far less to far more than the change of f along the ray. Within the free length proved for
@@ -77,14 +86,16 @@ def check_ray_samples(
     directions = random_directions(generator, n)
     size = float(np.ptp(points, axis=0).max()) or 1.0
     reach = size * 2.0 ** generator.uniform(-10, 1, n)
+    # The change of f along each ray, which gives a scale for the gaps.
     coarse_lift = lift_along_rays(field, points, directions, reach[:, None] * np.linspace(0, 1, 9))
     scale = np.abs(coarse_lift.moved).max(axis=1) + 1e-6
     for forwards in (True, False):
         gaps = scale[:, None] * 10.0 ** generator.uniform(-3, 0.5, (n, 2))
-        no_level = generator.integers(
-            0, 3, n
-        )  # 0: no level below; 1: none above; 2: levels on both sides
+        # 0: no level below; 1: no level above; 2: levels on both sides.
+        no_level = generator.integers(0, 3, n)
         gaps[no_level < 2, no_level[no_level < 2]] = np.inf
+        # A ray in direction -d that ends at the point has its last part at point + s d, s > 0. So
+        # both free lengths are tested on the same points.
         steps = proved_free_lengths(
             field, points, directions if forwards else -directions, reach, gaps,
             enclosures=enclosures, precision=precision, forwards=forwards,
@@ -95,7 +106,9 @@ def check_ray_samples(
         epsilon = 2.0**-52 if precision == "double" else 2.0**-23
         position = epsilon * (np.abs(points).max(axis=1)[:, None] + lengths) * path.gradient_norm
         allowed = path.error + path.error[:, :1] + 8 * position + 1e-12 * scale[:, None]
+        # By how much f leaves the two gaps.
         excess = np.maximum(path.moved - gaps[:, 1:], -path.moved - gaps[:, :1]) - allowed
+        # For each ray the largest excess, and the point where it is.
         worst = excess.max(axis=1)
         worst_points = (
             points + np.take_along_axis(lengths, excess.argmax(axis=1)[:, None], 1) * directions
@@ -122,8 +135,9 @@ def proved_free_lengths(
     ahead: (n,) the length of the ray for which enclosures are requested.
     gaps: (n, 2) the differences of f at the start to the next level below and above.
     enclosures: the classes of enclosures that may be used; None for the default.
-    forwards: True for the free length of the ray ahead of its start. False for a ray that ends at
-        the point: the free length of its part before the end.
+    precision: of the computation.
+    forwards: True for the free length of the ray in front of its start. False for a ray that ends
+        at the point: the free length of its part before the end.
     """
     backend = choose_backend(precision)
     ray = Ray(
@@ -151,25 +165,32 @@ def check_field(
 ) -> None:
     """Test what a field promises by sampling it in double precision.
 
-    points: (n, 3) the points of the test, without the points outside the field's domain; by default
-        `count` random points in its domain or, if it has none, around its default surface.
+    points: (n, 3) the points of the test; points outside the field's domain are left out. By
+        default `count` random points in its domain or, if it has none, around its default surface.
+    rng: a generator of random numbers, or a seed.
+    count: the number of random points.
     levels: the levels whose `extent` is tested; by default the default level.
-    directions: the number of paths from each point within each promise.
+    directions: the number of rays from each point on which each promise is tested.
 
-    Checked: values and gradients are numbers, alike in both precisions within `Sample.value_error`;
-    the gradient is that of the value; f is harmonic where a ball of dimension 2 or 3 promises it;
-    `differentiable_value` is the value and has this gradient; `hessian`, where there is one, is
-    symmetric, the derivative of the gradient and, of a harmonic f, without trace; the continuous
-    change of f keeps each promise (`HarmonicBall`, `Lipschitz`, `TaylorRemainder`: a bound of f on
-    a ball about the point) on the path to random points
-    of its ball, or for the last two to the point where the path leaves the domain, and at the end
-    of a search for the worst pairs of points in these balls (`search_violations`: about 14,000
-    pairs for each promise); enclosures along paths, of a field that gives its own
-    (`check_ray_samples`), hold; a step is possible at most points; no level set leaves its
-    `extent`. Jumps across facets are taken out along the path, and values may in addition move
-    between neighboring points by `Sample.value_error`, as they do where a tree approximates other
-    clusters as wholes. Near the branch points of a Riemann surface all branches are within the
-    bounds of these points.
+    These checks are made:
+
+    - Values and gradients are numbers, alike in both precisions within `Sample.value_error`. The
+      gradient is that of the value. f is harmonic where a ball of dimension 2 or 3 promises it.
+    - `differentiable_value` is the value and has this gradient. `hessian`, where there is one, is
+      symmetric, the derivative of the gradient and, of a harmonic f, without trace.
+    - The continuous change of f keeps each promise (`HarmonicBall`, `Lipschitz`, `TaylorRemainder`:
+      a bound of f on a ball about the point) on rays to random points of the ball. A ray ends where
+      it leaves the domain, if the promise need not hold outside.
+    - The same holds for the worst pairs of points in these balls that a search finds
+      (`search_violations`: about 14,000 pairs for each promise).
+    - Enclosures along rays, of a field that computes its own, hold (`check_ray_samples`). A step of
+      positive length is possible at most points.
+    - No level set leaves its `extent`.
+    - Near the branch points of a Riemann surface all branches are within the bounds that are stated
+      there.
+
+    Jumps across facets are taken out along a ray. Values may in addition change between neighboring
+    points by `Sample.value_error`, as they do where a tree approximates other clusters as wholes.
 
     The default takes one to three seconds for most fields, on two cores; for meshes about ten, for
     a `Morph` half a minute. It is a search and no proof: a promise that is wrong where nothing
@@ -182,6 +203,7 @@ def check_field(
     """
     check_is_field(field)
     generator = np.random.default_rng(rng)
+    # Check and convert the arguments.
     count, directions = (
         as_integer_in_range(number, name, 1, 2**31 - 1)
         for number, name in ((count, "count"), (directions, "directions"))
@@ -201,6 +223,7 @@ def check_field(
     levels = [
         as_real(field.default_level if level is None else level, "levels") for level in level_list
     ]
+    # The tests.
     samples = sample_field(field, points)
     _check_numbers(field, points, samples)
     check_derivatives(field, points, samples)
@@ -220,7 +243,8 @@ def check_field(
 
 def _overrides_sample_ray(field: Field) -> bool:
     """Whether the field computes the enclosures of its change along a ray by a method of its own,
-    and not from its promises (proved bounds near a point) as other fields do."""
+    and not from its promises (proved bounds near a point) as other fields do. Fields with jumps do
+    not count."""
     return type(field).sample_ray is not Field.sample_ray and not field.has_jumps
 
 
@@ -231,12 +255,13 @@ def _check_numbers(field: Field, points: FloatArray, samples: FieldSamples) -> N
     samples: the samples of the field at the points.
 
     Raises:
-        BrokenPromiseError: they are not.
+        BrokenPromiseError: a number is not valid, or no step is possible at most points.
     """
     if field.period is not None and not 0 < field.period < np.inf:
         raise BrokenPromiseError(f"period must be None or a positive number, not {field.period!r}")
     require(np.isfinite(samples.value), "the value is not a finite number", points)
     require(np.isfinite(samples.gradient).all(axis=1), "the gradient is not finite", points)
+    # Without promises there must be enclosures of the field's own.
     if not samples.promises:
         if _overrides_sample_ray(field):
             return
@@ -245,6 +270,7 @@ def _check_numbers(field: Field, points: FloatArray, samples: FieldSamples) -> N
         numbers = [vars(promise)[name] for name, *_ in promise.units]
         name = type(promise).__name__
         require(~np.isnan(numbers).any(axis=0), f"{name} has a NaN", points)
+        # The first pair of a promise is a range of f on the ball, so it contains the value.
         for lower, upper in promise.interval_pairs[:1]:
             is_inside = (vars(promise)[lower] <= samples.value) & (
                 samples.value <= vars(promise)[upper]
@@ -264,6 +290,7 @@ def _check_numbers(field: Field, points: FloatArray, samples: FieldSamples) -> N
                 raise BrokenPromiseError(f"HarmonicBall has dimension {promise.dimension!r}")
             is_bounded = np.isfinite(promise.lower) | np.isfinite(promise.upper)
             require(is_bounded, "HarmonicBall: both ends are infinite", points)
+    # A promise with the radius 0 proves nothing.
     is_usable = np.any([promise.radius > 0 for promise in samples.promises], axis=0)
     if is_usable.mean() < 0.5:
         raise BrokenPromiseError(
@@ -274,7 +301,9 @@ def _check_numbers(field: Field, points: FloatArray, samples: FieldSamples) -> N
 def _check_rounding(field: Field, points: FloatArray) -> None:
     """Check that the values at points (n, 3) in single precision differ from those in double
     precision by at most `Sample.value_error`, plus eight units in the last place, plus the change
-    of the value by rounding the point. Raises a BrokenPromiseError if they differ by more."""
+    of the value by rounding the point. Points very near a singular point are left out. Raises a
+    BrokenPromiseError if a value differs by more."""
+    # Points that single precision represents exactly.
     single = points.astype(np.float32).astype(np.float64)
     if field.domain is not None:
         single = single[field.domain.contains_points(single)]
@@ -284,11 +313,14 @@ def _check_rounding(field: Field, points: FloatArray) -> None:
     error = rounded.value - exact.value
     if field.period is not None:
         error -= field.period * np.round(error / field.period)
+    # The allowed difference: stated errors, roundings of the value, and of coordinates times the
+    # slope.
     roundoff = 2.0**-24
     length = np.linalg.norm(exact.gradient, axis=1)
     size = np.abs(single).max(axis=1)
     allowed = rounded.error + exact.error + 8 * roundoff * (np.abs(exact.value) + length * size)
     allowed += 8 * 2.0**-126  # numbers below the smallest normal one are lost
+    # Near a singular point some promise holds only on a very small ball.
     radii = [promise.radius for promise in exact.promises] or [np.full(len(single), np.inf)]
     is_singular = np.min(radii, axis=0) < 1e-4 * np.ptp(points)
     is_right = (np.abs(error) <= allowed) | is_singular
@@ -300,21 +332,21 @@ def _check_differentiable_value(field: Field, points: FloatArray, samples: Field
     and its derivative by the automatic differentiation of Dr.Jit, in reverse mode, has to be the
     gradient. Raises a BrokenPromiseError if not.
 
-    samples: the samples of the field at the points."""
+    samples: the samples of the field at the points.
+    """
     backend = choose_backend("double")
     prepared = field.prepare(backend)
     x = to_vector3(backend, points, "points")
     dr.enable_grad(x)
     value = prepared.differentiable_value(x)
+    # Differentiate the sum over all points: the derivative by each point is its own gradient.
     dr.backward(dr.sum(value), dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
     dr.eval(value, x.grad)
     error = np.abs(to_numpy(value) - samples.value)
     if field.period is not None:
         error = np.abs(error - field.period * np.round(error / field.period))
-    value_error, gradient_error = (
-        0.0,
-        0.0,
-    )  # truncation errors of values at points, which samples may lack
+    # Truncation errors of values at points, which samples may lack.
+    value_error, gradient_error = 0.0, 0.0
     if isinstance(field, BatchedField):
         value_error = field.error_bound(points, precision="double")
         gradient_error = field.gradient_error_bound(points, precision="double")
@@ -339,9 +371,11 @@ def _check_promise(
     3). f is sampled on rays in random directions from each point, up to the radius of the ball, or
     up to twice the extent of the points if that is less.
 
-    samples: the samples of the field at the points. directions: the number of rays from each.
+    samples: the samples of the field at the points.
+    promise: the promise, with one number for each point.
+    directions: the number of rays from each point.
 
-    Promises that also hold outside of the field's domain, such as those of harmonic balls, are
+    A promise that also holds outside of the field's domain, such as that of a harmonic ball, is
     tested there as well; others only on the part of a ray in the domain.
 
     Raises:
@@ -369,6 +403,7 @@ def _check_promise(
         slopes = SlopeRange(*((slope + sign * samples.gradient_error)[:, None] for sign in (-1, 1)))
         per_row = promise.map_numbers(lambda number, _, __: number[:, None])
         with np.errstate(invalid="ignore"):  # 0 * inf, at the point itself
+            # The promised bounds of f(t) - f(0) at each sample.
             lower, upper = per_row.movement_bounds(samples.value[:, None], slopes, t)
             excess = np.maximum(movement - upper, lower - movement)
         if isinstance(promise, HarmonicBall):
@@ -390,6 +425,7 @@ def _distance_to_exit(field: Field, points: FloatArray, d: FloatArray) -> FloatA
     o, direction = to_vector3(backend, points, "points"), to_vector3(backend, d, "d")
     ends = field.domain.prepare(backend).clip(o, direction, backend.Float(0), backend.Float(np.inf))
     end = np.broadcast_to(to_numpy(ends[1]), (len(points),))
+    # A little less, for rounding.
     return np.maximum(end * (1 - 1e-9) - 1e-12 * np.abs(points).max(axis=1), 0)
 
 
@@ -400,16 +436,19 @@ def _harnack_excess(
     function on a ball, by Harnack's inequality and by the range of its values there. If it is
     positive, f is not harmonic on the ball or leaves the range.
 
-    ball: n balls on which f is promised to be harmonic, with the ranges of f.
+    ball: the promises: n balls on which f is harmonic, with the ranges of f.
     value: (n,) f at the centers of the balls.
     movement: (n, m) f at m points of a ray from each center, minus its value at the center.
     fraction: (m,) the distances of these points from the center, as fractions of the radius.
     """
     n = ball.dimension
+    # By Harnack's inequality a positive harmonic function grows at most by the factor 1 + growth,
+    # and falls at most by the factor 1 - decay.
     growth = (1 + fraction) / (1 - fraction) ** (n - 1) - 1
     decay = 1 - (1 - fraction) / (1 + fraction) ** (n - 1)
     gap_below, gap_above = (value - ball.lower)[:, None], (ball.upper - value)[:, None]
     with np.errstate(invalid="ignore"):  # 0 * inf, where nothing is known
+        # Apply both to f - lower and to upper - f, which are positive.
         rise = np.fmin(np.fmin(gap_below * growth, gap_above), gap_above * decay)
         fall = np.fmin(np.fmin(gap_above * growth, gap_below), gap_below * decay)
     # If the radius was reduced, the comparison is only weaker.
@@ -417,9 +456,9 @@ def _harnack_excess(
 
 
 def _check_extent(field: Field, level: float, rng: np.random.Generator, count: int) -> None:
-    """Check that the level set stays within its extent, the region that is stated to contain it: f
-    must not cross the level on `count` random segments outside of the extent. Raises a
-    BrokenPromiseError if it does."""
+    """Check that the level set stays within its extent, the volume that is stated to contain it: f
+    must not cross the level outside of the extent on `count` random segments (more for a field with
+    a domain). Raises a BrokenPromiseError if it does."""
     volume = field.extent((level,))
     if volume is None:
         return
@@ -427,6 +466,7 @@ def _check_extent(field: Field, level: float, rng: np.random.Generator, count: i
     center, half = 0.5 * (lower + upper), 0.5 * (upper - lower)
     if not np.isfinite(half).all():
         return
+    # Random segments in and around the box of the extent, up to the border of the domain.
     start = center + rng.uniform(-2.5, 2.5, (count, 3)) * half
     if field.domain is not None:
         start = np.concatenate([start, random_points(field, rng, count)])
@@ -435,12 +475,14 @@ def _check_extent(field: Field, level: float, rng: np.random.Generator, count: i
     length = np.minimum(3 * float(half.max()), _distance_to_exit(field, start, d))
     t = np.linspace(0, 1, 160) * length[:, None]
     lift = lift_along_rays(field, start, d, t)
+    # f - level along each segment, with its jumps.
     offsets = sample_field(field, start).value[:, None] + lift.moved + lift.jumped - level
     # To first order farther from the level than a thousandth of the extent, so f does not touch it.
     is_clear = (
         _distance_to_level(field, offsets)
         > 1e-3 * float(half.max()) * lift.gradient_norm + lift.error
     )
+    # Between neighboring samples that are both clear of levels, f has passed a level.
     is_crossed = (
         _level_interval(field, offsets[:, 1:]) != _level_interval(field, offsets[:, :-1])
     ) & is_clear[:, 1:]
@@ -448,16 +490,18 @@ def _check_extent(field: Field, level: float, rng: np.random.Generator, count: i
     if not row.size:
         return
     before, after, offset = t[row, column], t[row, column + 1], offsets[row, column]
-    for _ in range(4):  # to 1e-6 of the interval
+    # Find each crossing more exactly: cut its interval into 32 parts, and keep the part with the
+    # crossing.
+    for _ in range(4):
         lengths = before[:, None] + (after - before)[:, None] * np.linspace(0, 1, 33)
         lift = lift_along_rays(field, start[row], d[row], lengths)
         values = offset[:, None] + lift.moved + lift.jumped
-        first = (_level_interval(field, values) != _level_interval(field, values[:, :1])).argmax(
-            axis=1
-        )
+        first_beyond = (
+            _level_interval(field, values) != _level_interval(field, values[:, :1])
+        ).argmax(axis=1)
         ids = np.arange(len(row))
-        before, after = lengths[ids, first - 1], lengths[ids, first]
-        offset = values[ids, first - 1]
+        before, after = lengths[ids, first_beyond - 1], lengths[ids, first_beyond]
+        offset = values[ids, first_beyond - 1]
     crossings = start[row] + after[:, None] * d[row]
     is_inside = volume.contains_points(crossings)
     require(is_inside, f"extent: the surface of level {level:g} leaves {volume} here", crossings)
@@ -465,11 +509,17 @@ def _check_extent(field: Field, level: float, rng: np.random.Generator, count: i
 
 def _level_interval(field: Field, offset: FloatArray) -> FloatArray:
     """The number of the interval between neighboring levels in which f lies. It is the same for two
-    values of f if no level separates them. offset: f - level for one of the levels."""
+    values of f if no level separates them.
+
+    offset: f - level for one of the levels.
+    """
     return np.sign(offset) if field.period is None else np.floor(offset / field.period)
 
 
 def _distance_to_level(field: Field, offset: FloatArray) -> FloatArray:
-    """The difference |f - level| to the nearest level. offset: f - level, for one of the levels."""
+    """The difference |f - level| to the nearest level.
+
+    offset: f - level for one of the levels.
+    """
     nearest = 0.0 if field.period is None else field.period * np.round(offset / field.period)
     return np.abs(offset - nearest)

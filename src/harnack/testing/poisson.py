@@ -1,10 +1,13 @@
-"""Poisson integrals along an axis, in double precision on the host.
+"""Poisson integrals along an axis: harmonic functions with known values, for tests of proofs. A
+positive harmonic function on the unit ball of R^n is the Poisson integral of a positive measure
+(mass) on the sphere: the integral of the Poisson kernel P over the mass. Its values on an axis
+depend only on the latitudes s of the mass: the cosines of the angles to the axis, s = 1 in front
+and s = -1 behind. A ring is mass at one latitude; a cap of height b is the part of the sphere with
+s >= 1 - b. All results are functions of the position q on the axis, -1 < q < 1, minus their value
+at the center q = 0 (movements).
 
-A positive harmonic function on the unit ball of R^n is the Poisson integral of a positive measure
-on the sphere. Its values on an axis depend only on the latitudes s of the mass: the cosines of the
-angles to the axis, s = 1 ahead and s = -1 behind. All results are differences to the value at the
-center (movements), as a function of the position q on the axis, -1 < q < 1. The formulas have no
-cancellation at small q, and none of them is used in `harnack.enclosures`.
+The formulas have no cancellation at small q, and none of them is used in `harnack.enclosures`. They
+are computed by NumPy in double precision.
 """
 
 from __future__ import annotations
@@ -24,7 +27,8 @@ _TERMS = 30
 
 def kernel_difference(q: npt.ArrayLike, s: npt.ArrayLike, dimension: int) -> FloatArray:
     """P(q, s) - 1 for 0 <= q < 1 and -1 <= s <= 1, where P = (1-q^2)/(1+q^2-2qs)^(n/2) is the
-    Poisson kernel of the unit ball of dimension n."""
+    Poisson kernel of the unit ball of dimension n, at the position q on the axis, for mass at the
+    latitude s."""
     q, s = np.asarray(q, np.float64), np.asarray(s, np.float64)
     squared_distance = (1 - q) ** 2 + 2 * q * (1 - s)  # accurate where q and s are near 1
     log = np.where(q < 0.5, np.log1p(np.maximum(q * (q - 2 * s), -0.99)), np.log(squared_distance))
@@ -61,6 +65,8 @@ def cap_movement(q: npt.ArrayLike, height: npt.ArrayLike, dimension: int) -> Flo
     """
     q, b = np.broadcast_arrays(np.asarray(q, np.float64), np.asarray(height, np.float64))
     is_small = np.abs(q) < _SERIES_BELOW
+    # Both formulas are computed at all positions, and one is selected. Where a formula is not
+    # valid, it is computed at a position where it is (0 or 0.5), and its result is not used.
     series = _cap_series(np.where(is_small, q, 0.0), b, dimension)
     closed_form = _cap_closed_form(np.where(is_small, 0.5, q), b, dimension) - cap_mass(
         b, dimension
@@ -69,7 +75,7 @@ def cap_movement(q: npt.ArrayLike, height: npt.ArrayLike, dimension: int) -> Flo
 
 
 def _cap_angle(height: FloatArray) -> FloatArray:
-    """The angle from the center of a cap to its border, as seen from the center of the sphere."""
+    """The angle between the axis and the border of a cap, as seen from the center of the sphere."""
     return 2 * np.arcsin(np.sqrt(np.clip(0.5 * height, 0, 1)))
 
 
@@ -78,12 +84,13 @@ def _cap_series(q: FloatArray, b: FloatArray, dimension: int) -> FloatArray:
     minus its value at q = 0. It is computed as the sum of c_l q^l over l >= 1, for small q.
 
     The series is the expansion of the Poisson kernel in Gegenbauer polynomials, integrated over the
-    cap s >= 1 - b, which begins at the latitude s = 1 - b.
-    For n = 3 these are the Legendre polynomials P_l: the integral of P_l over [s, 1] is
-    (1-s^2) P_l'(s)/(l(l+1)), and P_{l+1}' = P_{l-1}' + (2l+1) P_l.
+    cap, which reaches from the latitude s = 1 - b to 1. For n = 3 these are the Legendre
+    polynomials P_l: the integral of P_l over [s, 1] is (1-s^2) P_l'(s)/(l(l+1)), and P_{l+1}' =
+    P_{l-1}' + (2l+1) P_l.
     """
     total, power = np.zeros_like(q), np.ones_like(q)
     angle, s = _cap_angle(b), 1 - b
+    # For n = 3: P_(l-1) and P_l at s, then their derivatives.
     p0, p1 = np.ones_like(s), s
     d0, d1 = np.zeros_like(s), np.ones_like(s)
     for degree in range(1, _TERMS + 1):
@@ -121,6 +128,8 @@ def _cap_closed_form(q: FloatArray, b: FloatArray, dimension: int) -> FloatArray
 @dataclass(frozen=True)
 class AxialFunctions:
     """Harmonic functions u on balls of R^n, on an axis through the center; one function per row.
+    Each u is the Poisson integral of a few rings of mass on the sphere, or has boundary values that
+    are a sum of indicators of caps.
 
     measure: "points" if u is the Poisson integral of rings of mass; "caps" if the boundary values
         of u are a sum of indicators of caps.
@@ -138,7 +147,7 @@ class AxialFunctions:
 
     @property
     def slope(self) -> FloatArray:
-        """(rows,) derivative along the axis at the center."""
+        """(rows,) the derivatives of the functions along the axis, at the center."""
         if self.measure == "points":
             slopes = self.dimension * self.latitudes_or_heights
         else:
@@ -146,7 +155,8 @@ class AxialFunctions:
         return (self.weights * slopes).sum(axis=1) / self.radius
 
     def movement(self, t: FloatArray) -> FloatArray:
-        """u(t) - u(0) at distances t (rows, m) along the axis, 0 <= t < radius: (rows, m)."""
+        """u(t) - u(0), an array (rows, m), at distances t (rows, m) along the axis, 0 <= t <
+        radius."""
         q = t / self.radius[:, None]
         total = np.zeros_like(q)
         for j in range(self.latitudes_or_heights.shape[1]):
@@ -159,10 +169,11 @@ class AxialFunctions:
 @dataclass(frozen=True)
 class GreenPotentials:
     """Potentials of balls of constant density inside of the unit ball of R^3, evaluated on an axis
-    through the centers of all balls. The potentials vanish on the unit sphere.
+    through the centers of all balls; several balls per row. The potentials vanish on the unit
+    sphere.
 
-    centers, sizes: (rows, k) the positions of the balls on the axis, and their radii;
-        |center| + size <= 1.
+    centers, sizes: (rows, k) the positions of the balls on the axis, and their radii; |center| +
+        size <= 1.
 
     For a ball of density s, the potential w has the Laplacian -s in the ball, and 0 outside of it.
     It is Newton's potential of the ball minus that of its image. The image is outside of the unit
@@ -173,30 +184,43 @@ class GreenPotentials:
     sizes: FloatArray
 
     def at_center(self, density: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """The potentials (rows,) at the center of the unit ball, and their derivatives (rows,)
-        along the axis there. density: (rows, k) the densities of the balls."""
+        """The sums of the potentials (rows,) at the center of the unit ball, and their derivatives
+        (rows,) along the axis there.
+
+        density: (rows, k) the densities of the balls.
+        """
         y, size = self.centers, self.sizes
         distance = np.abs(y)
         with np.errstate(divide="ignore", invalid="ignore"):
+            # Newton's potential of a ball at the center, and its slope there: outside of the ball
+            # that of a point mass, else that of the interior.
             outside = distance > size
             value = np.where(outside, size**3 / (3 * distance), 0.5 * size**2 - y * y / 6)
             slope = np.where(outside, size**3 * y / (3 * distance**3), y / 3)
+        # Subtract the potential of the image.
         value, slope = value - size**3 / 3, slope - size**3 * y / 3
         return (density * value).sum(axis=1), (density * slope).sum(axis=1)
 
     def movement(self, q: FloatArray, density: FloatArray) -> FloatArray:
-        """(rows, m) w(q) - w(0) at the positions q (rows, m) on the axis, 0 <= q < 1, where w is
-        the potential. density: (rows, k) the densities of the balls."""
+        """w(q) - w(0), an array (rows, m), at the positions q (rows, m) on the axis, 0 <= q < 1,
+        where w is the sum of the potentials.
+
+        density: (rows, k) the densities of the balls.
+        """
         total = np.zeros_like(q)
         for j in range(self.centers.shape[1]):
             y, size = self.centers[:, j, None], self.sizes[:, j, None]
+            # The movement of the ball's Newtonian potential minus that of its image.
             total += density[:, j, None] * (_newton(q, y, size) - size**3 / 3 * q * y / (1 - q * y))
         return total
 
 
 def _newton(q: FloatArray, y: FloatArray, size: FloatArray) -> FloatArray:
     """Newton's potential of a ball of density 1, at the position q on the axis, minus its value at
-    0. y, size: the position of the ball's center on the axis, and its radius."""
+    0.
+
+    y, size: the position of the ball's center on the axis, and its radius.
+    """
     distance0, distance = np.abs(y), np.abs(q - y)
     values: list[FloatArray] = []
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -1,5 +1,9 @@
-"""Fields sampled as NumPy arrays; the search for points at which a field violates a promise (a
-bound of its function that it states as proved); and the error that reports them."""
+"""Search for points at which a field breaks a promise, and the tools of all tests of fields. A
+field has a function f. Its promises are bounds of f, on a ball about each point, that it states as
+proved. Here fields are sampled as NumPy arrays; f is followed continuously along rays (lifted),
+without its jumps across facets and by its period; and pairs of points are searched at which f
+exceeds a promised bound: a point p where the promise is made, and a point y of its ball where it is
+tested."""
 
 from __future__ import annotations
 
@@ -35,8 +39,8 @@ __all__ = [
 
 
 class BrokenPromiseError(AssertionError):
-    """A field or an enclosure promised something that is not true; the message says which promise,
-    and where."""
+    """Raised if a field or an enclosure promised something that is not true. The message says which
+    promise, and where."""
 
 
 def require(
@@ -46,10 +50,14 @@ def require(
     amount: FloatArray | None = None,
     there: FloatArray | None = None,
 ) -> None:
-    """Raise BrokenPromiseError for the worst of the points (n, 3) at which `good` (n,) is false.
+    """Raise BrokenPromiseError if `good` (n,) is False at any of the points (n, 3). The message
+    names the worst of these points.
 
-    amount: (n,) the size of the violation.
-    there: (n, 3) the points where it shows, if not at the points themselves.
+    good: (n,) whether the test holds at each point.
+    message: the beginning of the message.
+    amount: (n,) the size of the violation; the point of the largest is the worst. None for the
+        first point.
+    there: (n, 3) the points where the violation shows, if not at the points themselves.
     """
     is_broken: BoolArray = ~np.asarray(good, dtype=np.bool_)
     ids = np.flatnonzero(is_broken)
@@ -64,17 +72,19 @@ def require(
 
 
 def mutated_enclosure(kind: type[Enclosure], factor: float, *, covers: float | None = None) -> Any:
-    """A class of enclosures that is wrong on purpose, to test that the checks detect it.
+    """A class of enclosures that is wrong on purpose, to test that the checks detect it: its free
+    lengths (lengths proved to hold no level) are multiplied by a factor.
 
     kind: the class from which it is derived.
     factor: multiplies every free length.
     covers: multiplies every length that `is_free` accepts; None for the same factor.
     """
     covers_factor = factor if covers is None else covers
+    # Type checkers accept no variable as a base class.
     base: Any = kind
 
     class Scaled(base):
-        """The class with all lengths scaled."""
+        """The class `kind` with all lengths scaled."""
 
         original = kind
 
@@ -100,8 +110,8 @@ def original_enclosure(kind: type[Enclosure]) -> type[Enclosure]:
 
 @dataclass(frozen=True)
 class FieldSamples:
-    """Samples of a field at n points: values (n,), gradients (n, 3), their error bounds and the
-    promises, (n,) each."""
+    """Samples of a field at n points, as NumPy arrays: values (n,), gradients (n, 3), bounds of
+    their errors (n,), and promises (bounds of f near each point) whose numbers are arrays (n,)."""
 
     value: FloatArray
     gradient: FloatArray
@@ -110,7 +120,7 @@ class FieldSamples:
     promises: tuple[Promise, ...]
 
     def subset(self, rows: BoolArray) -> FieldSamples:
-        """The samples at the rows given by indices or by a mask."""
+        """The samples at some of the points, given by a mask or by indices."""
         return FieldSamples(
             self.value[rows],
             self.gradient[rows],
@@ -125,8 +135,9 @@ class FieldSamples:
 def sample_field(
     field: Field, points: FloatArray, precision: Precision = "double", *, closely: bool = False
 ) -> FieldSamples:
-    """Sample the field at points (n, 3); all numbers of its promises are float64 arrays (n,).
+    """Sample the field at points (n, 3). All numbers of its promises become float64 arrays (n,).
 
+    precision: of the evaluation.
     closely: whether to sample without truncation error.
     """
     n = len(points)
@@ -150,7 +161,8 @@ def sample_field(
 
 @dataclass(frozen=True)
 class RayLift:
-    """The continuous change of f at m points along each of n rays; all arrays are (n, m).
+    """The change of f along rays, followed continuously: at m points of each of n rays. All arrays
+    are (n, m).
 
     moved: the change of f since the ray's first point, without jumps across facets and without
         jumps by the period of f.
@@ -168,8 +180,8 @@ class RayLift:
 def lift_along_rays(
     field: Field, start: FloatArray, direction: FloatArray, lengths: FloatArray
 ) -> RayLift:
-    """The continuous change of f along rays, f(start + t direction) - f(start), without its jumps
-    across facets.
+    """Follow f continuously along rays: its change f(start + t direction) - f(start), without its
+    jumps across facets and without jumps by its period.
 
     start, direction: (n, 3) the starts of the rays, and unit vectors.
     lengths: (n, m) the values of t for each ray, ascending from 0.
@@ -199,20 +211,22 @@ def lift_along_rays(
 def accumulated_jumps(
     field: Field, start: FloatArray, direction: FloatArray, lengths: FloatArray
 ) -> FloatArray:
-    """(n, m) the sums of the jumps of f across facets between the first and each other point of
-    rays. The points are start + t direction for each t of `lengths` (n, m). The field's method
-    `next_jump` reports the jumps."""
+    """(n, m) the sums of the jumps of f across facets between the first point and each other point
+    of a ray. The points are start + t direction for each t of `lengths` (n, m). The field's method
+    `next_jump` reports the jumps one after the other."""
     total = np.zeros_like(lengths)
     if not field.has_jumps:
         return total
     backend = choose_backend("double")
     prepared = field.prepare(backend)
     o, d = to_vector3(backend, start), to_vector3(backend, direction)
+    # The crossing before the first one is at the start of the ray, on no facet.
     first, last = (backend.Float(np.ascontiguousarray(lengths[:, k])) for k in (0, -1))
     crossing = JumpCrossing(first, backend.UInt32(NO_FACET), backend.Float(0), d)
     while True:
         crossing = prepared.next_jump(o, d, crossing, last, backend.Bool(True))
         t, jump = (_to_lanes(values, len(start)) for values in (crossing.t, crossing.jump))
+        # Rays without another crossing have t = inf.
         is_ahead = np.isfinite(t)
         if not is_ahead.any():
             return total
@@ -221,12 +235,15 @@ def accumulated_jumps(
 
 
 def random_points(field: Field, rng: np.random.Generator, n: int) -> FloatArray:
-    """n points of the field's domain; where that is unbounded, around its default surface."""
+    """n random points (n, 3) of the field's domain. If it has none, points of the extent of its
+    default surface; if that is not known either, points around the origin. Where a box is
+    unbounded, it is cut at -3 and 3."""
     volume = field.domain if field.domain is not None else field.extent((field.default_level,))
     if volume is None:
         return 3 * random_directions(rng, n) * rng.random((n, 1))
     lower, upper = volume.bounds()
     lower, upper = np.where(np.isfinite(lower), lower, -3), np.where(np.isfinite(upper), upper, 3)
+    # Draw points in the box until enough of them lie in the domain.
     accepted = np.zeros((0, 3))
     while len(accepted) < n:
         points = rng.uniform(lower, upper, (4 * n, 3))
@@ -237,13 +254,16 @@ def random_points(field: Field, rng: np.random.Generator, n: int) -> FloatArray:
 
 
 def random_directions(rng: np.random.Generator, n: int) -> FloatArray:
-    """n unit vectors, uniform on the sphere."""
+    """n unit vectors (n, 3), uniform on the sphere."""
     directions = rng.normal(size=(n, 3))
     return directions / np.linalg.norm(directions, axis=1, keepdims=True)
 
 
 def _sample(field: Field, points: FloatArray, precision: Precision, closely: bool) -> Sample:
-    """The field's Dr.Jit sample at points (n, 3). closely: without truncation error."""
+    """The field's Dr.Jit sample at NumPy points (n, 3).
+
+    closely: whether to sample without truncation error.
+    """
     backend = choose_backend(precision)
     prepared = field.prepare(backend)
     evaluator = prepared.exact(backend) if closely else prepared
@@ -251,7 +271,7 @@ def _sample(field: Field, points: FloatArray, precision: Precision, closely: boo
 
 
 def _to_lanes(value: object, n: int) -> FloatArray:
-    """A Dr.Jit array or a number as a float64 array (n,)."""
+    """A Dr.Jit array or a number as a float64 array (n,). A single number is repeated."""
     array = to_numpy(value) if dr.is_array_v(value) else np.asarray(value)
     return np.broadcast_to(array, (n,)).astype(np.float64)
 
@@ -260,19 +280,20 @@ def _to_lanes(value: object, n: int) -> FloatArray:
 
 # The number of pairs of points that are improved: at most, and as a fraction of the points.
 _MAX_PAIRS, _PAIRS_OF_POINTS = 48, 0.25
-# The number of moves that each pair tries in an iteration, and of iterations. All these numbers are
-# divided by the last one if the movement of f is known along paths only, as each sample of a path
-# costs an evaluation.
+# The number of moves that each pair tries in an iteration, and the number of iterations. The
+# numbers of pairs, moves and iterations are divided by the last number if the change of f between
+# two points must be followed along a path, as each sample of the path takes an evaluation.
 _MOVES, _ROUNDS, _PATH_COST_DIVISOR = 8, 36, 2
 # Points stay within this fraction of the radius, off the border of the ball.
 _MAX_RADIUS_FRACTION = 1 - 1e-6
-# Lengths of moves, in radii: the first, the smallest, and the factors after success and failure.
+# Lengths of moves, in radii of the balls: the first, the smallest, and the factors after success
+# and failure.
 _FIRST_STEP, _MIN_STEP, _STEP_GROWTH, _STEP_SHRINKAGE = 0.25, 1e-9, 1.6, 0.6
 # Balls whose radius is below this fraction of the coordinates are left out, as rounding moves
 # points in them.
 _MIN_RELATIVE_RADIUS = 1e-6
-# Number of samples on a path between two points, if the movement of f is known along paths only: in
-# the search, and for the final test.
+# The number of samples on a path between two points, if f must be followed along it: in the search,
+# and for the final test.
 _PATH_SAMPLES, _FINAL_PATH_SAMPLES = 24, 600
 # How far a ratio may exceed 1 by rounding; and the relative rounding error of values.
 _RATIO_TOLERANCE, _ROUNDING = 1e-6, 1e-9
@@ -283,13 +304,13 @@ _DIFFERENCE_SPACING = 1e-3
 @dataclass(frozen=True)
 class _Candidates:
     """Pairs of points (p, y) at which a promise is tested: p is the point where the promise is
-    made, a bound of f on a ball about p; y is a point of the ball.
+    made, a bound of f on a ball about p; y is a point of the ball. The violation ratio of a pair is
+    the change of f from p to y relative to its bound; above 1 the promise is violated.
 
     p: (n, 3) the first points.
     w: (n, 3) the second points are y = p + reach * w, with |w| < 1.
     reach: (n,) the radii of the balls.
-    violation_ratio: (n,) the change of f from p to y relative to its bound. The promise is violated
-        if it is above 1.
+    violation_ratio: (n,) the violation ratios.
     """
 
     p: FloatArray
@@ -298,14 +319,16 @@ class _Candidates:
     violation_ratio: FloatArray
 
     def best_of(self, alternatives: _Candidates) -> tuple[_Candidates, BoolArray]:
-        """Choose between each of these n pairs and its m alternatives: the one with the largest
+        """Choose between each of these n pairs and its m alternatives: the pair with the largest
         violation ratio is best.
 
         alternatives: n * m pairs, the m alternatives of the first pair first.
 
-        Returns the n best pairs, and the mask (n,) of those that are alternatives."""
+        Returns the n best pairs, and a mask (n,): whether the best pair is an alternative.
+        """
         n = len(self.p)
         m = len(alternatives.p) // n
+        # The index of the best alternative of each pair.
         best = np.arange(n) * m + alternatives.violation_ratio.reshape(n, m).argmax(axis=1)
         is_better = alternatives.violation_ratio[best] > self.violation_ratio
         mask = is_better[:, None]
@@ -320,27 +343,31 @@ class _Candidates:
 def search_violations(
     field: Field, points: FloatArray, look: FieldSamples, number: int, rng: np.random.Generator
 ) -> None:
-    """Search for points that violate a promise, the one with index `number` in
+    """Search for points that violate a promise of a field, the one with index `number` in
     `Sample.all_promises`.
+
+    points: (n, 3) the points from which the search starts.
+    look: the samples of the field at the points.
 
     A promise that is wrong by a few percent is violated only at special points: beside a
     singularity that lies just inside of the ball, or in the one direction in which a range is
     attained. Random points miss these. So this is a random local search over pairs: a point p,
     where the promise is made, and a point y in its ball, where it is tested. Both are moved at
-    random, and a move is kept if it raises the violation ratio. The step length grows after success
-    and shrinks after failure.
+    random, and a move is kept if it raises the violation ratio (the change of f relative to its
+    bound). The step length grows after success and shrinks after failure.
 
-    points: (n, 3), and `look` the samples of the field there. The search starts from the points
-        with the smallest radius and from random points, with y towards the border of the ball:
-        along the gradient, against it, and in random directions.
+    The search starts from the points with the smallest radius and from random points, with y
+    towards the border of the ball: along the gradient, against it, and in random directions.
 
     Raises:
         BrokenPromiseError: naming both points of the worst pair.
     """
     search = _ViolationSearch(field, number, 2 * float(np.ptp(points, axis=0).max()) + 1e-300)
     divisor = _PATH_COST_DIVISOR if search.needs_path else 1
+    # The number of pairs. If f must be followed along paths, there are fewer pairs and moves.
     count = min(max(int(_PAIRS_OF_POINTS * len(points)), 6), _MAX_PAIRS) // divisor
     moves_each = _MOVES // divisor
+    # The start of the search: p, and y in one of three directions.
     order = np.argsort(np.broadcast_to(look.promises[number].radius, len(points)), kind="stable")
     rows = np.concatenate([order[: count // 3], rng.choice(len(points), count)])[:count]
     steepest = look.gradient[rows]
@@ -352,10 +379,11 @@ def search_violations(
     best = search.pairs(points[rows], directions * rng.uniform(0.3, 1, (count, 1)))
     steps = np.full(count, _FIRST_STEP)
     for _ in range(_ROUNDS // divisor):
+        # Each pair tries `moves_each` moves.
         step = np.repeat(steps, moves_each)[:, None]
         p, w = (np.repeat(array, moves_each, axis=0) for array in (best.p, best.w))
         reach = np.repeat(best.reach, moves_each)[:, None]
-        # Half of the moves keep p, a quarter of them y.
+        # Half of the moves keep p (kinds 0 and 1), a quarter keep y (kind 3).
         kind = np.arange(len(p))[:, None] % 4
         moves_point = kind >= 2
         change = rng.normal(size=p.shape) * step * 10 ** rng.uniform(-1, 0, (len(p), 1))
@@ -367,11 +395,13 @@ def search_violations(
         rotated = (w + length * change) * 10 ** rng.uniform(-1, 0.5, (len(p), 1))
         new_w = np.where(np.arange(len(p))[:, None] % 8 == 1, rotated, new_w)
         new_w = np.where(np.arange(len(p))[:, None] % 8 == 2, w + length * change, new_w)
+        # Keep the best move of each pair if it is better than the pair itself.
         best, is_better = best.best_of(search.pairs(p + reach * point_shift, new_w))
         steps = np.where(is_better, np.minimum(_STEP_GROWTH * steps, 1), _STEP_SHRINKAGE * steps)
         steps = np.where(steps < _MIN_STEP, _FIRST_STEP, steps)
     is_violated = best.violation_ratio > 1 + _RATIO_TOLERANCE
     if is_violated.any():
+        # Test the pairs again with more samples on each path, as too few may mislead.
         best = search.pairs(best.p[is_violated], best.w[is_violated], samples=_FINAL_PATH_SAMPLES)
         y = best.p + best.reach[:, None] * best.w
         holds = ~(best.violation_ratio > 1 + _RATIO_TOLERANCE)
@@ -382,8 +412,11 @@ def search_violations(
 
 @dataclass(frozen=True)
 class _ViolationSearch:
-    """The search for pairs of points that violate a promise.
+    """The search for pairs of points (p, y) that violate a promise: a bound of f that the field
+    states, at each point p, for a ball about p; y is a point of the ball. The violation ratio of a
+    pair is the change of f from p to y relative to its bound.
 
+    field: the field.
     promise_index: the index of the promise in `Sample.all_promises`.
     longest: the length that takes the place of an infinite radius.
     """
@@ -400,14 +433,18 @@ class _ViolationSearch:
         return self.field.period is not None or self.field.has_jumps
 
     def pairs(self, p: FloatArray, w: FloatArray, samples: int = _PATH_SAMPLES) -> _Candidates:
-        """Evaluate pairs of points: make the pairs of p (n, 3) and p + reach * w, where reach is
-        the radius of the promise at p, with their violation ratios.
+        """Evaluate pairs of points: make the pairs of p (n, 3) and y = p + reach * w, where reach
+        is the radius of the promise at p, with their violation ratios. The ratio is -inf for a pair
+        that cannot be tested: outside of the domain, or with a radius so small that rounding moves
+        the points.
 
-        w: (n, 3). Vectors of length 1 or more are shortened, so that the second point lies in the
-            ball. samples: the number of samples on each path between two points."""
+        w: (n, 3). Vectors of length 1 or more are shortened, so that y lies in the ball.
+        samples: the number of samples on each path from p to y.
+        """
         length = np.linalg.norm(w, axis=1, keepdims=True)
         w = w * np.minimum(1, _MAX_RADIUS_FRACTION / np.maximum(length, 1e-300))
         ratios, radii = np.full(len(p), -np.inf), np.full(len(p), 1.0)
+        # The pairs whose first point is in the domain; below, those that can be tested.
         rows = np.flatnonzero(self._is_in_domain(p))
         if len(rows):
             at_p = sample_field(self.field, p[rows])
@@ -433,12 +470,16 @@ class _ViolationSearch:
         self, at_p: FieldSamples, p: FloatArray, w: FloatArray, reach: FloatArray, samples: int
     ) -> FloatArray:
         """The violation ratios (n,) of pairs of points p (n, 3) and y = p + reach * w: the change
-        of f from p to y, less the error of this change, relative to the bounds of the promise made
+        of f from p to y, minus the error of this change, relative to the bounds of the promise made
         at p. Above 1 the promise is violated.
 
         at_p: the samples at p.
-        w: (n, 3), |w| < 1. reach: (n,) the radius of the promise.
+        w: (n, 3), |w| < 1.
+        reach: (n,) the radius of the promise.
         samples: the number of samples on a path from p to y.
+
+        For promises that are about harmonic functions or Laplacians, the ratio is also computed
+        from the gradients near y, and the larger one is taken.
         """
         promise, y = at_p.promises[self.promise_index], p + reach[:, None] * w
         at_y = sample_field(self.field, y)
@@ -450,7 +491,10 @@ class _ViolationSearch:
         distance = reach * np.linalg.norm(w, axis=1)
         with np.errstate(all="ignore"):
             slope = np.einsum("nk,nk->n", at_p.gradient, y - p) / distance
+            # The promised bounds of the change.
             lower, upper = promise.movement_bounds(at_p.value, SlopeRange(slope, slope), distance)
+            # A Lipschitz constant or Taylor remainder bounds the difference to the middle of both
+            # bounds, which for the latter is the linear part of f.
             if not promise.holds_outside_domain:
                 middle, half = 0.5 * (lower + upper), 0.5 * (upper - lower)
                 error = error + at_p.gradient_error * distance * (middle != 0)
@@ -458,6 +502,7 @@ class _ViolationSearch:
             max_fall, max_rise = error - lower, error + upper
             ratio, margin = np.maximum(moved / max_rise, -moved / max_fall), reach - distance
             if isinstance(promise, HarmonicBall):
+                # How far f at y is from the nearer end of its range.
                 gap = np.minimum(max_fall + moved, max_rise - moved)
                 ratio = np.fmax(ratio, _slope_ratio(promise, at_y, margin, gap))
             if isinstance(promise, BoundedLaplacian):
@@ -468,7 +513,7 @@ class _ViolationSearch:
     def _lift(self, p: FloatArray, y: FloatArray, samples: int) -> FloatArray:
         """The change (n,) of f along the segments from points p to points y (n, 3), without jumps
         at facets and without jumps by the period of f. f is followed through `samples` samples on
-        each segment. They are denser toward y, which is often near the border of the promise's
+        each segment. They are denser towards y, which is often near the border of the promise's
         ball, because singularities may lie there."""
         offset = y - p
         length = np.linalg.norm(offset, axis=1)
@@ -483,8 +528,11 @@ class _ViolationSearch:
         """(n,) the violation ratios of a promised bound of the Laplacian, at points y (n, 3): 1
         plus the amount by which the Laplacian is outside of its bounds, relative to their size.
 
-        at_y: the samples at y. h: (n,) the spacing of central differences of the gradient, from
-            which the Laplacian is computed; their error is estimated from the spacing 2h."""
+        bound: the promise.
+        at_y: the samples at y.
+        h: (n,) the spacing of central differences of the gradient, from which the Laplacian is
+            computed; their error is estimated from the spacing 2h.
+        """
         fine, wide = np.zeros(len(y)), np.zeros(len(y))
         rounding = 4 * at_y.gradient_error / h
         for axis in range(3):
@@ -497,6 +545,7 @@ class _ViolationSearch:
                 fine += weight * rate[:, axis] / (2 * h)
                 wide += wide_weight * rate[:, axis] / (2 * h)
         slope = np.linalg.norm(at_y.gradient, axis=1)
+        # The rounding of gradients and coordinates, and the estimated error of the differences.
         rounding += 1e-11 * slope * (1 + np.abs(y).max(axis=1) / h) / h + np.abs(fine - wide)
         excess = np.maximum(bound.laplacian_lower - fine, fine - bound.laplacian_upper) - rounding
         scale = np.abs(bound.laplacian_lower) + np.abs(bound.laplacian_upper) + 1e-300
@@ -506,11 +555,13 @@ class _ViolationSearch:
 def _slope_ratio(
     promise: HarmonicBall, at_y: FieldSamples, margin: FloatArray, gap: FloatArray
 ) -> FloatArray:
-    """The ratio (k,) of |grad f(y)| to the largest value that it can have if f is harmonic on the
-    ball and within its range there.
+    """The violation ratio (k,) of a promise that f is harmonic on a ball, from its gradient: |grad
+    f(y)| relative to the largest value that it can have if f is harmonic on the ball and within its
+    range there.
 
+    promise: the promise, a ball with a range of f.
     at_y: the samples at points y of the balls.
-    margin: (k,) the distances of the points from the border of their ball.
+    margin: (k,) the distances of the points y from the border of their ball.
     gap: (k,) the differences between f(y) and the nearer end of its range.
 
     Proof. f - lower is positive and harmonic on the ball of radius `margin` about y. So by

@@ -1,4 +1,6 @@
-"""Finds first hits and crossings of rays with level sets; every step along a ray is proved."""
+"""Finds first hits and crossings of rays with level sets of a function: the points at which it
+takes a given value. Every step along a ray is proved.
+"""
 
 from __future__ import annotations
 

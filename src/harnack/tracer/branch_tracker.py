@@ -71,8 +71,8 @@ class BranchReading(LevelReading):
 
 @dataclass(frozen=True)
 class BranchTracker:
-    """A `LevelRule` for samples that give f only modulo 1: it finds the branch, the integer that has
-    to be added. f is the winding number of a mesh, and it jumps by integers at facets (triangles).
+    """A `LevelRule` for samples that give f only modulo 1. It finds the branch, the integer that has
+    to be added. f is the winding number of a mesh, and jumps by integers at facets (triangles).
 
     levels: the true levels, at which rays hit. The periodic levels are all numbers that differ from
         a true level by an integer.
@@ -120,9 +120,7 @@ class BranchTracker:
         error = value_error_bound(ray_sample.sample, gradient_norm, size)
         ray_sample, is_sure = self.resolve(ray_sample, before, step, error)
         plain = read_plainly(self.levels, ray_sample, size)
-        gaps, passes, needs = self.gaps(
-            ray_sample.sample, is_modulo, is_sure, plain.total_error
-        )
+        gaps, passes, needs = self.gaps(ray_sample.sample, is_modulo, is_sure, plain.total_error)
         return BranchReading(
             ray_sample, gradient_norm, gaps, plain.nearest_gap, plain.total_error, passes, needs
         )
@@ -186,22 +184,22 @@ class BranchTracker:
         total_error: a bound of the error of the sampled f.
 
         Mostly the differences are those to the neighboring periodic levels (numbers that differ
-        from a true level by an integer). On some rays, in `passes`, they are those to the
+        from a true level by an integer). On some rays, in `passes_level`, they are those to the
         neighboring true levels: where the nearest periodic level is close and is no true level, or
         where the error of f is large.
 
-        The first mask returned holds the rays in `passes` whose sample was given with its branch.
-        The second holds the rays whose point has to be sampled again with the branch.
+        The first mask returned holds the rays in `passes_level` whose sample was given with its
+        branch. The second holds the rays whose point has to be sampled again with the branch.
 
         A ray passes a periodic level that is no true level by samples with known branch. A step
         from such a sample may cross that level, so the next sample needs a known branch, too.
         """
         periodic, true = self._periodic_levels.gaps(sample.value), self.levels.gaps(sample.value)
         near = fmax(2 * total_error, _NEAR_LEVEL)
-        passes = (periodic.nearest < near) & (periodic.nearest < 0.5 * true.nearest)
+        passes_level = (periodic.nearest < near) & (periodic.nearest < 0.5 * true.nearest)
         # Written so that an error that is NaN counts as large.
-        passes |= ~(total_error < _MAX_ERROR)
-        down = dr.select(passes, true.below, periodic.below)
-        up = dr.select(passes, true.above, periodic.above)
-        unsure = passes | (~is_sure & (periodic.nearest < 2 * total_error))
-        return LevelGaps(down, up), passes & ~is_modulo, unsure & is_modulo
+        passes_level |= ~(total_error < _MAX_ERROR)
+        down = dr.select(passes_level, true.below, periodic.below)
+        up = dr.select(passes_level, true.above, periodic.above)
+        unsure = passes_level | (~is_sure & (periodic.nearest < 2 * total_error))
+        return LevelGaps(down, up), passes_level & ~is_modulo, unsure & is_modulo

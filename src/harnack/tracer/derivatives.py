@@ -73,13 +73,11 @@ def needs_derivatives(prepared: SurfaceTracer, o: Vec3, d: Vec3) -> bool:
 class _NoDerivative(dr.CustomOp):
     """The identity, as a Dr.Jit operation, for a result whose derivative is not known. In reverse
     mode its derivative raises an error. Forward mode goes from parameters to all that depends on
-    them, needed or not, so the derivative is NaN there.
-    """
+    them, needed or not, so the derivative is NaN there."""
 
     def eval(self, value: Any, result_name: str, sources: list[Any]) -> Any:
         """Return `value`, and keep its name for the message. sources: the arrays on which it
-        depends.
-        """
+        depends."""
         del sources
         self._result_name = result_name
         return value
@@ -125,26 +123,26 @@ def attach_derivatives(
     derivative, which would need the Hessian. At hits on facets, t is exact already and does not
     depend on the level.
     """
-    t, hit, prepared = end.t, end.status == int(RayStatus.HIT), prepared.hit_surface(end)
+    t, is_hit, prepared = end.t, end.status == int(RayStatus.HIT), prepared.hit_surface(end)
     if prepared.field.has_jumps:
         t = _on_plane(prepared, o, d, end)
-        hit &= ~end.at_jump
+        is_hit &= ~end.at_jump
     backend = prepared.backend
     with dr.suspend_grad():
-        t_hit = dr.select(hit, t, 0)
+        t_hit = dr.select(is_hit, t, 0)
         origin, direction = dr.detach(o), dr.detach(d)
         steps = _NEWTON_STEPS
         if prepared.field.has_variable_accuracy:
             # Truncation is as large as the tolerance, and its derivative may be much larger.
             steps = _NEWTON_STEPS_OF_SUMS
-            detail = dr.select(hit, backend.Float(EXACT), 0)
+            detail = dr.select(is_hit, backend.Float(EXACT), 0)
             prepared = replace(prepared, field=prepared.field.at_accuracy(detail))
         for _ in range(steps):
             x = dr.fma(backend.Array3f(t_hit), direction, origin)
             sample = prepared.sample(x)
             offset = prepared.levels.offset_to_nearest(sample.value)
             slope = dr.dot(sample.gradient, direction)
-            step = dr.select(hit & (slope != 0), offset / slope, 0)
+            step = dr.select(is_hit & (slope != 0), offset / slope, 0)
             # A grazing ray may have no root to converge to; stay near the proved point.
             limit = 4 * prepared.tolerance.distance
             t_hit = t_hit + dr.clip(step, -limit, limit)
@@ -152,7 +150,7 @@ def attach_derivatives(
         sample = prepared.sample(x)
         slope = dr.dot(sample.gradient, direction)
         length = norm(sample.gradient)
-        normal = dr.select(hit & (length > 0), sample.gradient / length, normal)
+        normal = dr.select(is_hit & (length > 0), sample.gradient / length, normal)
         dr.eval(t_hit, x, slope, normal)
     point = dr.fma(backend.Array3f(t_hit), d, o)
     # x is the same point without derivatives.
@@ -162,13 +160,12 @@ def attach_derivatives(
         value = prepared.field.differentiable_value(point)
         change = value - dr.detach(value)
     change = change - _change_of_nearest(prepared, sample.value)
-    return dr.select(hit, _with_derivative(t_hit, change, slope, hit), t), normal
+    return dr.select(is_hit, _with_derivative(t_hit, change, slope, is_hit), t), normal
 
 
 def _on_plane(prepared: SurfaceTracer, o: Vec3, d: Vec3, end: MarchResult) -> Real:
     """Return the ray parameters t. At hits on facets, they have the derivative of the intersection
-    with the facet's plane.
-    """
+    with the facet's plane."""
     with dr.suspend_grad():
         t_hit = dr.select(end.at_jump, end.t, 0)
         slope = dr.dot(end.gradient, dr.detach(d))
@@ -189,8 +186,7 @@ def _with_derivative(t: Real, change: Real, slope: Real, is_attached: Mask) -> R
 
 def _change_of_nearest(prepared: SurfaceTracer, f: Real) -> Real:
     """Return level - detach(level) for the level nearest to f on each lane: a zero that carries the
-    derivative of this level.
-    """
+    derivative of this level."""
     nearest, change = dr.inf, prepared.backend.Float(0)
     for level in prepared.levels.values:
         with dr.suspend_grad():

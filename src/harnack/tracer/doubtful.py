@@ -103,8 +103,7 @@ def seen_distance(backend: Backend, field: Field, levels: Levels, hits: Doubtful
 
     def offset_of(sample: Any) -> tuple[Real, Real, Mask]:
         """Return f minus the level, the bound of its error, and whether it is certain on which side
-        of the level f is.
-        """
+        of the level f is."""
         offset, error = (
             sample.value - level,
             value_error_bound(sample, safe_norm(sample.gradient), hits.size),
@@ -129,8 +128,7 @@ def seen_distance(backend: Backend, field: Field, levels: Levels, hits: Doubtful
 
     def sample_once(now: _SearchState) -> _SearchState:
         """Take one more sample: in the next of six directions, or at the point at which f may turn
-        back. Returns the state after it.
-        """
+        back. Returns the state after it."""
         direction = dr.select(
             now.way < 2, hits.normal, dr.select(now.way < 4, first_axis, second_axis)
         )
@@ -143,14 +141,14 @@ def seen_distance(backend: Backend, field: Field, levels: Levels, hits: Doubtful
         first_slope = side * dr.dot(at_hit.gradient, direction)
         is_seen = (above & below) | (now.searches & (dr.abs(offset) <= error))
         # Does f turn back from the level in this direction?
-        turns = now.may_turn & ~now.searches & (now.way < 2)
-        turns &= (first_slope < 0) & (slope > sample.gradient_error)
+        is_turning = now.may_turn & ~now.searches & (now.way < 2)
+        is_turning &= (first_slope < 0) & (slope > sample.gradient_error)
         # The part of the interval in which the slope changes sign is kept.
         is_low = now.searches & (slope < 0)
-        is_high = turns | (now.searches & ~is_low)
-        low = dr.select(turns, 0, dr.select(is_low, length, now.low))
+        is_high = is_turning | (now.searches & ~is_low)
+        low = dr.select(is_turning, 0, dr.select(is_low, length, now.low))
         high = dr.select(is_high, length, now.high)
-        goes_on = turns | (now.searches & (high - low > smallest))
+        goes_on = is_turning | (now.searches & (high - low > smallest))
         keeps_way = goes_on & ~is_seen
         # Next direction; after the last one, the distance grows.
         way_index = dr.select(keeps_way, now.way, (now.way + 1) % _DIRECTION_COUNT)
@@ -163,7 +161,7 @@ def seen_distance(backend: Backend, field: Field, levels: Levels, hits: Doubtful
             below=below,
             low=low,
             high=high,
-            low_slope=dr.select(turns, first_slope, dr.select(is_low, slope, now.low_slope)),
+            low_slope=dr.select(is_turning, first_slope, dr.select(is_low, slope, now.low_slope)),
             high_slope=dr.select(is_high, slope, now.high_slope),
             searches=keeps_way,
             may_turn=now.may_turn & ~(now.searches & ~goes_on),
@@ -184,8 +182,7 @@ def seen_distance(backend: Backend, field: Field, levels: Levels, hits: Doubtful
 def _turning_point(now: _SearchState) -> Real:
     """Return the length along the gradient at which f may turn back from the level: by the secant
     through the slopes at `low` and `high`, and by bisection, in turns. If the secant leaves the
-    interval, it is halved.
-    """
+    interval, it is halved."""
     fraction = now.low_slope / (now.low_slope - now.high_slope)
     by_secant = ((now.sample_count & 1) == 0) & (fraction > 0) & (fraction < 1)
     return dr.fma(dr.select(by_secant, fraction, 0.5), now.high - now.low, now.low)

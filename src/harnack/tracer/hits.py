@@ -60,7 +60,8 @@ _DOUBT_FRACTION, _DOUBT_ROUNDINGS, _SHEET_COUNT, _SEARCH_TOLERANCES = 0.5, 64, 3
 
 @dataclass(frozen=True)
 class Hits:
-    """How n rays ended, as NumPy arrays or, if the rays were Dr.Jit arrays or tensors, as these.
+    """How n rays o + t d ended, as NumPy arrays or, if the rays were Dr.Jit arrays or tensors, as
+    these. f is the function of the field, and the surface is where f takes the level.
 
     is_hit: (n,) mask of rays that hit. Rays that ran out of steps have a finite t as well, so
         `isfinite(t)` is no such mask.
@@ -128,7 +129,8 @@ def trace(
     options: TraceOptions | None = None,
     **keywords: Unpack[TraceKeywords],
 ) -> Hits:
-    """First hits of rays with a level set of a field. No hit is missed: every step is proved.
+    """Find the first hits of rays with a level set of a field's function f: the points at which f
+    takes a given value, the level. No hit is missed: every step is proved.
 
     surface: a field; or a `Surface`, with its levels, clip, section and largest component. A
         `Surface` with a `side` raises an error: the faces of a solid where its clip cuts it are no
@@ -143,7 +145,7 @@ def trace(
         place of `options`: `trace(field, o, d, level=2.0, tolerance=1e-6)`.
 
     Arrays of float64 are traced in double precision and give such arrays, other arrays in single
-    precision, unless `precision` says otherwise. To find further crossings behind the first hit,
+    precision, unless `precision` says otherwise. To find further crossings beyond the first hit,
     use `crossings`.
 
     With Dr.Jit rays, t and position carry derivatives with respect to rays, level, and vertices of
@@ -157,11 +159,11 @@ def trace(
     proved for Dr.Jit's own backends only. So at each call up to 4,096 of the rays are traced by
     Dr.Jit, too, and the results of the device must agree.
 
-    On processors, if there are at least 4,096 rays and successive rays differ much, rays are traced
-    by few lanes that share a queue, unless samples are cheap (`Field.is_cheap`). This gives the
-    same hits, bit by bit, in about half the time. If only the `largest` component is traced, a ray
-    is out of steps if it starts so far away that its coordinates are rounded by more than a small
-    part of a cell.
+    On CPUs, if there are at least 4,096 rays and successive rays differ much, rays are traced by
+    few lanes that share a queue, unless evaluations of f are cheap (`Field.is_cheap`). This gives
+    the same hits, bit by bit, in about half the time. If only the `largest` component is traced, a
+    ray is out of steps if it starts so far away that its coordinates are rounded by more than a
+    small part of a cell.
 
     Raises:
         TypeError, ValueError: shapes that do not match, NaN, directions of length zero, an empty or
@@ -194,18 +196,19 @@ def _as_tensors(hits: Hits) -> Hits:
 
 def _trace(surface: TracedSurface, rays: RayBatch) -> Hits:
     """Trace rays, and return their hits as Dr.Jit arrays. The arrays carry derivatives if the rays
-    were given as Dr.Jit arrays, and rays, levels or field have derivatives enabled.
-    """
+    were given as Dr.Jit arrays, and rays, levels or field have derivatives enabled."""
     backend, o, d, count = rays.backend, rays.origin, rays.direction, rays.count
     prepared = surface.for_rays(count).prepare(backend, many_rays=count >= _MIN_RAYS_FOR_CELLS)
     if not prepared.field.is_cheap and _are_scattered(backend, dr.detach(o), dr.detach(d)):
         prepared = replace(prepared, uses_ray_queue=True)
+    # The trace itself has no derivatives; they are attached to its results.
     with dr.suspend_grad():
         end, hits, doubt = _first_hits(prepared, *(dr.detach(array) for array in rays.arrays))
         if doubt is not None:
             hits = _with_searched_distances(prepared, hits, doubt)
     if not rays.is_numpy and needs_derivatives(prepared, o, d):
         t, normal = attach_derivatives(prepared, o, d, end, hits.normal)
+        # Results without a known derivative raise an error if it is used.
         normal, value, uncertainty = (
             refuse_derivative(prepared, o, d, name, array)
             for name, array in (
@@ -239,8 +242,7 @@ def _are_scattered(backend: Backend, o: Vec3, d: Vec3) -> bool:
 
     def gather(rays: Vec3, rows: Any) -> FloatArray:
         """Return the vectors (n, 3) of the rays with the indices `rows`. A single vector belongs to
-        all rays.
-        """
+        all rays."""
         index = rows if dr.width(rays) > 1 else 0 * rows
         return to_numpy(dr.gather(backend.Array3f, rays, index)).astype(np.float64)
 
@@ -265,19 +267,19 @@ def _first_hits(
     """
     backend = prepared.backend
     end = prepared.first_hit(o, d, near, far)
-    hit = end.status == int(RayStatus.HIT)
+    is_hit = end.status == int(RayStatus.HIT)
     length = norm(end.gradient)
-    normal = dr.select(hit & (length > 0), end.gradient / length, 0)
+    normal = dr.select(is_hit & (length > 0), end.gradient / length, 0)
     index = dr.full(backend.Int32, -1, dr.width(end.status))
     if prepared.field.has_jumps:
         index = dr.reinterpret_array(backend.Int32, end.facet)  # NO_FACET becomes -1
     if end.patch is not None:
         index = dr.reinterpret_array(backend.Int32, end.patch)
-    smooth = hit & ~end.at_jump
+    is_smooth_hit = is_hit & ~end.at_jump
     # Where the gradient is NaN its length has no bound (`tracer.steep`).
     # Rounding adds the length excess / |grad f| to the distance of the surface.
-    uncertain = smooth & (end.tolerance_excess > 0) & (length == length)
-    uncertainty = dr.select(uncertain, end.tolerance_excess / length, 0)
+    is_uncertain = is_smooth_hit & (end.tolerance_excess > 0) & (length == length)
+    uncertainty = dr.select(is_uncertain, end.tolerance_excess / length, 0)
     doubt = None
     # Other hits are at a root, or were tested on the other side of the level.
     if end.side is None and not prepared.field.is_steep:
@@ -344,8 +346,7 @@ class _SearchedHits:
 @dataclass(frozen=True)
 class _SearchDistance:
     """The distance from a hit within which the surface was found, as a dataclass for
-    `compute_on_active`.
-    """
+    `compute_on_active`."""
 
     length: Real
 
@@ -419,8 +420,7 @@ def _trace_on_device(surface: TracedSurface, rays: RayBatch) -> Hits:
 
     def differences(rows: IntArray, expected: Arrays, computed: Arrays) -> str:
         """Return a message on how the device's hits of some rays differ from the expected ones; ""
-        if they agree. rows: the indices of these rays.
-        """
+        if they agree. rows: the indices of these rays."""
         pair = Hits(**expected), Hits(**computed)
         return _compare_hits(*pair, directions[rows], surface.hit_tolerance)
 
@@ -461,8 +461,8 @@ def _compare_hits(
     normal = cast("FloatArray", np.where(expected.is_hit[:, None], expected.normal, actual.normal))
     cosine = np.abs((normal * directions).sum(axis=1))
     differs = expected.status != actual.status
-    unproved = np.maximum(expected.status, actual.status) == int(RayStatus.OUT_OF_STEPS)
-    may_differ = unproved | (hit & (cosine < _GRAZING))
+    is_undecided = np.maximum(expected.status, actual.status) == int(RayStatus.OUT_OF_STEPS)
+    may_differ = is_undecided | (hit & (cosine < _GRAZING))
     if (differs & ~may_differ).any() or differs.sum() > _MAX_OUTLIERS * len(differs):
         k = int(np.flatnonzero(differs)[0])
         return (

@@ -46,8 +46,8 @@ class JumpTraceState:
     """The state of rays through a function f with jumps at facets (triangles), between two
     intervals of the march.
 
-    offset: the offset of f from its continuous part (a whole number for a winding number): that at
-        the start of the ray (`Field.initial_offset`) plus all jumps since.
+    offset: a number from which the field makes f on an interval (`Field.continuation`): that at the
+        start of the ray (`Field.initial_offset`) plus all jumps since.
     behind: the crossing of a facet that was passed last.
     march: the state of the march.
     reported_facet: for rays that look for crossings of the level, the index of the facet that is
@@ -201,8 +201,8 @@ class JumpTracer:
         passed = active & has_facet & (now.status == int(RayStatus.MISS))
         if now.contact is not None:
             return self._after_jump(outer, now, ahead, last, passed, active & has_facet)
-        spent = passed & (now.evaluations >= self.march.max_steps)
-        status = dr.select(spent, out_of_steps, now.status)
+        used_all_steps = passed & (now.evaluations >= self.march.max_steps)
+        status = dr.select(used_all_steps, out_of_steps, now.status)
         # Of several facets at a point, a hit reports `ahead`; a ray that passes goes on from
         # `last`.
         crossing = JumpCrossing(
@@ -214,7 +214,7 @@ class JumpTracer:
         return JumpTraceState(
             dr.select(passed, outer.offset + ahead.jump, outer.offset),
             crossing,
-            dataclasses.replace(now, status=status, active=passed & ~spent),
+            dataclasses.replace(now, status=status, active=passed & ~used_all_steps),
         )
 
     def _after_jump(
@@ -237,9 +237,12 @@ class JumpTracer:
         passed: mask of rays that have passed the facet without crossing the level.
         stopped: mask of rays whose interval ends at a facet.
         """
-        spent = passed & (now.evaluations >= self.march.max_steps)
-        status = dr.select(spent, self.backend.UInt32(int(RayStatus.OUT_OF_STEPS)), now.status)
+        used_all_steps = passed & (now.evaluations >= self.march.max_steps)
+        status = dr.select(
+            used_all_steps, self.backend.UInt32(int(RayStatus.OUT_OF_STEPS)), now.status
+        )
         is_past = passed | (stopped & (now.status == HIT_AT_JUMP))
+        # Rays that are past the facet go on from the last merged crossing.
         behind = JumpCrossing(
             dr.select(is_past, last.t, previous.behind.t),
             dr.select(is_past, last.facet, previous.behind.facet),
@@ -249,7 +252,7 @@ class JumpTracer:
         return JumpTraceState(
             dr.select(is_past, previous.offset + ahead.jump, previous.offset),
             behind,
-            dataclasses.replace(now, status=status, active=passed & ~spent),
+            dataclasses.replace(now, status=status, active=passed & ~used_all_steps),
             dr.select(is_past, ahead.facet, previous.reported_facet),
         )
 
@@ -280,6 +283,7 @@ class JumpTracer:
         tolerance = _COINCIDENT_ROUNDINGS * self.backend.machine_epsilon * (size + first.t)
         # A rounding across the facet is a length of rounding / sine along the ray.
         sine = fmax(dr.abs(dr.dot(first.normal, self.path.direction)), real(_MIN_SINE))
+        # Further crossings up to this t may be at the same point.
         limit = fmax(fmin(first.t + tolerance / sine, self.end), first.t)
 
         def add_next(now: _CoincidentJumps) -> _CoincidentJumps:
@@ -288,20 +292,23 @@ class JumpTracer:
                 JumpCrossing(now.t, now.last, 0.0, first.normal), limit, now.active
             )
             # Facets at an angle to each other are merged only at exactly the same t.
-            parallel = dr.abs(dr.dot(crossing.normal, first.normal)) > _MIN_COSINE
-            same = now.active & (crossing.facet != NO_FACET) & ((crossing.t == first.t) | parallel)
-            new_up = same & (crossing.jump > 0) & (now.up == NO_FACET)
-            new_down = same & (crossing.jump < 0) & (now.down == NO_FACET)
+            is_parallel = dr.abs(dr.dot(crossing.normal, first.normal)) > _MIN_COSINE
+            is_same_point = (
+                now.active & (crossing.facet != NO_FACET) & ((crossing.t == first.t) | is_parallel)
+            )
+            new_up = is_same_point & (crossing.jump > 0) & (now.up == NO_FACET)
+            new_down = is_same_point & (crossing.jump < 0) & (now.down == NO_FACET)
             return _CoincidentJumps(
-                jump=now.jump + dr.select(same, crossing.jump, 0),
-                t=dr.select(same, crossing.t, now.t),
-                last=dr.select(same, crossing.facet, now.last),
+                jump=now.jump + dr.select(is_same_point, crossing.jump, 0),
+                t=dr.select(is_same_point, crossing.t, now.t),
+                last=dr.select(is_same_point, crossing.facet, now.last),
                 up=dr.select(new_up, crossing.facet, now.up),
                 down=dr.select(new_down, crossing.facet, now.down),
                 normal_up=dr.select(new_up, crossing.normal, now.normal_up),
                 normal_down=dr.select(new_down, crossing.normal, now.normal_down),
-                folded=now.folded | (same & parallel & (crossing.jump * first.jump < 0)),
-                active=same,
+                folded=now.folded
+                | (is_same_point & is_parallel & (crossing.jump * first.jump < 0)),
+                active=is_same_point,
             )
 
         no_facet = count(NO_FACET)
@@ -317,25 +324,26 @@ class JumpTracer:
             active=self.backend.Bool(active) & (first.facet != NO_FACET),
         )
         total = loop_while_active(start, add_next, "together")
+        # The first facet whose jump has the sign of the sum gives index and normal.
         up, down = total.jump > 0, total.jump < 0
         facet = dr.select(up, total.up, dr.select(down, total.down, first.facet))
         normal = dr.select(up, total.normal_up, dr.select(down, total.normal_down, first.normal))
         behind = JumpCrossing(total.t, total.last, first.jump, first.normal)
-        unclear = total.folded & (total.jump == 0)
-        unclear &= tolerance > _COARSE_FRACTION * (self.end - self.start)
-        return JumpCrossing(first.t, facet, real(total.jump), normal), behind, unclear
+        is_unclear = total.folded & (total.jump == 0)
+        # Only where rounding is no small part of the ray.
+        is_unclear &= tolerance > _COARSE_FRACTION * (self.end - self.start)
+        return JumpCrossing(first.t, facet, real(total.jump), normal), behind, is_unclear
 
     def _next(self, behind: JumpCrossing, end: Real, active: Mask) -> JumpCrossing:
         """Return the next crossing of a facet after the crossing `behind`, as arrays of this
-        backend. If there is none up to the parameter `end`, its t is inf and its facet NO_FACET.
-        """
+        backend. If there is none up to the parameter `end`, its t is inf and its facet NO_FACET."""
         real, vector, count = self.backend.Float, self.backend.Array3f, self.backend.UInt32
         ahead = self.field.next_jump(self.path.origin, self.path.direction, behind, end, active)
-        valid = real(ahead.t) <= end
-        valid &= count(ahead.facet) != NO_FACET
+        is_valid = real(ahead.t) <= end
+        is_valid &= count(ahead.facet) != NO_FACET
         return JumpCrossing(
-            dr.select(valid, real(ahead.t), dr.inf),
-            dr.select(valid, count(ahead.facet), count(NO_FACET)),
-            dr.select(valid, real(ahead.jump), 0),
+            dr.select(is_valid, real(ahead.t), dr.inf),
+            dr.select(is_valid, count(ahead.facet), count(NO_FACET)),
+            dr.select(is_valid, real(ahead.jump), 0),
             vector(*ahead.normal),
         )

@@ -81,8 +81,7 @@ def _build_cells(
     field: Field, levels: tuple[float, ...], volume: Volume, solid: _Ends | None, across: int
 ) -> OccupancyGrid:
     """Compute the cells of `largest_component_cells`, which describes the parameters. There is no
-    marked cell if the volume is empty or a single point.
-    """
+    marked cell if the volume is empty or a single point."""
     distance_beyond = _distance_beyond(volume)
     project_to_domain = _projection_to_domain(field)
     in_solid = None if solid is None else _inside_solid(field, solid)
@@ -91,18 +90,17 @@ def _build_cells(
     def clearance(points: FloatArray) -> FloatArray:
         """Return lower bounds (n,) of the distances of points (n, 3) from the level set, or from
         the volume if that is farther; 0 inside the solid. They hold also for points outside the
-        field's domain.
-        """
+        field's domain."""
         clearances = np.maximum(distance_beyond(points), 0.0)
         inner, distances = project_to_domain(points)
-        finite = np.isfinite(distances)
-        if not finite.any():
+        is_finite = np.isfinite(distances)
+        if not is_finite.any():
             return clearances
-        length = distance_to_levels(inner[finite]) - distances[finite]
+        length = distance_to_levels(inner[is_finite]) - distances[is_finite]
         if in_solid is not None:
-            length[in_solid(inner[finite])] = 0.0
+            length[in_solid(inner[is_finite])] = 0.0
         # Both are lower bounds for the part of the surface in the volume, so the larger one holds.
-        clearances[finite] = np.maximum(clearances[finite], length)
+        clearances[is_finite] = np.maximum(clearances[is_finite], length)
         return clearances
 
     lower, upper = (np.array(end, np.float64) for end in volume.bounds())
@@ -118,18 +116,18 @@ def _refuse_if_unproved(
 ) -> None:
     """Raise ValueError if most of the marked cells have centers far from the surface, to first
     order: |f - level| > 4 |grad f| cell sizes. Centers in the solid or outside the domain do not
-    count as far.
-    """
+    count as far."""
     centers = cells.occupied_centers()
     if field.domain is not None:
         centers = centers[field.domain.contains_points(centers)]
     if not len(centers):
         return
     gap, slope, value = _samples(field, levels)(centers)
-    far = gap > _FAR_CELLS * cells.cell_size * slope
+    # To first order the surface is gap/slope away.
+    is_far = gap > _FAR_CELLS * cells.cell_size * slope
     if solid is not None:
-        far &= ~((value >= solid[0]) & (value <= solid[1]))
-    if far.sum() > _MAX_FAR_FRACTION * len(far):
+        is_far &= ~((value >= solid[0]) & (value <= solid[1]))
+    if is_far.sum() > _MAX_FAR_FRACTION * len(is_far):
         raise ValueError(
             f"largest: with {round(max(cells.shape))} cells along the longest side, most cells of "
             f"this {type(field).__name__} could not be proved empty, so that its components cannot "
@@ -151,15 +149,14 @@ def _projection_to_domain(field: Field) -> Callable[[FloatArray], tuple[FloatArr
 
     def project(points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return points (n, 3) in the domain near the given ones, and the distances (n,) between
-        the two.
-        """
+        the two."""
         distances = np.zeros(len(points))
         if domain is None or prepared is None:
             return points, distances
-        outside = ~domain.contains_points(points)
-        if not outside.any():
+        is_outside = ~domain.contains_points(points)
+        if not is_outside.any():
             return points, distances
-        points_outside = points[outside]
+        points_outside = points[is_outside]
         uploaded = to_vector3(backend, points_outside)
         # A little farther than the boundary, because of rounding.
         depth = (1 + 1e-9) * to_numpy(prepared.signed_distance(uploaded)) + 1e-12 * np.abs(
@@ -167,10 +164,10 @@ def _projection_to_domain(field: Field) -> Callable[[FloatArray], tuple[FloatArr
         ).max()
         moved = points_outside - depth[:, None] * to_numpy(prepared.outward_normal(uploaded))
         inner = points.copy()
-        inner[outside] = moved
+        inner[is_outside] = moved
         # Rounded up, so that the distance is an upper bound.
         length = 1.000001 * np.linalg.norm(points_outside - moved, axis=1)
-        distances[outside] = np.where(domain.contains_points(moved), length, np.inf)
+        distances[is_outside] = np.where(domain.contains_points(moved), length, np.inf)
         return inner, distances
 
     return project
@@ -178,15 +175,13 @@ def _projection_to_domain(field: Field) -> Callable[[FloatArray], tuple[FloatArr
 
 def _distance_beyond(volume: Volume) -> Callable[[FloatArray], FloatArray]:
     """Return a function of points (n, 3) that returns lower bounds (n,) of their distances from the
-    volume; they are negative inside the volume.
-    """
+    volume; they are negative inside the volume."""
     backend = choose_backend("double")
     prepared = volume.prepare(backend)
 
     def beyond(points: FloatArray) -> FloatArray:
         """Return lower bounds (n,) of the distances of points (n, 3) from the volume, with a margin
-        for rounding.
-        """
+        for rounding."""
         distance = to_numpy(prepared.signed_distance(to_vector3(backend, points)))
         rounding = 64 * float(np.finfo(np.float64).eps) * (1 + float(np.abs(points).max()))
         return np.broadcast_to(distance, len(points)) - rounding
@@ -198,16 +193,14 @@ def _samples(
     field: Field, levels: tuple[float, ...]
 ) -> Callable[[FloatArray], tuple[FloatArray, FloatArray, FloatArray]]:
     """Return a function of points (n, 3) that returns three arrays (n,): the differences between f
-    and the nearest level, |grad f|, and f.
-    """
+    and the nearest level, |grad f|, and f."""
     backend = choose_backend("double")
     prepared = field.prepare(backend)
     targets = Levels(tuple(dr.opaque(backend.Float, level) for level in levels), field.period)
 
     def samples(points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return the difference between f and the nearest level, |grad f|, and f, each (n,), at
-        points (n, 3).
-        """
+        points (n, 3)."""
         sample = prepared.evaluate(to_vector3(backend, points))
         arrays = (targets.gaps(sample.value).nearest, safe_norm(sample.gradient), sample.value)
         gap, slope, value = (np.broadcast_to(to_numpy(array), len(points)) for array in arrays)
@@ -218,8 +211,7 @@ def _samples(
 
 def _inside_solid(field: Field, solid: _Ends) -> Callable[[FloatArray], BoolArray]:
     """Return a function of points (n, 3) that returns the mask (n,) of points with low <= f <=
-    high, where solid = (low, high).
-    """
+    high, where solid = (low, high)."""
     backend = choose_backend("double")
     prepared = field.prepare(backend)
 

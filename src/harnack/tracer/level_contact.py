@@ -91,8 +91,7 @@ class HitTolerance:
 
     def prepare(self, backend: Backend) -> PreparedHitTolerance:
         """Return this tolerance as Dr.Jit numbers of a backend that kernels take as parameters. So
-        another tolerance compiles no new kernel.
-        """
+        another tolerance compiles no new kernel."""
         numbers = (self.distance, self.per_length, self.value)
         return PreparedHitTolerance(*(dr.opaque(backend.Float, number) for number in numbers))
 
@@ -112,7 +111,8 @@ class PreparedHitTolerance:
     value: Real
 
     def value_tolerance(self, gradient_norm: Real, t: Real) -> Real:
-        """The largest |f - level| at a hit at ray parameter t, where |grad f| = gradient_norm."""
+        """Return the largest |f - level| at a hit at ray parameter t, where |grad f| =
+        gradient_norm."""
         return fmax(gradient_norm * dr.fma(t, self.per_length, self.distance), self.value)
 
 
@@ -277,7 +277,7 @@ class Hysteresis:
     levels: all levels.
     spacing: the difference between the two closest levels; inf for a single level.
     is_free_before, is_free_after: whether the extent of the surface proves that the ray meets no
-        level before the interval that is marched, and behind it. Then f stays on one side of each
+        level before the interval that is marched, and after it. Then f stays on one side of each
         level there, and at that end of the interval it need differ from the level by no more than
         its error.
     start: the ray parameter at which the interval begins.
@@ -334,7 +334,7 @@ class Hysteresis:
         """Make the rule for given levels, and compute their spacing.
 
         free: the masks `is_free_before` and `is_free_after` of the class: whether no level lies on
-            the ray before and behind the interval that is marched.
+            the ray before and after the interval that is marched.
         start, rounding: as in the class.
         """
         period = levels.period
@@ -427,47 +427,48 @@ class Hysteresis:
         accepted: that point.
 
         A crossing is counted where f is on the other side of the level than the ray came from, by
-        more than half the band and more than the error of f. A contact begins at a point that is
+        more than half the band and more than the error of f. (At an end of the interval beyond
+        which no level lies, more than the error is enough.) A contact begins at a point that is
         near enough for a hit, and ends where f is farther from the level than the band. Inactive
         rays keep their contact.
         """
         # f minus the nearest level: positive on the side of larger values.
         offset = -self.levels.offset_to_nearest(accepted.value)
-        touching = now.is_touching
-        side = dr.select(touching, now.side, self._side(now, accepted, offset))
+        was_touching = now.is_touching
+        side = dr.select(was_touching, now.side, self._side(now, accepted, offset))
 
         # The root, if f has changed sides since the last point.
         t, value, slope, gradient = accepted.before
         offset_before = -self.levels.offset_to_nearest(value)
-        passes = active & touching & (side * offset_before > 0) & (side * offset <= 0)
+        changes_side = active & was_touching & (side * offset_before > 0) & (side * offset <= 0)
         fraction = cubic_root(
             offset_before, offset, (accepted.t - t) * slope, (accepted.t - t) * accepted.slope
         )
-        begins = active & ~touching & accepted.is_near
+        begins = active & ~was_touching & accepted.is_near
         root = dr.select(
-            passes, t + fraction * (accepted.t - t), dr.select(begins, accepted.t, now.root)
+            changes_side, t + fraction * (accepted.t - t), dr.select(begins, accepted.t, now.root)
         )
         at_root = dr.select(begins, accepted.gradient, now.gradient)
-        at_root = dr.select(passes, dr.lerp(gradient, accepted.gradient, fraction), at_root)
-        excess = dr.select(passes | begins, accepted.excess, now.tolerance_excess)
-        before = dr.select(passes, t, dr.select(begins, accepted.t, now.before))
-        after = dr.select(passes | begins, accepted.t, now.after)
+        at_root = dr.select(changes_side, dr.lerp(gradient, accepted.gradient, fraction), at_root)
+        excess = dr.select(changes_side | begins, accepted.excess, now.tolerance_excess)
+        before = dr.select(changes_side, t, dr.select(begins, accepted.t, now.before))
+        after = dr.select(changes_side | begins, accepted.t, now.after)
 
         # Is f far enough beyond the level to have crossed it, or has it left the band?
-        is_first = (now.side == 0) & ~touching
+        is_first = (now.side == 0) & ~was_touching
         # At a free end of the interval f cannot come back, so there f need differ from the level by
         # no more than its error.
         stays_on_side = (is_first & self.is_free_before) | (accepted.is_end & self.is_free_after)
         least_offset = dr.select(stays_on_side, 0, _CROSSED_FRACTION * accepted.band)
         is_off = dr.abs(offset) > fmax(least_offset, accepted.total_error)
-        crosses = active & touching & is_off & (side * offset < 0)
+        crosses = active & was_touching & is_off & (side * offset < 0)
         # A ray that started at the level is now on a side, without a crossing.
         settles = active & is_off & (side == 0)
         side = dr.select(settles | crosses, dr.select(offset > 0, type(offset)(1), -1), side)
-        is_touching = dr.select(touching, dr.abs(offset) <= accepted.band, accepted.is_near)
+        is_touching = dr.select(was_touching, dr.abs(offset) <= accepted.band, accepted.is_near)
         return Contact(
             dr.select(active, side, now.side),
-            dr.select(active, is_touching, touching),
+            dr.select(active, is_touching, was_touching),
             root,
             at_root,
             excess,
@@ -500,14 +501,15 @@ class Hysteresis:
         )
         side = dr.select(starts_on_facet, 0, side)
         offset_behind = offset + ahead.jump
-        passes = active & (side * offset > 0) & (side * offset_behind <= 0)
+        # The jump changes sides, brings f near the level, or is far enough beyond it to count.
+        changes_side = active & (side * offset > 0) & (side * offset_behind <= 0)
         begins = active & ~now.is_touching & (dr.abs(offset_behind) <= accepted.band)
         is_off = dr.abs(offset_behind) > fmax(
             _CROSSED_FRACTION * accepted.band, accepted.total_error
         )
         crosses = active & is_off & (side * offset_behind < 0)
         side = dr.select(is_off, dr.select(offset_behind > 0, one, -1), side)
-        at_facet = passes | begins
+        at_facet = changes_side | begins
         return Contact(
             dr.select(active, side, now.side),
             dr.select(active, dr.abs(offset_behind) <= accepted.band, now.is_touching),
@@ -577,7 +579,7 @@ def refine_crossing(
     tolerance and its error, bisection narrows the interval between the two points. It ends at a
     point within the tolerance, or where the interval is as short as rounding.
     """
-    # 1 if f is larger than the level before the crossing. (Contact has the side behind it.)
+    # 1 if f is larger than the level before the crossing. (Contact has the side after it.)
     side = -contact.side
     count = dr.uint32_array_t(type(contact.root))
     smallest = 4 * float(dr.epsilon(type(contact.root)))
@@ -586,20 +588,21 @@ def refine_crossing(
         """Sample f at the point t, and keep the half of the interval in which f takes the level."""
         sample, size = field.evaluate(path.point(now.t)), max_norm(path.origin) + now.t
         offset, steepness = -levels.offset_to_nearest(sample.value), safe_norm(sample.gradient)
-        near = dr.abs(offset) <= fmax(
+        is_near = dr.abs(offset) <= fmax(
             tolerance.value_tolerance(steepness, now.t), value_error_bound(sample, steepness, size)
         )
+        # The half in which f changes sides.
         is_before = side * offset > 0
         before = dr.select(is_before, now.t, now.before)
         behind = dr.select(is_before, now.behind, now.t)
-        goes_on = ~near & (behind - before > smallest * size)
+        goes_on = ~is_near & (behind - before > smallest * size)
         # If the cubic's root is good, its gradient stays.
-        is_first = near & (now.sample_count == 0)
+        is_good_root = is_near & (now.sample_count == 0)
         return _Bisection(
             before,
             behind,
             dr.select(goes_on, 0.5 * (before + behind), now.t),
-            dr.select(is_first, now.gradient, sample.gradient),
+            dr.select(is_good_root, now.gradient, sample.gradient),
             now.sample_count + 1,
             now.active & goes_on,
         )
@@ -624,13 +627,15 @@ def cubic_root(start: Real, end: Real, slope: Real, end_slope: Real) -> Any:
     b = 3 * (end - start) - 2 * slope - end_slope
     c = slope + end_slope - 2 * (end - start)
     low, high = type(start)(0), type(start)(1)
+    # Start at the root of the chord.
     u = start / (start - end)
     for _ in range(_ROOT_ITERATIONS):
         value = dr.fma(dr.fma(dr.fma(c, u, b), u, slope), u, start)
         rate = dr.fma(dr.fma(3 * c, u, 2 * b), u, slope)
-        before = (value > 0) == (start > 0)
-        low, high = dr.select(before, u, low), dr.select(before, high, u)
+        # Keep the part in which the sign changes.
+        is_before_root = (value > 0) == (start > 0)
+        low, high = dr.select(is_before_root, u, low), dr.select(is_before_root, high, u)
         next_u = u - value / rate
-        inside = (next_u >= low) & (next_u <= high)
-        u = dr.select(inside, next_u, 0.5 * (low + high))
+        is_inside = (next_u >= low) & (next_u <= high)
+        u = dr.select(is_inside, next_u, 0.5 * (low + high))
     return dr.clip(u, 0, 1)

@@ -279,7 +279,7 @@ class March:
 
         Hits. At a hit, |f - level| is at most the tolerance less the truncation error of f, or at
         most twice the rounding error of f if that is larger. If the level is nearer to f than the
-        error of f, the trial point may lie behind the root, by less than the tolerance. Then it is
+        error of f, the trial point may lie beyond the root, by less than the tolerance. Then it is
         a hit (`_refined_accuracy`), so no root is passed. If it is no hit, because the error is
         large, then no enclosure that reaches back makes it accepted, and no step from it is proved,
         as it is not known on which side of the point the level lies.
@@ -299,7 +299,7 @@ class March:
         cone grows by that much, unless the level is never met and f moves away from it faster than
         the cone grows.
 
-        With `occupied`, the part of the ray behind a proved step is skipped, too, as far as it lies
+        With `occupied`, the part of the ray beyond a proved step is skipped, too, as far as it lies
         in cells that contain no level (`EmptySpaceGrid.empty_run` has the proof).
 
         With `only_component`, levels outside of the marked cells belong to other components of the
@@ -309,7 +309,7 @@ class March:
         """
 
         def one_trial(now: MarchState) -> MarchState:
-            """One more trial point of each ray."""
+            """Return the state after one more trial point of each ray."""
             return self.next_trial(field, path, end, now, ahead)
 
         return loop_while_active(state, one_trial, "harnack")
@@ -357,6 +357,8 @@ class March:
                 ahead, accepted & trial.at_end, trial.value, trial.total_error, self.levels
             )
             gaps_ahead = trial.reading.gaps_after_jump(jump.gaps)
+        # Trial steps aim at other levels than those that proofs use only if the ray counts
+        # crossings.
         aim_gaps, contact, value = gaps_ahead, now.contact, trial.value
         if self.hysteresis is not None and now.contact is not None:
             contact, is_hit, jump, value = self._update_contact(
@@ -417,7 +419,7 @@ class March:
         """Evaluate f at the trial point of each ray, and derive all quantities of a `_TrialSample`.
 
         end: the ray parameter at which the ray, or its interval before the next jump, ends.
-        now: the state of the march; the trial point lies `trial_step` behind its last accepted
+        now: the state of the march; the trial point lies `trial_step` beyond its last accepted
             point.
         ahead: for a function with jumps, the crossing of the facet at the end of the interval; else
             None.
@@ -526,15 +528,17 @@ class March:
         tolerance = dr.fma(t, self.tolerance.per_length, self.tolerance.distance)
         slack = 8 * self.backend.machine_epsilon * size
         reach = fmax(tolerance, 2 * slack)
-        proved = gaps.nearest <= self.tolerance.value
+        is_proved = gaps.nearest <= self.tolerance.value
+        # The change of f along the ray may prove that it takes the level.
         for enclosure in ray_sample.forward:
-            proved |= enclosure.arrives(gaps, reach)
+            is_proved |= enclosure.arrives(gaps, reach)
+        # Otherwise samples are taken along the gradient and along the ray.
         toward = down_or_up(sample.gradient, gaps, path.direction)
         directions_and_slopes = (
             (toward, safe_norm(sample.gradient)),
             (path.direction, ray_sample.slope),
         )
-        unsure = is_near & ~proved
+        is_unsure = is_near & ~is_proved
         is_beyond, evaluations = beyond(
             self.backend,
             field,
@@ -545,9 +549,9 @@ class March:
             sample.value,
             reach,
             touches,
-            unsure,
+            is_unsure,
         )
-        return is_near & (proved | is_beyond), evaluations
+        return is_near & (is_proved | is_beyond), evaluations
 
     def _apply_hysteresis(
         self, trial: _TrialSample, hysteresis: Hysteresis, contact: Contact
@@ -593,12 +597,12 @@ class March:
         accepted = now.trial_step <= now.proved_step
         if self.over_relaxation > 1:
             knows_side = trial.accepts_unknown_side | (trial.gaps.nearest > trial.total_error)
-            proved = any_is_free(
+            is_proved = any_is_free(
                 trial.on_ray.backward,
                 trial.gaps.reduced_by(trial.total_error),
                 trial.unproved_length,
             )
-            accepted |= knows_side & proved
+            accepted |= knows_side & is_proved
         is_known = dr.isfinite(trial.total_error)  # without an error bound nothing is free
         if trial.steep is not None:  # values prove the next step
             is_known = is_known | (now.trial_step <= now.proved_step)
@@ -664,13 +668,14 @@ class March:
         return contact, crosses, jump, value
 
     def _proved_step(self, trial: _TrialSample, gaps: LevelGaps, contact: Contact | None) -> Real:
-        """Return the length of the ray behind the trial point that is proved to hold no level.
+        """Return the length of the ray beyond the trial point that is proved to hold no level.
 
         gaps: the differences between f at the trial point, or behind the jump there, and the next
             levels.
-        contact: the contact with a level behind the point; None if rays end at levels.
+        contact: the contact with a level after the point; None if rays end at levels.
 
-        It is 0 where the error of f is as large as its distance from a level.
+        For cones, the step is also limited by the growth of the cone. It is 0 where the error of f
+        is as large as its distance from a level.
         """
         growth = _GROWTH_FRACTION * trial.gaps.nearest
         # A tenth of the gap is kept for the growth of the cone.
@@ -705,7 +710,7 @@ class March:
         proved_step: Real,
         trial_step: Real,
     ) -> tuple[Real, Real]:
-        """Extend the proved step and the trial step over the cells behind the proved step that hold
+        """Extend the proved step and the trial step over the cells beyond the proved step that hold
         no level.
 
         occupied: the grid of cells. end: the ray parameter at which rays end.
@@ -745,15 +750,16 @@ class March:
         present length. A ray that has just left a level, or hit it, gets the rest of the ray up to
         `end`.
 
-        contact: the contact with a level behind the trial point; None if rays end at levels.
+        contact: the contact with a level after the trial point; None if rays end at levels.
+        is_hit: mask of trial points that are hits.
         """
         # After a step of zero, the next enclosures need reach only a third as far: bisection.
         candidate = fmin(now.enclosure_reach, end - trial.t)
         shorter = dr.select(dr.isfinite(candidate), candidate / 3, 1 + 16 * trial.coordinate_size)
         reach = dr.select(proved > 0, trial.on_ray.reach_growth * proved, shorter)
         if now.contact is not None and contact is not None:  # off the surface: the whole ray again
-            leaves = now.contact.is_touching & ~contact.is_touching
-            reach = dr.select(leaves | is_hit, end - trial.t, reach)
+            leaves_level = now.contact.is_touching & ~contact.is_touching
+            reach = dr.select(leaves_level | is_hit, end - trial.t, reach)
         return reach
 
     def _is_free(
@@ -769,7 +775,7 @@ class March:
 
         accepted: mask of accepted trial points. proved_step: the proved step from there, or from
             the last accepted point on other rays.
-        contact: the contact behind the trial point; None if rays end at levels.
+        contact: the contact after the trial point; None if rays end at levels.
 
         Rays without an end count as free from a very large t on. A ray in contact must sample its
         end (`Hysteresis.must_sample_end`).
@@ -789,35 +795,37 @@ class March:
         rounding: Real,
         ray_sample: RaySample,
         gradient_norm: Real,
-        size: Real,
+        length_scale: Real,
         end: Real,
     ) -> Mask:
-        """Mask of trial points at which a level is near enough in value for a hit, as `advance`
-        states.
+        """Return the mask of trial points at which f is near enough to a level for a hit, as
+        `advance` states.
 
         gap: the difference between f and the nearest level.
         within: the largest such difference that the tolerance allows.
         total_error, rounding: bounds of the error of f, and of its part due to rounding.
-        size: a bound of the coordinates.
+        ray_sample, gradient_norm: the sample of f at the point, and |grad f|.
+        length_scale: a bound of the coordinates.
+        end: the ray parameter at which the ray ends.
 
         A point is no hit if rounding leaves the distance to the surface uncertain by more than a
-            sixteenth of a length L: the size of the coordinates or, if larger, the radius of the
-            ball in which f is proved to be smooth. On a ray without an end, there is a second
-            condition. If only rounding brings the point near the level, it is no hit if rounding
-            leaves t uncertain by more than L. Otherwise, far enough away, rounding would make a hit
-            of every ray parallel to the surface.
+        sixteenth of a length L: the size of the coordinates or, if larger, the radius of the ball
+        in which f is proved to be smooth. On a ray without an end, there is a second condition. If
+        only rounding brings the point near the level, it is no hit if rounding leaves t uncertain
+        by more than L. Otherwise, far enough away, rounding would make a hit of every ray parallel
+        to the surface.
         """
         sample = ray_sample.sample
-        near = gap <= fmax(within - sample.truncation_error, 2 * rounding)
+        is_close = gap <= fmax(within - sample.truncation_error, 2 * rounding)
         for promise in sample.promises:
             radius = promise.radius
-            size = fmax(dr.select(dr.isfinite(radius), radius, 0), size)
+            length_scale = fmax(dr.select(dr.isfinite(radius), radius, 0), length_scale)
         # By how much |f - level| may exceed the tolerance. Divided by a slope, this is a length:
         # the uncertainty of t along the ray, and of the distance to the surface.
         excess = gap + total_error - within
         may_hit = (gap <= within - sample.truncation_error) | (end < dr.inf)
-        may_hit |= excess <= dr.abs(ray_sample.slope) * size
-        return near & may_hit & (excess <= _LARGEST_UNCERTAINTY * gradient_norm * size)
+        may_hit |= excess <= dr.abs(ray_sample.slope) * length_scale
+        return is_close & may_hit & (excess <= _LARGEST_UNCERTAINTY * gradient_norm * length_scale)
 
     def _next_trial_step(
         self,
@@ -834,6 +842,7 @@ class March:
         which f is predicted to reach a level. A wrong prediction does no harm: a trial point is
         accepted only if an enclosure of f that reaches back from it proves the rest of the step.
 
+        forward, ray_sample: the proved step from the trial point, and the sample of f there.
         gaps: the differences between f and the next levels.
         now: the state at the last accepted point.
         is_smooth: whether value and slope at the last accepted point help to predict f. They do not
@@ -861,7 +870,7 @@ class March:
         cubic has the values and slopes of f at the trial point and at the last accepted point. The
         result is 0 if no point was accepted before.
 
-        now: the state at the last accepted point.
+        ray_sample: the sample at the trial point. now: the state at the last accepted point.
 
         Let h be the distance of the two points, D the difference quotient, and s0 and s the slopes
         at the accepted and the trial point. The derivative is 2 (2s + s0 - 3D)/h (Hermite). For a
@@ -881,8 +890,7 @@ class March:
 
     def _status(self, is_hit: Mask, is_free: Mask) -> Any:
         """Return the `RayStatus` of rays: HIT on lanes of `is_hit`, MISS on other lanes of
-        `is_free` (the rest of the ray is proved to hold no level), else OUT_OF_STEPS.
-        """
+        `is_free` (the rest of the ray is proved to hold no level), else OUT_OF_STEPS."""
         ended = dr.select(is_free, int(RayStatus.MISS), int(RayStatus.OUT_OF_STEPS))
         return self.backend.UInt32(dr.select(is_hit, int(RayStatus.HIT), ended))
 
@@ -925,6 +933,7 @@ def _refined_accuracy(
     too_coarse = (
         (gap < _REFINE_BELOW * total_error) & (truncation > allowed) & (scale < _MAX_ACCURACY)
     )
+    # The truncation error falls as a power of the scale: so the scale for this target follows.
     target = fmax(_TRUNCATION_OF_GAP * gap, _TRUNCATION_OF_ALLOWED * allowed)
     factor = clamp(dr.power(truncation / target, 1 / _TRUNCATION_ORDER), *_REFINEMENT_LIMITS)
     return fmin(fmax(scale * factor, 1), _MAX_ACCURACY), too_coarse
@@ -939,5 +948,6 @@ def _next_accuracy(scale: Real, gap: Real, truncation: Real, coarsest: float) ->
         it.
     coarsest: the accuracy scale that 0 stands for.
     """
+    # The truncation error falls as a power of the scale.
     target = scale * dr.power(truncation / (_COARSE_FRACTION * gap), 1 / _TRUNCATION_ORDER)
     return dr.select(target > coarsest, fmin(fmax(target, 1), scale), 0)

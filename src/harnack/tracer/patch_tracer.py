@@ -152,22 +152,24 @@ class PatchTracer:
         now = dataclasses.replace(now, evaluations=backend.UInt32(walk.evaluations))
         now = self.march.advance(patch, path, backend.Float(end), now)
         out_of_steps = backend.UInt32(int(RayStatus.OUT_OF_STEPS))
-        hit = active & (now.status == int(RayStatus.HIT))
-        undecided = used_all_steps | (active & (now.status == int(RayStatus.OUT_OF_STEPS)))
-        ended = hit | undecided
+        is_hit = active & (now.status == int(RayStatus.HIT))
+        is_undecided = used_all_steps | (active & (now.status == int(RayStatus.OUT_OF_STEPS)))
+        has_ended = is_hit | is_undecided
         # Rays without a hit keep the value of the last patch.
-        takes_value = active & (ended | (walk.part == NO_PATCH))
+        takes_value = active & (has_ended | (walk.part == NO_PATCH))
         # After a hit, a patch whose box is entered before it may still be nearer.
-        goes_on = active & ~ended if self.any_hit else active & ~undecided
+        goes_on = active & ~has_ended if self.any_hit else active & ~is_undecided
         return PatchTraceState(
             enter=entry.enter,
             box=entry.patch,
-            t=dr.select(hit, now.proved_to, dr.select(undecided, start, walk.t)),
+            t=dr.select(is_hit, now.proved_to, dr.select(is_undecided, start, walk.t)),
             value=dr.select(takes_value, now.value, walk.value),
-            gradient=dr.select(ended, now.gradient, walk.gradient),
-            excess=dr.select(ended, now.tolerance_excess, walk.excess),
+            gradient=dr.select(has_ended, now.gradient, walk.gradient),
+            excess=dr.select(has_ended, now.tolerance_excess, walk.excess),
             evaluations=dr.select(active, now.evaluations, walk.evaluations),
-            status=dr.select(hit, now.status, dr.select(undecided, out_of_steps, walk.status)),
-            part=dr.select(hit, entry.patch, dr.select(undecided, NO_PATCH, walk.part)),
+            status=dr.select(
+                is_hit, now.status, dr.select(is_undecided, out_of_steps, walk.status)
+            ),
+            part=dr.select(is_hit, entry.patch, dr.select(is_undecided, NO_PATCH, walk.part)),
             active=goes_on,
         )

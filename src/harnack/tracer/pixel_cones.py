@@ -114,6 +114,7 @@ class PixelCones:
         margin = (
             _START_MARGIN_APPROXIMATE if prepared.field.has_variable_accuracy else _START_MARGIN
         )
+        # The march ends a small margin outside of the cover: the tolerance grows with the cone.
         tolerance = PreparedHitTolerance(real(0), margin * self.radius, real(0))
         rule = PlainLevels(prepared.levels)
         march_options = rule, tolerance, prepared.max_steps, prepared.over_relaxation
@@ -127,8 +128,7 @@ class PixelCones:
 
         def sample_at(t: Real) -> tuple[Real, Real]:
             """Return the height over the surface at parameters t, in radii of the cone, and its
-            derivative along the ray.
-            """
+            derivative along the ray."""
             field = (
                 prepared.field
                 if now.accuracy_scale is None
@@ -145,6 +145,7 @@ class PixelCones:
                 height, slope, (slope - last.slope) / last.step, _MAX_STEP_RATIO * last.step
             )
             count = last.sample_count + 1
+            # The passage ends behind the surface, off the cover, or where its samples are used up.
             has_left = (height >= _END_HEIGHT) & (slope >= 0)
             is_over = (height <= -1) | has_left | (count >= _MAX_SAMPLES) | (t >= t_end)
             step = fmax(step, _MIN_STEP * self.radius * t)

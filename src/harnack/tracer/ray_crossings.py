@@ -53,7 +53,8 @@ _HONORED = (
 
 @dataclass(frozen=True)
 class CrossingArrays:
-    """The first k crossings of n rays, as Dr.Jit arrays. Crossing j of ray i is at i k + j in
+    """The first k crossings of n rays with a surface, as Dr.Jit arrays. A crossing is a point at
+    which a function f passes to the other side of a level. Crossing j of ray i is at i k + j in
     arrays of n k entries.
 
     t: (n k) ray parameters; inf if a ray has fewer crossings.
@@ -65,7 +66,7 @@ class CrossingArrays:
     end: (n) the ray parameter up to which the ray was followed; inf if it was followed to its end.
     evaluations: (n) the number of evaluations of f.
     status: (n) a `RayStatus`: MISS if the ray has no further crossings, HIT if it has k,
-        OUT_OF_STEPS if the ray behind `end` is not known.
+        OUT_OF_STEPS if the ray beyond `end` is not known.
     """
 
     t: Real
@@ -119,7 +120,7 @@ def find_crossings(
 
     `Hysteresis`, the rule by which a crossing is counted, states the guarantees and proves them. A
     ray is marched from one crossing to the next without a new start: what is known of f at a
-    crossing is used behind it, and the ray may reach and leave levels any number of times.
+    crossing is used after it, and the ray may reach and leave levels any number of times.
     """
     backend = prepared.backend
     real, vector, count = backend.Float, backend.Array3f, backend.UInt32
@@ -137,8 +138,7 @@ def find_crossings(
     def advance(now: _SearchState) -> _SearchState:
         """Bring each active ray to its next crossing, to the next jump of f, or to its end. Returns
         the state after it. A crossing is written to the arrays outside, in the next free place of
-        its ray.
-        """
+        its ray."""
         next_state, facet = now, None
         if now.sheets is None:
             after = march.advance(prepared.field, path, end, now.now)
@@ -203,7 +203,8 @@ def find_crossings(
 
 @dataclass(frozen=True)
 class RayCrossings:
-    """The first k crossings of n rays with the level set, in the order along each ray.
+    """The first k crossings of n rays with a level set of a function f, in the order along each
+    ray. A crossing is a point at which f passes to the other side of the level.
 
     They are NumPy arrays; tensors if the rays were tensors; Dr.Jit arrays if the rays were Dr.Jit
     arrays. The latter are flat: crossing j of ray i is at i k + j.
@@ -220,10 +221,10 @@ class RayCrossings:
         0 for no crossing.
     count: (n,) the number of crossings, at most k.
     traced_to: (n,) the ray parameter up to which the ray was followed: inf if it was followed to
-        its end; else the point just behind the last crossing at which this crossing was noticed, or
+        its end; else the point just beyond the last crossing at which this crossing was noticed, or
         the point at which the ray ran out of steps.
     status: (n,) a `RayStatus`. MISS: the ray is proved to have no other crossings. HIT: there are k
-        crossings, and the rest of the ray was not examined. OUT_OF_STEPS: the ray behind
+        crossings, and the rest of the ray was not examined. OUT_OF_STEPS: the ray beyond
         `traced_to` is not known.
     evaluations: (n,) the number of evaluations of the field.
     """
@@ -252,7 +253,8 @@ def crossings(
     options: TraceOptions | None = None,
     **keywords: Unpack[TraceKeywords],
 ) -> RayCrossings:
-    """The first crossings of rays with a level set of a field, in the order along each ray.
+    """Find the first crossings of rays with a level set of a field's function f, in the order along
+    each ray. A crossing is a point at which f passes to the other side of the level.
 
     If f goes farther than the tolerance to both sides of the level, the crossing is not missed, and
     no crossing is counted twice. If a ray touches a level without passing to its other side, or
@@ -366,8 +368,7 @@ def crossings_to_numpy(hits: RayCrossings, n: int, k: int) -> RayCrossings:
 
     def of_ray(array: Any) -> Any:
         """Return an array with one entry for each ray as a NumPy array (n,); a single entry is
-        repeated.
-        """
+        repeated."""
         return np.broadcast_to(to_numpy(array), (n,)).copy()
 
     return RayCrossings(

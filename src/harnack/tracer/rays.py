@@ -1,4 +1,6 @@
-"""`RayBatch`: the rays of a call, as users give them, checked and on a backend."""
+"""`RayBatch`: the rays o + t d of a call, as users give them, checked and on a backend. The
+direction d becomes a unit vector, so that the ray parameter t is a length.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +14,7 @@ from harnack.backend import backend_of, choose_backend, to_float, to_numpy, to_v
 from harnack.backend.arrays import as_kernel_parameters, precision_of_input
 from harnack.backend.elementary import max_norm, safe_normalize
 from harnack.backend.tensors import is_tensor, tensor_to_array, tensor_to_vectors
+from harnack.backend.validation import check_largest_coordinate
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, FloatArray, Precision, Real, Vec3
@@ -67,6 +70,8 @@ class RayBatch:
         else:
             backend = choose_backend(precision or precision_of_input(origins, directions))
         o, d, near, far = _uploaded(backend, origins, directions, t_min, t_max)
+        # An empty array makes the whole call empty; others have one entry or as many as there are
+        # rays.
         widths = [dr.width(array) for array in (o, d, near, far)]
         count = max(widths) if min(widths) > 0 else 0
         return cls(backend, o, d, near, far, count, not drjit_arrays, has_tensors)
@@ -82,8 +87,7 @@ def _uploaded(
 ) -> tuple[Vec3, Vec3, Real, Real]:
     """Return origins, unit directions, t_min and t_max as Dr.Jit arrays of a backend. Raises
     ValueError for arrays whose lengths do not match, or that are no rays. Directions are
-    normalized.
-    """
+    normalized."""
     o = as_kernel_parameters(to_vector3(backend, origins, "origins"))
     d = as_kernel_parameters(to_vector3(backend, directions, "directions"))
     near, far = to_float(backend, t_min, "t_min"), to_float(backend, t_max, "t_max")
@@ -98,6 +102,9 @@ def _uploaded(
     # Reading the values of Dr.Jit arrays would evaluate them, so these are not checked.
     if not dr.is_array_v(type(directions)):
         _check_numpy_rays(to_numpy(max_norm(d)), to_numpy(near), to_numpy(far))
+    if not dr.is_array_v(type(origins)):
+        size = float(np.abs(np.asarray(origins)).max())
+        check_largest_coordinate(size, backend.precision, "origins have")
     return o, safe_normalize(d), near, far
 
 

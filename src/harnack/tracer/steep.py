@@ -46,8 +46,7 @@ _CONTINUITY_FACTOR = 1024.0
 
 def values_between(field: Field, p: Vec3, q: Vec3, slack: Real | None = None) -> Values | None:
     """Return the range of values of a field on the box with corners p and q, enlarged by `slack` on
-    all sides. The result is None if the field has no formula that takes ranges of coordinates.
-    """
+    all sides. The result is None if the field has no formula that takes ranges of coordinates."""
     coordinates = Values.between(p, q, slack)
     formula: Any = getattr(field, "formula", None)
     if formula is None:
@@ -75,7 +74,7 @@ def largest_change(field: Field, p: Vec3, value: Real, reach: Real) -> Real:
 @dataclass(frozen=True)
 class SteepPlace:
     """What ranges of the values of f prove at a trial point of a ray and on the length of the ray
-    behind it, where f is a function whose slope has no bound.
+    beyond it, where f is a function whose slope has no bound.
 
     error: a bound of the error of f at the point, from the rounding of f and of the point; inf if
         no bound is known. (|grad f| times the rounding of the point is no bound here.) None for
@@ -83,9 +82,9 @@ class SteepPlace:
     is_level: whether f may equal a level at the exact point. For this f must be continuous there,
         and the level must lie in the range of f around the rounded point, or just outside of it.
         This does not prove that f takes the level; `beyond` tests that.
-    free: a length of the ray behind the point on which f does not take a level, because it stays
+    free: a length of the ray beyond the point on which f does not take a level, because it stays
         away from levels or has no value at all; 0 if no length is proved.
-    ahead: the length of the ray behind the point on which values were bounded.
+    ahead: the length of the ray beyond the point on which values were bounded.
     fall, rise: bounds of how far f falls and rises on that length from its value at the point; inf
         if no bound is known.
     """
@@ -103,7 +102,7 @@ class SteepPlace:
     ) -> SteepPlace:
         """Compute the bounds at the parameter t of rays.
 
-        ahead: the length of the ray behind t on which values are bounded.
+        ahead: the length of the ray beyond t on which values are bounded.
         sample: the sample of f at t.
 
         Proof of the error. The exact point differs from the rounded point by at most `slack` in
@@ -123,7 +122,7 @@ class SteepPlace:
         if at_point is None or on_path is None:
             return cls(None, t < t, real(0), real(0), real(dr.inf), real(dr.inf))
         below, above = value - at_point.value.lower, at_point.value.upper - value
-        valid = (below >= 0) & (above >= 0) & ~at_point.jumps
+        is_valid = (below >= 0) & (above >= 0) & ~at_point.jumps
         gaps = levels.gaps(value)
         is_below = gaps.below < gaps.above
         error_to_level = dr.select(is_below, below, above)
@@ -136,7 +135,7 @@ class SteepPlace:
             & (error_away <= _MAX_ASYMMETRY * error_to_level)
         )
         error = error_to_level if gaps.is_one_sided else fmax(error_to_level, error_away)
-        error = dr.select(valid & dr.isfinite(error), error, dr.inf)
+        error = dr.select(is_valid & dr.isfinite(error), error, dr.inf)
         is_free = on_path.nowhere
         if levels.period is None:
             # A bound that is NaN stands for an infinite bound.
@@ -146,7 +145,7 @@ class SteepPlace:
             is_free = is_free | misses_levels
         free = dr.select(is_free, ahead, 0)
         fall, rise = value - on_path.value.lower, on_path.value.upper - value
-        return cls(error, is_level & valid, free, ahead, fall, rise)
+        return cls(error, is_level & is_valid, free, ahead, fall, rise)
 
     def free_of(self, gaps: LevelGaps) -> Real:
         """Return the length `ahead` of the ray if f is proved to change on it by less than `gaps`,
@@ -247,7 +246,7 @@ def beyond(
     twice as far; at `reach`. Along the second direction: twice as far as its slope says; at
     `reach`. Then, for points in `searches`: along the first direction by golden sections towards
     the point where f comes nearest to the level; then `reach` back along the second direction, as
-    rounding may have put p behind the level; then half of `reach` along each axis, both ways, from
+    rounding may have put p beyond the level; then half of `reach` along each axis, both ways, from
     the nearest point.
 
     Ranges of f around p prove nothing, as they may contain numbers that f does not take. The same
@@ -259,7 +258,7 @@ def beyond(
     shortest = 4 * epsilon * reach
 
     def sample_once(now: _SearchState) -> _SearchState:
-        """The state after one more sample q."""
+        """Evaluate f at the next point q, and return the state after it."""
         # Which of the points q comes next.
         is_first, is_far = now.count < 3, (now.count == 2) | (now.count == 4)
         is_search = now.count >= _TRIAL_COUNT
@@ -277,6 +276,7 @@ def beyond(
         )
         search_length = dr.select(is_behind, -reach, dr.select(is_side, now.inner, search_length))
         distance = dr.select(is_search, search_length, distance)
+        # Of the points after the search, two lie along each axis.
         axis_step = dr.select((now.side_count & 1) == 0, 0.5 * reach, -0.5 * reach)
         axis = (now.side_count - 1) >> 1  # no axis if the count is 0: 0 - 1 is a large number
         offset = type(p)(*(dr.select(is_side & (axis == k), axis_step, 0) for k in range(3)))
@@ -298,7 +298,9 @@ def beyond(
             low, high = at_q.value.lower, at_q.value.upper
             passed = passes(levels, value, low, high, gaps)
             passed &= ~(between.jumps | between.gaps | between.nowhere)
+            # Or a level lies in the range of f at q up to rounding, where f is continuous.
             passed |= holds(levels, value, low, high, gaps) & ~(around_q.jumps | at_q.nowhere)
+        # The difference between f at q and the level that is nearer to f at p.
         nearest = dr.select(
             gaps.below < gaps.above, gaps.below + low - value, gaps.above + value - high
         )
@@ -342,14 +344,14 @@ def _narrowed(now: _SearchState, length: Real, gap: Real, is_search: Mask) -> _S
     """
     # The worse point is the low end if it is the smaller length of the two: the old best, if the
     # new one is nearer and farther out, or the new one if it is neither.
-    nearer, is_farther = gap <= now.least_gap, length > now.inner
-    end, is_low = dr.select(nearer, now.inner, length), nearer == is_farther
+    is_nearer, is_farther = gap <= now.least_gap, length > now.inner
+    end, is_low = dr.select(is_nearer, now.inner, length), is_nearer == is_farther
     return replace(
         now,
         low=dr.select(is_search & is_low, end, now.low),
         high=dr.select(is_search & ~is_low, end, now.high),
-        inner=dr.select(is_search & nearer, length, now.inner),
-        least_gap=dr.select(is_search & nearer, gap, now.least_gap),
+        inner=dr.select(is_search & is_nearer, length, now.inner),
+        least_gap=dr.select(is_search & is_nearer, gap, now.least_gap),
     )
 
 
@@ -362,5 +364,5 @@ def down_or_up(gradient: Vec3, gaps: LevelGaps, otherwise: Vec3) -> Vec3:
     """
     direction = safe_normalize(gradient)
     direction = dr.select(gaps.below < gaps.above, -direction, direction)
-    finite = dr.isfinite(direction.x + direction.y + direction.z)
-    return dr.select(finite, direction, otherwise)
+    is_finite = dr.isfinite(direction.x + direction.y + direction.z)
+    return dr.select(is_finite, direction, otherwise)

@@ -32,8 +32,7 @@ SIDES: tuple[Side, ...] = get_args(Side)
 
 class SurfaceKeywords(TypedDict, total=False):
     """The keywords of `Surface`. Every function of the library that takes a surface (`trace`,
-    `render`, `mesh`, ...) takes them beside a field that is given without a `Surface`.
-    """
+    `render`, `mesh`, ...) takes them beside a field that is given without a `Surface`."""
 
     level: Any
     clip: Volume | None
@@ -89,6 +88,7 @@ class Surface:
         side: Side | None = None,
         largest: bool | int = False,
     ) -> None:
+        # All arguments are checked, so that no later call meets a wrong one.
         check_is_field(field)
         levels = _as_levels(field.default_level if level is None else level)
         for number in levels:
@@ -155,8 +155,7 @@ def side_range(side: Side | None, levels: Sequence[float]) -> tuple[float, float
 
 def intersection_of(volumes: Sequence[Volume | None]) -> Volume | None:
     """Return the intersection of volumes. Entries that are None stand for all of space, and so does
-    the result None. A volume that occurs twice counts once.
-    """
+    the result None. A volume that occurs twice counts once."""
     distinct = list(dict.fromkeys(volume for volume in volumes if volume is not None))
     if not distinct:
         return None
@@ -165,8 +164,7 @@ def intersection_of(volumes: Sequence[Volume | None]) -> Volume | None:
 
 def level_number(level: Any) -> float:
     """Return a level, which may be a Dr.Jit number, as a Python float. Raises TypeError for a level
-    that is no number.
-    """
+    that is no number."""
     if dr.is_array_v(type(level)):
         return float(dr.detach(level)[0])
     return as_number(level, "level must be a number, or several, such as 0.5 or 2 * math.pi")
@@ -174,8 +172,7 @@ def level_number(level: Any) -> float:
 
 def as_number(number: Any, message: str) -> float:
     """Return a number as a Python float. Raises TypeError, with a text that begins with `message`,
-    for anything else; also for texts, truth values, and numbers with derivatives enabled.
-    """
+    for anything else; also for texts, truth values, and numbers with derivatives enabled."""
     check_no_derivatives("a level or setting that is no Dr.Jit number", number)
     try:
         # float() would accept texts and truth values; "nothing" makes it raise ValueError.
@@ -186,8 +183,7 @@ def as_number(number: Any, message: str) -> float:
 
 def _check_side(side: Any, levels: Sequence[Any]) -> Side | None:
     """Return the option `side`. Raises ValueError if it is unknown, or if the number of levels does
-    not suit it.
-    """
+    not suit it."""
     if side is not None and not is_one_of(side, SIDES):
         names = ", ".join(f'"{name}"' for name in SIDES)
         raise ValueError(f"side must be one of {names}, not {side!r}{did_you_mean(side, SIDES)}")
@@ -207,8 +203,7 @@ def _check_side(side: Any, levels: Sequence[Any]) -> Side | None:
 
 def _in_order(levels: tuple[Any, ...], side: Side | None) -> tuple[Any, ...]:
     """Return the levels. Raises ValueError if `side` is "between" and they are not in ascending
-    order.
-    """
+    order."""
     if side == "between" and not level_number(levels[0]) < level_number(levels[1]):
         low, high = map(level_number, levels)
         raise ValueError(f'side="between" needs level=(low, high), low < high, not {(low, high)}')
@@ -217,8 +212,7 @@ def _in_order(levels: tuple[Any, ...], side: Side | None) -> tuple[Any, ...]:
 
 def _as_levels(level: Any) -> tuple[Any, ...]:
     """Return the levels as a tuple of numbers. level: a number or several, which may be Dr.Jit
-    numbers or a tensor.
-    """
+    numbers or a tensor."""
     if is_tensor(level):
         numbers = tensor_to_array(level, "level")
         backend = backend_of(numbers)

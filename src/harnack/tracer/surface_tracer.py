@@ -48,13 +48,11 @@ class RayTracer(Protocol):
     """Interface to the ways to trace rays: through smooth functions, functions with jumps at
     facets, and unions of patches. Each has a state of its own, `walk`; a `MarchState` is what all
     have in common. One call of `advance` makes one trial point, or marches one interval between
-    jumps, or one patch.
-    """
+    jumps, or one patch."""
 
     def begin(self, state: MarchState) -> Any:
         """Return this tracer's own state for rays that have not moved yet. state: their
-        `MarchState`.
-        """
+        `MarchState`."""
         ...
 
     def advance(self, walk: Any, /) -> Any:
@@ -71,8 +69,7 @@ class RayTracer(Protocol):
 
     def run(self, state: MarchState) -> tuple[MarchState, Any]:
         """Advance rays until all have ended, and return the result of `finish`. state: the
-        `MarchState` of rays that have not moved yet.
-        """
+        `MarchState` of rays that have not moved yet."""
         ...
 
 
@@ -109,16 +106,14 @@ class SmoothTracer:
 
     def run(self, state: MarchState) -> tuple[MarchState, Any]:
         """March rays from `state` to a hit or to their end. Returns their end state, and NO_FACET.
-        `March.advance` has the proof that no hit is missed.
-        """
+        `March.advance` has the proof that no hit is missed."""
         return self.finish(self.march.advance(self.field, self.path, self.end, state))
 
 
 @dataclass(frozen=True)
 class _QueuedRay:
     """A ray o + t d as it waits in the queue: its parameters from `start` to `end`, and the state
-    `walk` of its tracer. This is all that a lane needs when it takes the ray from the queue.
-    """
+    `walk` of its tracer. This is all that a lane needs when it takes the ray from the queue."""
 
     origin: Vec3
     direction: Vec3
@@ -199,7 +194,7 @@ class MarchResult:
         for other rays.
     side: if hits require a crossing, 1 if f rises through the level along the ray and -1 if it
         falls; otherwise None. If hits require a crossing, t and gradient are those of the root, and
-        `value` is f a little behind it.
+        `value` is f a little beyond it.
     patch: for a union of patches, the index of the patch that was hit, NO_PATCH for rays without a
         hit; None for other fields.
     """
@@ -224,8 +219,7 @@ class MarchResult:
 class _EndState:
     """What `SurfaceTracer.first_hit` needs of the end of rays: some attributes of a `MarchState`,
     and as `sheet` the index of the facet or patch that was hit. A queue writes each of them to
-    memory, so there are no others.
-    """
+    memory, so there are no others."""
 
     proved_to: Real
     value: Real
@@ -239,8 +233,7 @@ class _EndState:
     @classmethod
     def of(cls, end: MarchState, sheet: Any) -> _EndState:
         """Take these attributes from the end state of rays. sheet: the index of the facet or patch
-        hit.
-        """
+        hit."""
         names = (field.name for field in dataclasses.fields(cls) if field.name != "sheet")
         return cls(**{name: getattr(end, name) for name in names}, sheet=sheet)
 
@@ -254,8 +247,7 @@ class _EndStatus:
     @classmethod
     def of(cls, end: MarchState, sheet: Any) -> _EndStatus:
         """Take the status from the end state of rays; the index of the facet or patch hit is not
-        used.
-        """
+        used."""
         del sheet
         return cls(end.status)
 
@@ -323,8 +315,7 @@ class SurfaceTracer:
 
     def hit_surface(self, hit: MarchResult) -> SurfaceTracer:
         """Return the surface that each ray hit: the patch that was hit if the field is a union of
-        patches, else this surface. Rays without a hit get the first patch.
-        """
+        patches, else this surface. Rays without a hit get the first patch."""
         if hit.patch is None:
             return self
         patch = dr.select(hit.patch == NO_PATCH, self.backend.UInt32(0), hit.patch)
@@ -332,8 +323,7 @@ class SurfaceTracer:
 
     def level_counts(self, p: Vec3) -> Mask:
         """Return the mask of points p at which a level belongs to the surface. If only the largest
-        component is traced, these are the points in its cells; else all points.
-        """
+        component is traced, these are the points in its cells; else all points."""
         if self.occupied is None or not self.only_component:
             return self.backend.Bool(True)
         return self.occupied.cell(p).empty_distance == 0
@@ -351,8 +341,7 @@ class SurfaceTracer:
 
     def clip(self, o: Vec3, d: Vec3, t_min: Real, t_max: Real) -> tuple[Real, Real]:
         """Return the interval (start, end) of ray parameters, within [t_min, t_max], on which rays
-        o + t d can meet the surface: the part in `volume`. It is empty unless start < end.
-        """
+        o + t d can meet the surface: the part in `volume`. It is empty unless start < end."""
         if self.volume is None:
             return t_min, t_max
         return self.volume.clip(o, d, t_min, t_max)
@@ -499,9 +488,9 @@ class SurfaceTracer:
 
         Proof that this suffices if f is convex along the ray. Suppose that f is W below the level
         at some point of the extent, and reaches the level at the end of the extent. Let e be the
-        error of f there; W >= 8 e (`Hysteresis.band`). Behind the end, f rises at least as steeply
+        error of f there; W >= 8 e (`Hysteresis.band`). Beyond the end, f rises at least as steeply
         as on average before it, and the way from that point to the end is at most end - start. So
-        (end - start)/7 behind the end, f is at least W/7 >= 8/7 e above the level, which a sample
+        (end - start)/7 beyond the end, f is at least W/7 >= 8/7 e above the level, which a sample
         there shows.
         """
         never, size = self.backend.Bool(False), max_norm(path.origin)
@@ -533,11 +522,16 @@ class SurfaceTracer:
         *,
         any_hit: bool = False,
     ) -> Ends:
-        """Trace rays o + t d, and return `collect(end state, index)`. The end state is a
-        `MarchState`, and the index is that of the facet or patch that each ray hit.
+        """Trace rays o + t d, t_min <= t <= t_max, and return `collect(end state, index)`. The end
+        state is a `MarchState`, and the index is that of the facet or patch that each ray hit.
 
+        active: mask of rays that are traced.
+        collect: makes a dataclass of arrays from the end state and the index.
         any_hit: whether a ray may end at any hit, if that takes less work than finding the first
             hit.
+
+        With a queue of rays, rays are traced at once; but not if they look for crossings or if
+        evaluations of the field are cheap.
         """
         march, path, start, end, state = self.begin_march(
             o, d, t_min, t_max, active, crosses=self.require_crossing

@@ -28,8 +28,7 @@ _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 class TraceKeywords(SurfaceKeywords, total=False):
     """The keywords of `Surface` and of `TraceOptions`, which the functions of the library (`trace`,
-    `render`, ...) take in place of these objects.
-    """
+    `render`, ...) take in place of these objects."""
 
     tolerance: float | HitTolerance | None
     enclosures: EnclosureChoice
@@ -78,6 +77,8 @@ class TraceOptions:
     require_crossing: bool = False
 
     def __post_init__(self) -> None:
+        """Check all values; `max_steps` and `over_relaxation` become Python numbers."""
+        # These properties raise an error for wrong values.
         _ = self.hit_tolerance, self.enclosure_kinds
         count = as_integer_in_range(self.max_steps, "max_steps", 1, 2**31 - 1)
         object.__setattr__(self, "max_steps", count)
@@ -107,8 +108,7 @@ class TraceOptions:
     @property
     def enclosure_kinds(self) -> EnclosureKinds:
         """The classes of enclosures by which steps are proved. An enclosure is an interval that is
-        proved to contain the change of f along a ray.
-        """
+        proved to contain the change of f along a ray."""
         return choose_enclosures(self.enclosures)
 
     def replace(self, **changes: Any) -> TraceOptions:
@@ -144,6 +144,7 @@ def surface_and_options(
             `TraceOptions` beside `options`; `surface` is neither a field nor a `Surface`.
         ValueError: a value that `Surface` or `TraceOptions` refuses.
     """
+    # First, keywords that the called function does not have.
     for name in keywords:
         if name in (*SURFACE_OPTIONS, *TRACE_OPTIONS) and name not in honored:
             raise TypeError(_refusal(verb, name, honored))
@@ -159,6 +160,7 @@ def surface_and_options(
             )
     else:
         surface = Surface(surface, **surface_keywords)
+    # A `Surface` may hold options that the called function does not have.
     if "side" not in honored and surface.solid_range is not None:
         raise TypeError(
             f'{verb} has no side, and this is side="{surface.side}" of a level: faces of a solid '
@@ -190,8 +192,7 @@ def trace_options(
 
 def _refusal(verb: str, name: str, honored: Sequence[str]) -> str:
     """Return the text of the error for an option `name` that the called function `verb` does not
-    have. It lists those that it has, `honored`.
-    """
+    have. It lists those that it has, `honored`."""
     return (
         f"{verb} has no {name}; of the options of surfaces and traces it has {', '.join(honored)}"
     )
@@ -211,16 +212,15 @@ def trace_options_among(options: Any, keywords: Mapping[str, Any]) -> TraceOptio
         raise TypeError(f"options must be harnack.TraceOptions(...), not {options!r:.60}")
     if trace_keywords:
         raise TypeError(
-            f"{', '.join(trace_keywords)}: there are options already; give all of them in options, such "
-            f"as options.replace({next(iter(trace_keywords))}=...), or none"
+            f"{', '.join(trace_keywords)}: there are options already; give all of them in options, "
+            f"such as options.replace({next(iter(trace_keywords))}=...), or none"
         )
     return options
 
 
 def shorthand_parameters() -> dict[str, inspect.Parameter]:
     """Return the options of `Surface` and `TraceOptions`, by name, as keyword-only parameters for
-    signatures.
-    """
+    signatures."""
     kinds: tuple[Callable[..., Any], ...] = (Surface, TraceOptions)
     return {
         name: parameter.replace(kind=parameter.KEYWORD_ONLY)

@@ -17,6 +17,7 @@ import numpy as np
 
 from harnack.backend import to_float
 from harnack.backend.arrays import as_kernel_parameters
+from harnack.backend.validation import check_length_range
 from harnack.enclosures import EnclosureKinds, Levels, choose_enclosures
 from harnack.tracer.largest_component import largest_component_cells
 from harnack.tracer.level_contact import HitTolerance
@@ -118,8 +119,7 @@ class TracedSurface:
     @property
     def surface(self) -> Surface:
         """The field with its levels, volumes and side as a `Surface`, without the options of
-        traces.
-        """
+        traces."""
         return Surface(
             self.field, self.levels, clip=self.clip, section=self.section, side=self.side,
             largest=self.largest,
@@ -184,8 +184,7 @@ class TracedSurface:
 
     def memoize(self, key: Any, compute: Callable[[], _T]) -> _T:
         """Return `compute()`. Within a call of the library the result is cached for this field,
-        these levels and `key`; otherwise `compute` is called each time.
-        """
+        these levels and `key`; otherwise `compute` is called each time."""
         if self._call_cache is None:
             return compute()
         full_key = key, id(self.field), self.level_values
@@ -202,15 +201,13 @@ class TracedSurface:
     @property
     def volume(self) -> Volume | None:
         """The volume to which rays are clipped: the intersection of the field's domain, the proved
-        extent, clip and section; None for all of space.
-        """
+        extent, clip and section; None for all of space."""
         return intersection_of([self.field.domain, self.extent, self.clip, self.section])
 
     @property
     def hit_tolerance(self) -> HitTolerance:
         """How near to the surface a hit must be: the tolerance that was set, or else 1e-4 of the
-        longest side of the box of `volume` (1e-4 if this box is unbounded).
-        """
+        longest side of the box of `volume` (1e-4 if this box is unbounded)."""
         return default_tolerance(self.volume) if self.tolerance is None else self.tolerance
 
     def for_rays(self, count: int) -> TracedSurface:
@@ -219,16 +216,14 @@ class TracedSurface:
 
     def evaluator(self, backend: Backend) -> Field:
         """Return the field, prepared for its levels and for a backend. It is cached; a field with
-        derivatives enabled and one without have separate entries.
-        """
+        derivatives enabled and one without have separate entries."""
         has_derivatives = any(dr.grad_enabled(parameter) for parameter in self.field.parameters())
         key = "field", backend, has_derivatives
         return self.memoize(key, lambda: self.field.with_levels(self.level_values).prepare(backend))
 
     def target_levels(self, backend: Backend) -> Levels:
         """Return the levels as Dr.Jit numbers that kernels take as parameters, with the period of
-        the field.
-        """
+        the field."""
         levels = tuple(
             as_kernel_parameters(to_float(backend, level, "level")) for level in self.levels
         )
@@ -237,14 +232,20 @@ class TracedSurface:
     def _occupied(self) -> OccupancyGrid | None:
         """Return the grid of cells with a mark on those that may contain a level of the surface;
         None if no cells are known. If only the largest component is traced, only its cells are
-        marked.
-        """
+        marked."""
         if not self.largest:
             return self.memoize("cells", lambda: self.field.occupied_cells(self.level_values))
         volume = intersection_of([self.field.domain, self.extent, self.clip])
         arguments = self.field, self.level_values, volume, self.solid_range, self.largest
         key = "largest", self.clip, self.side, self.largest
         return self.memoize(key, lambda: largest_component_cells(*arguments))
+
+    def _check_size(self, backend: Backend) -> None:
+        """Raise ValueError if the surface is too large or too small for a backend's precision."""
+        around, volume = intersection_of([self.field.domain, self.extent]), self.volume
+        for box in (around, volume):
+            if box is not None:
+                check_length_range(box.bounds(), backend.precision, "the surface has")
 
     def prepare(
         self, backend: Backend, *, crosses: bool = False, many_rays: bool = True
@@ -263,6 +264,7 @@ class TracedSurface:
         if self.largest and crosses:
             raise ValueError(_FIRST_HITS_ONLY)
         volume, region = self.volume, None
+        self._check_size(backend)
         occupied = self._occupied() if self.largest or (many_rays and not crosses) else None
         if crosses or self.require_crossing:
             region = intersection_of([self.field.domain, self.clip, self.section])
@@ -317,8 +319,8 @@ def traced_surface(
 
 
 def check_has_inside(surface: TracedSurface) -> None:
-    """Raise ValueError if this is the boundary of a solid, and the field is of a kind that has no
-    closed solids: angle-valued, with jumps, or a union of patches."""
+    """Raise ValueError if the surface is meant as the boundary of a solid, and the field is of a
+    kind that has no closed solids: angle-valued, with jumps, or a union of patches."""
     field = surface.field
     if surface.solid_range is None:
         return
@@ -337,8 +339,7 @@ def check_has_inside(surface: TracedSurface) -> None:
 
 def default_tolerance(volume: Volume | None) -> HitTolerance:
     """Return the default tolerance of hits: 1e-4 of the longest side of the box of a volume; the
-    length 1e-4 if the volume is None or unbounded.
-    """
+    length 1e-4 if the volume is None or unbounded."""
     side = math.nan if volume is None else float(np.ptp(np.array(volume.bounds()), axis=0).max())
     is_bounded = math.isfinite(side) and side > 0
     return HitTolerance(_RELATIVE_TOLERANCE * side if is_bounded else _UNBOUNDED_TOLERANCE)
@@ -347,7 +348,6 @@ def default_tolerance(volume: Volume | None) -> HitTolerance:
 def _with_reduced_levels(levels: tuple[float, ...]) -> tuple[float, ...]:
     """Return the levels, and after them the remainders modulo 1, in [-1/2, 1/2], of those levels
     that are beyond 1/2 in absolute value. These are the numbers nearest to 0 that differ from a
-    level by an integer.
-    """
+    level by an integer."""
     remainders = dict.fromkeys(math.remainder(level, 1) for level in levels if abs(level) > 0.5)
     return levels + tuple(level for level in remainders if level not in levels)

@@ -1,7 +1,6 @@
-"""Trees over points, segments and triangles, and grids of cells.
-
-Built in NumPy, traversed in Dr.Jit. No formulas.
-"""
+"""Trees over points, segments and triangles, and grids of cells. A *primitive* is one of the
+points, segments or triangles; a *leaf* holds a few of them, and a *node* stands for all primitives
+below it. Trees are built in NumPy and traversed in Dr.Jit."""
 
 from __future__ import annotations
 

@@ -1,7 +1,12 @@
-"""Balanced trees: built by median splits, stored as records, traversed without a stack.
+"""Balanced trees over primitives (points, segments or triangles), built by median splits, stored as
+records, and traversed without a stack. A *leaf* holds a few primitives, in numbered *slots*, the
+last of which may be empty. A *node* is a leaf or has children; a *level* is all nodes at the same
+height above the leaves. A *record* is a row of numbers that kernels read, for a node or a
+primitive. A *lane* is one entry of Dr.Jit's arrays, such as a ray or a point; each lane walks
+through the tree by itself.
 
-- `BalancedTree`: which primitive (point, segment or triangle) lies in which leaf.
-  `build_balanced_tree` computes it in vectorized NumPy.
+- `BalancedTree`: which primitive lies in which leaf. `build_balanced_tree` computes it in
+  vectorized NumPy.
 - `PackedTree`: nodes and primitives as records on a backend, from `pack_tree`.
 - `traverse`: visits nodes depth first, and enters or skips each subtree; `for_each_primitive`:
   visits the primitives of a leaf.
@@ -42,8 +47,8 @@ _MAX_LOOPED_ROW = 48
 
 @dataclass(frozen=True)
 class BalancedTree:
-    """A balanced tree: primitives (points, segments or triangles) in leaves, and levels of nodes
-    above the leaves.
+    """The shape of a balanced tree: which primitive (point, segment or triangle) lies in which
+    leaf, and how many children the nodes above the leaves have. It holds no positions.
 
     Every leaf has w slots and holds w or w - 1 primitives. All nodes of a level have the same
     number of children, in order, so the level above is a reshape of arrays, and a sum over the
@@ -60,7 +65,7 @@ class BalancedTree:
 
     @property
     def leaf_size(self) -> int:
-        """The number of slots of a leaf."""
+        """The number w of slots of a leaf."""
         return self.leaf_slots.shape[1]
 
     @property
@@ -77,7 +82,8 @@ class BalancedTree:
         return sum(self.counts)
 
     def node_links(self) -> tuple[tuple[IntArray, ...], tuple[IntArray, ...], tuple[IntArray, ...]]:
-        """The links between nodes with which a walk visits all nodes depth first, without a stack.
+        """Number the nodes, and compute the links with which a walk visits all of them depth first,
+        without a stack.
 
         Returns:
             Three tuples of arrays, one array for each level of the tree, leaves first: the index of
@@ -92,22 +98,27 @@ class BalancedTree:
         below = [0]  # the number of nodes below a node, for each level
         for arity in self.arities:
             below.append(arity * (1 + below[-1]))
-        number, after = [np.zeros(1, np.int64)], [np.array([self.node_count], np.int64)]
-        first = [np.ones(1, np.int64)]
+        # The root has the index 0, its first child 1. From there, level by level downwards.
+        # `next_index` is where the walk goes on after a node's subtree.
+        index, next_index = [np.zeros(1, np.int64)], [np.array([self.node_count], np.int64)]
+        first_child = [np.ones(1, np.int64)]
         for level, arity in reversed(list(enumerate(self.arities))):
             position = np.arange(arity)
-            child = first[0][:, None] + position
-            following = np.where(position < arity - 1, child + 1, after[0][:, None])
-            start = first[0][:, None] + arity + position * below[level]
-            number.insert(0, child.reshape(-1))
-            after.insert(0, following.reshape(-1))
-            first.insert(0, start.reshape(-1))
-        first[0] = np.zeros_like(first[0])
-        return tuple(number), tuple(first), tuple(after)
+            child = first_child[0][:, None] + position
+            # After a child's subtree comes its next sibling; after the last, what follows its
+            # parent's subtree.
+            after_child = np.where(position < arity - 1, child + 1, next_index[0][:, None])
+            child_of_child = first_child[0][:, None] + arity + position * below[level]
+            index.insert(0, child.reshape(-1))
+            next_index.insert(0, after_child.reshape(-1))
+            first_child.insert(0, child_of_child.reshape(-1))
+        first_child[0] = np.zeros_like(first_child[0])
+        return tuple(index), tuple(first_child), tuple(next_index)
 
     def values_in_slots(self, values: FloatArray, empty: float = 0.0) -> FloatArray:
-        """Arrange values (n, ...) of primitives by slots: (leaves, leaf_size, ...). Empty slots
-        hold the value `empty`."""
+        """Arrange values (n, ...) of the n primitives by the slots of leaves: (leaves, leaf_size,
+        ...). Empty slots get the value `empty`."""
+        # "clip" reads some value for NO_PRIMITIVE, which is overwritten.
         out = values.take(self.leaf_slots, axis=0, mode="clip")
         leaf, slot = np.nonzero(self.leaf_slots == NO_PRIMITIVE)
         out[leaf, slot] = empty
@@ -115,8 +126,8 @@ class BalancedTree:
 
 
 def build_balanced_tree(points: FloatArray, *, leaf_size: int = 8, arity: int = 4) -> BalancedTree:
-    """Build a tree over finite points (n, 3), n >= 1, by splits at the median along the longest
-    side of each node's box.
+    """Build a balanced tree over finite points (n, 3), n >= 1. Nodes are split at the median along
+    the longest side of the bounding box of their points.
 
     leaf_size: the largest number of points of a leaf.
     arity: the number of children of a node, 2 or 4 (two splits at once). With 4, the root has 2
@@ -131,17 +142,21 @@ def build_balanced_tree(points: FloatArray, *, leaf_size: int = 8, arity: int = 
     """
     if arity not in (2, 4):
         raise ValueError(f"arity must be 2 or 4, not {arity}")
-    rows = np.arange(len(points), dtype=np.int64)[None]
-    x = np.array(points.T, dtype=np.float64, order="C")[:, None]
+    # One row for each node: the indices of its points, and their coordinates (3, nodes, points).
+    point_ids = np.arange(len(points), dtype=np.int64)[None]
+    positions = np.array(points.T, dtype=np.float64, order="C")[:, None]
     depth = max(0, math.ceil(math.log2(len(points) / leaf_size)))
     remaining = depth
-    while remaining and rows.shape[1] > _POINTS_IN_CACHE:
-        rows, x = _split(rows, x)
+    while remaining and point_ids.shape[1] > _POINTS_IN_CACHE:
+        point_ids, positions = _split(point_ids, positions)
         remaining -= 1
-    at_once = max(1, _POINTS_IN_CACHE // rows.shape[1])
+    at_once = max(1, _POINTS_IN_CACHE // point_ids.shape[1])
     leaves: list[IntArray] = []
-    for start in range(0, len(rows), at_once):
-        batch, coordinates = rows[start : start + at_once], x[:, start : start + at_once]
+    for start in range(0, len(point_ids), at_once):
+        batch, coordinates = (
+            point_ids[start : start + at_once],
+            positions[:, start : start + at_once],
+        )
         for _ in range(remaining):
             batch, coordinates = _split(batch, coordinates)
         leaves.append(batch)
@@ -151,11 +166,11 @@ def build_balanced_tree(points: FloatArray, *, leaf_size: int = 8, arity: int = 
     return BalancedTree(slots, (4,) * (depth // 2) + (2,) * (depth % 2))
 
 
-def _split(rows: IntArray, positions: FloatArray) -> tuple[IntArray, FloatArray]:
-    """Split each node into two halves of its points, at the median along the longest side of the
-    points' bounding box.
+def _split(point_ids: IntArray, positions: FloatArray) -> tuple[IntArray, FloatArray]:
+    """Split each of k nodes into two halves of its points, at the median along the longest side of
+    the points' bounding box.
 
-    rows: (k, w) the indices of the points of each node, one node per row.
+    point_ids: (k, w) the indices of the points of each node, one node per row.
     positions: (3, k, w) the coordinates of these points.
 
     The last slot of a row may be empty: its index is NO_PRIMITIVE and its position NaN, which sorts
@@ -166,24 +181,27 @@ def _split(rows: IntArray, positions: FloatArray) -> tuple[IntArray, FloatArray]
         The indices (2k, ceil(w/2)) and the positions (3, 2k, ceil(w/2)) of the points of the
         halves; the two halves of a node follow each other.
     """
-    count, width = rows.shape
+    count, width = point_ids.shape
     half, middle = (width + 1) // 2, width // 2
+    # The coordinate of each point along its node's longest side, and the order that splits it.
     key = positions[_box_sizes(positions).argmax(axis=0), np.arange(count)]
     order = cast("IntArray", np.argpartition(key, middle, axis=1))
-    short = np.flatnonzero(np.isnan(key[:, -1]))
-    at = (order[short] == width - 1).argmax(axis=1)  # the empty slot: somewhere on the right
-    order[short, at], order[short, -1] = order[short, -1], width - 1
+    short_rows = np.flatnonzero(np.isnan(key[:, -1]))
+    # The empty slot is somewhere on the right: move it to the end of the row.
+    empty_slot = (order[short_rows] == width - 1).argmax(axis=1)
+    order[short_rows, empty_slot], order[short_rows, -1] = order[short_rows, -1], width - 1
     if width % 2:  # m points of 2m on either side, the empty slot on the left
-        order[short, -1], order[short, middle] = order[short, middle], width - 1
-    order += np.arange(0, rows.size, width, dtype=np.int64)[:, None]
-    return _halves(rows, order, half, NO_PRIMITIVE), np.stack(
+        order[short_rows, -1], order[short_rows, middle] = order[short_rows, middle], width - 1
+    # From places in a row to places in the flattened array.
+    order += np.arange(0, point_ids.size, width, dtype=np.int64)[:, None]
+    return _halves(point_ids, order, half, NO_PRIMITIVE), np.stack(
         [_halves(coordinate, order, half, np.nan) for coordinate in positions]
     )
 
 
 def _box_sizes(positions: FloatArray) -> FloatArray:
-    """(3, k) the edge lengths of the bounding boxes of k rows of w points, positions (3, k, w). NaN
-    marks an empty slot."""
+    """The edge lengths (3, k) of the bounding boxes of k nodes. positions: (3, k, w) the
+    coordinates of the w points of each node; NaN marks an empty slot."""
     if positions.shape[2] > _MAX_LOOPED_ROW:
         return np.fmax.reduce(positions, axis=2) - np.fmin.reduce(positions, axis=2)
     low = high = positions[..., 0]
@@ -193,13 +211,14 @@ def _box_sizes(positions: FloatArray) -> FloatArray:
 
 
 def _halves(values: npt.NDArray[Any], order: IntArray, half: int, empty: float) -> Any:
-    """Reorder each row of values (k, w) and cut it in two.
+    """Reorder each row of values (k, w) and cut it in two halves.
 
     order: (k, w) for each new place, the index into the flattened values.
     half: the length of each half, ceil(w/2).
     empty: the value that fills the last slot of second halves, if w is odd.
 
-    Returns (2k, half): the two halves of a row follow each other."""
+    Returns (2k, half): the two halves of a row follow each other.
+    """
     count, width = order.shape
     halves = np.empty((count, 2, half), values.dtype)
     flat = values.reshape(-1)
@@ -218,10 +237,10 @@ _MAX_NODES = 2**24
 
 @dataclass(frozen=True)
 class PackedTree:
-    """A tree uploaded to a backend, for walks in Dr.Jit: records (rows of numbers) of its nodes and
-    of its primitives (points, segments or triangles).
-
-    Siblings lie side by side (`BalancedTree.node_links`), and primitives leaf by leaf.
+    """A tree on a backend, for walks in Dr.Jit: records (rows of numbers) of its nodes and of its
+    primitives (points, segments or triangles). The leaves have slots for primitives, of which the
+    last may be empty. Siblings lie side by side (`BalancedTree.node_links`), and primitives leaf by
+    leaf.
 
     node_heads: eight numbers for each node: six of the caller; the index of the node at which the
         walk goes on if it skips the node's subtree; and for a leaf its index among leaves, or for
@@ -229,7 +248,8 @@ class PackedTree:
     node_payloads: further numbers of the caller for each node, or None. They are stored separately
         because a walk reads many heads in a row and few payloads.
     node_count: the number of nodes.
-    primitives: `leaf_size` records for each leaf."""
+    primitives: the records of primitives, `leaf_size` for each leaf.
+    """
 
     backend: Backend
     node_heads: RecordTable
@@ -243,11 +263,11 @@ class PackedTree:
         return self.node_heads.read_record(i)
 
     def payload(self, i: Any, active: Mask) -> list[Real]:
-        """The numbers of node i in `node_payloads`, read where active; [] if there are none."""
+        """The numbers of node i in `node_payloads`, read on active lanes; [] if there are none."""
         return [] if self.node_payloads is None else self.node_payloads.read_record(i, active)
 
     def primitive(self, leaf: Any, slot: Any, active: Mask) -> list[Real]:
-        """The record of the primitive in a slot of a leaf, read where active."""
+        """The record of the primitive in a slot of a leaf, read on active lanes."""
         return self.primitives.read_record(leaf * self.leaf_size + slot, active)
 
 
@@ -256,10 +276,11 @@ def pack_tree(
 ) -> PackedTree:
     """Upload a tree to a backend, for `traverse`.
 
-    levels: for each level of the tree, leaves first, the numbers (k, c) of its nodes, c >= 6. The
-        first six numbers of a node are read at every visit of the node, the further numbers only on
-        demand.
-    primitives: (leaves, leaf_size, j) the numbers of the primitive in each slot
+    tree: the shape of the tree.
+    levels: for each level of the tree, leaves first, the caller's numbers (k, c) of its k nodes, c
+        >= 6. The first six numbers of a node are read at every visit of the node, the further
+        numbers only on demand.
+    primitives: (leaves, leaf_size, j) the record of the primitive in each slot
         (`BalancedTree.values_in_slots`).
 
     Raises:
@@ -271,11 +292,12 @@ def pack_tree(
     heads = np.zeros((tree.node_count, PACKET), backend.dtype)
     payloads = np.zeros((tree.node_count, extra), backend.dtype)
     links = tree.node_links()
-    for number, first, after, values in zip(*links, levels, strict=True):
-        heads[number, :_CALLER_NUMBERS] = values[:, :_CALLER_NUMBERS]
-        heads[number, _CALLER_NUMBERS] = after
-        heads[number, _CALLER_NUMBERS + 1] = -first
-        payloads[number] = values[:, _CALLER_NUMBERS:]
+    for index, first_child, next_index, values in zip(*links, levels, strict=True):
+        heads[index, :_CALLER_NUMBERS] = values[:, :_CALLER_NUMBERS]
+        heads[index, _CALLER_NUMBERS] = next_index
+        # Minus the first child; for leaves it is replaced below.
+        heads[index, _CALLER_NUMBERS + 1] = -first_child
+        payloads[index] = values[:, _CALLER_NUMBERS:]
     leaves = links[0][0]
     heads[leaves, _CALLER_NUMBERS + 1] = np.arange(len(leaves))
     return PackedTree(
@@ -293,12 +315,13 @@ LoopValues: TypeAlias = "tuple[Any, ...]"
 
 @dataclass(frozen=True)
 class VisitedNode:
-    """The node that a walk visits; each lane may visit a different node.
+    """The node that a walk through a tree visits now; each lane may visit a different node.
 
     index: the index of the node.
     head: the first six numbers of the node, which the caller of `pack_tree` gave.
-    leaf: the index of its leaf; it has no meaning for an inner node.
-    is_leaf: whether the node is a leaf."""
+    leaf: the index of the node among the leaves; it has no meaning for an inner node.
+    is_leaf: whether the node is a leaf.
+    """
 
     tree: PackedTree
     index: Any
@@ -307,7 +330,7 @@ class VisitedNode:
     is_leaf: Mask
 
     def payload(self, active: Mask) -> list[Real]:
-        """The further numbers of the node, fetched where active; [] if there are none."""
+        """The further numbers of the node, fetched on active lanes; [] if there are none."""
         return self.tree.payload(self.index, active)
 
 
@@ -319,12 +342,13 @@ def traverse(tree: PackedTree, visit: Visit, state: LoopValues, active: Mask = T
     """Visit the nodes of a tree depth first, from the root on, and return the final state. Each
     lane (entry of Dr.Jit's arrays, such as a ray) walks by itself.
 
-    visit: takes a `VisitedNode` and the state. It returns a mask, whether to visit the node's
-        children (otherwise its subtree is skipped), and the new state.
+    visit: a function that takes a `VisitedNode` and the state. It returns a mask, whether to visit
+        the node's children (otherwise its subtree is skipped), and the new state.
     state: a tuple of arrays, which `visit` updates.
     active: the lanes that walk at all.
 
-    May be called while a loop is being recorded."""
+    May be called while a loop is being recorded.
+    """
     index, mask = tree.backend.UInt32, tree.backend.Bool
 
     def body(i: Any, *state: Any) -> LoopValues:
@@ -337,8 +361,10 @@ def traverse(tree: PackedTree, visit: Visit, state: LoopValues, active: Mask = T
         return i, *state
 
     def is_running(i: Any, *_: Any) -> Mask:
+        """Whether a lane has further nodes to visit."""
         return i < tree.node_count
 
+    # Lanes that are not active begin behind the last node.
     start = dr.select(mask(active), index(0), tree.node_count)
     return dr.while_loop((start, *state), is_running, body, label="walk")[1:]
 
@@ -349,17 +375,18 @@ def for_each_primitive(
     """Update a state by each primitive of the leaf `node`, and return the final state.
 
     active: the lanes whose node is a leaf and whose state is to be updated.
-    body: takes the record of a primitive, the mask of active lanes and the state; returns the new
-        state.
+    body: a function that takes the record of a primitive, the mask of active lanes and the state,
+        and returns the new state.
     state: a tuple of arrays.
 
-    A packet of lanes that are all inactive costs nothing. Empty slots are visited as well: the
+    A packet of lanes that are all inactive costs no time. Empty slots are visited as well: the
     caller of `pack_tree` has filled them with numbers that have no effect.
     """
     tree = node.tree
     index = tree.backend.UInt32
 
     def is_running(slot: Any, *_: Any) -> Mask:
+        """Whether an active lane has further slots to visit."""
         return active & (slot < tree.leaf_size)
 
     def step(slot: Any, *state: Any) -> LoopValues:

@@ -1,4 +1,8 @@
-"""Queries of trees: the boxes that a ray enters, in order, and the triangles closest to a point."""
+"""Searches in trees: the boxes that a ray enters, in order, and the triangles closest to a point. A
+*node* of a tree has a box around all that is below it, so that a search skips a node whose box is
+too far. A *record* (`row` in the code) is the row of numbers that describes one box or one
+triangle. A *lane* is one entry of Dr.Jit's arrays, such as a point or a ray; each lane searches by
+itself."""
 
 from __future__ import annotations
 
@@ -45,24 +49,27 @@ _LEAF_SIZE = 4
 
 @dataclass(frozen=True)
 class BoxTree:
-    """A tree of boxes, which may overlap. Their coordinates are at most about 1."""
+    """A tree of boxes on a backend, which may overlap, with a search for the boxes that a ray
+    enters. Their coordinates are at most about 1."""
 
     tree: PackedTree
 
     @classmethod
     def from_corners(cls, backend: Backend, lower: FloatArray, upper: FloatArray) -> BoxTree:
-        """The tree of n boxes, from their lower and upper corners, (n, 3) each. Boxes are numbered
-        in this order."""
+        """Build the tree of n boxes from their lower and upper corners, (n, 3) each. Boxes are
+        numbered in this order."""
         hierarchy = build_balanced_tree(0.5 * (lower + upper), leaf_size=_LEAF_SIZE)
         number = np.arange(len(lower), dtype=np.float64)[:, None]
         records = hierarchy.values_in_slots(np.concatenate([lower, upper, number], axis=1))
+        # Empty slots hold an empty box, with the number -1.
         records[hierarchy.leaf_slots < 0] = [np.inf] * 3 + [-np.inf] * 3 + [-1.0]
         return cls(pack_tree(backend, hierarchy, node_boxes(hierarchy, lower, upper), records))
 
     def next_box(
         self, o: Vec3, d: Vec3, after: tuple[Real, Any], start: Real, end: Real, active: Mask
     ) -> tuple[Real, Real, Any]:
-        """The next box that each ray o + t d, |d| = 1, enters after the pair `after` = (t, number).
+        """The next box that each ray o + t d, |d| = 1, enters after the pair `after` = (t, number),
+        on active lanes.
 
         A ray that has not left a box before t = start enters it at max(t of its first point in the
         box, start). Boxes are ordered by this t, and at the same t by number. Repeated calls, the
@@ -76,29 +83,34 @@ class BoxTree:
         """
         real, index = self.tree.backend.Float, self.tree.backend.UInt32
         t_after, n_after = real(after[0]), index(after[1])
-        span = self._make_slab_test(o, d)
+        # A function from a box to the t where the ray enters it and leaves it.
+        enter_and_leave = self._make_slab_test(o, d)
 
         def visit(node: VisitedNode, state: LoopValues) -> tuple[Mask, LoopValues]:
             """Enter a node if the ray meets its box before the best box so far."""
-            near, far = span(node.head)
+            near, far = enter_and_leave(node.head)
             is_met = (near <= far) & (far >= start) & (near <= fmin(state[0], end))
             return is_met, for_each_primitive(node, is_met & node.is_leaf, nearer, state)
 
         def nearer(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
-            """Take the box of a record if it comes after `after` and before the best so far."""
+            """Take the box in the record `row` if it comes after `after` and before the best so
+            far."""
             best, leave, number = state
-            near, far = span(row)
+            near, far = enter_and_leave(row)
             t, n = fmax(near, start), index(fmax(row[_BOX_NUMBER_COLUMN], real(0)))
             is_after = (t > t_after) | ((t == t_after) & (n > n_after))
             is_before_best = (t < best) | ((t == best) & (n < number))
-            entered = (near <= far) & (far >= start) & (t <= end) & (row[_BOX_NUMBER_COLUMN] >= 0)
-            chosen = active & entered & is_after & is_before_best
+            is_entered = (
+                (near <= far) & (far >= start) & (t <= end) & (row[_BOX_NUMBER_COLUMN] >= 0)
+            )
+            is_chosen = active & is_entered & is_after & is_before_best
             return (
-                dr.select(chosen, t, best),
-                dr.select(chosen, far, leave),
-                dr.select(chosen, n, number),
+                dr.select(is_chosen, t, best),
+                dr.select(is_chosen, far, leave),
+                dr.select(is_chosen, n, number),
             )
 
+        # The best box so far: where the ray enters and leaves it, and its number.
         initial = (real(dr.inf), real(dr.inf), index(NO_BOX))
         near, far, number = traverse(self.tree, visit, initial, active)
         return near, far, number
@@ -140,15 +152,16 @@ _ROUNDING_EPSILONS = 16.0
 
 @dataclass(frozen=True)
 class ClosestTriangle:
-    """For each lane, the triangle nearest to its point x, among the triangles that a query
-    considers.
+    """The result of a search, for each lane: the triangle nearest to its point x, among the
+    triangles that the search considers.
 
-    squared_distance: of the triangle from x; inf if there is no triangle.
+    squared_distance: the squared distance of the triangle from x; inf if there is no triangle.
     triangle: its index; NO_TRIANGLE if there is none.
     offset: (3,) the vector from x to the nearest point of the triangle.
     normal: (3,) a normal of the triangle by the right-hand rule, of any length; zero for a triangle
         of zero area.
-    is_inner: whether the nearest point lies inside the triangle, not on its edges."""
+    is_inner: whether the nearest point lies inside the triangle, not on its edges.
+    """
 
     squared_distance: Real
     triangle: Any
@@ -158,8 +171,8 @@ class ClosestTriangle:
 
 
 def distance_lower_bound(triangles: TriangleTree, x: Vec3) -> Real:
-    """A proved lower bound of the distance from x to the triangles, a length; it is exact up to
-    rounding. Coordinates of triangles are at most about one.
+    """A proved lower bound of the distance from points x to the triangles of a tree; it is exact up
+    to rounding. Coordinates of triangles are at most about one.
 
     Proof. The distance computed by `ClosestPointOnTriangle` is off by a few machine epsilons of |x|
     + 1, as is proved there. Boxes of the tree are skipped only if they are farther than the
@@ -168,39 +181,44 @@ def distance_lower_bound(triangles: TriangleTree, x: Vec3) -> Real:
     """
     real, vector = triangles.tree.backend.Float, triangles.tree.backend.Array3f
     x = vector(x)
-    pad = _pad(triangles, x)
-    inside = _distance_test(triangles, x, pad)
+    pad = _distance_rounding(triangles, x)
+    may_be_within = _distance_test(triangles, x, pad)
 
     def visit(node: VisitedNode, state: LoopValues) -> tuple[Mask, LoopValues]:
         """Enter a node if its box is nearer than the best distance so far."""
-        closer = inside(node, state[0])
-        return closer, for_each_primitive(node, closer & node.is_leaf, nearer, state)
+        is_near = may_be_within(node, state[0])
+        return is_near, for_each_primitive(node, is_near & node.is_leaf, nearer, state)
 
     def nearer(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
-        """The smaller of the best squared distance so far and that to the triangle of a record."""
+        """The smaller of the best squared distance so far and that to the triangle in the record
+        `row`."""
         square = ClosestPointOnTriangle.of(row, x).squared_distance
         return (dr.select(active, fmin(square, state[0]), state[0]),)
 
+    # The state is the smallest squared distance so far.
     start = (initial_squared_distance(triangles, x),)
     return fmax(dr.sqrt(traverse(triangles.tree, visit, start)[0]) - pad, real(0))
 
 
 def initial_squared_distance(triangles: TriangleTree, x: Vec3) -> Real:
-    """An upper bound of the squared distance from x to the triangles. A search that starts with it
-    skips most boxes at once. It is the squared distance to a corner of a triangle in a nearby leaf,
-    rounded up.
-    """
-    square, pad = squared_distance_in_nearby_leaf(triangles.tree, x, 0), _pad(triangles, x)
+    """An upper bound of the squared distance from points x to the triangles of a tree. A search
+    that starts with it skips most boxes at once. It is the squared distance to a corner of a
+    triangle in a nearby leaf, rounded up."""
+    square, pad = (
+        squared_distance_in_nearby_leaf(triangles.tree, x, 0),
+        _distance_rounding(triangles, x),
+    )
+    # More than (sqrt(square) + pad)^2.
     return square + 2 * pad * (dr.sqrt(square) + pad)
 
 
 def squared_distance_in_nearby_leaf(tree: PackedTree, x: Vec3, column: int) -> Real:
-    """The smallest squared distance from x to the points of a nearby leaf. It is an upper bound of
-    the smallest squared distance to any point of the tree.
+    """An upper bound of the smallest squared distance from x to the points of a tree: the smallest
+    squared distance to the points of one leaf nearby. The leaf is found from the root by always
+    going to the child whose box has the nearest center.
 
-    The leaf is found from the root by always going to the child whose box has the nearest center.
-
-    column: the column of a record at which the three coordinates of its point begin."""
+    column: the column of a record at which the three coordinates of its point begin.
+    """
     backend = tree.backend
     real, index, vector = backend.Float, backend.UInt32, backend.Array3f
     x = vector(x)
@@ -212,25 +230,29 @@ def squared_distance_in_nearby_leaf(tree: PackedTree, x: Vec3, column: int) -> R
 
         best: the smallest squared distance of a sibling's center so far.
         nearest_leaf: the leaf of that sibling, NO_TRIANGLE for an inner node.
-        first, after: the first child of that sibling, and the node after its subtree."""
+        first, after: the first child of that sibling, and the node after its subtree.
+        """
         head = tree.head(i)
         middle = 0.5 * (vector(*head[:3]) + vector(*head[3:6]))
         square = dr.squared_norm(middle - x)
-        nearer, following = square < best, index(head[6])
-        best = dr.select(nearer, square, best)
+        is_nearer, following = square < best, index(head[6])
+        best = dr.select(is_nearer, square, best)
+        # The index of the leaf, or of the first child.
         is_leaf, number = head[7] >= 0, index(dr.abs(head[7]))
         # For the nearest sibling so far: its leaf if it is a leaf, or its first child and the end
         # of its children.
-        nearest_leaf = dr.select(nearer, dr.select(is_leaf, number, NO_TRIANGLE), nearest_leaf)
-        first = dr.select(nearer, number, first)
-        after = dr.select(nearer, following, after)
+        nearest_leaf = dr.select(is_nearer, dr.select(is_leaf, number, NO_TRIANGLE), nearest_leaf)
+        first = dr.select(is_nearer, number, first)
+        after = dr.select(is_nearer, following, after)
         is_last = following == end
-        down = is_last & (nearest_leaf == NO_TRIANGLE)
-        i = dr.select(down, first, following)
-        end, best = dr.select(down, after, end), dr.select(down, dr.inf, best)
+        goes_down = is_last & (nearest_leaf == NO_TRIANGLE)
+        i = dr.select(goes_down, first, following)
+        end, best = dr.select(goes_down, after, end), dr.select(goes_down, dr.inf, best)
         return i, end, best, first, after, nearest_leaf
 
     def is_running(i: Any, end: Any, *state: Any) -> Mask:
+        """Whether a lane has not passed the last sibling, which happens only where that sibling is
+        a leaf."""
         return i != end
 
     start = (
@@ -245,6 +267,7 @@ def squared_distance_in_nearby_leaf(tree: PackedTree, x: Vec3, column: int) -> R
         return slot + 1, fmin(square, dr.squared_norm(point - x))
 
     def has_slots(slot: Any, square: Real) -> Mask:
+        """Whether the leaf has further slots."""
         del square
         return slot < tree.leaf_size
 
@@ -254,49 +277,52 @@ def squared_distance_in_nearby_leaf(tree: PackedTree, x: Vec3, column: int) -> R
 def next_closest_triangle(
     triangles: TriangleTree, x: Vec3, after: tuple[Real, Any], limit: Real, active: Mask
 ) -> ClosestTriangle:
-    """The triangle that comes next after the pair `after` and is nearer to x than `limit`, a
-    squared distance.
+    """The next triangle in the order of distance from points x: the one that comes after the pair
+    `after`, and is nearer than `limit`, a squared distance. Only active lanes search.
 
     Triangles are ordered by squared distance from x, and at equal distances by number; `after` is a
     squared distance and a number. Repeated calls, the first with (-1, NO_TRIANGLE), return each
     triangle within the limit once. If there is no further triangle, the result's `triangle` is
-    NO_TRIANGLE."""
+    NO_TRIANGLE.
+    """
     backend = triangles.tree.backend
     real, index, vector = backend.Float, backend.UInt32, backend.Array3f
     x, limit = vector(x), real(limit)
     square_after, number_after = real(after[0]), index(after[1])
-    inside = _distance_test(triangles, x, _pad(triangles, x))
+    may_be_within = _distance_test(triangles, x, _distance_rounding(triangles, x))
 
     def visit(node: VisitedNode, state: LoopValues) -> tuple[Mask, LoopValues]:
         """Enter a node if its box is nearer than the best triangle so far."""
-        closer = inside(node, state[0])
-        return closer, for_each_primitive(node, closer & node.is_leaf, nearer, state)
+        is_near = may_be_within(node, state[0])
+        return is_near, for_each_primitive(node, is_near & node.is_leaf, nearer, state)
 
     def nearer(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
-        """Take the triangle of a record if it comes after `after` and before the best so far."""
+        """Take the triangle in the record `row` if it comes after `after` and before the best so
+        far."""
         best, number, offset, normal, is_inner = state
         point = ClosestPointOnTriangle.of(row, x)
         square, n = point.squared_distance, index(fmax(row[NUMBER_COLUMN], real(0)))
         is_after = (square > square_after) | ((square == square_after) & (n > number_after))
         is_before_best = (square < best) | ((square == best) & (n < number))
-        chosen = active & is_after & is_before_best & (row[NUMBER_COLUMN] >= 0)
+        is_chosen = active & is_after & is_before_best & (row[NUMBER_COLUMN] >= 0)
         return (
-            dr.select(chosen, square, best),
-            dr.select(chosen, n, number),
-            dr.select(chosen, point.offset, offset),
-            dr.select(chosen, normal_of(row, vector), normal),
-            dr.select(chosen, point.is_inner, is_inner),
+            dr.select(is_chosen, square, best),
+            dr.select(is_chosen, n, number),
+            dr.select(is_chosen, point.offset, offset),
+            dr.select(is_chosen, normal_of(row, vector), normal),
+            dr.select(is_chosen, point.is_inner, is_inner),
         )
 
+    # The best triangle so far: squared distance, number, offset, normal, and `is_inner`.
     start = (limit, index(NO_TRIANGLE), vector(0), vector(0), backend.Bool(False))
     square, number, offset, normal, is_inner = traverse(triangles.tree, visit, start, active)
     exists = number != NO_TRIANGLE
     return ClosestTriangle(dr.select(exists, square, dr.inf), number, offset, normal, is_inner)
 
 
-def _pad(triangles: TriangleTree, x: Vec3) -> Real:
-    """A bound of the rounding error of computed distances from x to triangles: a length, 16 machine
-    epsilons of |x| + 1 (`distance_lower_bound`)."""
+def _distance_rounding(triangles: TriangleTree, x: Vec3) -> Real:
+    """A bound of the rounding error of computed distances from points x to triangles: a length, 16
+    machine epsilons of |x| + 1 (`distance_lower_bound`)."""
     return _ROUNDING_EPSILONS * triangles.tree.backend.machine_epsilon * (1 + dr.max(dr.abs(x)))
 
 
@@ -305,18 +331,21 @@ def _distance_test(triangles: TriangleTree, x: Vec3, pad: Real) -> Any:
 
     The function takes a node and a squared distance, and returns a mask. It tests the distance of x
     from the node's bounding box and, if the tree has slabs, from the node's slab (a flat cylinder
-    around its triangles, see `node_slabs`). Box and slab are enlarged by the length `pad`."""
+    around its triangles, see `node_slabs`). Box and slab are enlarged by the length `pad`.
+    """
     vector = triangles.tree.backend.Array3f
 
     def may_be_within(node: VisitedNode, square: Real) -> Mask:
         """Whether the node's enlarged box and slab come within the distance sqrt(square) of x."""
         low, high = vector(*node.head[:3]) - pad, vector(*node.head[3:]) + pad
+        # The vector from x to the box, up to signs.
         gap = dr.select(x < low, low - x, dr.select(x > high, x - high, 0))
         is_box_near = dr.squared_norm(gap) <= square
         slab = node.payload(is_box_near)
         if not slab:
             return is_box_near
         n, offset, thickness, radius = vector(*slab[:3]), slab[3], slab[4], slab[5]
+        # x relative to the center of the box, along the cylinder's axis and across it.
         relative = x - 0.5 * (low + high)
         height = dr.dot(relative, n)
         radial = dr.norm(dr.fma(vector(-height), n, relative))
@@ -331,14 +360,14 @@ def _distance_test(triangles: TriangleTree, x: Vec3, pad: Real) -> Any:
 class ClosestPointOnTriangle:
     """The point of a triangle that is closest to a point x.
 
-    squared_distance: from x.
-    offset: (3,) from x to the point.
+    squared_distance: the squared distance of that point from x.
+    offset: (3,) the vector from x to that point.
     is_inner: whether the point lies inside the triangle, not on its edges.
 
     It is the closest point of the triangle's plane if that point lies in the triangle, otherwise
     the closest point of the edges. The closest point of the plane is computed as a + alpha e + s h:
-    a and L are the start and the length of the longest edge e, and h is the altitude on e, from
-    which the component along e is removed twice.
+    a and e are the start and the vector of the longest edge, L is its length, and h is the altitude
+    on e, from which the component along e is removed twice.
 
     Proof that the distance is off by only a few machine epsilons of l = L + |x - a|, however thin
     the triangle. (A normal from a cross product would be off by epsilon L/|h|, which is large for a
@@ -359,34 +388,46 @@ class ClosestPointOnTriangle:
 
     @classmethod
     def of(cls, row: list[Real], x: Vec3) -> ClosestPointOnTriangle:
-        """The closest point to x of the triangle of a record (`triangle_records`)."""
+        """Find the point of the triangle in the record `row` (`triangle_records`) that is closest
+        to x."""
         vector = cast("Any", type(x))
+        # x is the origin. The closest point of the edges comes first.
         p, q, r = (corner - x for corner in corners_of(row, vector))
-        first, second, third = row[INVERSE_SQUARES_COLUMN : INVERSE_SQUARES_COLUMN + 3]
+        inverse_pq, inverse_qr, inverse_pr = row[
+            INVERSE_SQUARES_COLUMN : INVERSE_SQUARES_COLUMN + 3
+        ]
         pq, qr, pr = q - p, r - q, r - p
         best, offset = _shortest_vector(
-            _closest_on_segment(p, pq, first),
-            _closest_on_segment(q, qr, second),
-            _closest_on_segment(p, pr, third),
+            _closest_on_segment(p, pq, inverse_pq),
+            _closest_on_segment(q, qr, inverse_qr),
+            _closest_on_segment(p, pr, inverse_pr),
         )
         squares = [dr.squared_norm(edge) for edge in (pq, qr, pr)]
-        by_pr = (squares[2] > squares[0]) & (squares[2] >= squares[1])
-        by_qr = ~by_pr & (squares[1] > squares[0])
+        is_pr_longest = (squares[2] > squares[0]) & (squares[2] >= squares[1])
+        is_qr_longest = ~is_pr_longest & (squares[1] > squares[0])
 
-        def chosen(of_pq: Any, of_qr: Any, of_pr: Any) -> Any:
+        def of_longest(of_pq: Any, of_qr: Any, of_pr: Any) -> Any:
             """Select the number or vector of the longest edge, from the three that belong to the
             edges pq, qr and pr."""
-            return dr.select(by_pr, of_pr, dr.select(by_qr, of_qr, of_pq))
+            return dr.select(is_pr_longest, of_pr, dr.select(is_qr_longest, of_qr, of_pq))
 
-        a, e, inverse = chosen(p, q, p), chosen(pq, qr, pr), chosen(first, second, third)
+        a, e, inverse = (
+            of_longest(p, q, p),
+            of_longest(pq, qr, pr),
+            of_longest(inverse_pq, inverse_qr, inverse_pr),
+        )
+        # x is a + alpha e + away, and the corner opposite to the edge a + beta e + h.
         alpha, away = _project_on_edge(-a, e, inverse)
-        beta, h = _project_on_edge(chosen(r, p, q) - a, e, inverse)
+        beta, h = _project_on_edge(of_longest(r, p, q) - a, e, inverse)
         s = dr.dot(away, h) / dr.squared_norm(h)  # NaN for a triangle without an area: not inside
-        inside = (s >= 0) & (s <= 1) & (alpha >= s * beta) & (1 - alpha >= s * (1 - beta))
+        is_inside = (s >= 0) & (s <= 1) & (alpha >= s * beta) & (1 - alpha >= s * (1 - beta))
+        # From x to the closest point of the plane.
         across = dr.fma(vector(s), h, -away)
         square = dr.squared_norm(across)
-        inside &= square < best
-        return cls(dr.select(inside, square, best), dr.select(inside, across, offset), inside)
+        is_inside &= square < best
+        return cls(
+            dr.select(is_inside, square, best), dr.select(is_inside, across, offset), is_inside
+        )
 
 
 def _project_on_edge(v: Vec3, e: Vec3, inverse: Real) -> tuple[Real, Vec3]:
@@ -401,7 +442,8 @@ def _project_on_edge(v: Vec3, e: Vec3, inverse: Real) -> tuple[Real, Vec3]:
 
 
 def _closest_on_segment(a: Vec3, e: Vec3, inverse: Real) -> Vec3:
-    """The point of the segment from a to a + e that is nearest to the origin. inverse: 1/|e|^2."""
+    """The point of the segment from a to a + e that is nearest to the origin. inverse: 1/|e|^2; any
+    finite number if e = 0."""
     real, vector = cast("Any", type(inverse)), cast("Any", type(a))
     return dr.fma(vector(clamp(-dr.dot(a, e) * inverse, real(0), real(1))), e, a)
 
@@ -419,29 +461,31 @@ def _shortest_vector(*vectors: Vec3) -> tuple[Real, Vec3]:
 def squared_distance_to_segment(a: Vec3, e: Vec3, inverse: Real) -> Real:
     """The squared distance from the origin to the segment from a to a + e.
 
-    inverse: 1/|e|^2; any finite number if e = 0."""
+    inverse: 1/|e|^2; any finite number if e = 0.
+    """
     return dr.squared_norm(_closest_on_segment(a, e, inverse))
 
 
 def jump_sum_within(triangles: TriangleTree, x: Vec3, distance: Real, active: Mask = True) -> Real:
-    """The sum of |jump| over all triangles within `distance` of x: the jump is the change of the
-    winding number across a triangle, which its record holds."""
+    """The sum of |jump| over all triangles within `distance` of points x. The jump is the change of
+    the winding number across a triangle, which its record holds."""
     real, vector = triangles.tree.backend.Float, triangles.tree.backend.Array3f
     x, distance = vector(x), real(distance)
-    reach, inside = distance * distance, _distance_test(triangles, x, distance)
+    # Boxes are enlarged by `distance` besides, which covers rounding.
+    square, may_be_within = distance * distance, _distance_test(triangles, x, distance)
 
     def visit(node: VisitedNode, state: LoopValues) -> tuple[Mask, LoopValues]:
         """Enter a node if its box comes within `distance` of x."""
-        close = inside(node, reach)
-        return close, for_each_primitive(node, close & node.is_leaf, add, state)
+        is_near = may_be_within(node, square)
+        return is_near, for_each_primitive(node, is_near & node.is_leaf, add, state)
 
     def add(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
-        """Add the jump across the triangle of a record, if it is within the distance."""
-        within = (
+        """Add the jump across the triangle in the record `row`, if it is within the distance."""
+        is_within = (
             active
             & (row[NUMBER_COLUMN] >= 0)
-            & (ClosestPointOnTriangle.of(row, x).squared_distance <= reach)
+            & (ClosestPointOnTriangle.of(row, x).squared_distance <= square)
         )
-        return (state[0] + dr.select(within, dr.abs(row[PARITY_COLUMN]), 0),)
+        return (state[0] + dr.select(is_within, dr.abs(row[PARITY_COLUMN]), 0),)
 
     return traverse(triangles.tree, visit, (real(0),), active)[0]

@@ -1,5 +1,7 @@
-"""Triangles that overlap in the same plane, as where parts of a mesh touch; and the borders of the
-overlaps.
+"""Triangles of a mesh that overlap in the same plane, as where parts of a mesh touch; and the
+borders of the overlaps. A face is *covered* where other faces in its plane lie on it. To *cut* a
+face, it is divided by the plane of another triangle, a *knife*. A *lane* is one entry of Dr.Jit's
+arrays, here a face.
 
 Two such triangles do not pass through each other: no edge of either crosses the other. Yet the
 winding number beside one triangle changes along the border of the other.
@@ -44,6 +46,7 @@ def borders_of_overlaps(
     that each piece is covered completely or not at all.
 
     tree: a tree of the same faces, with coordinates of at most about 1.
+    vertices, faces: (n, 3) and (m, 3), the mesh.
     at_every_edge: whether to cut along all edges of the covering faces. If not, an edge is left out
         if all faces at it cover the face and run it equally often in both directions: the face is
         then equally covered on both sides of the edge.
@@ -55,6 +58,8 @@ def borders_of_overlaps(
     covered, covering = overlapping_faces(tree, vertices, faces)
     if not len(covered):
         return covered, np.zeros((0, 3, 3))
+    # Each pair of a covered face and an edge of a covering face becomes one integer. `count` is how
+    # many covering faces have the edge, `net` the sum of its directions there.
     edges, sign = _edges(faces[covering])
     unique_edges, edge_index = np.unique(edges, axis=0, return_inverse=True)
     edge_index = edge_index.reshape(-1)
@@ -63,20 +68,23 @@ def borders_of_overlaps(
     net = np.zeros(len(pair_keys), np.int64)
     np.add.at(net, pair_index.reshape(-1), sign)
     face, edge = np.divmod(pair_keys, len(unique_edges))
+    # How many faces of the mesh have the edge. Edges are looked up by a single integer each.
     ends, face_count = np.unique(_edges(faces)[0], axis=0, return_counts=True)
     width = len(vertices)
-    row = np.searchsorted(ends @ [width, 1], unique_edges[edge] @ [width, 1])
-    is_border = at_every_edge | (net != 0) | (count != face_count[row])
+    place_in_ends = np.searchsorted(ends @ [width, 1], unique_edges[edge] @ [width, 1])
+    is_border = at_every_edge | (net != 0) | (count != face_count[place_in_ends])
     face, edge = face[is_border], edge[is_border]
     p, q = np.moveaxis(vertices[unique_edges[edge]], 1, 0)
     normal, _ = _normals(vertices[faces[face]])
+    # Two corners of a knife are behind the face and one is in front of it. The face's plane cuts
+    # the knife halfway between them, in the edge from p to q.
     away = np.linalg.norm(q - p, axis=1, keepdims=True) * normal
     middle, side = 0.5 * (p + q), q - p
     return face, np.stack([middle - away - side, middle - away + side, middle + away], axis=1)
 
 
 def _edges(faces: IntArray) -> tuple[IntArray, IntArray]:
-    """The edges of faces (m, 3), with their directions.
+    """The three edges of each of the faces (m, 3), with their directions.
 
     Returns:
         (3 m, 2) the vertices of each edge, the lower index first; and (3 m,) 1 if the face runs the
@@ -87,8 +95,8 @@ def _edges(faces: IntArray) -> tuple[IntArray, IntArray]:
 
 
 def _normals(corners: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Unit normals (m, 3) of triangles (m, 3, 3), 0 for triangles without a normal; and their
-    heights (m,) above their longest edges."""
+    """Unit normals (m, 3) of triangles with corners (m, 3, 3), 0 for triangles without an area; and
+    their heights (m,) above their longest edges."""
     u, v = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     normal = np.cross(u, v)
     area = np.sqrt(np.einsum("ni,ni->n", normal, normal))
@@ -112,10 +120,12 @@ def _candidates(corners: FloatArray, normals: FloatArray, heights: FloatArray) -
     by `_IN_PLANE`, divided by the smaller of the triangles' heights. R^4 is divided into cells. So
     a triangle that is alone in its cell shares its plane with another triangle only in two cases:
     its point is nearer to a wall of the cell than this difference, or a coordinate of its normal is
-    nearer to 0.3 in magnitude than this difference."""
+    nearer to 0.3 in magnitude than this difference.
+    """
     excess = np.abs(normals) - 0.3
-    first = np.take_along_axis(normals, (excess > 0).argmax(axis=1)[:, None], axis=1)
-    normals = np.where(first < 0, -normals, normals)
+    # The coordinate that decides the orientation.
+    deciding = np.take_along_axis(normals, (excess > 0).argmax(axis=1)[:, None], axis=1)
+    normals = np.where(deciding < 0, -normals, normals)
     plane = np.column_stack([normals, np.einsum("ni,ni->n", normals, corners[:, 0])]) / _PLANE_CELL
     cell = np.floor(plane)
     in_cell = plane - cell
@@ -134,24 +144,29 @@ def overlapping_faces(
     """All pairs of faces (m, 3) that lie in one plane and overlap. Returns the indices (k,) of the
     first and (k,) of the second faces of the pairs; each pair occurs in both orders.
 
-    tree: of the same faces, with coordinates of at most about 1.
+    tree: a tree of the same faces, with coordinates of at most about 1.
 
     The search begins at the smaller face of each pair: for each face it finds the overlapping faces
-    that are at least as large, and there are few of them."""
+    that are at least as large, and there are few of them. The size of a face is its height over its
+    longest edge.
+    """
     backend = tree.tree.backend
     corners = vertices[faces]
     normals, heights = _normals(corners)
-    rows = _candidates(corners, normals, heights)
-    sizes, after = backend.Float(heights), np.full(len(rows), -1.0)
+    # In each round, find the next partner of each face of `searching`, after the last one found.
+    searching = _candidates(corners, normals, heights)
+    sizes, after = backend.Float(heights), np.full(len(searching), -1.0)
     batches: list[IntArray] = []
-    while len(rows):
-        ends = tuple(to_vector3(backend, corner) for corner in np.moveaxis(corners[rows], 1, 0))
-        ids = upload_integers(backend, rows)
+    while len(searching):
+        ends = tuple(
+            to_vector3(backend, corner) for corner in np.moveaxis(corners[searching], 1, 0)
+        )
+        ids = upload_integers(backend, searching)
         partners = _next_in_plane(tree, ends, ids, sizes, backend.Float(after))
         number = to_numpy(partners).astype(np.int64)
-        hit = number != NO_TRIANGLE
-        rows, after = rows[hit], number[hit].astype(np.float64)
-        batches.append(np.column_stack([rows, number[hit]]))
+        is_found = number != NO_TRIANGLE
+        searching, after = searching[is_found], number[is_found].astype(np.float64)
+        batches.append(np.column_stack([searching, number[is_found]]))
     if not batches:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
     pairs = np.concatenate(batches)
@@ -162,12 +177,15 @@ def overlapping_faces(
 def _next_in_plane(
     tree: TriangleTree, corners: tuple[Vec3, ...], face: Any, sizes: Real, after: Real
 ) -> Any:
-    """For each lane, the lowest-numbered face after the number `after` that is coplanar with the
-    lane's face, overlaps it and is at least as large. NO_TRIANGLE if there is none.
+    """For each lane, which has one face, the lowest-numbered face after the number `after` that is
+    coplanar with the lane's face, overlaps it and is at least as large. NO_TRIANGLE if there is
+    none.
 
+    tree: a tree of all faces.
     corners, face: the corners and the number of the lane's face.
     sizes: the heights of all faces over their longest edges; of two faces with equal heights the
-        later one counts as larger."""
+        later one counts as larger.
+    """
     backend = tree.tree.backend
     real, index, vector = backend.Float, backend.UInt32, backend.Array3f
     a, b, c = corners
@@ -181,15 +199,17 @@ def _next_in_plane(
         return is_near, for_each_primitive(node, is_near & node.is_leaf, nearer, state)
 
     def nearer(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
-        """Take the face of a record if it fits and has a lower number than the best so far."""
+        """Take the face in the record `row` if it fits and has a lower number than the best so
+        far."""
         number = index(fmax(row[NUMBER_COLUMN], real(0)))
         other_corners = corners_of(row, vector)
         other_size = dr.gather(real, sizes, number, active)
-        larger = (other_size > size) | ((other_size == size) & (number > face))
-        chosen = active & (row[NUMBER_COLUMN] > after) & (number < state[0]) & larger
-        chosen &= _in_plane(corners, other_corners) & _overlap(corners, other_corners)
-        return (dr.select(chosen, number, state[0]),)
+        is_larger = (other_size > size) | ((other_size == size) & (number > face))
+        is_chosen = active & (row[NUMBER_COLUMN] > after) & (number < state[0]) & is_larger
+        is_chosen &= _in_plane(corners, other_corners) & _overlap(corners, other_corners)
+        return (dr.select(is_chosen, number, state[0]),)
 
+    # The state is the lowest number so far.
     return traverse(tree.tree, visit, (index(NO_TRIANGLE),))[0]
 
 
@@ -200,7 +220,7 @@ def _unit(vector: Vec3) -> Vec3:
 
 
 def _normal(corners: tuple[Vec3, ...]) -> Vec3:
-    """The unit normal of a triangle; 0 if it has no area."""
+    """The unit normal of a triangle with three corners; 0 if it has no area."""
     a, b, c = corners
     return _unit(dr.cross(b - a, c - a))
 
@@ -208,13 +228,16 @@ def _normal(corners: tuple[Vec3, ...]) -> Vec3:
 def _in_plane(ours: tuple[Vec3, ...], theirs: tuple[Vec3, ...]) -> Mask:
     """Whether one of two triangles has all its corners in the plane of the other one, up to
     `_IN_PLANE`. It is enough that this holds for one of the two planes, since the normal of a thin
-    triangle may be only rounding error."""
+    triangle may be only rounding error.
+
+    ours, theirs: the corners of the two triangles.
+    """
 
     def lies_in(corners: tuple[Vec3, ...], plane: tuple[Vec3, ...]) -> Mask:
         """Whether three corners lie in the plane of a triangle; False if that has no normal."""
         normal = _normal(plane)
-        near = [dr.abs(dr.dot(normal, p - plane[0])) <= _IN_PLANE for p in corners]
-        return near[0] & near[1] & near[2] & (dr.squared_norm(normal) > 0.5)
+        is_near = [dr.abs(dr.dot(normal, p - plane[0])) <= _IN_PLANE for p in corners]
+        return is_near[0] & is_near[1] & is_near[2] & (dr.squared_norm(normal) > 0.5)
 
     return lies_in(ours, theirs) | lies_in(theirs, ours)
 
@@ -222,6 +245,8 @@ def _in_plane(ours: tuple[Vec3, ...], theirs: tuple[Vec3, ...]) -> Mask:
 def _overlap(ours: tuple[Vec3, ...], theirs: tuple[Vec3, ...]) -> Mask:
     """Whether two triangles in one plane overlap by more than the length `_IN_PLANE`. They do if no
     edge of either triangle separates them, that is, has the whole other triangle on its outer side.
+
+    ours, theirs: the corners of the two triangles.
     """
     overlaps: Mask = True
     for first, second in ((ours, theirs), (theirs, ours)):

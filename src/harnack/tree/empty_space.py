@@ -1,5 +1,8 @@
 """Cells of a box that are proved to contain no point of a set, such as a level set, and the
-remaining cells: octrees, uniform grids, and connected components of cells.
+remaining cells: octrees, uniform grids, and connected components of cells. A cell is *empty* if it
+is proved to contain no point of the set, and otherwise *occupied*: it may contain points. The
+*clearance* is a function from points to proved lower bounds of their distances from the set. The
+*margin* of a cell is a layer around it, by which it is enlarged on all sides before it is tested.
 
 - `RefinedCells`, from `refine_cells` and `nonempty_cells`: a box split where it is not proved
   empty.
@@ -7,9 +10,9 @@ remaining cells: octrees, uniform grids, and connected components of cells.
 - `OccupancyGrid`: such a grid of the cells that may contain a set of points, computed by an octree.
 - `largest_connected_component`: the largest group of connected cells that are not proved empty.
 
-A component is a group of cells that are not proved empty and are connected by faces, edges and
-corners. If a single component is to be drawn, the cells of all other components count as empty:
-rays jump across them, so that nothing in them is hit.
+A component is a group of occupied cells that are connected by faces, edges and corners. If a single
+component is to be drawn, the cells of all other components count as empty: rays jump across them,
+so that nothing in them is hit.
 """
 
 from __future__ import annotations
@@ -57,17 +60,18 @@ _OCTANTS = np.array(list(itertools.product((0.0, 1.0), repeat=3)))
 
 @dataclass(frozen=True)
 class BoxCells:
-    """Boxes of equal size.
+    """Boxes of equal size, the cells of a grid or of one depth of an octree.
 
     corners: (n, 3) the lower corner of each box.
-    size: (3,) the edge lengths of every box."""
+    size: (3,) the edge lengths of every box.
+    """
 
     corners: FloatArray
     size: FloatArray
 
     @property
     def centers(self) -> FloatArray:
-        """(n, 3) the centers of the boxes."""
+        """The centers (n, 3) of the boxes."""
         return self.corners + 0.5 * self.size
 
     @property
@@ -86,22 +90,23 @@ class BoxCells:
         return _kdop_of_boxes(self.centers, 0.5 * self.size + slack)
 
     def octants(self) -> BoxCells:
-        """The 8 n boxes of half the size into which the n boxes are divided, the octants of each
-        box in a row."""
+        """The 8 n boxes of half the size into which the n boxes are divided, the eight octants of
+        each box in a row."""
         half = 0.5 * self.size
         return BoxCells((self.corners[:, None] + _OCTANTS * half).reshape(-1, 3), half)
 
     def subset(self, which: BoolArray) -> BoxCells:
-        """The boxes for which the mask (n,) is set."""
+        """The boxes for which the mask `which` (n,) is True."""
         return BoxCells(self.corners[which], self.size)
 
     def is_proved_empty(self, clearance: Clearance, margin: float = 0.0) -> BoolArray:
-        """(n,) whether each box, enlarged on all sides by `margin` times its size, is proved to
-        hold no point of a set.
+        """Whether each box, enlarged on all sides by `margin` times its size, is proved to hold no
+        point of a set: a mask (n,).
 
         clearance: gives proved lower bounds of the distances of points from the set. A box is
             proved empty if the ball around the enlarged box is smaller than the clearance of its
-            center."""
+            center.
+        """
         if not len(self.corners):
             return np.zeros(0, np.bool_)
         return clearance(self.centers) > self.half_diagonal * (1 + 2 * margin + 1e-9)
@@ -129,6 +134,7 @@ def _kdop_of_boxes(centers: FloatArray, half: FloatArray) -> ConvexHull:
     contains boxes with centers (n, 3) and half edge lengths `half` (3,)."""
     normals = np.array([v for v in itertools.product((-1, 0, 1), repeat=3) if any(v)], float)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    # A box reaches |n| . half beyond its center in the direction n.
     offsets = (centers @ normals.T).max(axis=0) + np.abs(normals) @ half
     return ConvexHull(normals, offsets, centers.min(axis=0) - half, centers.max(axis=0) + half)
 
@@ -140,7 +146,8 @@ class RefinedCells:
 
     occupied: the cells of the finest size that are not proved empty: they may contain points of the
         set.
-    empty: the cells that are proved empty, the largest first."""
+    empty: the cells that are proved empty: one `BoxCells` for each size, the largest first.
+    """
 
     occupied: BoxCells
     empty: tuple[BoxCells, ...]
@@ -157,32 +164,35 @@ def refine_cells(
     rounds. Returns the cells of the last round that are not proved empty, and all cells proved
     empty.
 
-    clearance: gives proved lower bounds of the distances of points from the set.
+    clearance: gives proved lower bounds of the distances of points from a set. An empty cell holds
+        no point of the set.
     max_cells_per_round: refinement stops before a round that would test more cells than this.
     max_rounds: the largest number of rounds; each halves the edges.
     margin: a cell counts as empty only if it is proved empty after it was enlarged on all sides by
-        this fraction of its size."""
+        this fraction of its size.
+    """
     empty: list[BoxCells] = []
     for _ in range(max_rounds):
         if 8 * len(cells.corners) > max_cells_per_round:
             break
         split = cells.octants()
-        free = split.is_proved_empty(clearance, margin)
-        cells = split.subset(~free)
-        empty.append(split.subset(free))
+        is_empty = split.is_proved_empty(clearance, margin)
+        cells = split.subset(~is_empty)
+        empty.append(split.subset(is_empty))
     return RefinedCells(cells, tuple(empty))
 
 
 def nonempty_cells(
     lower: FloatArray, upper: FloatArray, clearance: Clearance, max_cells: int, finest: int
 ) -> BoxCells:
-    """The leaves of the octree of a box that are not proved to be free of a set, of equal size.
-    There are none if all of the box is proved empty.
+    """The cells of a box that may contain points of a set: the octree leaves of the finest size
+    that are not proved empty. There are none if all of the box is proved empty.
 
     lower, upper: the corners (3,) of the box.
     clearance: gives proved lower bounds of the distances of points from the set.
     max_cells: refinement stops before a round that would test more cells than this.
-    finest: the largest number of rounds; each halves the edges."""
+    finest: the largest number of rounds; each halves the edges.
+    """
     root = BoxCells(np.array(lower)[None], np.array(upper) - np.array(lower))
     return refine_cells(root, clearance, max_cells, finest).occupied
 
@@ -196,13 +206,14 @@ Layout = TypeVar("Layout", bound="GridData")
 
 @dataclass(frozen=True)
 class GridData:
-    """A uniform grid of cubes, some of them proved to contain no point of a set; in NumPy.
+    """A uniform grid of cubes, some of them proved to contain no point of a set (empty); in NumPy.
 
     origin: (3,) the lower corner of the grid, in numbers of single precision.
     cell_size: the width of a cell (`round_to_short_float`).
     shape: the number of cells along x, y and z.
     empty_distance: (cells,), x fastest: for each cell the chessboard distance, in cells, to the
-        nearest cell that is not proved empty; 0 for such a cell itself."""
+        nearest cell that is not proved empty; 0 for such a cell itself.
+    """
 
     origin: FloatArray
     cell_size: float
@@ -212,8 +223,9 @@ class GridData:
 
 @dataclass(frozen=True)
 class EmptySpaceGrid:
-    """A uniform grid of cubes, some of them proved to contain no point of a set, on a backend. All
-    numbers are parameters of kernels, so that kernels are compiled once for all grids.
+    """A uniform grid of cubes on a backend, some of them proved to contain no point of a set
+    (empty), for rays that jump across empty cells. All numbers are parameters of kernels, so that
+    kernels are compiled once for all grids.
 
     A point outside of the grid is treated like its nearest cell.
 
@@ -234,11 +246,14 @@ class EmptySpaceGrid:
 
     @staticmethod
     def upload_layout(backend: Backend, layout: GridData) -> tuple[Backend, Vec3, Real, Vec3, Any]:
-        """Upload a grid. Returns the attributes backend, origin, cell_size, shape and
-        empty_distance."""
+        """Upload a grid to a backend. Returns the attributes backend, origin, cell_size, shape and
+        empty_distance of an `EmptySpaceGrid`.
+
+        layout: the grid in NumPy.
+        """
 
         def vector(numbers: Any) -> Vec3:
-            """Three numbers, uploaded."""
+            """Three numbers, uploaded as a vector."""
             return backend.Array3f(*(dr.opaque(backend.Float, float(number)) for number in numbers))
 
         return (
@@ -258,7 +273,8 @@ class EmptySpaceGrid:
         return GridCell(self, position, corner, x + row * (y + layer * z))
 
     def empty_run(self, p: Vec3, d: Vec3, length: Real) -> Real:
-        """A length s for which p + s d is proved to stay in empty cells; it may exceed `length`.
+        """For each ray, a length s for which p + s d is proved to stay in empty cells from p on; it
+        may exceed `length`. It is 0 if p is not in an empty cell.
 
         p, d: the start and the direction of each ray.
         length: the length at which the search may stop.
@@ -267,43 +283,48 @@ class EmptySpaceGrid:
         are the margins around them. These cells form a cube, and with their margins a cube larger
         by the margin. A step leaves the cube of cells by at most the margin minus
         `_ROUNDING_SHARE`, so it stays inside of the larger cube; the remaining `_ROUNDING_SHARE` is
-        for the rounding of positions. Steps end in the first cell that is not proved empty."""
+        for the rounding of positions. Steps end in the first cell that is not proved empty.
+        """
 
         def extend(s: Real) -> tuple[Real, Mask]:
             """A length, at least s, up to which the path from p + s d on stays in empty cells; and
             a mask of whether the cell at p + s d is empty. If it is not, the length is s."""
             cell = self.cell(dr.fma(type(p)(s), d, p))
-            free = cell.empty_distance
+            free_cells = cell.empty_distance
             return dr.select(
-                free > 0, s + cell.exit_distance(d, self.backend.Float(free)), s
-            ), free > 0
+                free_cells > 0, s + cell.exit_distance(d, self.backend.Float(free_cells)), s
+            ), free_cells > 0
 
         def body(s: Real, active: Mask) -> tuple[Real, Mask]:
             """Extend s on active lanes; they stay active while cells are empty and s < length."""
             further, empty = extend(s)
             return dr.select(active, further, s), active & empty & (further < length)
 
+        # 0 for each lane, but NaN if p is not finite: then the lane is not active.
         start = self.backend.Float(0) + 0 * p.x
         active = dr.full(self.backend.Bool, True, 1) & (start == start) & (length > 0)
 
         def running(s: Real, active: Mask) -> Mask:
+            """Whether a lane is still in empty cells and shorter than `length`."""
             del s
             return active
 
         return dr.while_loop((start, active), running, body, label="empty cells")[0]
 
     def is_resolved(self, o: Vec3, end: Real) -> Mask:
-        """Whether rounding moves points of rays from o, up to the length `end`, by less than the
-        part of the margin that is reserved for rounding. False if o is not finite."""
+        """Whether coordinates are precise enough for the grid: whether rounding moves points of
+        rays from o, up to the length `end`, by less than the part of the margin that is reserved
+        for rounding. False if o is not finite."""
         rounding = 4 * self.backend.machine_epsilon * (max_norm(o) + end)
         return (rounding < _ROUNDING_SHARE * self.cell_size) & dr.all(dr.isfinite(o))
 
     def end_of_empty_run(self, o: Vec3, d: Vec3, t: Real, end: Real) -> Real:
-        """A length, at most `end`, up to which rays o + t d, |d| = 1, stay in empty cells from `t`
-        on.
+        """A ray parameter, at most `end`, up to which rays o + t d, |d| = 1, are proved to stay in
+        empty cells from `t` on.
 
         It is `t` itself if coordinates are so large that rounding might move a point too far
-        (`is_resolved`): a point is off by at most four roundings of its largest coordinate."""
+        (`is_resolved`): a point is off by at most four roundings of its largest coordinate.
+        """
         length = dr.select(self.is_resolved(o, end), end - t, 0)
         run = self.empty_run(dr.fma(type(o)(t), d, o), d, length)
         return dr.select(length > 0, fmin(t + run, end), t)
@@ -311,11 +332,13 @@ class EmptySpaceGrid:
 
 @dataclass(frozen=True)
 class GridCell:
-    """The cell of a grid in which a point lies, for each lane.
+    """The cell of a grid in which a point lies, for each lane (entry of Dr.Jit's arrays).
+    Coordinates are in units of cells from the origin of the grid.
 
-    cell_coordinates: the point, in units of cells from the origin of the grid.
-    corner: the lower corner of its cell, in the same units.
-    index: the index of the cell in `EmptySpaceGrid.empty_distance`."""
+    cell_coordinates: the coordinates of the point.
+    corner: the coordinates of the lower corner of its cell.
+    index: the index of the cell in `EmptySpaceGrid.empty_distance`.
+    """
 
     grid: EmptySpaceGrid
     cell_coordinates: Vec3
@@ -336,25 +359,30 @@ class GridCell:
             and of the margin around them.
 
         The path may leave the cube through a face on which the grid ends, since points outside of
-        the grid are treated like the nearest cell. So the length may be infinite."""
+        the grid are treated like the nearest cell. So the length may be infinite.
+        """
         length: Real = self.grid.backend.Float(dr.inf)
         margin = self.grid.margin - _ROUNDING_SHARE
         for k in range(3):
+            # The planes of the cube across this axis; the path leaves through one of them.
             upper, lower = self.corner[k] + reach, self.corner[k] + 1 - reach
-            rising = d[k] > 0
+            is_rising = d[k] > 0
             gap = dr.select(
-                rising, upper - self.cell_coordinates[k], self.cell_coordinates[k] - lower
+                is_rising, upper - self.cell_coordinates[k], self.cell_coordinates[k] - lower
             )
-            is_grid_end = dr.select(rising, upper >= self.grid.shape[k], lower <= 0)
+            is_grid_end = dr.select(is_rising, upper >= self.grid.shape[k], lower <= 0)
             distance = (gap + margin) / dr.abs(d[k])
             length = fmin(dr.select(is_grid_end | (d[k] == 0), dr.inf, distance), length)
         return length * self.grid.cell_size
 
 
 def distance_to_occupied(empty: BoolArray) -> IntArray:
-    """The array `GridData.empty_distance` (cells,), x fastest, from a mask (nz, ny, nx) of the
-    empty cells: the chessboard distance of each cell, in cells, from the nearest cell that is not
-    empty. If all cells are empty, it is the largest number of cells along an axis."""
+    """The array `GridData.empty_distance` (cells,), x fastest: for each cell the chessboard
+    distance, in cells, from the nearest cell that is not empty. If all cells are empty, it is the
+    largest number of cells along an axis.
+
+    empty: (nz, ny, nx) a mask of the empty cells.
+    """
     if empty.all():
         return np.full(empty.size, max(empty.shape), np.int64)
     from scipy import ndimage  # imported here: it takes a third of a second
@@ -377,22 +405,24 @@ _MARGIN, _ROUNDS = 1 / 16, 3
 
 @dataclass(frozen=True)
 class OccupancyGrid(GridData):
-    """A uniform grid of cubes, some of which may contain points of a set. The empty cells, and
-    margins of 1/16 cell around them, contain no point of the set."""
+    """A uniform grid of cubes, some of which may contain points of a set; the other cells are
+    empty. Empty cells, and margins of 1/16 cell around them, are proved to contain no point of the
+    set."""
 
     @classmethod
     def from_clearance(
         cls, lower: FloatArray, upper: FloatArray, clearance: Clearance, across: int
     ) -> OccupancyGrid:
-        """A grid over a box that holds the set, with about `across` cells along the box's longest
-        side.
+        """Build a grid over a box that contains the set, with about `across` cells along the box's
+        longest side.
 
         lower, upper: the corners (3,) of the box.
         clearance: gives proved lower bounds of the distances of points from the set.
 
         There are no points of the set outside of the box, so an empty cell at a face of the box
         stays empty if it is extended outwards. Cells are never smaller than the spacing of the
-        box's largest coordinate in single precision, so there may be fewer than `across`."""
+        box's largest coordinate in single precision, so there may be fewer than `across`.
+        """
         reach = np.abs([lower, upper]).max().astype(np.float32)
         cell = max(float((upper - lower).max()) / across, float(np.spacing(reach)))
         cell = round_to_short_float(cell)
@@ -400,6 +430,7 @@ class OccupancyGrid(GridData):
         room = (_MARGIN + 1e-3) * cell
         origin = np.nextafter((lower - room).astype(np.float32), np.float32(-np.inf))
         origin = origin.astype(np.float64)
+        # The grid is first filled with cubes of this width, which are then halved down to cells.
         side = cell * 2**_ROUNDS
         nx, ny, nz = (int(count) for count in np.ceil((upper + room - origin) / side))
         indices = np.indices((nx, ny, nz)).reshape(3, -1).T
@@ -407,14 +438,14 @@ class OccupancyGrid(GridData):
         roots = roots.subset(~roots.is_proved_empty(clearance, _MARGIN))
         cells = refine_cells(roots, clearance, np.iinfo(np.int64).max, _ROUNDS, _MARGIN).occupied
         nx, ny, nz = (count << _ROUNDS for count in (nx, ny, nz))
-        empty = np.ones((nz, ny, nx), np.bool_)
+        is_empty = np.ones((nz, ny, nx), np.bool_)
         x, y, z = np.round((cells.corners - origin) / cell).astype(np.int64).T
-        empty[z, y, x] = False
-        return cls(origin, cell, (nx, ny, nz), distance_to_occupied(empty))
+        is_empty[z, y, x] = False
+        return cls(origin, cell, (nx, ny, nz), distance_to_occupied(is_empty))
 
     @classmethod
     def empty(cls) -> OccupancyGrid:
-        """The grid of the empty set: a single cell, which is empty."""
+        """The grid of a set without points: a single cell, which is empty."""
         return cls(np.zeros(3), 1.0, (1, 1, 1), distance_to_occupied(np.ones((1, 1, 1), np.bool_)))
 
     def occupied_centers(self) -> FloatArray:
@@ -427,15 +458,19 @@ class OccupancyGrid(GridData):
         """The same grid with more empty cells: a cell also counts as empty if its eight octants are
         all proved empty, each enlarged by the margin of the cell.
 
-        clearance: gives proved lower bounds of the distances of points from the set."""
+        clearance: gives proved lower bounds of the distances of points from the set.
+        """
         x, y, z = self.shape
-        full = (self.empty_distance == 0).reshape(z, y, x)
-        indices = np.argwhere(full)[:, ::-1]
+        is_occupied = (self.empty_distance == 0).reshape(z, y, x)
+        indices = np.argwhere(is_occupied)[:, ::-1]
         halves = BoxCells(
             self.origin + self.cell_size * indices, np.full(3, self.cell_size)
         ).octants()
-        full[full] = ~halves.is_proved_empty(clearance, 2 * _MARGIN).reshape(-1, 8).all(axis=1)
-        return replace(self, empty_distance=distance_to_occupied(~full))
+        # Margins are fractions of the size, here of half a cell.
+        is_occupied[is_occupied] = ~halves.is_proved_empty(clearance, 2 * _MARGIN).reshape(
+            -1, 8
+        ).all(axis=1)
+        return replace(self, empty_distance=distance_to_occupied(~is_occupied))
 
     def upload(self, backend: Backend) -> EmptySpaceGrid:
         """The grid on a backend, for rays."""
@@ -448,7 +483,7 @@ _NEIGHBOR_STENCIL = np.ones((3, 3, 3), np.bool_)
 
 def largest_connected_component(cells: OccupancyGrid) -> OccupancyGrid:
     """The grid in which only the largest group of connected cells counts as occupied, that is, as
-    not proved empty.
+    not proved empty. A grid without occupied cells is returned as it is.
 
     The size of a group is the sum of its projections along the three axes. A projection counts the
     rows of cells along an axis that contain a cell of the group. Of equal groups, the first along
@@ -470,25 +505,30 @@ def largest_connected_component(cells: OccupancyGrid) -> OccupancyGrid:
     Proof that rays may jump across the other groups, and beyond their cells by the margin
     (`EmptySpaceGrid.empty_run`). A neighbor of a cell of another group belongs to that group or was
     empty before, and the margin is less than a cell. So the margin contains nothing of the chosen
-    group. The margin of a cell that was empty before contains nothing of the set at all."""
+    group. The margin of a cell that was empty before contains nothing of the set at all.
+    """
     x, y, z = cells.shape
-    full = (cells.empty_distance == 0).reshape(z, y, x)
-    if not full.any():
+    is_occupied = (cells.empty_distance == 0).reshape(z, y, x)
+    if not is_occupied.any():
         return cells
     from scipy import ndimage  # imported here: it takes a third of a second
 
-    groups, count = cast("Any", ndimage).label(full, _NEIGHBOR_STENCIL)
-    group, indices = groups[full], np.argwhere(full)
+    # groups: 0 for empty cells, else the number of the group, from 1 on.
+    groups, count = cast("Any", ndimage).label(is_occupied, _NEIGHBOR_STENCIL)
+    group, indices = groups[is_occupied], np.argwhere(is_occupied)
     sizes = sum(_projection_sizes(group, np.delete(indices, axis, 1), count) for axis in range(3))
     chosen = groups == 1 + int(np.argmax(sizes))
     return replace(cells, empty_distance=distance_to_occupied(~chosen))
 
 
 def _projection_sizes(group: IntArray, places: IntArray, count: int) -> IntArray:
-    """(count,) the number of different places of each group.
+    """The number (count,) of different places of each group: the size of its projection onto a
+    plane.
 
     group: (n,) the group that each place belongs to, from 1 to count.
-    places: (n, 2) cells of a plane, onto which the cells of groups were projected."""
+    places: (n, 2) cells of a plane, onto which the cells of groups were projected.
+    """
+    # A group and a place become one integer, from which the group is recovered by division.
     width = 1 + places.max(axis=0)
     index = (group * width[0] + places[:, 0]) * width[1] + places[:, 1]
     return np.bincount(np.unique(index) // (width[0] * width[1]), minlength=count + 1)[1:]

@@ -1,7 +1,7 @@
-"""Lists of nodes and primitives of a tree, a list for each lane (an entry of Dr.Jit's arrays, such
-as a query point), built and traversed in Dr.Jit.
+"""Lists of integers, such as indices of nodes or primitives of a tree, one list for each lane. A
+lane is an entry of Dr.Jit's arrays, such as a query point. Lists are built and traversed in Dr.Jit.
 
-- `LaneLists`: many lists of integers, one list after the other in memory.
+- `LaneLists`: many lists, one after the other in memory.
 - `build_lists`: builds lists by a walk that runs twice, to count entries and to write them.
 - `traverse_subtrees`: visits the subtrees of the listed nodes; `for_each_entry`: a loop over the
   entries.
@@ -32,7 +32,8 @@ _TOO_LONG = "more than 2^31 entries of lists: cut the input in parts"
 
 @dataclass(frozen=True)
 class LaneLists:
-    """One list of integers for each lane.
+    """One list of integers for each lane, where a lane is an entry of Dr.Jit's arrays, such as a
+    query point.
 
     first: the index in `entries` at which each list begins.
     count: the length of each list.
@@ -45,20 +46,20 @@ class LaneLists:
 
     @classmethod
     def of_root(cls, backend: Backend) -> LaneLists:
-        """A single list, whose only entry is the root of a tree."""
+        """The list of a single lane, whose only entry is 0, the index of the root of a tree."""
         index = backend.UInt32
         return cls(index(0), index(1), index(0))
 
     @classmethod
     def empty(cls, backend: Backend) -> LaneLists:
-        """A single list, which is empty."""
+        """The list of a single lane, without entries."""
         index = backend.UInt32
         return cls(index(0), index(0), index(0))
 
     @classmethod
     def concatenate(cls, backend: Backend, parts: list[LaneLists]) -> LaneLists:
-        """The lists of all `parts` together: those of the lanes of the first part, then those of
-        the lanes of the second part, and so on.
+        """The lists of all `parts` together: the lists of the first part, then those of the second
+        part, and so on.
 
         In each part, the first list must begin at entry 0 and each list where the one before ends.
 
@@ -70,12 +71,13 @@ class LaneLists:
         first = np.cumsum(counts, dtype=np.int64) - counts
         if first[-1] + counts[-1] >= 2**31:
             raise ValueError(_TOO_LONG)
+        # One further entry, so that the array is never empty.
         arrays = first, counts, np.append(np.concatenate(entries), 0)
         return cls(*(upload_integers(backend, part) for part in arrays))
 
     def subset(self, backend: Backend, lanes: IntArray) -> LaneLists:
-        """The lists of the lanes with indices `lanes` (k,), as k lists; a lane may occur several
-        times."""
+        """The lists of some lanes: k lists, for the lanes with indices `lanes` (k,). A lane may
+        occur several times. The entries are shared, not copied."""
         index = backend.UInt32
         uploaded = upload_integers(backend, lanes)
         first, count = (dr.gather(index, numbers, uploaded) for numbers in (self.first, self.count))
@@ -83,7 +85,8 @@ class LaneLists:
 
 
 def build_lists(backend: Backend, walk: Callable[[WriteEntry | None], Any]) -> LaneLists:
-    """Build one list for each lane by running `walk` twice: to count the entries and to write them.
+    """Build one list for each lane by running the function `walk` twice: to count the entries, and
+    to write them.
 
     walk: called with None, it returns the number of entries of each lane. Called with a
         `WriteEntry`, a function that writes one entry, it also calls that function for each entry.
@@ -94,14 +97,14 @@ def build_lists(backend: Backend, walk: Callable[[WriteEntry | None], Any]) -> L
     index = backend.UInt32
     count = walk(None)
     dr.eval(count)
+    # Where each list begins, and the number of all entries.
     start = np.concatenate([[0], np.cumsum(to_numpy(count).astype(np.int64))])
     if start[-1] >= 2**31:
         raise ValueError(_TOO_LONG)
     first, entries = upload_integers(backend, start[:-1]), dr.zeros(index, max(1, int(start[-1])))
 
     def write_entry(position: Any, entry: Any, active: Mask) -> None:
-        """The `WriteEntry` for `walk`: write an entry at a position of the list of each active
-        lane."""
+        """Write an entry at a position of the list of each active lane."""
         dr.scatter(entries, index(entry), first + position, active)
 
     dr.eval(walk(write_entry), entries)
@@ -111,17 +114,20 @@ def build_lists(backend: Backend, walk: Callable[[WriteEntry | None], Any]) -> L
 def traverse_subtrees(
     tree: PackedTree, lists: LaneLists, visit: Visit, state: LoopValues
 ) -> LoopValues:
-    """Visit the nodes of the subtrees below the listed nodes, depth first; return the final state.
+    """Visit the subtrees below the listed nodes of a tree, depth first, and return the final state.
     Each lane walks through the nodes of its own list, one subtree after the other.
 
-    visit: takes a `VisitedNode` and the state; returns whether to visit the node's children, and
-        the new state.
-    state: a tuple of arrays."""
+    lists: the indices of nodes, one list for each lane.
+    visit: a function that takes a `VisitedNode` and the state. It returns a mask, whether to visit
+        the node's children, and the new state.
+    state: a tuple of arrays, which `visit` updates.
+    """
     index = tree.backend.UInt32
 
     def body(k: Any, i: Any, end: Any, *state: Any) -> LoopValues:
         """Visit node i of the subtree of list entry k; `end` is the node after that subtree. If i
         equals `end`, begin the subtree of entry k instead."""
+        # At the start i and end are both 0, so that the first subtree begins.
         begins = i == end
         entry = dr.gather(index, lists.entries, lists.first + k, begins & (k < lists.count))
         i = dr.select(begins, entry, i)
@@ -133,6 +139,7 @@ def traverse_subtrees(
         return k + dr.select(i == end, index(1), index(0)), i, end, *state
 
     def is_running(k: Any, *_: Any) -> Mask:
+        """Whether a lane's list has further entries."""
         return k < lists.count
 
     start = (index(0), index(0), index(0), *state)
@@ -145,9 +152,12 @@ def for_each_entry(
     body: Callable[[Any, Mask, LoopValues], LoopValues],
     state: LoopValues,
 ) -> LoopValues:
-    """Update the state by `body` for each entry of each lane's list, and return it.
+    """Call the function `body` for each entry of each lane's list, and return the final state.
 
-    body: takes an entry, the mask of the lanes that have one, and the state; returns the state."""
+    body: takes an entry, the mask of the lanes that have one, and the state, a tuple of arrays;
+        returns the new state.
+    state: the first state.
+    """
     index = backend.UInt32
 
     def step(k: Any, *state: Any) -> LoopValues:
@@ -157,6 +167,7 @@ def for_each_entry(
         return k + 1, *body(entry, active, state)
 
     def is_running(k: Any, *_: Any) -> Mask:
+        """Whether a lane's list has further entries."""
         return k < lists.count
 
     return dr.while_loop((index(0), *state), is_running, step, label="entries")[1:]

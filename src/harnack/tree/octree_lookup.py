@@ -1,4 +1,7 @@
-"""Lookup of the octree leaf that contains a point, on a backend.
+"""Lookup of the leaf of an octree that contains a point, on a backend. An octree divides a cube
+into eight equal octants, and these again; a *leaf* is a cube that is not divided. A node is
+*encoded* as one integer: an inner node as the index of the first of its eight children, leaf k as
+-1 - k.
 
 The builder of an octree lists its nodes depth by depth (`OctreeLookup.from_levels`). A lookup
 returns the index of a leaf; the caller keeps what belongs to the leaf, such as a local expansion.
@@ -34,30 +37,33 @@ OCTANT_DIRECTIONS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
 
 
 def encode_nodes(is_leaf: BoolArray, leaves: int, split: int) -> IntArray:
-    """Encode the nodes of one depth of an octree for `OctreeLookup.from_levels`.
-
-    An inner node is encoded as the index of its first child, leaf k as -1 - k.
+    """Encode the nodes of one depth of an octree as integers, for `OctreeLookup.from_levels`. An
+    inner node is encoded as the index of its first child, leaf k as -1 - k. Leaves and inner nodes
+    are each numbered depth by depth.
 
     is_leaf: (n,) whether each node of this depth is a leaf.
     leaves: the number of leaves at smaller depths.
-    split: the number of inner nodes at smaller depths, the root included."""
+    split: the number of inner nodes at smaller depths, the root included.
+    """
     number = np.empty(len(is_leaf), np.int64)
     number[is_leaf] = -1 - (leaves + np.arange(int(is_leaf.sum())))
+    # The children of inner node j begin at 8 j, as the root is not in the list of nodes.
     number[~is_leaf] = 8 * (split + np.arange(int((~is_leaf).sum())))
     return number
 
 
 @dataclass(frozen=True)
 class OctreeLookup:
-    """The octree of a cube, on a backend, for `find_leaf`.
+    """The octree of a cube on a backend, in which `find_leaf` looks up the leaf that contains a
+    point. A node is encoded as one integer: an inner node as the index of the first of its eight
+    consecutive children (z fastest), leaf k as -1 - k.
 
     lower_corner: (3,) the lower corner of the cube.
     cells_per_length: 2^MAX_DEPTH divided by the width of the cube.
     top_grid: (8^_TOP_DEPTH,) an encoded node for each cell of a uniform grid, z fastest. It is the
         node of depth _TOP_DEPTH that fills the cell, or a leaf of smaller depth that contains the
         cell.
-    encoded_nodes: all nodes except the root, encoded: an inner node as the index of the first of
-        its eight consecutive children (z fastest), leaf k as -1 - k.
+    encoded_nodes: all nodes except the root, encoded.
     """
 
     backend: Backend
@@ -75,7 +81,8 @@ class OctreeLookup:
         low, side: the lower corner (3,) and the width of its cube.
         levels: for each depth, the root first, the encoded nodes (`encode_nodes`). The eight
             children of each inner node follow each other, in the order of the inner nodes of the
-            depth above."""
+            depth above.
+        """
         root, *below = levels
         nodes = np.concatenate([*below, np.zeros(8, np.int64)])  # room for any octant
         corner = backend.Array3f(*(dr.opaque(backend.Float, float(number)) for number in low))
@@ -92,11 +99,16 @@ class OctreeLookup:
 
     def find_leaf(self, x: Vec3) -> tuple[Any, Mask]:
         """The index of the leaf that contains x, and a mask of whether x lies in the octree's cube.
-        For points outside of the cube, the index is that of the leaf at the lower corner."""
+        For points outside of the cube, the index is that of the leaf at the lower corner.
+
+        The lookup begins in a uniform grid, and then goes from node to child until it is at a leaf.
+        """
         index, integer = self.backend.UInt32, self.backend.Int32
         position = (x - self.lower_corner) * self.cells_per_length
-        inside = dr.all((position >= 0) & (position < float(2**MAX_DEPTH)))
-        ix, iy, iz = (index(dr.select(inside, position[k], 0)) for k in range(3))
+        is_inside = dr.all((position >= 0) & (position < float(2**MAX_DEPTH)))
+        ix, iy, iz = (index(dr.select(is_inside, position[k], 0)) for k in range(3))
+        # Integer coordinates in cells of the greatest depth. Their upper bits give the cell of the
+        # uniform grid, the other `down` bits one octant for each further depth.
         down = MAX_DEPTH - _TOP_DEPTH
         first = (((ix >> down) << _TOP_DEPTH | (iy >> down)) << _TOP_DEPTH) | (iz >> down)
 
@@ -112,7 +124,7 @@ class OctreeLookup:
 
         node = dr.gather(integer, self.top_grid, first)
         node, _ = dr.while_loop((node, index(down - 1) + 0 * ix), is_inner, step, label="cell")
-        return index(-1 - node), inside
+        return index(-1 - node), is_inside
 
 
 def _build_top_grid(encoded_root: int, nodes: IntArray) -> IntArray:
@@ -120,9 +132,11 @@ def _build_top_grid(encoded_root: int, nodes: IntArray) -> IntArray:
     fastest, the encoded node that the cell is, or the encoded leaf that contains the cell.
 
     encoded_root: the root, encoded as by `encode_nodes`.
-    nodes: all other nodes, encoded."""
+    nodes: all other nodes, encoded.
+    """
     grid = np.full((1, 1, 1), encoded_root, np.int64)
     for _ in range(_TOP_DEPTH):
+        # Halve the cells: each takes the child of its cell's node, or stays with a leaf.
         x, y, z = np.indices([2 * side for side in grid.shape])
         node = grid[x >> 1, y >> 1, z >> 1]
         octant = (x & 1) * 4 + (y & 1) * 2 + (z & 1)

@@ -1,5 +1,6 @@
 """Translates kernels that Dr.Jit recorded for GPUs that WebGPU supports, runs them there, and
-compares the results with Dr.Jit's.
+compares the results with Dr.Jit's. A kernel is the program that Dr.Jit compiles for a computation
+on arrays; it runs once for each lane, that is for each entry of the arrays, such as a ray.
 
 Dr.Jit prints a recorded kernel, loops included, as a program in LLVM's language. `llvm_parser`
 parses this text and `wgsl` writes it in WGSL, WebGPU's language. Labels that Dr.Jit prints tell

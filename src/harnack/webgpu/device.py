@@ -1,5 +1,7 @@
-"""Runs shaders (programs in WGSL) on a GPU by WebGPU, and compares a sample of the results with
-Dr.Jit's.
+"""Runs shaders (programs in WGSL, WebGPU's language) on a GPU, and compares a sample of the results
+with Dr.Jit's. A shader runs once for each lane, that is for each entry of its input arrays, such as
+a ray. A label is the name by which the caller and the shader identify an array. A table is an array
+that lanes read at computed indices.
 
 The package `wgpu` drives the GPU through Vulkan, Metal or Direct3D.
 """
@@ -46,13 +48,13 @@ _SHADER_CACHE_SIZE = 64
 
 
 class NoDeviceError(RuntimeError):
-    """WebGPU finds no device, or the package `wgpu` is not installed."""
+    """The error if WebGPU finds no device, or the package `wgpu` is not installed."""
 
 
 @dataclass(frozen=True)
 class Device:
-    """A WebGPU device. handle: the device object of the package `wgpu`. name: the device's own
-    name."""
+    """A GPU that WebGPU drives. handle: the device object of the package `wgpu`. name: the device's
+    own name."""
 
     handle: Any
     name: str
@@ -69,7 +71,7 @@ class Device:
 
 @functools.cache
 def find_device() -> Device:
-    """The fastest WebGPU device of this machine.
+    """Return the fastest WebGPU device of this machine.
 
     Raises:
         NoDeviceError: there is no device, or the package `wgpu` is not installed.
@@ -84,6 +86,7 @@ def find_device() -> Device:
         adapter: Any = wgpu.gpu.request_adapter_sync(power_preference="high-performance")
     except RuntimeError as error:
         raise NoDeviceError(f"no device for WebGPU was found: {error}") from None
+    # Ask for buffers as large as the device allows; WebGPU's default limits are smaller.
     names = ("max-storage-buffer-binding-size", "max-buffer-size")
     limits = {name: adapter.limits[name] for name in names}
     info = adapter.info
@@ -93,8 +96,9 @@ def find_device() -> Device:
 
 @dataclass(frozen=True)
 class CompiledShader:
-    """A shader that is compiled for a device. pipeline: the compute pipeline of the package
-    `wgpu`."""
+    """A shader (a program in WGSL, WebGPU's language) that is compiled for a device. It runs once
+    for each lane, that is for each entry of its input arrays. A label is the name of an array.
+    pipeline: the compute pipeline of the package `wgpu`."""
 
     device: Device
     shader: Shader
@@ -103,8 +107,8 @@ class CompiledShader:
     def run(
         self, data: Mapping[str, Any], lanes: Mapping[str, Any], count: int
     ) -> dict[str, Words]:
-        """Run the shader on `count` lanes. Returns the 32 bits of each result as arrays (count,),
-        by label.
+        """Run the shader on `count` lanes. Returns the results by label, each as the 32 bits of its
+        numbers, (count,).
 
         data: the numbers and tables that the shader reads, by label.
         lanes: arrays (count,) with an entry for each lane, by label.
@@ -113,18 +117,19 @@ class CompiledShader:
         second.
         """
         packed = pack_shader_data(self.shader, data)
-        lane_bits = np.stack([as_words(lanes[label]) for label in self.shader.lanes])
+        lane_words = np.stack([as_words(lanes[label]) for label in self.shader.lanes])
         results = np.empty((len(self.shader.results), count), np.uint32)
-        start, size = 0, _INITIAL_BATCH
+        start, batch_size = 0, _INITIAL_BATCH
         while start < count:
-            end = min(start + size, count)
+            end = min(start + batch_size, count)
             start_time = time.perf_counter()
-            results[:, start:end] = self._dispatch(packed, lane_bits[:, start:end])
+            results[:, start:end] = self._dispatch(packed, lane_words[:, start:end])
             elapsed = time.perf_counter() - start_time
-            if elapsed < _MIN_DISPATCH_SECONDS and size < _MAX_BATCH:
-                size *= 2
-            elif elapsed > _MAX_DISPATCH_SECONDS and size > WORKGROUP:
-                size //= 2
+            # Long computations may block the display, and short ones waste time on their start.
+            if elapsed < _MIN_DISPATCH_SECONDS and batch_size < _MAX_BATCH:
+                batch_size *= 2
+            elif elapsed > _MAX_DISPATCH_SECONDS and batch_size > WORKGROUP:
+                batch_size //= 2
             start = end
         return dict(zip(self.shader.results, results, strict=True))
 
@@ -140,12 +145,13 @@ class CompiledShader:
         handle, usage = self.device.handle, wgpu.BufferUsage
         count = lanes.shape[1]
         data = data.copy()
+        # The first word of the data is the number of lanes.
         data[0] = count
-        size = 4 * count * len(self.shader.results)
+        result_bytes = 4 * count * len(self.shader.results)
         buffers = [
             handle.create_buffer_with_data(data=data, usage=usage.STORAGE),
             handle.create_buffer_with_data(data=np.ascontiguousarray(lanes), usage=usage.STORAGE),
-            handle.create_buffer(size=size, usage=usage.STORAGE | usage.COPY_SRC),
+            handle.create_buffer(size=result_bytes, usage=usage.STORAGE | usage.COPY_SRC),
         ]
         entries = [
             {"binding": k, "resource": {"buffer": buffer}} for k, buffer in enumerate(buffers)
@@ -156,32 +162,33 @@ class CompiledShader:
         compute_pass.set_pipeline(self.pipeline)
         compute_pass.set_bind_group(0, handle.create_bind_group(layout=layout, entries=entries))
         groups = -(-count // WORKGROUP)
-        width = min(groups, _MAX_WORKGROUPS_PER_AXIS)
-        compute_pass.dispatch_workgroups(width, -(-groups // width))
+        # The groups of lanes are arranged in a rectangle, as each axis is limited.
+        groups_a_row = min(groups, _MAX_WORKGROUPS_PER_AXIS)
+        compute_pass.dispatch_workgroups(groups_a_row, -(-groups // groups_a_row))
         compute_pass.end()
         handle.queue.submit([encoder.finish()])
-        words: Words = np.frombuffer(handle.queue.read_buffer(buffers[2]), dtype=np.uint32)
+        result_words: Words = np.frombuffer(handle.queue.read_buffer(buffers[2]), dtype=np.uint32)
         for buffer in buffers:
             buffer.destroy()
-        return words.reshape(-1, count)
+        return result_words.reshape(-1, count)
 
 
 def pack_shader_data(shader: Shader, data: Mapping[str, Any]) -> Words:
-    """The buffer of numbers and tables that a shader reads, as 32-bit words (see `Shader` for its
-    layout). The number of lanes, its first word, is 0.
+    """Return the buffer of numbers and tables that a shader reads, as 32-bit words (see `Shader`
+    for its layout). The number of lanes, its first word, is 0.
 
     data: the numbers and tables by label.
     """
     tables = [as_words(data[label]) for label in shader.tables]
     numbers = [as_words(data[label])[:1] for label in shader.numbers]
-    first_start = 2 + len(tables) + len(numbers)
-    table_starts = first_start + np.cumsum([0, *map(len, tables)])[:-1].astype(np.uint32)
+    tables_start = 2 + len(tables) + len(numbers)
+    table_starts = tables_start + np.cumsum([0, *map(len, tables)])[:-1].astype(np.uint32)
     header = np.zeros(2, np.uint32)
     return np.concatenate([header, table_starts, *numbers, *tables]).astype(np.uint32)
 
 
 def as_words(array: Any) -> Words:
-    """The entries of a number or array as 32-bit words (n,): the bits of 32-bit floats and
+    """Return the entries of a number or array as 32-bit words (n,): the bits of 32-bit floats and
     integers. Numbers of other types are converted to integers first."""
     values: npt.NDArray[Any] = np.atleast_1d(
         to_numpy(array) if dr.is_array_v(type(array)) else array
@@ -199,7 +206,8 @@ _CHECKED_LANES = 4096
 
 
 class DeviceMismatchError(RuntimeError):
-    """The results of a device disagree with Dr.Jit's results for a sample of the lanes."""
+    """The error if the results of a device disagree with Dr.Jit's results for a sample of the
+    lanes."""
 
 
 def evaluate_on_device(
@@ -219,6 +227,8 @@ def evaluate_on_device(
         these lanes, Dr.Jit's results and the device's results, and returns a description of an
         error of the device, or "" if the results agree.
 
+    The kernel is recorded while Dr.Jit computes the sample itself.
+
     Raises:
         UntranslatableError: the kernel contains an unknown operation.
         DeviceMismatchError: the results differ.
@@ -226,23 +236,26 @@ def evaluate_on_device(
     count = max(dr.width(array) for array in lanes.values())
     # At least two: a single lane would be a number.
     sample_count = max(2, min(count, _CHECKED_LANES))
-    rows: IntArray = np.arange(sample_count) * (count - 1) // (sample_count - 1)
+    sample_lanes: IntArray = np.arange(sample_count) * (count - 1) // (sample_count - 1)
     recording = record_kernel(
-        compute, {name: _gather_lanes(array, rows) for name, array in lanes.items()}, data
+        compute, {name: _gather_lanes(array, sample_lanes) for name, array in lanes.items()}, data
     )
-    program = device.compile(recording.shader)
+    compiled = device.compile(recording.shader)
     lane_arrays = {label: to_numpy(array) for label, array in labeled_leaves("lane", dict(lanes))}
-    bits = program.run(recording.data, lane_arrays, count)
+    bits = compiled.run(recording.data, lane_arrays, count)
     expected: Arrays = {}
     results: Arrays = {}
     for label, array in recording.results.items():
         expected[label] = to_numpy(array)
         results[label] = bits[label].view(expected[label].dtype)
+    # Results that are the same constant for all lanes are not computed by the kernel.
     for label, array in recording.constants.items():
-        expected[label] = np.full(len(rows), to_numpy(array)[0])
+        expected[label] = np.full(len(sample_lanes), to_numpy(array)[0])
         results[label] = np.full(count, to_numpy(array)[0])
-    sample = {label: array[rows] for label, array in results.items()}
-    mismatch = find_mismatch(rows, _columns_to_arrays(expected), _columns_to_arrays(sample))
+    device_sample = {label: array[sample_lanes] for label, array in results.items()}
+    mismatch = find_mismatch(
+        sample_lanes, _columns_to_arrays(expected), _columns_to_arrays(device_sample)
+    )
     if mismatch:
         raise DeviceMismatchError(
             f"{device.name} does not compute what Dr.Jit does: {mismatch}. Nothing that it says is "
@@ -252,7 +265,7 @@ def evaluate_on_device(
 
 
 def _gather_lanes(array: Any, rows: npt.NDArray[np.int64]) -> Any:
-    """The entries of a Dr.Jit array at the indices `rows` (k,), evaluated."""
+    """Return the entries of a Dr.Jit array at the indices `rows` (k,), evaluated."""
     index = upload_integers(backend_of(array), rows.astype(np.uint32))
     gathered = dr.gather(type(array), array, index)
     dr.make_opaque(gathered)
@@ -260,8 +273,12 @@ def _gather_lanes(array: Any, rows: npt.NDArray[np.int64]) -> Any:
 
 
 def _columns_to_arrays(columns: Arrays) -> Arrays:
-    """The results by name, each an array (n,) or (n, 3). columns: arrays (n,) with the labels
-    "result NAME" for numbers, or "result NAME k" for component k of a vector."""
+    """Put components together to vectors. Returns the results by name, each an array (n,) or
+    (n, 3).
+
+    columns: arrays (n,) with the labels "result NAME" for numbers, or "result NAME k" for component
+        k of a vector.
+    """
     groups: dict[str, list[npt.NDArray[Any]]] = {}
     for label, column in columns.items():
         groups.setdefault(label.split()[1], []).append(column)

@@ -1,4 +1,8 @@
-"""Parses kernels that Dr.Jit recorded into operations on single lanes and nested loops.
+"""Parses kernels that Dr.Jit recorded into operations on single lanes and nested loops. A kernel is
+a program in LLVM's language that runs once for each lane, that is for each entry of its arrays. A
+statement computes a result from operands, loads an entry of an array, or stores one. The parameters
+of a kernel are pointers to its arrays, and a label is the name of an array, which Dr.Jit prints as
+a comment. A table is an array that lanes read at computed indices.
 
 Dr.Jit writes a kernel for LLVM as a function of packets, vectors of several lanes. The program of
 every lane is the same, so the parser replaces packets by single lanes, and drops the masks that
@@ -30,12 +34,12 @@ _KINDS: dict[str, Kind] = {"float": "f32", "i32": "u32", "i1": "bool", "i8": "u3
 
 
 class UntranslatableError(NotImplementedError):
-    """A kernel contains an operation that the translation does not know."""
+    """The error for a kernel that contains an operation which the translation does not know."""
 
 
 @dataclass(frozen=True)
 class Constant:
-    """A constant of a kernel. bits: its 32 bits as an integer; 0 or 1 for a "bool"."""
+    """A constant operand. bits: its 32 bits as an integer; 0 or 1 for a "bool"."""
 
     kind: Kind
     bits: int
@@ -62,6 +66,7 @@ class Load:
     source: which entry is read. "lane": the entry of the lane. "number": the only entry. "table":
         entry index * stride + offset if `mask` is True (or None), otherwise the result is 0.
     parameter: the index of the array among the parameters of the kernel.
+    index, stride, offset, mask: for "table" only.
     """
 
     result: str
@@ -76,8 +81,8 @@ class Load:
 
 @dataclass(frozen=True)
 class Store:
-    """A statement that stores `value` as the lane's entry of the array with the index
-    `parameter`."""
+    """The statement that stores `value` as the lane's entry of an array. parameter: the index of
+    the array among the parameters of the kernel. kind: the type of the value."""
 
     parameter: int
     kind: Kind
@@ -86,8 +91,8 @@ class Store:
 
 @dataclass(frozen=True)
 class LoopVariable:
-    """A variable of a loop. before: its value before the first iteration. after: its value after an
-    iteration, in terms of the values in that iteration."""
+    """A variable that a loop changes. before: its value before the first iteration. after: its
+    value after an iteration, in terms of the values in that iteration."""
 
     name: str
     kind: Kind
@@ -111,7 +116,7 @@ Statement: TypeAlias = "Operation | Load | Store | Loop"
 
 @dataclass(frozen=True)
 class ComputeKernel:
-    """The program that each lane of a kernel runs.
+    """The program that each lane of a kernel runs, as a list of statements.
 
     statements: the statements in order.
     labels: for the index of a kernel parameter, the label of its array, if a label is known. An
@@ -149,8 +154,8 @@ def parse(text: str) -> ComputeKernel:
 
 @dataclass
 class _Address:
-    """The address from which an instruction reads: an array of records of `stride` numbers each,
-    and the index of a record.
+    """The address from which an instruction reads. It means record `index` of an array of records
+    of `stride` numbers each.
 
     parameter: the index of the array among the kernel's parameters.
     index: the index of the record; None for the array itself.
@@ -201,12 +206,16 @@ _CALLS = {
 
 
 def _ignore(*groups: str) -> None:
-    """The action for instructions that have no effect on single lanes: do nothing."""
+    """Do nothing: the action for instructions that have no effect on single lanes."""
     del groups
 
 
 class _LLVMParser:
-    """Parses a kernel line by line.
+    """Parses a kernel, a program in LLVM's language, line by line. Each line assigns the result of
+    an instruction to a name. Patterns recognize instructions, and each pattern has an action, a
+    method that notes something or appends a statement to the current block: the main program, or
+    the test or body of a loop. An `element` is the LLVM type of a number, such as "float". A label
+    is the name of an array, which Dr.Jit prints as a comment above an instruction.
 
     statements: the statements parsed so far.
     labels: for the index of a kernel parameter, the label of its array.
@@ -237,6 +246,7 @@ class _LLVMParser:
         Raises:
             UntranslatableError: the instruction is unknown.
         """
+        # Metadata follows ", !".
         text = line.partition(", !")[0].strip()
         if text.startswith(";"):
             self._label, self._labeled = text[1:].strip(), ""
@@ -245,9 +255,12 @@ class _LLVMParser:
         elif text:
             result, _, instruction = text.rpartition(" = ")
             variable = result.partition("_")[0]
+            # A label belongs to the instructions that compute one variable, such as %f12 and
+            # %f12_1.
             self._labeled = self._labeled or variable
             if variable != self._labeled:
                 self._label = None
+            # Alignments and flags have no effect on the result here.
             instruction = _FLAGS.sub("", instruction.partition(", align ")[0])
             for pattern, action in self._patterns.get(instruction.partition(" ")[0], ()):
                 if (match := pattern.fullmatch(instruction)) is not None:
@@ -270,15 +283,16 @@ class _LLVMParser:
             self._current_block = self._loops[-1].body
         elif re.fullmatch(r"l_\d+_done", block):
             loop = self._loops.pop()
+            # The values after an iteration were kept as text until all of the body was known.
             loop.variables = [
                 replace(var, after=self._value(str(var.after), var.kind)) for var in loop.variables
             ]
-            outer = self._loops[-1] if self._loops else None
-            self._current_block = outer.body if outer else self.statements
+            outer_loop = self._loops[-1] if self._loops else None
+            self._current_block = outer_loop.body if outer_loop else self.statements
 
     def _value(self, text: str, kind: Kind) -> Operand:
-        """The operand that a text stands for: the name of a result, or a constant of the type
-        `kind`."""
+        """Return the operand that a text stands for: the name of a result, or a constant of the
+        type `kind`."""
         text = text.strip()
         if text.startswith("%"):
             return self._aliases.get(text, text)
@@ -286,9 +300,12 @@ class _LLVMParser:
             return Constant(kind, 0)
         if text == "true":
             return Constant(kind, 1)
+        # A constant of a packet repeats the constant of a lane: the first one is taken.
         if (match := re.match(r"<\w+ (\S+?)(?:,|>)", text)) is not None:
             text = match.group(1)
         if kind == "f32":
+            # LLVM writes floats as decimal numbers or, if these are not exact, as the bits of a
+            # double.
             double = (
                 struct.unpack(">d", bytes.fromhex(text[2:].zfill(16)))[0]
                 if text.startswith("0x")
@@ -298,7 +315,8 @@ class _LLVMParser:
         return Constant(kind, int(text) & 0xFFFFFFFF)
 
     def _emit(self, result: str, kind: Kind, name: str, *operands: Operand) -> None:
-        """Append the operation result = name(operands) to the current block."""
+        """Append the operation result = name(operands) to the current block. kind: the type of the
+        result."""
         self._current_block.append(Operation(result, kind, name, operands))
 
     def _label_parameter(self, parameter: int) -> None:
@@ -308,8 +326,8 @@ class _LLVMParser:
             self.labels.setdefault(parameter, self._label)
 
     def _grammar(self) -> dict[str, list[tuple[str, Callable[..., None]]]]:
-        """The grammar: for the first word of an instruction, a list of (pattern, action). The
-        action of the first pattern that matches is called with the name of the result (if the
+        """Return the grammar: for the first word of an instruction, a list of (pattern, action).
+        The action of the first pattern that matches is called with the name of the result (if the
         instruction has one) and the groups of the pattern."""
         entry = rf"ptr ({_NAME}), <\d+ x i32> (\S+)"
         binary: list[tuple[str, Callable[..., None]]]
@@ -390,82 +408,96 @@ class _LLVMParser:
     # The actions of the grammar.
 
     def _test(self, condition: str) -> None:
-        """Note the condition of the current loop."""
+        """Note the condition under which the current loop goes on. The instruction is the branch to
+        the loop's body, "br i1 %condition, ..."."""
         self._loops[-1].condition = self._value(condition, "bool")
 
     def _phi(self, result: str, element: str, before: str, after: str) -> None:
-        """Add a variable to the current loop, with its value before the first iteration and after
-        each iteration. element: its LLVM type."""
+        """Add a variable to the current loop, such as "%result = phi <8 x float> [ %before, ... ],
+        [ %after, ... ]". The two operands are its values before the first iteration and after each
+        iteration. element: its LLVM type, such as "float"."""
         kind = self._kind(element)
+        # The value after an iteration stays text here: its definition comes later, in the body.
         variable = LoopVariable(result, kind, self._value(before, kind), after)
         self._loops[-1].variables.append(variable)
 
     def _alias(self, result: str, element: str, value: str) -> None:
-        """Note that the result is another name of a value. element: the value's LLVM type."""
+        """Note that the result of an instruction is another name of a value, as in "%result =
+        shufflevector <8 x float> %value, ...", which copies a value to all lanes. element: the
+        value's LLVM type, such as "float"."""
         if element != "ptr":
             self._aliases[result] = self._value(value, self._kind(element))
 
     def _lane(self, result: str, name: str) -> None:
-        """Note that the result is the index of the lane, or the number of lanes."""
+        """Note that the result of "%result = trunc i64 %name to i32" is the index of the lane, if
+        `name` is "index", or the number of lanes."""
         self._aliases[result] = "lane" if name == "index" else "count"
 
     def _parameter(self, result: str, number: str) -> None:
-        """Note that the result is the address of the array of kernel parameter `number`."""
+        """Note that the result of an instruction is the address of the array of kernel parameter
+        `number`. The current label is the label of this array."""
         self._addresses[result] = _Address(int(number))
         self._label_parameter(int(number))
 
     def _pointer(self, result: str, pointer: str) -> None:
-        """Note that the result is another name of an address."""
+        """Note that the result of an instruction is another name of the address `pointer`."""
         self._addresses[result] = self._addresses[pointer]
 
     def _load_number(self, result: str, element: str, pointer: str) -> None:
-        """Append a statement that loads the only entry of an array. element: its LLVM type."""
+        """Append a statement for "%result = load float, ptr %pointer": it loads the only entry of
+        an array. element: its LLVM type, here "float"."""
         source = self._addresses[pointer]
         self._current_block.append(Load(result, self._kind(element), "number", source.parameter))
 
     def _load_lane(self, result: str, element: str, pointer: str) -> None:
-        """Append a statement that loads the lane's entry of an array. element: its LLVM type."""
+        """Append a statement for "%result = load <8 x float>, ptr %pointer": it loads the lane's
+        entry of an array. element: its LLVM type, here "float"."""
         source = self._addresses[pointer]
         self._current_block.append(Load(result, self._kind(element), "lane", source.parameter))
 
     def _store(self, element: str, value: str, pointer: str) -> None:
-        """Append a statement that stores a value as the lane's entry of an array. element: its LLVM
-        type."""
+        """Append a statement for "store <8 x float> %value, ptr %pointer": it stores a value as the
+        lane's entry of an array. element: its LLVM type, here "float"."""
         kind = self._kind(element)
         self._current_block.append(
             Store(self._addresses[pointer].parameter, kind, self._value(value, kind))
         )
 
     def _record(self, result: str, stride: str, pointer: str, index: str) -> None:
-        """Note that the result is the address of record `index` in a table of records of `stride`
-        numbers."""
+        """Note that the result of "%result = getelementptr [stride x float], ptr %pointer, <8 x
+        i32> %index" is the address of record `index` in a table of records of `stride` numbers."""
         source = self._addresses[pointer]
         self._addresses[result] = _Address(source.parameter, self._value(index, "u32"), int(stride))
 
     def _set_address_mask(self, result: str, mask: str, pointer: str) -> None:
-        """Note that the result is the address `pointer`, to be read only if `mask` is True."""
+        """Note that the result of "%result = select <8 x i1> %mask, <8 x ptr> %pointer, ..." is the
+        address `pointer`, to be read only if `mask` is True."""
         source = self._addresses[pointer]
         self._addresses[result] = _Address(
             source.parameter, source.index, source.stride, self._value(mask, "bool")
         )
 
     def _entry(self, result: str, pointer: str, index: str) -> None:
-        """Note that the result is the address of entry `index` of a table."""
+        """Note that the result of "%result = getelementptr float, ptr %pointer, <8 x i32> %index"
+        is the address of entry `index` of a table."""
         self._record(result, "1", pointer, index)
 
     def _gather_record(self, result: str, pointer: str) -> None:
-        """Note the address of the record that the result holds; `_extract` reads the record's
-        numbers one by one."""
+        """Note that the result of a call of Dr.Jit's function gather_...(%pointer) holds all
+        numbers of the record at the address `pointer`. `_extract` reads them one by one."""
         self._records[result] = self._addresses[pointer]
 
     def _extract(self, result: str, element: str, record: str, entry: str) -> None:
-        """Append a statement that loads number `entry` of a record."""
+        """Append a statement for "%result = extractvalue [4 x <8 x float>] %record, entry": it
+        loads number `entry` of a record. element: its LLVM type, here "float"."""
         source = self._records[record]
         self._read_table(result, element, source, int(entry), source.mask)
 
     def _gather(self, result: str, element: str, pointer: str, mask: str) -> None:
-        """Append a statement that loads an entry of a table if the mask is True, otherwise 0. The
-        current label, that of the result, becomes the label of the table."""
+        """Append a statement for "%result = call <8 x float> @llvm.masked.gather(%pointer, ...,
+        %mask, ...)": it loads the entry of a table at an address if the mask is True, otherwise 0.
+        The current label belongs to the result, and becomes the label of the table. element: the
+        LLVM type of the entry, here "float"."""
         source = self._addresses[pointer]
         self._read_table(result, element, source, 0, self._value(mask, "bool"))
         self._label_parameter(source.parameter)
@@ -473,8 +505,13 @@ class _LLVMParser:
     def _read_table(
         self, result: str, element: str, source: _Address, entry: int, mask: Operand | None
     ) -> None:
-        """Append a statement that loads number `entry` of the record at an address if `mask` is
-        True or None, otherwise 0."""
+        """Append a statement that loads number `entry` of the record at the address `source` if
+        `mask` is True or None, otherwise 0. The table is noted for the result, as a later
+        instruction may bring its label.
+
+        result: the name of the result.
+        element: the LLVM type of the number, such as "float".
+        """
         kind = self._kind(element)
         load = Load(
             result, kind, "table", source.parameter, source.index, source.stride, entry, mask
@@ -483,50 +520,70 @@ class _LLVMParser:
         self._tables[result] = source.parameter
 
     def _arithmetic(self, result: str, name: str, element: str, a: str, b: str) -> None:
-        """Append an operation on two operands of the same type as the result."""
+        """Append the operation for an instruction such as "%result = fadd <8 x float> %a, %b",
+        whose name is "fadd". The operands have the type of the result. element: this LLVM type,
+        here "float"."""
         kind = self._kind(element)
         self._emit(result, kind, name, self._value(a, kind), self._value(b, kind))
 
     def _unary(self, result: str, name: str, element: str, a: str) -> None:
-        """Append an operation on a single operand."""
+        """Append the operation for an instruction such as "%result = fneg <8 x float> %a", whose
+        name is "fneg". element: the LLVM type of operand and result, here "float"."""
         kind = self._kind(element)
         self._emit(result, kind, name, self._value(a, kind))
 
     def _compare(self, result: str, name: str, element: str, a: str, b: str) -> None:
-        """Append a comparison of two operands."""
+        """Append the comparison for an instruction such as "%result = fcmp olt <8 x float> %a, %b",
+        whose name is "fcmp olt". element: the LLVM type of the operands, here "float"."""
         kind = self._kind(element)
         self._emit(result, "bool", name, self._value(a, kind), self._value(b, kind))
 
     def _select(self, result: str, mask: str, element: str, a: str, b: str) -> None:
-        """Append an operation whose result is a if the mask is True, otherwise b."""
+        """Append the operation for "%result = select <8 x i1> %mask, <8 x float> %a, <8 x float>
+        %b": the result is a if the mask is True, otherwise b. element: the LLVM type of a and b,
+        here "float"."""
         kind = self._kind(element)
         values = self._value(mask, "bool"), self._value(a, kind), self._value(b, kind)
         self._emit(result, kind, "select", *values)
 
     def _convert(self, result: str, name: str, source_type: str, a: str, target_type: str) -> None:
-        """Append a conversion of `a` between LLVM types. A bitcast between equal types only gives a
-        value another name; if the value was read from a table, the current label becomes the
-        table's label."""
-        kind, source = self._kind(target_type), self._kind(source_type)
-        value = self._value(a, source)
-        if name == "bitcast" and isinstance(value, str):  # of a value that was read from a table
+        """Append the conversion for an instruction such as "%result = sitofp <8 x i32> %a to <8 x
+        float>", whose name is "sitofp" and whose source and target types are "i32" and "float".
+
+        A bitcast between equal types only gives a value another name. If a value that was read from
+        a table is bitcast, the current label becomes the label of the table.
+        """
+        kind, source_kind = self._kind(target_type), self._kind(source_type)
+        value = self._value(a, source_kind)
+        if name == "bitcast" and isinstance(value, str):
             if value in self._tables:
                 self._label_parameter(self._tables[value])
-            if kind == source:
+            if kind == source_kind:
                 self._aliases[result] = value
                 return
-        self._emit(result, kind, f"{name} {source}", value)
+        self._emit(result, kind, f"{name} {source_kind}", value)
 
     def _class(self, result: str, name: str, element: str, value: str, mask: str) -> None:
         """Append a test whether a float belongs to certain classes (NaN, infinity, zero and so on).
-        mask: the classes as bits, as in AVX-512's `fpclass`."""
+        It is a call of AVX-512's function `fpclass`.
+
+        result, name, element, value: the name of the result, "fpclass", the LLVM type "float", and
+            the operand.
+        mask: the classes as bits.
+        """
         self._emit(result, "bool", f"{name} {mask}", self._value(value, self._kind(element)))
 
     def _call(self, result: str, element: str, function: str, arguments: str) -> None:
-        """Append the operation that stands for a call of an LLVM function. arguments: their text.
-        Raises `UntranslatableError` for an unknown function."""
+        """Append the operation that stands for a call of an LLVM function, such as "%result = call
+        <8 x float> @llvm.sqrt.v8f32(<8 x float> %a)". The function here is "sqrt.v8f32". arguments:
+        their text. element: the LLVM type of the result, here "float".
+
+        Raises:
+            UntranslatableError: the function is unknown.
+        """
         kind = self._kind(element)
         operands = re.findall(r"<\d+ x \w+> (<[^>]*>|[^,\s]+)", arguments)
+        # The name of the function without the types and sizes of its operands.
         stem = re.sub(r"\.(?:v\d+\w*|ps|f32|i32|ss)\b.*", "", function)
         if stem in _UNARY_CALLS:
             self._emit(result, kind, _UNARY_CALLS[stem], self._value(operands[0], kind))
@@ -539,8 +596,12 @@ class _LLVMParser:
 
     @staticmethod
     def _kind(element: str) -> Kind:
-        """The type of numbers in our programs for an LLVM type. Raises `UntranslatableError` for
-        types that other GPUs do not have, such as double precision."""
+        """Return the type that numbers of an LLVM type have in the parsed program: "f32" for
+        "float", "u32" for "i32" and so on. element: the LLVM type.
+
+        Raises:
+            UntranslatableError: other GPUs do not have the type, such as double precision.
+        """
         if element not in _KINDS:
             raise UntranslatableError(
                 f"a kernel of this field computes with numbers of type {element}: other GPUs have "

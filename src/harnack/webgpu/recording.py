@@ -1,5 +1,7 @@
 """Records the kernel of a computation by Dr.Jit, and finds out which array each of its parameters
-is.
+is. A kernel is the program that Dr.Jit compiles for a computation; it runs once for each lane, that
+is for each entry of its arrays. Dr.Jit records operations and runs them as a kernel when their
+result is evaluated, that is, needed in memory. A label is a name for an array.
 
 A kernel's text distinguishes its arrays only by the positions of their pointers. But Dr.Jit also
 prints labels as comments: `drjit.set_label` labels a variable, and `JitFlag.PrintIR` prints labels.
@@ -32,8 +34,8 @@ _RECORDING_LOCK = threading.Lock()
 
 @dataclass(frozen=True)
 class RecordedKernel:
-    """A kernel as a shader (a program in WGSL), and the arrays that it reads and writes, by their
-    labels.
+    """A kernel as a shader (a program in WGSL, WebGPU's language), and the arrays that it reads and
+    writes, by their labels.
 
     data: the numbers and tables that the kernel reads.
     results: Dr.Jit's own results for the lanes of the recording.
@@ -50,7 +52,7 @@ def record_kernel(
     compute: Callable[..., Mapping[str, Any]], lanes: Mapping[str, Any], data: Any
 ) -> RecordedKernel:
     """Record the kernel of `compute(**lanes)`. It also runs on Dr.Jit's own backend for these
-    lanes.
+    lanes. Returns the kernel with the results.
 
     compute: returns arrays by name, none of them evaluated, all from a single kernel.
     lanes: arrays by name, of the same length of at least 2.
@@ -69,6 +71,7 @@ def record_kernel(
         with dr.suspend_grad(), labels.label_gathers():
             outputs = compute(**lanes)
         results = dict(labeled_leaves("result", dict(outputs)))
+        # Constants need no kernel.
         computed = {k: value for k, value in results.items() if not _is_constant(value)}
         for label, array in computed.items():
             dr.set_label(array, label)
@@ -79,12 +82,13 @@ def record_kernel(
 
 @functools.lru_cache(maxsize=64)
 def _cached_shader(text: str) -> Shader:
-    """The shader for the text of a kernel in LLVM's language."""
+    """Translate the text of a kernel in LLVM's language into a shader. The 64 shaders used last are
+    kept."""
     return to_shader(parse(text))
 
 
 def _is_constant(array: Any) -> bool:
-    """Whether a Dr.Jit array is a literal: a constant in the code of kernels."""
+    """Return whether a Dr.Jit array is a literal: a constant in the code of kernels."""
     return array.state == dr.VarState.Literal
 
 
@@ -126,7 +130,9 @@ def _garbage_collection_paused() -> Generator[None]:
 
 
 class _ArrayLabels:
-    """Gives arrays labels, which are numbered in the order of the calls.
+    """Gives labels (names) to the arrays that a kernel reads, so that the text of the kernel says
+    which is which. Labels are numbered in the order of the calls. An array is evaluated if its
+    numbers are in memory; otherwise a kernel still has to compute them.
 
     Labels are part of the text of a kernel. Data of the same structure get the same labels, so that
     their kernel is neither translated nor compiled again.
@@ -166,21 +172,22 @@ class _ArrayLabels:
             module.gather = original
 
     def _label_gathered(self, gathered: Any, source: Any) -> None:
-        """Label the components of a value that `drjit.gather` read from the array `source`, so
-        that the inputs of the recorded kernel can be identified.
+        """Label the numbers that `drjit.gather` has read from the array `source`, so that the
+        inputs of the kernel can be told from its text. Vectors are labeled component by component.
 
-        A component that the kernel itself reads gets the label of `source`. If the indices were
-        constants, Dr.Jit has read the component at once: it is an evaluated array, and so an input
-        of its own, which gets the next label.
+        Normally the kernel itself reads the numbers, and they get the label of `source`. But
+        numbers at constant indices are read by Dr.Jit at once. They are then evaluated arrays and
+        inputs of their own, which get the next label.
         """
-        for _, leaf in labeled_leaves("", gathered):
-            if leaf.state == dr.VarState.Evaluated:  # gathered at known indices
-                self.label_array(leaf)
+        for _, component in labeled_leaves("", gathered):
+            if component.state == dr.VarState.Evaluated:  # read at constant indices
+                self.label_array(component)
             elif source.state == dr.VarState.Evaluated:
-                dr.set_label(leaf, self._table_label(source))
+                dr.set_label(component, self._table_label(source))
 
     def _table_label(self, source: Any) -> str:
-        """The label of an evaluated array from which lanes read; it gets one at the first call."""
+        """Return the label of an evaluated array from which lanes read. The array gets one at the
+        first call."""
         if source.index not in self._tables:
             label = f"table {len(self._tables)}"
             self._tables[source.index] = label
@@ -190,9 +197,12 @@ class _ArrayLabels:
 
 
 def labeled_leaves(name: str, value: Any) -> list[tuple[str, Any]]:
-    """The one-dimensional Dr.Jit arrays in a value, as (label, array). The label is `name` followed
-    by the keys and indices that lead to the array, such as "lane o 0" for component 0 of the entry
-    "o". value: a dictionary, a Dr.Jit vector or nested array; other values contain none."""
+    """Find the one-dimensional Dr.Jit arrays in a value. Returns them as pairs (label, array). The
+    label is `name` followed by the keys and indices that lead to the array, such as "lane o 0" for
+    component 0 of the entry "o".
+
+    value: a dictionary, a Dr.Jit vector or nested array; other values contain none.
+    """
     if dr.is_array_v(type(value)):
         if (
             dr.depth_v(type(value)) == 1
@@ -212,6 +222,7 @@ def _find_arrays(data: Any) -> Iterator[Any]:
     each once, in an order that depends only on the structure of the object."""
     visited: set[int] = set()
     pending: list[Any] = [data]
+    # The search is breadth-first. Objects that were seen before are skipped, so cycles end.
     while pending:
         node = pending.pop(0)
         if id(node) in visited or isinstance(

@@ -1,4 +1,7 @@
-"""Translates recorded kernels to WGSL, WebGPU's language; the program runs once for each lane.
+"""Translates recorded kernels to WGSL, WebGPU's language. A kernel is a program that runs once for
+each lane, that is for each entry of its arrays; `llvm_parser` has parsed it into statements, whose
+operands are constants or results of earlier statements. The WGSL program is called a shader. A
+kernel's parameters are its arrays, and a label is the name of an array.
 
 WGSL promises less than LLVM: division may be off by 2.5 units in the last place, `fma` may round
 twice, subnormal numbers may be zero, and a compiler may assume that infinities and NaN do not
@@ -69,8 +72,8 @@ _NEGATED_COMPARISONS = {"gt": "le", "ge": "lt", "lt": "ge", "le": "gt"}
 
 @dataclass(frozen=True)
 class Shader:
-    """A kernel in WGSL, and the layout of its buffers. All fields except `code` are labels of
-    arrays, in the order of the buffers.
+    """A kernel in WGSL, and the layout of its buffers (arrays in the GPU's memory). All fields
+    except `code` are labels of arrays, in the order of the buffers.
 
     The buffer of data holds 32-bit words: the number of lanes; 0; the start of each table; each
     number; then the tables. The buffer of lanes holds the arrays `lanes`, one after the other, with
@@ -87,7 +90,7 @@ class Shader:
 
 
 def to_shader(kernel: ComputeKernel) -> Shader:
-    """Translate a kernel.
+    """Translate a kernel to WGSL.
 
     Raises:
         UntranslatableError: an operation is unknown; or an array has no label, by which the caller
@@ -97,7 +100,9 @@ def to_shader(kernel: ComputeKernel) -> Shader:
 
 
 class _WGSLWriter:
-    """Writes a kernel as a shader, statement by statement.
+    """Writes a kernel as a shader, a program in WGSL, statement by statement. Each result of a
+    statement becomes a variable of the shader. Arrays are read from three buffers: data (single
+    numbers and tables), lanes (an entry per lane), and results.
 
     _buffer_slots: for "number", "table" and "lane", the kernel parameters of this kind in the order
         of the buffers.
@@ -148,8 +153,11 @@ class _WGSLWriter:
         return Shader(code, names["number"], names["table"], names["lane"], results)
 
     def _label(self, parameter: int) -> str:
-        """The label of the array of a kernel parameter. Raises `UntranslatableError` if it has
-        none."""
+        """Return the label of the array of a kernel parameter.
+
+        Raises:
+            UntranslatableError: it has none.
+        """
         label = self._kernel.labels.get(parameter)
         if label is None:
             raise UntranslatableError(f"parameter {parameter} of a kernel has no name")
@@ -174,7 +182,8 @@ class _WGSLWriter:
             self._emit(f"let {_variable(statement.result)} = {self._operation(statement)};")
 
     def _loop(self, loop: Loop) -> None:
-        """Append the code of a loop."""
+        """Append the code of a loop: its variables with their first values, the test, the body, and
+        the assignment of new values."""
         for node in loop.variables:
             self._emit(
                 f"var {_variable(node.name)}: {node.kind} = {self._operand_text(node.before)};"
@@ -186,40 +195,48 @@ class _WGSLWriter:
         self._emit(f"if (!{self._operand_text(loop.condition)}) {{ break; }}")
         for node in loop.body:
             self._write(node)
-        changed = [node for node in loop.variables if node.after != node.name]
+        changed_variables = [node for node in loop.variables if node.after != node.name]
         # All new values are computed first: one may be the old value of another variable.
-        for node in changed:
+        for node in changed_variables:
             self._emit(f"let next_{_variable(node.name)} = {self._operand_text(node.after)};")
-        for node in changed:
+        for node in changed_variables:
             self._emit(f"{_variable(node.name)} = next_{_variable(node.name)};")
         self._depth -= 1
         self._emit("}")
 
     def _load(self, load: Load) -> str:
-        """The WGSL expression that reads an entry of an array from a buffer (`Shader` describes the
-        layout)."""
-        slot = self._buffer_slots[load.source].index(load.parameter)
+        """Return the WGSL expression that reads an entry of an array from a buffer (`Shader`
+        describes the layout)."""
+        place = self._buffer_slots[load.source].index(load.parameter)
         if load.source == "lane":
-            bits = f"lanes[{slot}u * count + lane]"
+            bits = f"lanes[{place}u * count + lane]"
         elif load.source == "number":
-            bits = f"data[{2 + len(self._buffer_slots['table']) + slot}]"
+            bits = f"data[{2 + len(self._buffer_slots['table']) + place}]"
         else:
             assert load.index is not None
             index = self._operand_text(load.index)
+            # The table consists of records; the offset is the number's place in its record.
             if load.stride > 1:
                 index = f"{index} * {load.stride}u + {load.offset}u"
-            bits = f"data[data[{2 + slot}] + {index}]"
+            # The word data[2 + k] is where table k starts.
+            bits = f"data[data[{2 + place}] + {index}]"
+            # A mask that is constantly true needs no test.
             if load.mask is not None and not (isinstance(load.mask, Constant) and load.mask.bits):
                 bits = f"select(0u, {bits}, {self._operand_text(load.mask)})"
         return bits if load.kind == "u32" else f"bitcast<f32>({bits})"
 
     def _operation(self, operation: Operation) -> str:
-        """The WGSL expression of an operation; `a` holds the expressions of its operands. Integers
-        are unsigned in the shader; signed operations reinterpret their bits."""
+        """Return the WGSL expression of an operation; `a` holds the expressions of its operands.
+        Integers are unsigned in the shader; signed operations reinterpret their bits.
+
+        The name of an operation may be followed by a variant: the predicate of a comparison ("fcmp
+        olt"), the classes of a test, or the source type of a conversion.
+        """
         a = [self._operand_text(value) for value in operation.operands]
         name, _, variant = operation.name.partition(" ")
         if name in _INFIX:
             return f"{a[0]} {_INFIX[name]} {a[1]}"
+        # The second operator of a pair is for truth values.
         if name in _BIT_OPERATORS:
             return f"{a[0]} {_BIT_OPERATORS[name][operation.kind == 'bool']} {a[1]}"
         if name in _FUNCTIONS:
@@ -242,11 +259,13 @@ class _WGSLWriter:
                 return f"bitcast<u32>({name[1:]}({_as_signed(a[0])}, {_as_signed(a[1])}))"
             case "iabs":
                 return f"bitcast<u32>(abs({_as_signed(a[0])}))"
+            # The bits of the first number without its sign, and the sign of the second.
             case "copysign":
                 return (
                     f"bitcast<f32>((bitcast<u32>({a[0]}) & 0x7fffffffu) | "
                     f"(bitcast<u32>({a[1]}) & 0x80000000u))"
                 )
+            # WGSL's select has the value for False first.
             case "select":
                 return f"select({a[2]}, {a[1]}, {a[0]})"
             case "fpclass":
@@ -256,13 +275,15 @@ class _WGSLWriter:
             case "icmp":
                 if variant in ("eq", "ne"):
                     return f"{a[0]} {_COMPARISONS[variant]} {a[1]}"
+                # Predicates such as "slt" compare signed integers, "ult" unsigned ones.
                 x, y = (_as_signed(v) for v in a) if variant[0] == "s" else a
                 return f"{x} {_COMPARISONS[variant[1:]]} {y}"
             case _:
                 return _conversion(operation, name, variant, a[0])
 
     def _operand_text(self, value: Operand) -> str:
-        """The WGSL expression of an operand: a variable, or a constant with exactly its bits."""
+        """Return the WGSL expression of an operand: a variable, or a constant with exactly its
+        bits."""
         if isinstance(value, str):
             return _variable(value)
         if value.kind == "bool":
@@ -271,48 +292,63 @@ class _WGSLWriter:
             return f"{value.bits}u"
         number: float = struct.unpack("<f", struct.pack("<I", value.bits))[0]
         exponent = (value.bits >> 23) & 255
+        # Infinity or NaN. A compiler must not know the bits, so a zero from a buffer is mixed in.
         if exponent == 255:
             return f"bitcast<f32>({value.bits}u ^ zero)"
+        # A subnormal number, whose decimal form a compiler might round to 0.
         if exponent == 0 and value.bits:
             return f"bitcast<f32>({value.bits}u)"
+        # Negative numbers and -0 stand in brackets, as an operator may precede them.
         return f"{number!r}f" if number >= 0 and value.bits >> 31 == 0 else f"({number!r}f)"
 
 
 def _variable(result: str) -> str:
-    """The name of the WGSL variable for a result's name in LLVM, such as v_r12 for %r12."""
+    """Return the name of the WGSL variable for a result's name in LLVM, such as v_r12 for %r12."""
     return result.replace("%", "v_").replace(".", "_")
 
 
 def _as_signed(text: str) -> str:
-    """The WGSL expression that reinterprets an expression's bits as a signed integer."""
+    """Return the WGSL expression that reinterprets an expression's bits as a signed integer."""
     return f"bitcast<i32>({text})"
 
 
 def _float_comparison(predicate: str, x: str, y: str) -> str:
-    """The WGSL expression that compares two floats x and y by an LLVM predicate. Predicates that
-    begin with "o" (ordered) are false if an operand is NaN; those that begin with "u" (unordered)
-    are true."""
+    """Return the WGSL expression that compares two floats x and y by an LLVM predicate. Predicates
+    that begin with "o" (ordered) are false if an operand is NaN; those that begin with "u"
+    (unordered) are true.
+
+    Ordered comparisons are WGSL's own, which are false for NaN. An unordered one is the negation of
+    the opposite comparison.
+    """
     if predicate in ("ord", "uno"):
         any_nan = f"is_nan({x}) | is_nan({y})"
         return any_nan if predicate == "uno" else f"!({any_nan})"
+    # The texts are equal: a number is compared with itself, which is a test for NaN.
     if x == y and predicate in ("oeq", "une"):
         return f"is_nan({x})" if predicate == "une" else f"!is_nan({x})"
-    family, order = predicate[0], predicate[1:]
+    first_letter, order = predicate[0], predicate[1:]
     if predicate == "ueq":
         return f"({x} == {y}) | is_nan({x}) | is_nan({y})"
     if predicate == "one":
         return f"({x} != {y}) & !is_nan({x}) & !is_nan({y})"
     if predicate == "une":
         return f"({x} != {y}) | is_nan({x}) | is_nan({y})"
-    if family == "o":
+    if first_letter == "o":
         return f"{x} {_COMPARISONS[order]} {y}"
     return f"!({x} {_COMPARISONS[_NEGATED_COMPARISONS[order]]} {y})"
 
 
 def _float_class_test(classes: int, x: str) -> str:
-    """The WGSL expression that tests whether the float x belongs to one of some classes (NaN,
-    zeros, infinities, subnormal numbers). classes: their bits, as in AVX-512's `fpclass`."""
+    """Return the WGSL expression that tests whether the float x belongs to one of some classes
+    (NaN, zeros, infinities, subnormal numbers).
+
+    classes: their bits, as in AVX-512's `fpclass`.
+
+    Raises:
+        UntranslatableError: no class, or negative numbers.
+    """
     bits = f"bitcast<u32>({x})"
+    # By the bits of `classes`: NaN, quiet or signaling; 0; -0; infinity; -infinity; subnormal.
     tests = {
         0x81: f"is_nan({x})",
         0x02: f"({bits} == 0u)",
@@ -327,8 +363,10 @@ def _float_class_test(classes: int, x: str) -> str:
 
 
 def _conversion(op: Operation, name: str, source: str, x: str) -> str:
-    """The WGSL expression that converts x by the LLVM conversion `name`, from the type `source` to
-    the type of the operation `op`.
+    """Return the WGSL expression that converts x to the type of the operation `op`.
+
+    name: the LLVM conversion, such as "sitofp" (signed integer to float).
+    source: the type of x: "f32", "u32" or "bool".
 
     Raises:
         UntranslatableError: the conversion is unknown.
@@ -344,6 +382,7 @@ def _conversion(op: Operation, name: str, source: str, x: str) -> str:
             return f"to_signed({x})"
         case "fptoui", _, _:
             return f"u32({x})"
+        # Extended with its sign, True becomes an integer of ones.
         case "sext", "bool", _:
             return f"select(0u, 0xffffffffu, {x})"
         case "zext", "bool", _:

@@ -1,1 +1,2 @@
-"""Solid angles of curves, winding numbers of meshes and clouds, and what they are sums of."""
+"""Solid angles of curves, winding numbers of meshes and point clouds, and the sums over edges,
+triangles and dipoles from which they are computed."""

@@ -1,13 +1,13 @@
-"""The argument `cells` of fields that may have FMM cells, and the decision whether cells pay.
+"""The option `cells` of fields that are sums over many sources (dipoles, triangles or edges of
+curves): whether to build FMM cells. These are cells of an octree, each with a list of near sources
+and one polynomial for all far sources, so that a sample costs less time. To build them takes time
+and memory. None builds cells if they save more time than they cost, True builds them in any case,
+and False builds none. A number builds them in any case and limits their memory to this number of
+megabytes.
 
-FMM cells are cells of an octree, each with a list of near sources and a polynomial for all far
-sources. Fields with cells (`dipole_cells`, `curve_cells`) take an argument `cells`. None builds
-cells if they pay, True builds cells in any case, and False builds none. A number builds cells in
-any case and limits their memory to this number of megabytes.
-
-`trace`, `render`, and views that Python draws tell a field the number of rays
-(`Field.for_ray_count`). The field builds cells if that pays: to build the cells of a cloud takes as
-long as to trace about six rays per point without cells. Solids tell their operands the number, too.
+The number of rays decides whether cells save time. `trace`, `render`, and views that Python draws
+tell it to a field (`Field.for_ray_count`); solids tell it to their operands, too. To build the
+cells of a cloud takes as long as to trace about six rays per point without cells.
 
 Values at points use cells if the user requested cells, whatever the number of points. If that
 number decided, the values of a part of the points could differ from those of all points by more
@@ -34,14 +34,15 @@ if TYPE_CHECKING:
 
 __all__ = ["BuiltCells", "FieldWithCells"]
 
-# Megabytes that cells may take if the argument `cells` does not say how many.
+# Megabytes that cells may take if the option `cells` is True, and so names no limit.
 _MEGABYTES = 256.0
 
 Built = TypeVar("Built")
 
 
 class BuiltCells(Protocol):
-    """The FMM cells of a field, once they have been built.
+    """The FMM cells of a field (octree cells, each with a polynomial for all far sources), once
+    they have been built.
 
     count: the number of cells.
     size: the number of bytes that they take.
@@ -55,15 +56,19 @@ class BuiltCells(Protocol):
 
 
 class FieldWithCells(Field):
-    """A field that may have FMM cells. The constructor of a subclass calls `configure_cells`, which
-    sets the attributes, and the subclass defines `cells_pay_from`.
+    """A field that may have FMM cells: octree cells, each with a list of near sources and a
+    polynomial for all far sources. With cells a sample costs less time, but to build them takes
+    time, too. So by default the number of rays decides whether the field has cells, and how small
+    they are. The constructor of a subclass calls `configure_cells`, which sets the attributes, and
+    the subclass defines `cells_pay_from`.
 
-    cells: the argument `cells`, as described in this module.
+    cells: True for cells in any case, False for none, None if the number of rays decides, or a
+        number of megabytes, for cells in any case with this limit of memory.
     cells_for_values: whether values at points use the cells, too. It is true if the user requested
         cells, whatever the number of points, so that values and their error bounds always come from
         the same method.
-    finer_cells: whether the number of rays is so large that smaller cells pay; true if the user
-        requested cells.
+    finer_cells: whether cells are smaller, which takes longer to build them and saves time for very
+        many rays; true if the user requested cells.
     """
 
     cells: bool | float | None
@@ -73,8 +78,8 @@ class FieldWithCells(Field):
     _batches: Any
 
     def configure_cells(self, cells: Any) -> None:
-        """Set whether the field uses FMM cells (octree cells, each with a polynomial for all far
-        sources), and forget all cells that have been built.
+        """Set whether the field has FMM cells, and forget all cells that have been built. Values at
+        points use the cells if the user requested them, by True or a number.
 
         cells: True to build them in any case, False for none, None to build them if the number of
             rays is large enough, or a number of megabytes that limits their memory.
@@ -83,7 +88,7 @@ class FieldWithCells(Field):
             ValueError: `cells` is none of these.
         """
         kind = cast("Any", type(cells))
-        if issubclass(kind, np.bool_):  # True is no megabyte
+        if issubclass(kind, np.bool_):  # so that np.True_ does not count as one megabyte
             cells = bool(cells)
         is_number = issubclass(kind, (int, float, np.bool_, np.integer, np.floating))
         if cells is not None and not (is_number and 0 <= cells < math.inf):
@@ -91,20 +96,26 @@ class FieldWithCells(Field):
                 f"cells must be True, False, a number of megabytes or None, not {cells!r}"
             )
         self.cells = cells
+        # `with_cells` results by `finer_cells`; and built cells by backend, bytes and
+        # `finer_cells`.
         self.cells_for_values, self.finer_cells = bool(cells), True
         self._with_cells: TransientCache[bool, Self] = TransientCache()
         self._built: TransientCache[tuple[Backend, int, bool], Any] = TransientCache()
 
     def with_cells(self, cells: bool = True) -> Self:
-        """A copy of this field that uses cells for rays only, or with cells=False no cells."""
+        """Copy this field, with cells that are used for rays but not for values at points; or
+        without cells, for cells=False."""
         field = copy.copy(self)
         field.configure_cells(cells)
         field.cells_for_values, field._device, field._batches = False, None, TransientCache()
         return field
 
     def build_cached(self, backend: Backend, build: Callable[[], Built]) -> Built:
-        """The result of `build()` for a backend. It is computed once, and used for values and for
-        tracing, as long as the limit of bytes and `finer_cells` are the same."""
+        """Return the cells of a backend, which are built once and used for values and for tracing.
+        They are built anew if the limit of bytes or `finer_cells` has changed.
+
+        build: a function that builds the cells.
+        """
         key = backend, self.max_bytes(), self.finer_cells
         if key not in self._built:
             self._built[key] = build()
@@ -112,21 +123,19 @@ class FieldWithCells(Field):
 
     @abc.abstractmethod
     def cells_pay_from(self) -> float:
-        """The smallest number of rays for which cells save more time than it takes to build them;
+        """The smallest number of rays for which cells save more time than their construction takes;
         infinite if they never do."""
 
     def finer_cells_pay_from(self) -> float:
-        """The smallest number of rays for which smaller cells (octree cells with local expansions)
-        save more time than their longer construction takes.
-
-        By default it is 0: fields whose cells have only one size take no account of the choice.
-        """
+        """The smallest number of rays for which smaller cells save more time than their longer
+        construction takes. It is 0 by default, for fields whose cells have only one size: they
+        ignore `finer_cells`."""
         return 0.0
 
     def for_ray_count(self, count: int) -> Self:
-        """The field for tracing `count` rays. It has cells if the user left the choice open
-        (`cells` is None) and `count` is at least `cells_pay_from()`; otherwise it is this field
-        itself."""
+        """Return the field with which to trace `count` rays. It is a copy with cells if the user
+        left the choice open (`cells` is None) and there are so many rays that cells save time.
+        Otherwise it is this field itself."""
         if self.cells is not None or not self.cells_pay_from() <= count:
             return self
         finer = self.finer_cells_pay_from() <= count
@@ -136,17 +145,18 @@ class FieldWithCells(Field):
         return self._with_cells[finer]
 
     def max_bytes(self) -> int:
-        """The number of bytes that the cells may take."""
+        """Compute the number of bytes that the cells may take; 0 if there are none."""
         return int(1e6 * (_MEGABYTES if self.cells is True else float(self.cells or 0)))
 
     def describe_cells(self, built: BuiltCells | None) -> dict[str, str]:
-        """The entry "cells" of `describe`, or an empty dictionary if the field has no cells.
+        """Make the entry "cells" of `describe`, or an empty dictionary if the field has no cells.
 
-        built: in a prepared field the cells; None if they would have taken too much memory.
+        built: in a prepared field (which is on a backend) its cells; None if they would have taken
+            too much memory.
 
-        In a prepared field the entry states the number and the memory of the cells. In a field that
-        is not prepared it states how much memory they may take. If the field decides by the number
-        of rays, the entry is the smallest number of rays for which it builds cells.
+        For a prepared field the entry states the number and the memory of the cells; for another
+        one, how much memory they may take. If the number of rays decides, the entry states the
+        smallest number for which the field builds cells.
         """
         if self.cells is None and self.cells_pay_from() < math.inf:
             return {"cells": f"from {math.ceil(self.cells_pay_from()):,} rays on"}

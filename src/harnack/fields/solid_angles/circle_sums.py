@@ -1,5 +1,7 @@
-"""The solid angle of a circle at a point, and sums over many circles with the integrals that bound
-them.
+"""The solid angle Omega of a circle, seen from a point x, and sums over many circles with the
+integrals that bound them. Omega is known modulo 4 pi. In integrals along a circle, p is a point of
+the circle, |dp| the length element, and D the distance from x to p. A record of a circle holds its
+center, radius and unit normal.
 
 - `UnitCircle`: the formulas, by complete elliptic integrals.
 - `CircleSet`: circles on a backend, and the sums over them.
@@ -29,26 +31,28 @@ if TYPE_CHECKING:
 
 __all__ = ["CircleSet", "CircleSums", "UnitCircle"]
 
+# The number of rounds of arithmetic-geometric means, after which they have converged.
 _AGM_ROUNDS = {"single": 6, "double": 8}
 
 
 @dataclass(frozen=True)
 class UnitCircle:
-    """The solid angle Omega of the unit circle at a point, and its derivatives.
+    """The solid angle Omega of the unit circle, seen from a point, and its derivatives. The circle
+    has radius 1 and lies in the plane z = 0 around the z axis, run counter-clockwise as seen from
+    above.
 
     r, z: the distance of the point from the axis, and its height above the plane.
     angle: Omega in (-2 pi, 2 pi).
-    nearest, farthest: the distances Rm and Rp of the point from the circle's nearest and farthest
-        points.
+    nearest, farthest: the distances Rm and Rp of the point from the nearest and the farthest point
+        of the circle.
     share: q = 4/(Rp (Rp + Rm)), so that q r = 1 - kc.
     radial: J/q^2, with the integral J below.
     axial: the component of the gradient along the axis.
     third: the integral I3 below.
 
-    The circle has radius 1 and lies in the plane z = 0, run counter-clockwise as seen from above.
-    Rm^2 = (1-r)^2 + z^2 and Rp^2 = (1+r)^2 + z^2. All integrals have the complementary modulus
-    kc = Rm/Rp; K and E are the complete elliptic integrals of the first and second kind with this
-    modulus. A = 1 + r^2 + z^2.
+    Symbols. Rm^2 = (1-r)^2 + z^2, Rp^2 = (1+r)^2 + z^2, and A = 1 + r^2 + z^2. K and E are the
+    complete elliptic integrals of the first and second kind with the complementary modulus
+    kc = Rm/Rp.
 
     Value. Omega = -sgn(z) W, W = 2 pi [r < 1] - 4|z| cel/((1+r) Rp). Here cel is the integral of
     (cos^2 + gamma sin^2)/(D (cos^2 + gamma^2 sin^2)) over the angles in [0, pi/2], with
@@ -56,10 +60,11 @@ class UnitCircle:
     cel(kc, gamma^2, 1, gamma) (Bulirsch 1969, Numer. Math. 13). On the cylinder r = 1, where
     gamma = 0, W = pi - 2|z| K/Rp.
 
-    All integrals come from one loop of arithmetic-geometric means, which converges quadratically:
-    six rounds for single precision and eight for double, unrolled to plain arithmetic. Besides the
-    means a_n it computes the differences c_(n+1) = c_n^2/(4 a_(n+1)), c_1 = (1-kc)/2, and the sum
-    S of 2^n c_(n+1)^2/(1-kc)^2 over n >= 1. Then E = K (1 - (1-kc^2)/2 - (1-kc)^2 (1/4 + S)).
+    Loop. cel, K and E come from one loop of arithmetic-geometric means, which converges
+    quadratically: six rounds for single precision and eight for double, unrolled to plain
+    arithmetic. Besides the means a_n it computes the differences c_(n+1) = c_n^2/(4 a_(n+1)),
+    c_1 = (1-kc)/2, and the sum S of 2^n c_(n+1)^2/(1-kc)^2 over n >= 1. Then
+    E = K (1 - (1-kc^2)/2 - (1-kc)^2 (1/4 + S)).
 
     Derivatives. Let D now be the distance of the point from the circle's point at the angle phi.
     Biot and Savart's integrals over the circle,
@@ -67,8 +72,8 @@ class UnitCircle:
         I3 = integral of dphi/D^3 = 4E/(Rp Rm^2),   C3 = integral of cos(phi) dphi/D^3 = r J,
 
     give the gradient (z x J, z y J, I3 - r^2 J) at the point (x, y, z). The known form
-    J = 2 (A E/Rm^2 - K)/(r^2 Rp) cancels near the axis and far away. With E as above,
-    1 - kc = q r and A = Rp^2 (1 + kc^2)/2, the terms of order 0 and 1 in 1 - kc drop out, which
+    J = 2 (A E/Rm^2 - K)/(r^2 Rp) cancels near the axis and far away. Insert E as above,
+    1 - kc = q r, and A = Rp^2 (1 + kc^2)/2. The terms of order 0 and 1 in 1 - kc drop out, which
     leaves
 
         J = K q^2 [(1 + 4 kc + kc^2)/4 - (1 + kc^2) S]/(Rp kc^2).
@@ -77,13 +82,13 @@ class UnitCircle:
     2 [K + ((1-r)(1+r) - z^2) E/Rm^2]/Rp does not.
 
     Second derivatives need I5 and C5, the same integrals with D^-5 instead of D^-3. As
-    D^2 = A - 2r cos(phi), A I5 - 2r C5 = I3; and by parts, C3 = 3r times the integral of
-    sin^2(phi)/D^5, that is 3 A C5 = 6 r I5 + C3. So, as A^2 - 4r^2 = Rm^2 Rp^2,
+    D^2 = A - 2r cos(phi), A I5 - 2r C5 = I3. And integration by parts gives C3 as 3r times the
+    integral of sin^2(phi)/D^5, that is 3 A C5 = 6 r I5 + C3. So, as A^2 - 4r^2 = Rm^2 Rp^2,
 
         C5/r = (2 I3 + A J/3)/(Rm^2 Rp^2),   I5 = (I3 + 2r C5)/A,
 
-    sums of positive terms, and Omega_zz = -3z (I5 - r C5), Omega_rz = C3 - 3 z^2 C5,
-    Omega_r/r = z J; the trace is 0.
+    which are sums of positive terms. The second derivatives are Omega_zz = -3z (I5 - r C5),
+    Omega_rz = C3 - 3 z^2 C5, and Omega_r/r = z J in the tangential direction; the trace is 0.
     """
 
     r: Real
@@ -98,8 +103,12 @@ class UnitCircle:
 
     @classmethod
     def at(cls, r: Real, z: Real) -> UnitCircle:
-        """Evaluate the circle's solid angle at the distance r >= 0 from the axis and the height z.
-        Both are Dr.Jit numbers."""
+        """Compute the unit circle's solid angle, and what its derivatives need, at a point.
+
+        r, z: the distance r >= 0 of the point from the axis, and its height z, as Dr.Jit numbers.
+
+        On the circle's own plane z = 0 the sign of the zero decides the side.
+        """
         real: Any = cast("Any", type(r))
         agm_rounds = _AGM_ROUNDS["double" if float(dr.epsilon(r)) < 1e-10 else "single"]
         gap = 1 - r
@@ -109,8 +118,9 @@ class UnitCircle:
         kc = nearest * inverse
         q = 4 * inverse / (farthest + nearest)
         gamma = gap / (1 + r)
-        # c, d, p are Bulirsch's numbers for cel; m and e are the numbers of the means. In the loop
-        # `difference` becomes c_(n+1)/(1-kc), and `total` the sum S; kc_gap is 1 - kc.
+        # c, d and p are Bulirsch's numbers for cel. m, k and e belong to the means: m is 2^n times
+        # the arithmetic mean after n rounds. In the loop `difference` becomes c_(n+1)/(1-kc), and
+        # `total` the sum S; kc_gap is 1 - kc. p must not be 0, which it would be on r = 1.
         c, d, p = real(1), dr.copysign(real(1), gamma), fmax(dr.abs(gamma), 1e-30)
         k, e, m = kc, kc, real(1)
         total, difference, kc_gap = real(0), real(0.5), q * r
@@ -126,25 +136,27 @@ class UnitCircle:
         cel = (math.pi / 2) * dr.fma(c, m, d) / (m * (m + p))
         first = (math.pi / 2 * 2.0**agm_rounds) / m  # K
         second = first * (1 - 0.5 * kc_gap * (1 + kc) - kc_gap * kc_gap * (0.25 + total))  # E
+        # w: W of the class, with its own formula on the cylinder r = 1.
         height = dr.abs(z)
         w = dr.select(r < 1, real(2 * math.pi), 0) - 4 * height * inverse / (1 + r) * cel
         w = dr.select(r == 1, math.pi - 2 * height * inverse * first, w)
         bracket = 0.25 * dr.fma(kc, 4 + kc, 1) - dr.fma(kc, kc, 1) * total
         radial = first * inverse * bracket / (kc * kc)
         third = 4 * second * inverse / square
+        # I3 - r^2 J in two forms; the first is for points near the circle.
         near_form = 2 * inverse * (first + (gap * (1 + r) - z * z) / square * second)
         axial = dr.select(first * square < 2 * second, near_form, third - kc_gap * kc_gap * radial)
         return cls(r, z, -dr.mulsign(w, z), nearest, farthest, q, radial, axial, third)
 
     @property
     def across(self) -> Real:
-        """z J, with the integral J of the class. The component of the gradient perpendicular to the
-        axis is (x, y) times this number."""
+        """z J, with the integral J of the class. At the point (x, y, z), this number times (x, y)
+        is the component of the gradient perpendicular to the axis."""
         return (self.z * self.share) * (self.share * self.radial)
 
     def second_derivatives(self) -> tuple[Real, Real, Real]:
-        """Three numbers from which the Hessian of the solid angle follows: its entry zz, its entry
-        rz divided by r, and its entry tt, which is z J with the integral J of the class.
+        """Compute three numbers from which the Hessian of the solid angle follows: its entry zz,
+        its entry rz divided by r, and its entry tt, which is z J with the integral J of the class.
 
         z is the direction of the circle's axis, r the radial and t the tangential direction. The
         entry rr is minus the sum of the entries zz and tt; the entries rt and zt are 0.
@@ -162,15 +174,17 @@ class UnitCircle:
 
 @dataclass(frozen=True)
 class CircleSums:
-    """Quantities of a set of circles at a point x, summed over the circles.
+    """Quantities of a set of circles at a point x, summed over the circles: the solid angle that
+    they subtend at x, its gradient, the distance, and integrals that bound derivatives.
 
-    angle, gradient: the sum of the circles' solid angles, each in (-2 pi, 2 pi), and its gradient.
-    distance: the distance to the nearest circle.
+    angle: the sum of the circles' solid angles, seen from x, each in (-2 pi, 2 pi).
+    gradient: (3,) its gradient.
+    distance: the distance from x to the nearest circle.
     inverse_squares, inverse_cubes: the integrals of |dp|/D^2 and |dp|/D^3 along the circles, with D
         the distance from x to the point p of a circle.
     inverse_fourths: an upper bound of the integral of |dp|/D^4.
-    lower, upper: bounds of the lifted angle on the ball around x of radius `distance`. The lifted
-        angle is the angle continued from x without its jumps of 4 pi (`planar` has the proof).
+    lower, upper: bounds of the angle on the ball around x of radius `distance`, if it is continued
+        from x without its jumps of 4 pi (`planar` has the proof).
     """
 
     angle: Real
@@ -185,12 +199,14 @@ class CircleSums:
 
 @dataclass(frozen=True)
 class _RelativeCircle:
-    """A circle relative to a point x.
+    """A circle of any position and size, relative to a point x. In units of the circle's radius a,
+    x is at the distance r from the circle's axis and at the height z above its plane.
 
     a: the radius of the circle.
     normal: its unit normal.
     outward: the component of x - center in the circle's plane, of length r a.
-    circle: the unit circle at (r, z); x is z a above the circle's plane.
+    circle: the solid angle of the unit circle, seen from a point at the distance r and the height
+        z.
     """
 
     a: Real
@@ -211,7 +227,9 @@ class _RelativeCircle:
 
 @dataclass(frozen=True)
 class CircleSet:
-    """Circles on a backend. A record holds center, radius and normal, with lengths of order one."""
+    """A set of circles on a backend, in unit coordinates, in which lengths are of order one. Its
+    methods sum over the solid angles of all circles, seen from a point x. A record of a circle
+    holds its center (3,), radius, and unit normal (3,)."""
 
     records: RecordTable
 
@@ -219,8 +237,8 @@ class CircleSet:
     def upload(
         cls, backend: Backend, circles: Sequence[Circle], center: FloatArray, size: float
     ) -> CircleSet:
-        """The circles in unit coordinates: their centers relative to `center` (3,), and all lengths
-        divided by `size`."""
+        """Upload circles to a backend, in unit coordinates: positions relative to `center` (3,),
+        and all lengths divided by `size`."""
         rows = [
             [*(np.array(circle.center) - center) / size, circle.radius / size, *circle.normal, 0.0]
             for circle in circles
@@ -228,14 +246,14 @@ class CircleSet:
         return cls(RecordTable.upload(backend, np.array(rows)))
 
     def sums(self, x: Vec3) -> CircleSums:
-        """The sums over all circles at points x (3, n), in unit coordinates, in one loop over the
+        """Sum over all circles at points x (3, n), in unit coordinates, in one loop over the
         circles."""
         real, vector = self._types
         x = vector(x)
 
         def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
-            """Add the circle in the record `row` to the state: angle, gradient, nearest distance,
-            the three integrals, and the lower bound of the lifted angle."""
+            """Add the circle in the record `row` to the state: angle, gradient, distance of the
+            nearest circle, the three integrals, and the lower bound of the continued angle."""
             angle, gradient, distance, inverse_squares, inverse_cubes, inverse_fourths, lower = (
                 state
             )
@@ -246,7 +264,10 @@ class CircleSet:
             gradient = dr.fma(vector(circle.axial / a), relative.normal, gradient)
             nearest, farthest = circle.nearest, circle.farthest
             cube = circle.third / (a * a)
-            # The sign comes from the height: far away the angle consists of rounding only.
+            # The range of the circle's continued angle, of width 4 pi, begins at `lower_end`. Above
+            # the disk the angle lies in [-4 pi, 0], below it in [0, 4 pi], elsewhere in
+            # [-2 pi, 2 pi]. The sign comes from the height: far away the angle consists of rounding
+            # only.
             is_above = dr.mulsign(real(1), circle.z) > 0
             lower_end = dr.select(
                 circle.r < 1, dr.select(is_above, real(-4 * math.pi), 0), -2 * math.pi
@@ -271,14 +292,14 @@ class CircleSet:
         )
 
     def hessian(self, x: Vec3) -> SymmetricMatrix:
-        """The Hessian of the sum of the circles' solid angles at points x (3, n), in unit
+        """Compute the Hessian of the sum of the circles' solid angles at points x (3, n), in unit
         coordinates."""
         real, vector = self._types
         x = vector(x)
 
         def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
-            """Add the Hessian of the circle in the record `row` to the entries `state` of the
-            total."""
+            """Add the Hessian of the circle in the record `row` to the total, whose entries are the
+            state."""
             relative = self._relative(row, x)
             a, n, outward = relative.a, relative.normal, relative.outward
             f_zz, f_rz_over_r, f_tt = relative.circle.second_derivatives()
@@ -302,37 +323,43 @@ class CircleSet:
     def line_rates(
         self, line: RayLine, lengths: tuple[Real, ...], active: Mask
     ) -> tuple[Real, ...]:
-        """For each length T, a bound of the size of the derivative of the solid angle along a line,
-        at all points of the line within T of x in both directions.
+        """Bound the size of the derivative of the circles' solid angle along a line, on several
+        parts of the line: for each length T, at all points within T of x in both directions.
 
         line: the line through x = line.x, with the unit direction line.v.
         lengths: the lengths T.
+        active: the mask of the lanes to compute.
 
         Returns a tuple with one bound for each length. A bound is infinite where a circle may be
-        within T, and on lanes that are not active.
+        within T of x, and on lanes that are not active.
 
-        For one circle, let a be its radius, r and z the distance of the point from the axis and the
-        height above the circle's plane, and d and P the distances of the nearest and the farthest
-        point of the circle. D is the distance from the point to a point p of the circle. E is the
-        complete elliptic integral of the second kind with the complementary modulus kc = d/P.
-        Biot and Savart's integrals have closed forms:
+        Proof. Consider one circle and a point of the line. Symbols:
+
+        - a: the radius of the circle;
+        - r, z: the distance of the point from the circle's axis, and its height above the plane;
+        - d, P: the distances from the point to the nearest and the farthest point of the circle;
+        - D: the distance from the point to a point p of the circle;
+        - E: the complete elliptic integral of the second kind, of complementary modulus kc = d/P;
+        - w: the component of the line's direction along the circle's normal.
+
+        (1) Two integrals have closed forms:
 
             |grad Omega| <= integral of |dp|/D^2 = 2 pi a/(P d),
 
             integral of |dp|/D^3 = 4 a E/(P d^2) <= 2 pi a B,   B = sqrt((1/d^2 + 1/P^2)/2)/(P d).
 
-        The first bound is attained at the center. The second one holds since
+        The first inequality is Biot and Savart's law. The second holds since
         E <= (pi/2) sqrt((1 + kc^2)/2), by Jensen's inequality for the square root.
 
-        Both bounds fall as d and P grow. If the point moves by t, d and P fall by at most t. And
-        d >= |r - a|: for a line that passes by the circle, this is a better bound than the distance
-        of a single point of the line. So both bounds hold on the whole part of the line, with the
-        smallest possible d and P.
+        (2) The component of the gradient along the circle's plane is at most |z| times the integral
+        of |dp|/D^3. So the derivative along the line is at most
+        |w| 2 pi a/(P d) + sqrt(1-w^2) |z| 2 pi a B, which is small if the line runs along the
+        plane.
 
-        The component of the gradient along the circle's plane is at most |z| times the integral of
-        |dp|/D^3. So for a line whose direction has the component w along the circle's normal, the
-        derivative is at most |w| 2 pi a/(P d) + sqrt(1-w^2) |z| 2 pi a B, which is small if the
-        line runs along the plane.
+        (3) These bounds fall as d and P grow. So they hold on a whole part of the line with the
+        smallest d and P on it. If the point moves by t, d and P fall by at most t. Also
+        d >= |r - a|: for a line that passes by the circle, this is a better bound than the distance
+        of a single point of the line.
         """
         real, vector = self._types
 
@@ -353,6 +380,7 @@ class CircleSet:
             new_rates: list[Real] = []
             for length, rate in zip(lengths, rates, strict=True):
                 positions = (clamp(closest_position, -length, length), -length, length)
+                # r at the position nearest to the axis, and at both ends of the part.
                 lowest, first, last = (
                     dr.norm(dr.fma(vector(s), flat_v, relative.outward)) for s in positions
                 )
@@ -362,6 +390,7 @@ class CircleSet:
                 near = fmax(relative.distance - length, plane_distance) - slack
                 far = fmax(relative.farthest - length, near + slack) - slack
                 bound = 2 * math.pi * relative.a / (near * far)
+                # B is mean_inverse/(P d), the root mean square of 1/d and 1/P over P d.
                 mean_inverse = dr.sqrt(0.5 * (dr.rcp(near * near) + dr.rcp(far * far)))
                 max_height = dr.fma(length, axial, height)
                 term = bound * dr.fma(across * max_height, mean_inverse, axial)
@@ -373,35 +402,38 @@ class CircleSet:
         return tuple(dr.select(active, rate, dr.inf) for rate in rates)
 
     def closest(self, x: Vec3) -> tuple[Vec3, Real]:
-        """The point (3, n) on the circles that is closest to each point x (3, n), and the square of
-        its distance from x. Both are in unit coordinates."""
+        """Find, for each of the points x (3, n), the closest point (3, n) on any of the circles.
+        Returns it with the square of its distance from x, all in unit coordinates."""
         real, vector = self._types
         x = vector(x)
 
         def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
-            """The closest point and its squared distance `state`, updated by the circle in a
-            record."""
-            best, nearest = state
+            """Update the state by the circle in the record `row`. The state holds the closest point
+            so far, and its squared distance."""
+            closest_point, smallest_square = state
             relative = self._relative(row, x)
-            # All points of the circle are equally far from the axis: any direction in the plane is
-            # right.
+            # The closest point lies in the direction of `outward` from the center. If x is on the
+            # axis, all points of the circle are equally far: any direction in the plane is right.
             outward_length = dr.norm(relative.outward)
             perpendicular = dr.normalize(_perpendicular(vector, relative.normal))
             radial = dr.select(outward_length > 0, relative.outward / outward_length, perpendicular)
             point = dr.fma(vector(relative.a), radial, vector(*row[:3]))
-            square = dr.squared_norm(x - point)
-            closer = square < nearest
-            return dr.select(closer, point, best), dr.select(closer, square, nearest)
+            squared_distance = dr.squared_norm(x - point)
+            is_closer = squared_distance < smallest_square
+            return dr.select(is_closer, point, closest_point), dr.select(
+                is_closer, squared_distance, smallest_square
+            )
 
         return self.records.for_each(add, (vector(0), real(dr.inf)), "nearest circle")
 
     @property
     def _types(self) -> tuple[Any, Any]:
-        """The backend's types of numbers and of vectors."""
+        """The backend's type of numbers, and its type of vectors."""
         return self.records.backend.Float, self.records.backend.Array3f
 
     def _relative(self, row: list[Real], x: Vec3) -> _RelativeCircle:
-        """The circle in a record (center, radius, normal), relative to points x."""
+        """Compute how the circle in the record `row` is seen from points x (3, n), in unit
+        coordinates."""
         vector = self.records.backend.Array3f
         center, a, normal = vector(*row[:3]), row[3], vector(*row[4:7])
         displacement = x - center
@@ -413,7 +445,9 @@ class CircleSet:
 
 
 def _perpendicular(vector: Any, n: Vec3) -> Vec3:
-    """A vector perpendicular to the unit vector n, of a length that is not small. vector: the type
-    of vectors."""
+    """Compute a vector perpendicular to the unit vector n. Its length is at least 0.7.
+
+    vector: the type of vectors.
+    """
     is_flat = dr.abs(n.z) < 0.7
     return dr.select(is_flat, vector(-n.y, n.x, 0), vector(0, -n.z, n.y))

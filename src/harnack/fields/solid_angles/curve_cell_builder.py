@@ -1,10 +1,15 @@
-"""Builds FMM cells of curves (`curve_cells`), one octree depth at a time.
+"""Builds FMM cells of curves (`curve_cells`), one octree depth at a time. A curve consists of
+closed loops of straight edges, in unit coordinates (a size of about 1). In a cell, its solid angle
+is a sum over the near edges, plus a local expansion: a harmonic polynomial for all far edges. The
+ball of a cell is a ball around the cell; an edge is near if it is within a few radii of the ball
+from the cell's center. The near edges form runs of consecutive edges, each of which is closed to a
+loop by two closing edges that meet in a further vertex, its apex (`edge_runs`). The parent of a
+cell is the cell around it that was split.
 
-In a cell, the solid angle of a curve is a sum over a list of near edges, plus a local expansion: a
-polynomial for all far edges. A cell inherits the expansion and the near list of its parent. The
-edges of that list that are far from the cell are added to the expansion. So the work for a cell is
-proportional to the near list of its parent, and not to the whole curve. All edges are visited only
-for bounds of the far edges.
+A cell inherits the expansion and the near runs of its parent. The edges of these runs that are far
+from the cell are added to the expansion. So the work for a cell is proportional to the number of
+near edges of its parent, and not to the whole curve. All edges are visited only for bounds of the
+far edges.
 
 - `build_curve_cells`: builds the cells of a cube, with a limit of their bytes.
 """
@@ -41,16 +46,16 @@ if TYPE_CHECKING:
 
 _PERIOD = 4 * math.pi
 # Edges are near to a cell if they are within this many radii of its ball from its center:
-# `_NEAR_RADII` for cells that are not split; `_SHARED_RADII` for cells that are split, as the
-# expansion of their far edges is passed on to all cells inside them.
+# `_NEAR_RADII` for cells that are not split; `_SHARED_RADII` for cells that are split. It is larger
+# for these, as the expansion of their far edges is passed on to all cells inside them.
 _NEAR_RADII, _SHARED_RADII = 3.0, 4.5
 # Cells are split if they have more near edges than `_NEAR_PER_CUBE_ROOT` times the cube root of the
 # number of all edges (but at least `_MIN_NEAR`), or if the truncation error exceeds about
 # `_MAX_TAIL_RATIO` times the integral of |dp|/D^2, a bound of the gradient. Chosen by
 # experiment.
 _NEAR_PER_CUBE_ROOT, _MIN_NEAR, _MAX_TAIL_RATIO = 2.0, 6.0, 1e-5
-# If memory is short, cells get twice as many near edges and four times the truncation, in at most
-# this many attempts.
+# If memory is short, cells may have twice as many near edges and four times the truncation error,
+# in at most this many attempts.
 _ATTEMPTS = 4
 # Corners and centers of all cells are multiples of this over 2^DEEPEST, in unit coordinates: single
 # precision holds them exactly.
@@ -66,14 +71,18 @@ def build_curve_cells(
     backend: Backend, loops: tuple[FloatArray, ...], low: FloatArray, high: FloatArray,
     most_bytes: int, near: float = 1.0, shared: float = _SHARED_RADII,
 ) -> CurveCells | None:  # fmt: skip
-    """Build cells of a cube around the box from low (3,) to high (3,), of at most `most_bytes`
-    bytes. Returns None if the cells would take more bytes even with larger cells and more near
-    edges.
+    """Build the FMM cells of a curve, in a cube around a box.
 
-    loops: closed curves (n, 3), of a size of about 1.
-    near: the factor by which cells may have more near edges, and more truncation, than usual.
+    loops: for each loop of the curve, its vertices (n, 3) in unit coordinates (a size of about 1).
+    low, high: (3,) two opposite corners of the box, in unit coordinates.
+    most_bytes: the number of bytes that the cells may take. If they would take more, they are built
+        again, larger and with more near edges.
+    near: the factor by which cells may have more near edges, and a larger truncation error, than
+        usual.
     shared: if a cell is split, the edges farther than this many radii of its ball from its center
         are summed once, in an expansion that all cells inside it inherit.
+
+    Returns None if even the largest cells would take more than `most_bytes`.
 
     Proof. The cell of the cube begins with all loops as its near runs and an expansion of 0. Each
     cell keeps those edges of its parent's runs that are near to it, as runs that are closed again.
@@ -82,6 +91,7 @@ def build_curve_cells(
     angle of the curve, modulo 4 pi.
     """
     loops = tuple(loop.astype(backend.dtype).astype(np.float64) for loop in loops)
+    # The cube's center and half side are multiples of `_GRID_STEP`; one step is in hand.
     middle = np.round(0.5 * (low + high) / _GRID_STEP) * _GRID_STEP
     half = float(np.maximum(high - middle, middle - low).max())
     half = (math.ceil(half / _GRID_STEP) + 1) * _GRID_STEP
@@ -103,19 +113,23 @@ def build_curve_cells(
 
 @dataclass
 class _CurveCellBuilder:
-    """The cells of a cube under construction: the octree of the cells, and their records.
+    """The FMM cells of a curve in a cube, under construction: the octree of the cells, and the
+    records of the cells that are not split. In integrals along the curve, D is the distance from a
+    cell's center to the point p of the curve.
 
     backend: the backend of the finished cells.
-    vertices, edges: the curve, for runs of edges and for sums over all edges.
-    middle, half: center (3,) of the cube, and half of its side.
+    vertices: the curve as a table of vertices, for runs of edges.
+    edges: the same curve on the backend, for sums over all edges.
+    middle, half: the center (3,) of the cube, and half of its side.
     most_near, max_tail_ratio: a cell is split if it has more near edges than `most_near`, or if its
         truncation error is more than `max_tail_ratio` times the integral of |dp|/D^2.
     parent_ratio: edges are near to a cell that is split if they are within this many radii of its
         ball from its center.
-    nodes: the octree's nodes at each depth, for `OctreeLookup.from_levels`.
-    tables, near: records of the cells and of their near edges, as in `CurveCells`.
-    leaves: the number of cells that are not split.
-    near_record_count: the number of records of near edges.
+    nodes: the octree's nodes at each depth so far, for `OctreeLookup.from_levels`.
+    tables: the records of the cells so far that are not split, as in `CurveCells.records`.
+    near: the records of their near edges, as in `CurveCells.near`.
+    leaves: the number of cells so far that are not split.
+    near_record_count: the number of records of near edges so far.
     """
 
     backend: Backend
@@ -134,7 +148,9 @@ class _CurveCellBuilder:
 
     def grow(self, most_bytes: int) -> bool:
         """Build all cells, one depth of the octree after the other. Returns False as soon as the
-        cells exceed `most_bytes`, and True when all are built."""
+        cells exceed `most_bytes` or there are too many records of near edges, and True when all are
+        built."""
+        # far: the expansions of the cells of a depth; split_count: the cells split so far.
         shifts = local_to_local_matrices(DEGREE, 0.5 / (math.sqrt(3) * BALL_MARGIN))
         centers, runs, far = (
             self.middle[None],
@@ -173,22 +189,25 @@ class _CurveCellBuilder:
 
         centers: (n, 3) of the cells.
         radius: the radius of their balls.
-        runs: the runs of consecutive edges that the cells inherit from their parents' near lists.
+        runs: the near runs that the cells inherit from their parents.
         far: the expansions of far edges that the cells inherit from their parents.
         is_last: whether no cell may be split any more.
 
         Returns the mask (n,) of the cells that are not split, and the near runs and the expansions
         of all n cells.
         """
+        # run, cell, distance: for each edge of the inherited runs, the index of its run, the index
+        # of its cell, and its distance from the cell's center.
         double, n = choose_backend("double"), len(centers)
         run, vertex_ids = runs.edges()
         cell = runs.cell[run]
         distance = _distances(self.vertices, centers, cell, vertex_ids, double)
-        count = np.bincount(cell, distance <= _NEAR_RADII * radius, n)
+        near_count = np.bincount(cell, distance <= _NEAR_RADII * radius, n)
         far_bounds = _FarBounds.of(self.edges, centers, radius)
-        is_leaf = (count <= self.most_near) & (
+        is_leaf = (near_count <= self.most_near) & (
             far_bounds.tail <= self.max_tail_ratio * far_bounds.total
         ) | is_last
+        # The runs of near edges, closed again; all other edges go into the expansion.
         near_radius = np.where(is_leaf, _NEAR_RADII, self.parent_ratio) * radius
         near_runs, is_kept = runs.restrict_to_near(run, distance <= near_radius[cell])
         near_runs = near_runs.with_apexes(
@@ -197,16 +216,25 @@ class _CurveCellBuilder:
         remaining = subtract_runs(
             runs, (run, vertex_ids), is_kept, near_runs, len(self.vertices.points)
         )
+        # `remaining` refers to a table of the vertices, the old apexes and the new apexes.
         points = np.concatenate([self.vertices.points, runs.apex, near_runs.apex])
-        rows = RecordTable.upload(double, np.column_stack([points, np.zeros((len(points), 5))]))
+        point_records = RecordTable.upload(
+            double, np.column_stack([points, np.zeros((len(points), 5))])
+        )
         far = far.plus(
             EdgeExpansions.of(
-                rows, remaining, to_vector3(double, centers), dr.opaque(double.Float, radius), n
+                point_records,
+                remaining,
+                to_vector3(double, centers),
+                dr.opaque(double.Float, radius),
+                n,
             )
         )
         if is_leaf.any():
-            table, first_record, record_counts = near_records(self.vertices, near_runs, is_leaf)
-            self.near.append(table)
+            near_table, first_record, record_counts = near_records(
+                self.vertices, near_runs, is_leaf
+            )
+            self.near.append(near_table)
             factor = _rounding_factor(self.vertices, near_runs, centers, radius)[is_leaf]
             bounds = far.subset(is_leaf), far_bounds.subset(is_leaf), factor
             near_range = self.near_record_count + first_record, record_counts
@@ -214,15 +242,16 @@ class _CurveCellBuilder:
             self.tables.append(records)
             self.leaves, self.near_record_count = (
                 self.leaves + len(records),
-                self.near_record_count + len(table),
+                self.near_record_count + len(near_table),
             )
         return is_leaf, near_runs, far
 
     @property
     def size(self) -> int:
-        """The number of bytes of all cells so far: their records, near edges and nodes, and the
-        grid of the lookup."""
+        """The number of bytes of all cells so far: their records, the records of their near edges,
+        and the octree with its lookup grid."""
         number_size = np.dtype(self.backend.dtype).itemsize
+        # A record takes a multiple of eight numbers.
         record = 8 * -(-(HEADER_SIZE + COEFFICIENTS) // 8)
         lookup = OctreeLookup.memory_bytes(sum(len(level) for level in self.nodes))
         return (
@@ -231,11 +260,12 @@ class _CurveCellBuilder:
         )
 
     def cells(self) -> CurveCells:
-        """The finished cells, uploaded to the backend."""
+        """Upload the finished cells to the backend."""
         backend = self.backend
         lookup = OctreeLookup.from_levels(
             backend, self.middle - self.half, 2 * self.half, self.nodes
         )
+        # One more record, so that the table is not empty if no cell has near edges.
         near = np.concatenate([*self.near, np.zeros((1, 4 * VERTICES_PER_RECORD))])
         records = RecordTable.upload(backend, np.concatenate(self.tables))
         near_edges = RecordTable.upload(backend, near)
@@ -244,14 +274,14 @@ class _CurveCellBuilder:
 
 @dataclass(frozen=True)
 class _FarBounds:
-    """Bounds of the far edges of n cells, for the ball of each cell. D is the distance of a point
-    of an edge from the cell's center.
+    """Bounds of sums over the far edges of a curve, for each of n cells. D is the distance of the
+    point p of an edge from the cell's center.
 
     least: (n,) a lower bound of the distance of the far edges from the center.
-    inverse_cubes: (n,) an upper bound of the integral of |dp|/D^3.
+    inverse_cubes: (n,) an upper bound of the integral of |dp|/D^3 over the far edges.
     slope: (n, 3) the gradient of this integral as a function of the center.
     tail: (n,) an estimate of the truncation error of the expansion's value.
-    total: (n,) an upper bound of the integral of |dp|/D^2, over all edges.
+    total: (n,) an upper bound of the integral of |dp|/D^2 over all edges, far and near.
     """
 
     least: FloatArray
@@ -262,26 +292,34 @@ class _FarBounds:
 
     @classmethod
     def of(cls, edges: LoopEdges, centers: FloatArray, radius: float) -> _FarBounds:
-        """The bounds for cells with these centers (n, 3) and balls of this radius. Edges farther
-        than about `_NEAR_RADII` radii from a center count as far."""
+        """Compute the bounds for n cells, by a sum over all edges. Edges farther than about
+        `_NEAR_RADII` radii from a center count as far.
+
+        edges: the edges of the curve.
+        centers: (n, 3) the centers of the cells.
+        radius: the radius of their balls.
+        """
         backend, c = edges.backend, to_vector3(edges.backend, centers)
         ball_radius = dr.opaque(backend.Float, radius)
         far_from = dr.opaque(backend.Float, _NEAR_RADII * radius * (1 - _SUM_MARGIN))
 
         def add(p: Vec3, q: Vec3, inverse: Real, state: tuple[Any, ...]) -> tuple[Any, ...]:
-            """Add the edge from p to q to the sums `state` of the cells with the centers c.
-
-            The state holds the smallest squared distance of a far edge; then, summed over the far
-            edges, the integral of |dp|/D^3, the gradient of this integral, and an estimate of the
-            truncation error; then, summed over all edges, the integral of |dp|/D^2.
+            """Add the edge from p to q to the sums of the cells with the centers c.
 
             inverse: 1/|q - p|^2.
+            state: the smallest squared distance of a far edge; then, summed over the far edges,
+                the integral of |dp|/D^3, the gradient of this integral, and an estimate of the
+                truncation error; then, summed over all edges, the integral of |dp|/D^2.
+
+            Returns the new state.
             """
             least_square, inverse_cubes, slope, tail, total = state
             edge = Edge.between(p, q, inverse, c)
             square, length = edge.squared_distance, dr.rsqrt(inverse)
             weight, inverse_distance = edge.biot_savart()[0] * length, dr.rsqrt(square)
             is_far, radius_ratio = square > far_from * far_from, ball_radius * inverse_distance
+            # The first omitted term, of degree p + 1: proportional to (radius/D)^(p+1)/D per
+            # length.
             truncation = weight * square
             for _ in range(DEGREE + 1):
                 truncation = truncation * radius_ratio
@@ -309,16 +347,20 @@ class _FarBounds:
         )
 
     def subset(self, which: BoolArray) -> _FarBounds:
-        """The bounds of the cells that a mask (n,) selects."""
+        """Select the bounds of the cells on which a mask (n,) is true."""
         return _FarBounds(*(values[which] for values in vars(self).values()))
 
 
 def _distances(
     vertices: VertexTable, centers: FloatArray, cell: IntArray, first: IntArray, backend: Backend
 ) -> FloatArray:
-    """Distances (k,) of edges from the centers (n, 3) of the cells to which they belong. Edge i
-    runs from row `first[i]` of the table of vertices to the next row, and belongs to the cell of
-    index `cell[i]`."""
+    """Compute the distances (k,) of edges from the centers of their cells.
+
+    vertices: the table of the curve's vertices.
+    centers: (n, 3) of the cells.
+    cell: (k,) for each edge the index of its cell.
+    first: (k,) for each edge the row of its start in the table; its end is in the next row.
+    """
     if not len(cell):
         return np.zeros(0)
     vector = backend.Array3f
@@ -326,6 +368,7 @@ def _distances(
     start = upload_integers(backend, first)
     c = dr.gather(vector, middles, upload_integers(backend, cell))
     p, q = dr.gather(vector, points, start), dr.gather(vector, points, start + 1)
+    # For an edge of length 0 any finite number will do.
     inverse = dr.rcp(fmax(dr.squared_norm(q - p), backend.Float(1e-30)))
     return to_numpy(dr.sqrt(squared_distance_to_segment(p - c, q - p, inverse)))
 
@@ -333,15 +376,18 @@ def _distances(
 def near_records(
     vertices: VertexTable, runs: EdgeRuns, is_leaf: BoolArray
 ) -> tuple[FloatArray, IntArray, IntArray]:
-    """Records of the near edges of the cells that are not split, as `CurveCells.near` describes
-    them.
+    """Make the records of the near edges of the cells that are not split, as `CurveCells.near`
+    describes them. A cell's records hold the vertices of its near runs, one after another: those of
+    the run itself, then, unless the run is a whole loop, the apex and the first vertex again.
 
+    vertices: the table of the curve's vertices.
     runs: the near runs of all n cells, closed by apexes.
     is_leaf: (n,) the mask of the cells that are not split.
 
     Returns the table of records; and two arrays with an entry for each cell that is not split: the
     index of its first record, and the number of its records.
     """
+    # length: the number of vertices that a run takes; `count` is the number of its edges.
     run_ids = np.flatnonzero(is_leaf[runs.cell])
     first, count, is_open = runs.first[run_ids], runs.count[run_ids], ~runs.is_whole[run_ids]
     leaf_index = (np.cumsum(is_leaf) - 1)[runs.cell[run_ids]]
@@ -354,6 +400,8 @@ def near_records(
     first_slot = np.cumsum(length) - length - (np.cumsum(per_leaf) - per_leaf)[leaf_index]
     first_slot += first_record[leaf_index] * VERTICES_PER_RECORD
     table = np.zeros((int(record_count.sum()) * VERTICES_PER_RECORD, 4))
+    # The vertices of the runs: rank is the position of a vertex in its run. The first vertex of a
+    # run keeps the number 0, as no edge leads to it.
     run = np.repeat(np.arange(len(run_ids)), count + 1)
     rank = np.arange(len(run)) - (np.cumsum(count + 1) - count - 1)[run]
     slot, vertex = first_slot[run] + rank, first[run] + rank
@@ -361,6 +409,7 @@ def near_records(
     is_later = rank > 0
     edge = vertices.points[vertex[is_later]] - vertices.points[vertex[is_later] - 1]
     table[slot[is_later], 3] = inverse_squares(edge)
+    # The two closing edges of each open run, marked by negative numbers.
     last_slot = (first_slot + count)[is_open]
     apex, start_point = runs.apex[run_ids[is_open]], vertices.points[first[is_open]]
     table[last_slot + 1, :3], table[last_slot + 2, :3] = apex, start_point
@@ -372,17 +421,22 @@ def near_records(
 def _rounding_factor(
     vertices: VertexTable, runs: EdgeRuns, centers: FloatArray, radius: float
 ) -> FloatArray:
-    """Factors (n,) by which `edges.vertex_rounding` is to be multiplied so that it bounds the
-    rounding for the near loops of n cells.
+    """Compute factors (n,) for the rounding errors of the near loops of n cells. The result of
+    `edges.vertex_rounding`, times the cell's factor, bounds the error also for loops with apexes.
 
+    vertices: the table of the curve's vertices.
     runs: the near runs of the cells.
-    centers, radius: centers (n, 3) of the cells, and the radius of their balls.
+    centers: (n, 3) the centers of the cells.
+    radius: the radius of their balls.
 
-    `edges.vertex_rounding` assumes edges of half length h <= 1 and vertices at most 1 + |x| from x.
-    It is linear in h and in that distance. The apexes are the only vertices that may be outside of
-    the unit ball. So a factor that is at least 1, at least h, and at least the distance from x to
-    any apex, covers the loops that contain an apex.
+    Proof. `edges.vertex_rounding` assumes edges of half length h <= 1, and vertices at most 1 + |x|
+    from x. It is linear in h and in that distance. The apexes are the only vertices that may be
+    outside of the unit ball. So a factor that is at least 1, at least h, and at least the distance
+    from x to any apex, covers the loops that contain an apex. (The factors 0.51 = 1.02/2 and 1.01
+    leave a little for rounding.)
     """
+    # Each cell's factor is the largest over its runs: of the half lengths of their closing edges,
+    # and of the distances of their apexes from the points of the ball.
     factors = np.ones(len(centers))
     run_ids = np.flatnonzero(~runs.is_whole)
     apex, cell, first = runs.apex[run_ids], runs.cell[run_ids], runs.first[run_ids]
@@ -397,32 +451,40 @@ def _cell_records(
     backend: Backend, centers: FloatArray, radius: float, far: EdgeExpansions, bounds: _FarBounds,
     factor: FloatArray, first: IntArray, count: IntArray,
 ) -> FloatArray:  # fmt: skip
-    """The records (n, k) of n cells that are not split, with the columns that `CurveCells.records`
-    describes.
+    """Make the records (n, k) of n cells that are not split, with the columns that
+    `CurveCells.records` describes.
 
-    centers, radius: centers (n, 3) of the cells, and the radius of their balls.
-    far, bounds: expansions and bounds of their far edges.
+    centers: (n, 3) the centers of the cells.
+    radius: the radius of their balls.
+    far: the expansions of their far edges.
+    bounds: the bounds of their far edges.
     factor: (n,) factors for the rounding of the near loops, from `_rounding_factor`.
-    first, count: (n,) index of the first record of near edges, and the number of these records.
+    first: (n,) the index of the first record of near edges of each cell.
+    count: (n,) the number of these records.
 
     The rounding of the value has three parts. The first is that of the polynomial without its
     constant (`rounding_tables`). The second is that of the angle of the near loops
     (`LoopEdges.rounding`). The third comes from the constant, which is at most 2 pi, and from two
     sums, each of which is at most 6 pi plus the polynomial: it is at most 32 epsilon, plus a part
-    that the tables cover. The rounding of the gradient, which is proportional to 1/radius, counts
-    as truncation.
+    that the tables cover. The rounding of the gradient, which is proportional to 1/radius, is added
+    to the bound of its truncation error.
     """
     tables = rounding_tables(DEGREE, BALL_MARGIN / math.sqrt(3))
     coefficients, margin = far.coefficients.copy(), 1 + _SUM_MARGIN
+    # The constant is known modulo 4 pi: the smallest such number is used.
     coefficients[:, 0] -= _PERIOD * np.round(coefficients[:, 0] / _PERIOD)
     rounding = backend.machine_epsilon * np.abs(coefficients[:, 1:]) @ tables[1:]
-    value = rounding[:, 0] + backend.machine_epsilon * (48 + 7.25 * VERTICES_PER_RECORD * count)
-    slope = far.slope + rounding[:, 1:].sum(axis=1) / radius
+    # 48 is 16 of `LoopEdges.rounding` and 32 of the third part.
+    value_rounding = rounding[:, 0] + backend.machine_epsilon * (
+        48 + 7.25 * VERTICES_PER_RECORD * count
+    )
+    slope_error = far.slope + rounding[:, 1:].sum(axis=1) / radius
+    # `least` is finite also for cells without far edges.
     inverse, least = np.full(len(first), 1 / radius), np.minimum(bounds.least, 1e3)
     columns = [
         far.error * margin,
-        slope * margin,
-        value * margin,
+        slope_error * margin,
+        value_rounding * margin,
         least,
         factor,
         bounds.inverse_cubes,

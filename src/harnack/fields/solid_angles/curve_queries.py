@@ -1,15 +1,16 @@
-"""Further quantities of the edges of a curve: derivatives, closest points, changes, promises.
+"""Further quantities of a closed curve of straight edges, and of its solid angle f at a point x:
+derivatives, closest points, changes, and proved bounds of f near x. f is known modulo 4 pi. In
+integrals along the curve, p is a point of the curve, |dp| the length element, and D = p - x.
 
 - `differentiable_angle`: the solid angle as an expression that Dr.Jit differentiates.
 - `closest_on_segments`: the closest point of the curve, at which the level sets end.
 - `continuous_change`: the change of the solid angle along a straight segment.
-- `remainder_promises`, `gradient_change_bound`, `lift_ball`: promises (proved bounds) of the solid
-  angle near a point.
+- `remainder_promises`, `gradient_change_bound`, `lift_ball`: proved bounds of f near x. The ray
+  tracer makes steps that are as long as such a bound allows.
 
-By default a curve promises a bound of second derivatives. It comes from the integral of
-|dp|/|p - x|^3, which is also the weight in Biot and Savart's law. Other step rules need the range
-of the solid angle on a ball instead; with these, polygons and knots take 1.4 to 2 times as many
-evaluations.
+By default the tracer uses a bound of second derivatives. It comes from the integral of |dp|/|D|^3,
+which is also the weight in Biot and Savart's law. Other step rules need the range of f on a ball
+instead; with these, polygons and knots take 1.4 to 2 times as many evaluations.
 """
 
 from __future__ import annotations
@@ -42,16 +43,17 @@ __all__ = [
 
 
 def differentiable_angle(backend: Backend, loops: tuple[Any, ...], x: Vec3) -> Real:
-    """Omega(x) in steradians, modulo 4 pi, of closed loops. The result is one wide expression that
-    Dr.Jit can differentiate in both directions.
+    """Compute the solid angle (n,) of closed loops at points x, in steradians and modulo 4 pi, as
+    an expression that Dr.Jit can differentiate in forward and reverse mode.
 
-    loops: the vertices of each loop, as an (n, 3) array or as a Dr.Jit vector.
+    loops: the vertices of each loop, as an array (m, 3) or as a Dr.Jit vector.
+    x: (3, n).
 
-    The loop of `sum_over_edges` computes the value fastest, but reverse mode cannot differentiate a
-    recorded loop. Here every pair of a point and an edge is a lane, and a block sum adds up the
-    edges of each point. So the memory is proportional to the number of points times the number of
-    vertices. The formula is that of `sum_over_edges`, with one angle for each edge instead of a
-    product. An angle may jump by 4 pi; its derivative does not.
+    `edges.sum_over_edges` computes the value faster, but in a recorded loop, which reverse mode
+    cannot differentiate. Here every pair of a point and an edge is a lane, and a block sum adds up
+    the edges of each point. So the memory is proportional to the number of points times the number
+    of vertices. The formula is the same, but with one angle for each edge instead of a product. An
+    angle may jump by 4 pi; its derivative does not.
     """
     total = dr.zeros(backend.Float, dr.width(x))
     for loop in loops:
@@ -61,8 +63,13 @@ def differentiable_angle(backend: Backend, loops: tuple[Any, ...], x: Vec3) -> R
 
 
 def _loop_angle(backend: Backend, vertices: Vec3, x: Vec3) -> Real:
-    """The solid angle (n,), in steradians and modulo 4 pi, of one closed loop at points x (3, n),
-    as an expression that Dr.Jit can differentiate. vertices: (3, m) of the loop."""
+    """Compute the solid angle (n,) of one closed loop at points x, in steradians and modulo 4 pi,
+    as an expression that Dr.Jit can differentiate.
+
+    vertices: (3, m) of the loop.
+    x: (3, n).
+    """
+    # Lane i stands for point i // m and the edge from vertex i % m to the next one.
     point_count, edge_count = dr.width(x), dr.width(vertices)
     lane = dr.arange(backend.UInt32, point_count * edge_count)
     point, edge = lane // edge_count, lane % edge_count
@@ -70,29 +77,37 @@ def _loop_angle(backend: Backend, vertices: Vec3, x: Vec3) -> Real:
     lane_x = gather_vectors(backend, x, point)
     a = gather_vectors(backend, vertices, edge) - lane_x
     b = gather_vectors(backend, vertices, next_vertex) - lane_x
-    # The phase of a vertex's spinor is arbitrary; it enters its two edges with opposite signs.
+    # The edge adds twice the argument of an inner product of spinors. The phase of a vertex's
+    # spinor is arbitrary; it enters the two edges at the vertex with opposite signs.
     re, im = inner_product(spinor(a)[2], spinor(b)[2])
     return dr.block_sum(2 * dr.atan2(im, re), edge_count)
 
 
 def segment_records(backend: Backend, start: FloatArray, end: FloatArray) -> RecordTable:
-    """Records of the k >= 1 segments from start (k, 3) to end (k, 3). The coordinates should be of
-    order one. Ends that are equal in the backend's precision make a record of a point."""
+    """Upload k >= 1 straight segments as records for `closest_on_segments`. A segment whose ends
+    are equal in the backend's precision counts as a point.
+
+    start, end: (k, 3) the ends of the segments, with coordinates of order one.
+    """
     start, end = (q.astype(backend.dtype).astype(np.float64) for q in (start, end))
     return RecordTable.upload(backend, single_edges(start, end))
 
 
 def closest_on_segments(segments: RecordTable, x: Vec3) -> Vec3:
-    """The point (3, n) on any of the segments that is closest to each point x (3, n). segments:
-    the result of `segment_records`."""
+    """Find, for each of n points x, the closest point (3, n) on any of the segments.
+
+    segments: the result of `segment_records`.
+    x: (3, n).
+    """
     vector = segments.backend.Array3f
     x = vector(x)
 
     def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
-        """The least squared distance and the closest point `state`, updated by the segment in a
-        record."""
+        """Update the state by the segment in the record `row`. The state holds the smallest squared
+        distance so far, and the closest point."""
         nearest, closest = state
         p, q = vector(*row[:3]), vector(*row[4:7])
+        # row[7] is 1/|q - p|^2; the fraction is 0 at p and 1 at q.
         fraction = clamp(dr.dot(x - p, q - p) * row[7], 0, 1)
         point = dr.fma(vector(fraction), q - p, p)
         square = dr.squared_norm(x - point)
@@ -104,23 +119,26 @@ def closest_on_segments(segments: RecordTable, x: Vec3) -> Vec3:
 
 
 def continuous_change(edges: LoopEdges, p: Vec3, q: Vec3) -> Real:
-    """The change (n,) of the curve's solid angle, followed continuously along the segments from
-    points p to points q. p and q must differ.
+    """Compute the change (n,) of the curve's solid angle, followed continuously along n straight
+    segments from p to q. The result is a real number, and not only known modulo 4 pi.
 
-    The change is the integral of Biot and Savart's field along the segment. For an edge from a to b
-    of the curve, it is minus the solid angle at the origin of the parallelogram (a - p) + s (b - a)
-    - t (q - p) with s and t from 0 to 1. This is less than 2 pi in size, because the plane of the
-    parallelogram misses the origin unless the segment meets the edge. The parallelogram is split
-    into two triangles, whose solid angles are twice an arctangent each (van Oosterom and Strackee
-    1983), so there is no branch to choose.
+    edges: the edges of the curve.
+    p, q: (3, n) the ends of the segments; they must differ.
+
+    The change is the integral of the curve's Biot and Savart field along the segment. The part of
+    an edge from a to b is minus the solid angle, at the origin, of the parallelogram
+    (a - p) + s (b - a) - t (q - p) with s and t from 0 to 1. This is less than 2 pi in size,
+    because the plane of the parallelogram misses the origin unless the segment meets the edge. The
+    parallelogram is split into two triangles, whose solid angles are twice an arctangent each (van
+    Oosterom and Strackee 1983), so there is no branch to choose.
     """
     real = edges.backend.Float
 
     def add(a: Vec3, b: Vec3, inverse: Real, state: tuple[Any, ...]) -> tuple[Any, ...]:
-        """Add the edge from a to b to the change of the solid angle, which is the state of the
-        loop.
-        inverse: not used here."""
+        """Add the part of the edge from a to b to the change of the solid angle, the only entry of
+        the state. inverse: not used here."""
         del inverse
+        # The corners of the parallelogram, in order.
         ap, bp, bq, aq = a - p, b - p, b - q, a - q
         return (state[0] - _angle(ap, bp, bq) - _angle(ap, bq, aq),)
 
@@ -128,7 +146,8 @@ def continuous_change(edges: LoopEdges, p: Vec3, q: Vec3) -> Real:
 
 
 def _angle(a: Vec3, b: Vec3, c: Vec3) -> Real:
-    """The signed solid angle at the origin of the triangle with the corners a, b, c."""
+    """Compute the signed solid angle, at the origin, of the triangle with the corners a, b, c:
+    twice the argument of |a||b||c| + (a.b)|c| + (b.c)|a| + (c.a)|b| + i det(a, b, c)."""
     la, lb, lc = dr.norm(a), dr.norm(b), dr.norm(c)
     volume = dr.dot(a, dr.cross(b, c))
     dot_terms = dr.fma(dr.dot(a, b), lc, dr.fma(dr.dot(b, c), la, dr.dot(c, a) * lb))
@@ -136,21 +155,22 @@ def _angle(a: Vec3, b: Vec3, c: Vec3) -> Real:
     return dr.select(volume == 0, 0, 2 * dr.atan2(volume, dr.fma(la * lb, lc, dot_terms)))
 
 
-# Radii of the promises as fractions of the distance to the curve, by experiment.
+# The radii of the balls of `remainder_promises`, as fractions of the distance to the curve, by
+# experiment.
 _RADIUS_FRACTIONS = (0.3, 0.6, 0.85)
 
 
 def remainder_promises(
     inverse_cubes: Real, inverse_fourths: Real, distance: Real
 ) -> tuple[TaylorRemainder, ...]:
-    """Promises for a curve's solid angle at points x: bounds of what it differs, on balls around x,
-    from its linear Taylor polynomial at x.
+    """Bound how much a curve's solid angle f differs from its linear Taylor polynomial at x, on
+    several balls around x.
 
     inverse_cubes, inverse_fourths: I3 and I4, the integrals of |dp|/|D|^3 and |dp|/|D|^4 over the
-        curve, with D = p - x.
+        curve, with the vector D = p - x from x to the point p of the curve; or upper bounds.
     distance: the distance d from x to the curve, or a lower bound of it.
 
-    Returns one promise for each radius q d, for a few fixed fractions q.
+    Returns one bound for each radius q d, for a few fixed fractions q.
 
     Proof. Along a unit direction v the derivative of the solid angle is the integral of v.(D x
     dp)/|D|^3 over the curve (Biot and Savart). Its second derivative is the integral of 3
@@ -162,9 +182,10 @@ def remainder_promises(
         3/2 integral of |dp| integral over [0, t] of (t-s)/(|D|-s)^3 ds
             = 3/4 t^2 integral of |dp|/(|D|^3 (1 - t/|D|)).
 
-    For u = t/|D| <= q, 1/(1 - u) <= 1 + u/(1 - q). On the ball of radius q d that is
-    `TaylorRemainder` with the constant 3/2 (I3 + q d I4/(1 - q)). The bound holds for any piece of
-    a curve, and the bounds of pieces add up.
+    For u = t/|D| <= q, 1/(1 - u) <= 1 + u/(1 - q). So on the ball of radius q d, where t <= q d,
+    the remainder is at most 3/4 t^2 (I3 + q d I4/(1 - q)). This is `TaylorRemainder` with the
+    constant 3/2 (I3 + q d I4/(1 - q)), a bound of second derivatives. The bound holds for any piece
+    of a curve, and the bounds of pieces add up.
     """
     scale = 1.5 * (1 + SUM_MARGIN)
     return tuple(
@@ -178,12 +199,14 @@ def remainder_promises(
 def gradient_change_bound(
     inverse_cubes: Real, inverse_fourths: Real, distance: Real, radius: Real
 ) -> Real:
-    """A bound of |grad f(y) - grad f(x)| for |y - x| <= `radius`, with f the solid angle of a
-    curve. It is infinite unless `radius` is less than `distance`.
+    """Bound how much the gradient of a curve's solid angle f changes near a point x: the result is
+    a bound of |grad f(y) - grad f(x)| for |y - x| <= `radius`. It is infinite unless `radius` is
+    less than `distance`.
 
     inverse_cubes, inverse_fourths: I3 and I4, the integrals of |dp|/|D|^3 and |dp|/|D|^4 over the
-        curve, with D the vector from x to the point p of the curve.
+        curve, with D the vector from x to the point p of the curve; or upper bounds.
     distance: d, the distance from x to the curve, or a lower bound of it.
+    radius: the radius of the ball around x.
 
     Proof. At x, the second derivative of the solid angle along every line is at most 3/2 times the
     integral of |dp|/|D|^3 (`remainder_promises`), and so is the norm of the Hessian. At a point at
@@ -210,16 +233,18 @@ def lift_ball(
     bends: tuple[TaylorRemainder, ...],
     slope_error: Real = 0.0,
 ) -> HarmonicBall:
-    """A ball around x, and a range in which the solid angle is proved to lie on it. The solid angle
-    is lifted, that is, continued from x without its jumps of 4 pi. The ball is that of the second
-    of the promises `bends`. The promises themselves prove longer steps than this range.
+    """Compute a range in which a curve's solid angle is proved to lie, on a ball around x. The
+    solid angle is continued from x without its jumps of 4 pi.
 
     value, gradient: the solid angle and its gradient at x.
-    inverse_squares: the integral of |dp|/|D|^2, to which the rounding of the gradient is
-        proportional.
-    bends: the bounds of second derivatives on balls around x, from `remainder_promises`.
+    inverse_squares: the integral of |dp|/|D|^2 along the curve, or an upper bound; the rounding of
+        the gradient is proportional to it.
+    bends: the bounds of second derivatives on balls around x, from `remainder_promises`. The second
+        one gives the radius of the ball, and the range by Taylor's formula. The bounds themselves
+        prove longer steps than this range.
     slope_error: a bound of the errors of the gradient other than its rounding.
     """
+    # |f(y) - f(x)| <= r (|grad f(x)| + r/2 times the bound of second derivatives) for |y - x| <= r.
     promise = bends[1]
     gradient_bound = dr.norm(gradient) + SUM_MARGIN * inverse_squares + slope_error
     max_change = (

@@ -1,10 +1,12 @@
-"""Prepare noisy points for a smoothed sum of dipoles: points moved onto the surface, estimated
-normals if the cloud has none, and the smoothing length.
+"""Prepare a noisy point cloud for a smoothed sum of dipoles (`DipolePotential`): points are moved
+onto the surface, normals are estimated if the cloud has none, and the smoothing length is chosen.
+Each point is a dipole along its normal; the sum of their potentials, smoothed over a length, falls
+along outward normals across the surface.
 
-The sum itself corrects the signs of estimated normals (Lin et al. 2024). If most of the normals are
-right, the sum of all dipoles, smoothed over several points, falls across the surface in the right
-direction also at points whose own normals are wrong. Such points are, for example, those of a thin
-ear where the estimate confused the two sides.
+Signs of estimated normals. Some may point inwards, for example at a thin ear where the estimate
+confused the two sides. If most of the normals are right, the sum of all dipoles, smoothed over
+several points, falls across the surface in the right direction also at points whose own normals
+are wrong. So the sum corrects the signs (Lin et al. 2024).
 """
 
 from __future__ import annotations
@@ -29,12 +31,12 @@ if TYPE_CHECKING:
 
     from harnack.backend import FloatArray
 
-    # A function that returns the gradients (n, 3) of the smoothed sum at the points of its dipoles,
-    # from points (n, 3), normals (n, 3), areas (n,) and the smoothing length.
+    # A function that computes the gradients (n, 3) of a smoothed sum at the points of its dipoles.
+    # Its arguments are points (n, 3), normals (n, 3), areas (n,) and the smoothing length.
     Gradients = Callable[[FloatArray, FloatArray, FloatArray, float], FloatArray]
 
-# The number of rounds in which signs of normals are corrected, and the smoothing length of the sums
-# that correct them, in spacings.
+# The number of rounds in which signs of normals are corrected; and the smoothing length of the sums
+# that correct them, as a multiple of the spacing of the points.
 _FLIP_ROUNDS, _FLIP_SMOOTHING = 2, 3.0
 # The smoothing length, as a multiple of the spacing, is the smaller of `_SMOOTHING` and
 # `_SMOOTHING_OF_ROOT` times the square root of noise over spacing. If it is below `_NO_NOISE`,
@@ -46,13 +48,15 @@ _MIN_POINTS = 32
 
 @dataclass(frozen=True)
 class DenoisedCloud:
-    """The result of denoising a cloud: the points that were kept, and the length over which the sum
-    of their dipoles is to be smoothed.
+    """The result of denoising a point cloud: the points that were kept, their normals, and the
+    length over which the sum of their dipoles is to be smoothed.
 
-    points, normals: (m, 3) of the points that were kept, moved onto the surface.
-    smoothing: the length over which their sum is to be smoothed; 0 if there is hardly any noise.
-    report: the estimated noise, the spacing, and the numbers of points, as entries for
-        `Field.describe`.
+    points: (m, 3) the points that were kept, moved onto the surface. If there is hardly any noise
+        they are where they were.
+    normals: (m, 3) their unit normals.
+    smoothing: the smoothing length; 0 if there is hardly any noise.
+    report: entries for `Field.describe`: the number of given points and of points left out, the
+        estimated noise, the spacing, and the number of neighbors of each fit.
     """
 
     points: FloatArray
@@ -62,15 +66,15 @@ class DenoisedCloud:
 
     @classmethod
     def of(cls, points: Any, normals: Any | None, gradients: Gradients) -> DenoisedCloud:
-        """Denoise points (n, 3) with normals (n, 3). If `normals` is None, they are estimated.
+        """Denoise a point cloud. Warns if points are left out because they are far from all others.
 
-        gradients: computes gradients of the smoothed sum, by which signs of estimated normals are
-            corrected.
-
-        Warns if points are left out because they are far from all others.
+        points: (n, 3).
+        normals: (n, 3), of any length; None to estimate them.
+        gradients: a function that computes gradients of the smoothed sum (`Gradients`), by which
+            signs of estimated normals are corrected.
 
         Raises:
-            CloudError: as `validate_cloud` and `estimate_normals`; or there are too few points.
+            CloudError: the points or the normals are not valid, or there are too few points.
         """
         x = as_cloud_points(points)
         known_normals = None if normals is None else as_unit_normals(normals, len(x))
@@ -91,6 +95,7 @@ class DenoisedCloud:
                 f"{len(outliers):,} of {total:,} points are far from all others and were left out",
                 stacklevel=4,
             )
+        # If the noise is larger than the spacing, the denoiser selects only some of the points.
         cloud = CloudDenoiser(x, estimate_noise(x, known_normals, tree), tree)
         if known_normals is None:
             new_points, new_normals = cloud.denoise_points_and_normals(
@@ -102,6 +107,7 @@ class DenoisedCloud:
                 known_normals[cloud.selected],
             )
         noise, spacing = cloud.noise.deviation, cloud.spacing
+        # As a multiple of the spacing.
         smoothing = min(_SMOOTHING, _SMOOTHING_OF_ROOT * (noise / spacing) ** 0.5)
         report = {
             "given": total,
@@ -116,15 +122,17 @@ class DenoisedCloud:
 
 
 def _estimated_normals(cloud: CloudDenoiser, gradients: Gradients) -> FloatArray:
-    """Estimate normals (m, 3) of the selected points of a cloud, at their original positions. Where
-    the smoothed sum rises along a normal, the normal is replaced by the direction in which the sum
-    falls.
+    """Estimate normals (m, 3) of the selected points of a cloud, at their original positions, and
+    correct their signs. Along a right normal, which points outwards, the smoothed sum of the
+    dipoles falls. Where it rises along a normal, the normal is replaced by the direction in which
+    the sum falls most.
 
-    gradients: a function that returns gradients of the smoothed sum, from points, normals, areas
-        and the smoothing length.
+    cloud: the cloud, with the selection of its points.
+    gradients: a function that computes gradients of the smoothed sum (`Gradients`).
     """
     x = cloud.points[cloud.selected]
     normals = estimate_normals(x)
+    # Each point stands for a square whose side is the spacing.
     areas = np.full(len(x), cloud.spacing**2)
     for _ in range(_FLIP_ROUNDS):
         slopes = gradients(x, normals, areas, _FLIP_SMOOTHING * cloud.spacing)

@@ -1,4 +1,9 @@
-"""The dipole potential of oriented point clouds: Poisson reconstruction without a grid.
+"""The dipole potential f of an oriented point cloud, whose level set f = 2 pi is a surface through
+the points: Poisson reconstruction without a grid. Each point is a dipole: its moment is its area
+times its normal, and f is the sum over all dipoles. The sum is computed by a tree, or by FMM cells
+(octree cells with a list of near dipoles and a polynomial for all far ones). A sample is f and its
+gradient at a point, with error bounds and proved bounds of f near the point. The accuracy scale is
+a number by which samples are made more accurate; larger is more accurate.
 
 - `DipolePotential`: the field.
 - `DipoleTree`: its sum by a tree, with multipole moments of far dipoles.
@@ -57,9 +62,9 @@ if TYPE_CHECKING:
     from harnack.geometry import Volume
     from harnack.tree import BalancedTree
 
-# Cells pay if there are at least `_PAYS` rays per point and at least `_LEAST_RAYS`
-# rays, and at most `_MAX_POINTS` points: to build them takes as long as to trace about 6 rays per
-# point without them. Smaller cells, in which a ray takes two thirds of the time, pay if there are
+# Cells save time if there are at least `_PAYS` rays per point and at least `_LEAST_RAYS` rays, and
+# at most `_MAX_POINTS` points: to build them takes as long as to trace about 6 rays per point
+# without them. Smaller cells, in which a ray takes two thirds of the time, save time if there are
 # at least `_FINER_PAYS_PER_POINT` rays per point.
 _PAYS, _LEAST_RAYS, _MAX_POINTS = 7, 100_000, 200_000
 _FINER_PAYS_PER_POINT = 60
@@ -75,13 +80,15 @@ its dipoles as records, and the same records on the backend."""
 
 @dataclass(frozen=True)
 class DipoleTree:
-    """The sum of m_i.(y_i - x)/|y_i - x|^3 over dipoles i on a backend. A record of a dipole holds
-    its position y_i, its moment m_i and |m_i|.
+    """The sum f(x) of m_i.(y_i - x)/|y_i - x|^3 over all dipoles i, on a backend. The positions y_i
+    and the moments m_i, which are area times normal, are in unit coordinates: the cloud is centered
+    at 0 and its size is about one. Far dipoles are summed by the tree's multipole moments or by the
+    cells, near dipoles one by one. A record of a dipole holds y_i, m_i and |m_i|.
 
     clusters: the tree with its multipole moments.
-    rounding: a bound of the rounding of the final operations on the value.
-    cells: FMM cells, with which the cost of a sample depends only on the number of near dipoles;
-        None for no cells.
+    rounding: a bound of the rounding of the last operations, which turn the sums into f.
+    cells: FMM cells of the dipoles, with which the cost of a sample depends only on the number of
+        near dipoles; None for no cells.
     """
 
     clusters: Treecode
@@ -97,16 +104,20 @@ class DipoleTree:
         cls, backend: Backend, tree: BalancedTree, points: FloatArray, moments: FloatArray,
         accuracy: float, build: BuildCells | None = None,
     ) -> DipoleTree:  # fmt: skip
-        """Build the tree over points (n, 3), of size about one, with moments (n, 3), which are area
-        times normal.
+        """Build the sum over dipoles, with its tree, and with cells if they are requested.
 
-        tree: the result of `dipole_hierarchy` for these points, or for the same points at earlier
-            positions.
-        accuracy: the moments of a node are used beyond this many times its radius.
-        build: builds cells; None for no cells.
+        tree: the hierarchy of the tree: which points are in which node. It is the result of
+            `dipole_hierarchy` for these points, or for the same points at earlier positions.
+        points: (n, 3) the positions of the dipoles, in unit coordinates.
+        moments: (n, 3) their moments, which are area times normal.
+        accuracy: the multipole moments of a node are used at points that are farther from its
+            center than this many times its radius.
+        build: a function that builds cells; None for no cells.
         """
+        # Each dipole is a source with one position and one moment, and its own center.
         levels = dipole_tree_moments(tree, points[:, None], moments[:, None], points, points)
         rows = dipole_records(points, moments)
+        # Column 6 is |m_i|; the rounding is proportional to the size of the sum.
         rounding = final_rounding(backend, size=max(1.0, float(rows[:, 6].sum())))
         slots = records_in_slots(tree, rows)
         clusters = Treecode.of(backend, tree, levels, slots, accuracy)
@@ -115,15 +126,15 @@ class DipoleTree:
 
     @property
     def coarsest_accuracy(self) -> float:
-        """The accuracy scale of the coarsest samples that `_sums` can give
-        (`Field.coarsest_accuracy`). A smaller accuracy scale has the same effect. It is 1 if there
-        are cells, which have a single accuracy."""
+        """The smallest accuracy scale that makes a difference: a smaller one gives the same samples
+        (`Field.coarsest_accuracy`). It is 1 if there are cells, which have a single accuracy."""
         return self.clusters.coarsest_accuracy if self.cells is None else 1.0
 
     def values(self, x: Vec3, derivatives: int, closer: Real) -> PointValues:
-        """Value and derivatives of the sum at points x, up to order `derivatives`, with error
-        bounds.
+        """Compute f at points x, with derivatives and with error bounds, in unit coordinates.
 
+        x: (3, n).
+        derivatives: 0 for the value only, 1 with the gradient, 2 with the Hessian.
         closer: the accuracy scale (`Field.at_accuracy`); larger is more accurate. A number below 1
             counts as 1.
         """
@@ -132,15 +143,18 @@ class DipoleTree:
             fmax(self.backend.Float(closer), self.backend.Float(1)),
         )
         sums, _ = self._near_sums(x, detail, unit, derivatives)
-        return self.clusters.values(sums, 1.0, unit, self.rounding)
+        return self.clusters.values(sums, 1.0, unit, self.rounding)  # f is 1.0 times the sum
 
     def _sums(self, x: Vec3, detail: Real, unit: Real, derivatives: int) -> tuple[SourceSums, Vec3]:
-        """The sums over all dipoles at points x, by the tree; and the moment (3, n) of the nearest
-        of the dipoles that are summed one by one.
+        """Sum over all dipoles at points x, by the tree.
 
-        detail: the accuracy scale.
+        x: (3, n).
+        detail: the accuracy scale; larger is more accurate.
         unit: a bound of the rounding of a coordinate of x.
         derivatives: 0 for the value only, 1 with the gradient, 2 with the Hessian.
+
+        Returns the sums, and the moment (3, n) of the nearest dipole: among those that are summed
+        one by one, and not by the moments of a node.
         """
         add, vector = _dipole_adder(x, unit, derivatives), self.backend.Array3f
         sums, state = self.clusters.sums(x, detail, add, (vector(0),), derivatives=derivatives)
@@ -149,37 +163,48 @@ class DipoleTree:
     def _near_sums(
         self, x: Vec3, detail: Real, unit: Real, derivatives: int = 1
     ) -> tuple[SourceSums, Vec3]:
-        """The sums over all dipoles at points x, and the moment (3, n) of the nearest of the
-        dipoles that are summed one by one. They come from the cells if there are cells and no
-        second derivatives are requested, else from the tree. The arguments are those of `_sums`."""
+        """Sum over all dipoles at points x: by the cells if there are cells and no second
+        derivatives are requested, else by the tree.
+
+        x: (3, n).
+        detail: the accuracy scale; larger is more accurate.
+        unit: a bound of the rounding of a coordinate of x.
+        derivatives: 0 for the value only, 1 with the gradient, 2 with the Hessian.
+
+        Returns the sums, and the moment (3, n) of the nearest dipole: among those that are summed
+        one by one, and not by a node or a cell.
+        """
         if self.cells is None or derivatives == 2:
             return self._sums(x, detail, unit, derivatives)
+        # The state is the moment of the nearest dipole so far; cells and tree add dipoles alike.
         add, start = _dipole_adder(x, unit, 1), (self.backend.Array3f(0),)
         sums, state = self.cells.sums_with_tree(self.clusters, x, detail, (add, add), start)
         return sums, state[0]
 
     def sample(self, x: Vec3, detail: Real) -> Sample:
-        """The sample at points x: value, gradient, errors and promises (proved bounds of f near x).
-        detail: the accuracy scale.
+        """Compute a sample at points x (3, n): f, its gradient, error bounds, proved bounds of f
+        near x, and a normal for shading.
 
-        If there are cells, accuracy scales up to 1 get the accuracy of the cells' expansions, and
-        larger scales are computed by the tree.
+        detail: the accuracy scale; larger is more accurate. If there are cells, scales up to 1 get
+            the accuracy of the cells' polynomials, and for larger scales the tree is used.
         """
         unit = coordinate_rounding(x)
-        sums, nearest = self._near_sums(x, detail, unit)
+        sums, nearest_moment = self._near_sums(x, detail, unit)
         # Where the field of a single point dominates, shading uses that point's normal. It is
         # reversed, because gradients point inwards: f is larger inside.
-        area = dr.norm(nearest)
+        area = dr.norm(nearest_moment)
         is_dominated = (
             sums.singularity_distance * sums.singularity_distance < _NEAR_SQUARE_PER_AREA * area
         ) & (area > 0)
-        normal = dr.select(is_dominated, -nearest / area, dr.normalize(sums.gradient))
+        normal = dr.select(is_dominated, -nearest_moment / area, dr.normalize(sums.gradient))
         return sums.sample(1.0, unit, self.rounding, normal)
 
 
 def _dipole_adder(x: Vec3, unit: Real, derivatives: int) -> AddPrimitive:
-    """Make a function `add` that adds a dipole to sums at points x (`treecode.AddPrimitive`).
+    """Return a function that adds one dipole to sums over dipoles at points x
+    (`treecode.AddPrimitive`).
 
+    x: (3, n).
     unit: a bound of the rounding of a coordinate of x.
     derivatives: 0 for the value only, 1 with the gradient, 2 with the Hessian.
     """
@@ -188,22 +213,28 @@ def _dipole_adder(x: Vec3, unit: Real, derivatives: int) -> AddPrimitive:
     def add(
         row: list[Real], active: Mask, sums: SourceSums, state: tuple[Any, ...]
     ) -> tuple[SourceSums, tuple[Any, ...]]:
-        """Add the dipole of the record `row` to the sums on active lanes.
+        """Add one dipole to the sums on active lanes.
 
-        state: the moment of the nearest dipole so far.
+        row: the record of the dipole: position, moment, and length of the moment. A record of
+            length 0 is padding and adds nothing.
+        sums: the sums so far, with the distance of the nearest dipole.
+        state: a tuple with the moment of the nearest dipole so far.
 
         Returns the new sums and the new state.
         """
         inverse, terms = _dipole_term(row, x, derivatives)
         distance, has_area = dr.rcp(inverse), active & (row[6] > 0)
-        # `upper` is an upper bound of 1/(distance - 2 unit), as 2 unit bounds the rounding of
-        # the distance. With z = 2 unit/distance, 1/(1-z) <= 1 + 2z for z <= 1/2. Nearer to a dipole
-        # all bounds are infinite. Padding has no area and adds nothing.
+        # `upper` is an upper bound of 1/(distance - 2 unit): one over the true distance is at most
+        # this, as 2 unit bounds the rounding of the distance. With z = 2 unit/distance,
+        # 1/(1-z) <= 1 + 2z for z <= 1/2. Nearer to a dipole, where z > 1/2, all bounds are
+        # infinite. Padding has no area and adds nothing.
         relative_rounding = 2 * unit * inverse
         upper = dr.select(
             relative_rounding <= 0.5, dr.fma(2 * relative_rounding, inverse, inverse), dr.inf
         )
         upper = dr.select(has_area, upper, 0)
+        # s4 and s5 bound the sums of |m|/distance^4 and |m|/distance^5, from which bounds of the
+        # second and third derivatives follow.
         fourth = row[6] * dr.square(upper * upper)
         is_nearest = has_area & (distance <= sums.singularity_distance)
         added = sums.add_term(terms, active & (inverse < dr.inf))
@@ -220,11 +251,16 @@ def _dipole_adder(x: Vec3, unit: Real, derivatives: int) -> AddPrimitive:
 
 
 def _dipole_term(row: list[Real], x: Vec3, derivatives: int) -> tuple[Real, SourceTerm]:
-    """Two results for the dipole of the record `row`: one over its distance from x; and its value
-    at x with gradient (paper, Eq. 12 and 15) and Hessian, up to order `derivatives`.
+    """Compute the potential f of one dipole at points x (3, n), with its derivatives (paper, Eq. 12
+    and 15).
 
-    With the dipole's moment m, z = y - x and u = 1/|z|: f = m.z u^3, grad f = 3 (m.z) u^5 z - m
-    u^3, and Hess f = 15 (m.z) u^7 z z^T - 3 u^5 (m z^T + z m^T + (m.z) I).
+    row: the record of the dipole: its position y, then its moment m.
+    derivatives: 0 for the value only, 1 with the gradient, 2 with the Hessian.
+
+    Returns one over the distance of the dipole from x, and the value with its derivatives.
+
+    With z = y - x and u = 1/|z|: f = m.z u^3, grad f = 3 (m.z) u^5 z - m u^3, and
+    Hess f = 15 (m.z) u^7 z z^T - 3 u^5 (m z^T + z m^T + (m.z) I).
     """
     vector = cast("Any", type(x))
     z, m = vector(*row[:3]) - x, vector(*row[3:6])
@@ -259,11 +295,11 @@ _FAR_OF_SIZE = 0.04
 
 
 class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_DipoleData"]):
-    """f(x) = sum a_i n_i.(p_i - x)/|p_i - x|^3 of oriented points (paper, Eq. 12).
-
-    The points p_i have unit normals n_i, and stand for areas a_i of the surface. f is about 4 pi
-    inside and 0 outside, and the surface is f = 2 pi. It passes through every point, with the
-    point's normal.
+    """The dipole potential f(x) = sum a_i n_i.(p_i - x)/|p_i - x|^3 of oriented points p_i with
+    unit normals n_i (paper, Eq. 12). Each point stands for an area a_i of the surface. f is about 4
+    pi inside and 0 outside, and the surface is the level set f = 2 pi. It passes through every
+    point, with the point's normal. In unit coordinates the cloud is centered at 0 and its size is
+    about one.
 
     smoothing: a length h, for points with noise. Then
 
@@ -277,13 +313,14 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
     good, where noise is the standard deviation of the noise along an axis, and spacing the distance
     between neighboring points.
 
-    smoothing="auto": for points with noise of unknown size. The sum is then not that of the input
-    points. Points far from all others are left out, with a warning. The remaining points are moved
-    along their normals onto the surface that fits their neighbors (`geometry.denoising`); if the
-    noise is larger than the spacing, only some of these points are used. Their sum is smoothed
-    over their spacing, or less. Estimated normals are corrected by the sum and by the moved points.
-    `points`, `normals`, `areas` and `smoothing` are the data of that sum. `describe` has the
-    estimated noise, and the numbers of points of the input and of points that were left out.
+    smoothing="auto": for points with noise of unknown size. f is then the sum over denoised points
+    instead of the input points. Points far from all others are left out, with a warning. The
+    remaining points are moved along their normals onto the surface that fits their neighbors
+    (`geometry.denoising`); if the noise is larger than the spacing, only some of these points are
+    used. The smoothing length h is their spacing, or less. Estimated normals are corrected by the
+    sum and by the moved points. The attributes `points`, `normals`, `areas` and `smoothing` are
+    those of the denoised points. `describe` has the estimated noise, the number of input points,
+    and the number of points that were left out.
 
     points: (n, 3).
     normals: (n, 3), outward, of any length; or "estimate", from neighbors, oriented along a
@@ -297,14 +334,16 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
         (`gradient_error_bound` bounds it).
     cells: whether to build FMM cells, for many rays through many points. In a cell, near points are
         summed directly and all others are one polynomial, so that an evaluation for tracing costs a
-        tenth. None builds cells if they pay (`for_ray_count`), which is so for pictures of small
-        clouds and for path tracing. True always builds them, also for values and gradients at
-        points, which pays for more than some 600 values per point. False never builds them. They
-        take some 1 kB per point; if this is more than the number of megabytes of this argument
-        (True: 256), cells are larger and slower. If these would still be too large, there are no
-        cells, and `describe` of a prepared field reports this. They are built at the first trace,
-        for each precision, which takes as long as tracing 100,000 to a million rays without cells,
-        and several times their memory. All bounds are proved, whatever the arguments.
+        tenth. None builds cells if they save more time than their construction takes
+        (`for_ray_count`): for pictures of small clouds and for path tracing. True always builds
+        them, and uses them also for values and gradients at points, which saves time for more than
+        some 600 values per point. False never builds them. A number builds them, too, and limits
+        their memory to so many megabytes; the limit is 256 for True. Cells take some 1 kB per
+        point. If this exceeds the limit, cells are larger and slower. If these would still be too
+        large, there are no cells, and `describe` of a prepared field reports this. Cells are built
+        at the first trace, for each precision. This takes as long as tracing 100,000 to a million
+        rays without cells, and several times the memory of the cells. All bounds are proved,
+        whatever the arguments.
 
     `with_points` gives the field of points that have moved.
 
@@ -334,14 +373,15 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
             )
         if accuracy is not None and not 1.5 <= as_real(accuracy, "accuracy") <= 100:
             raise ValueError(f"accuracy must lie between 1.5 and 100, not {accuracy}")
-        self.is_estimated = [isinstance(normals, str), areas is None]
+        self.is_estimated = [isinstance(normals, str), areas is None]  # normals, areas
         if isinstance(normals, str) and normals != "estimate":
             raise CloudError(f'normals must be (n, 3) or "estimate", not {normals!r}')
         self.fit_report: dict[str, Any] = {}
-        if isinstance(smoothing, str):
+        if isinstance(smoothing, str):  # "auto"
             points, normals, smoothing = self._fitted(points, normals, areas, smoothing)
         if isinstance(normals, str):
             normals = estimate_normals(points)
+        # 1.0 is only a valid number for the check, if areas are still to be estimated.
         known_areas = 1.0 if areas is None else areas
         points, normals, known_areas = validate_cloud(points, normals, known_areas)
         self._set_points(
@@ -350,6 +390,9 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
         self.accuracy = accuracy
         self.configure_cells(cells)
         self._box = low, high = self.points.min(axis=0), self.points.max(axis=0)
+        # Unit coordinates: relative to the center, over a power of two as size, so that the
+        # division does not round. The size is no smaller than a length that belongs to the total
+        # area, for clouds whose areas are large for their box.
         self._center = round_to_single(0.5 * (low + high))
         extent = max(0.5 * float((high - low).max()), math.sqrt(float(self.areas.sum())) / 4)
         self._size = 2.0 ** math.ceil(math.log2(extent))
@@ -365,9 +408,13 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
     def _fitted(
         self, points: Any, normals: Any, areas: Any, smoothing: str
     ) -> tuple[FloatArray, FloatArray, float]:
-        """Denoise the cloud for `smoothing="auto"`. Returns the kept points (m, 3) moved onto the
-        surface, their normals (m, 3), and the smoothing length. Sets `fit_report` to the report
-        about the noise.
+        """Denoise the cloud for `smoothing="auto"`, and set `fit_report` to the report about the
+        noise.
+
+        points, normals, areas, smoothing: the arguments of the constructor.
+
+        Returns the kept points (m, 3) moved onto the surface, their normals (m, 3), and the
+        smoothing length.
 
         Raises:
             ValueError: `smoothing` is another string than "auto".
@@ -382,20 +429,27 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
             )
 
         def gradients(x: FloatArray, n: FloatArray, areas: FloatArray, length: float) -> FloatArray:
-            """Gradients (n, 3) of the sum smoothed over `length`, at its own points x (n, 3) with
-            normals n (n, 3)."""
+            """Compute the gradients (n, 3) of a smoothed dipole potential at its own points.
+
+            x, n, areas: the points (n, 3), their normals (n, 3), and their areas (n,).
+            length: the smoothing length.
+            """
             field = DipolePotential(x, n, areas, smoothing=length)
             return np.asarray(field.rough_value_and_gradient(x)[1], np.float64)
 
-        known_normals = None if isinstance(normals, str) else normals
+        known_normals = None if isinstance(normals, str) else normals  # else "estimate"
         cloud = DenoisedCloud.of(points, known_normals, gradients)
         self.fit_report = cloud.report
         return cloud.points, cloud.normals, cloud.smoothing
 
     def _median_level(self) -> float:
-        """The median of the smoothed sum at the points, or at some of the points if there are many.
-        Raises ValueError if the smoothing length is too small or too large for the cloud, and
-        CloudError if the median is not far enough from 0."""
+        """Compute the default level of a smoothed sum: the median of f at the points, or at some of
+        the points if there are many. Warns if the smoothing seems to be too long.
+
+        Raises:
+            ValueError: the smoothing length is too small or too large for the cloud.
+            CloudError: the median is not far enough from 0.
+        """
         if not _MIN_SMOOTHING <= self.smoothing / self._size <= 1:
             raise ValueError(
                 f"smoothing={self.smoothing:g} is a length in the unit of the points, whose cloud "
@@ -403,6 +457,7 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
                 f"{_MIN_SMOOTHING * self._size:.2g} and {self._size:.2g}, such as the length of "
                 "the noise"
             )
+        # Every k-th point, with the smallest k that gives no more than `_MAX_LEVEL_SAMPLES`.
         samples = self.points[:: -(-len(self.points) // _MAX_LEVEL_SAMPLES)]
         values = np.asarray(self.value(samples, precision="double"))
         level = float(np.median(values))
@@ -419,12 +474,15 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
         return level
 
     def _warn_if_far(self, points: FloatArray, values: FloatArray) -> None:
-        """Warn if a tenth of the points is far from the smoothed surface, to first order.
+        """Warn if a tenth of the points are farther from the smoothed surface than `_FAR_OF_SIZE`
+        times the longest side of the cloud. The distance of a point is estimated as |f - level|
+        over the length of the gradient.
 
         points: (n, 3).
-        values: (n,) the smoothed sum at the points minus the level.
+        values: (n,) f minus the level, at the points.
         """
         gradients = self.rough_value_and_gradient(points, precision="double")[1]
+        # The distance that nine tenths of the points do not exceed.
         norms = np.linalg.norm(gradients, axis=1)
         far = float(np.quantile(np.abs(values) / np.maximum(norms, 1e-300), 0.9))
         longest = float((self._box[1] - self._box[0]).max())
@@ -440,13 +498,17 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
     def with_points(
         self, points: Any, normals: Any | Literal["estimate"] = None, areas: Any = None
     ) -> DipolePotential:
-        """The potential of the same points at other positions (n, 3). Normals and areas are given
-        as for a new field.
+        """Make the field of the same points at other positions.
 
-        If this field has a tree, the new field's tree has the same hierarchy of points, with new
-        centers, radii, moments and bounds. All promises are computed from the new positions. So a
-        tree whose points moved far is slower than a new tree, but never wrong. Raises CloudError as
-        for a new field.
+        points: (n, 3) the new positions, in the same order.
+        normals, areas: as for a new field.
+
+        If this field has a tree, the new field's tree has the same hierarchy: the same points are
+        in the same nodes. Centers, radii, moments and all bounds are computed from the new
+        positions. So a tree whose points moved far is slower than a new tree, but never wrong.
+
+        Raises:
+            CloudError: the arguments are no oriented point cloud, or the number of points differs.
         """
         field = DipolePotential(
             points,
@@ -461,17 +523,20 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
                 f"points: {len(field.points)} of them, where {len(self.points)} were before: "
                 "moving points keeps their number and their order"
             )
+        # `_hierarchy` is in the dictionary if this field has computed it (`cached_property`).
         field._given_hierarchy = vars(self).get("_hierarchy", self._given_hierarchy)
         return field
 
     def values_at(self, x: Vec3, derivatives: int, closer: Real = 1.0) -> PointValues:
-        """Values and derivatives at points x (3, n), with error bounds (`BatchedField.values_at`).
+        """Compute f and its derivatives at points x (3, n), in the user's unit, with error bounds
+        (`BatchedField.values_at`).
 
         derivatives: 0 for the value only, 1 with the gradient, 2 with the Hessian.
-        closer: the accuracy scale.
+        closer: the accuracy scale; larger is more accurate. A number below 1 counts as 1.
         """
         data = self._batch_data(backend_of(x))
         x = data.to_unit(x)
+        # The sum of the areas, in unit coordinates.
         weight = float(self.areas.sum()) / self._size**2
         return (
             data.tree.values(x, derivatives, closer)
@@ -480,21 +545,21 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
         )
 
     def sharp_values_at(self, x: Vec3) -> PointValues:
-        """Values and gradients at points x. The accuracy is increased until the error of the
-        gradient is about 1 % of its length, unless the user chose the accuracy."""
+        """Compute f and its gradient at points x (3, n), with error bounds. Unless the user chose
+        the accuracy, it is increased until the error of the gradient is about 1 % of its length."""
         if self.accuracy is not None:
             return self.values_at(x, 1)
         return sharpened(lambda points, factor: self.values_at(points, 1, factor), x)
 
     @functools.cached_property
     def _hierarchy(self) -> BalancedTree:
-        """The hierarchy of the tree over the points: which points are in which node. If the points
-        were moved (`with_points`), the hierarchy is that of their earlier positions, which stays
-        valid; otherwise it is computed from the points."""
+        """The hierarchy of the tree over the points: which points are in which node. It is computed
+        from the points. But if this field was made by `with_points` from a field that has a
+        hierarchy, it is that hierarchy, which stays valid for moved points."""
         return self._given_hierarchy or dipole_hierarchy((self.points - self._center) / self._size)
 
     def _upload(self, backend: Backend, *, traced: bool) -> _DipoleData:
-        """Upload the sum over the dipoles to a backend.
+        """Build the sum over the dipoles on a backend: smoothed, or with cells if they are wanted.
 
         traced: whether the sum is for tracing, and not for values at points. By default a sum for
             tracing is more accurate.
@@ -504,6 +569,7 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
         # Areas scale with the square of lengths; the potential is invariant under scaling.
         moments = (self.areas / self._size**2)[:, None] * self.normals
         if self.smoothing:
+            # height: the smoothing length in unit coordinates.
             height, rows = self.smoothing / self._size, dipole_records(unit, moments)
             tree = SmoothedSum.of(backend, self._hierarchy, rows, height, accuracy)
         else:
@@ -514,16 +580,18 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
         return _DipoleData(*frame_parameters(backend, self._center, self._size), tree)
 
     def _cell_builder(self, backend: Backend, half: float) -> BuildCells:
-        """Make a function that builds the FMM cells of the cube [-half, half]^3 on a backend
-        (`BuildCells`). The cells are built by its first call, and kept for later calls."""
+        """Return a function that builds the FMM cells of the cube [-half, half]^3, in unit
+        coordinates, on a backend (`BuildCells`). Its first call builds the cells; later calls
+        return the same cells."""
 
         def build(
             levels: list[NodeMoments], rows: FloatArray, dipoles: RecordTable
         ) -> DipoleCells | None:
-            """Return the cells that were built before, or build them.
+            """Return the cells that were built before, or build them. Returns None if they would
+            take too much memory.
 
-            levels: the moments of all levels of the tree.
-            rows: the dipoles as records.
+            levels: the multipole moments of the tree's nodes, one entry for each level of the tree.
+            rows: the records of the dipoles, in the slots of the tree's leaves.
             dipoles: the same records on the backend.
             """
             return self.build_cached(
@@ -537,11 +605,12 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
         return build
 
     def _half_side(self, unit: FloatArray) -> float:
-        """Half the side, in unit coordinates, of the cube that the cells fill. This cube contains
-        the `extent` of the default level, because rays begin at the faces of the extent.
+        """Compute half the side, in unit coordinates, of the cube that the cells fill. This cube
+        contains the `extent` of the default level, because rays begin at the faces of the extent.
 
         unit: (n, 3) the points in unit coordinates.
         """
+        # As in `extent`, with 0.1 % in hand for rounding.
         margin = math.sqrt(float(self.areas.sum()) / self.default_level) / self._size
         return 1.001 * (float(np.abs(unit).max()) + margin)
 
@@ -552,8 +621,8 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
         return max(_LEAST_RAYS, _PAYS * len(self.points)) if is_small else math.inf
 
     def finer_cells_pay_from(self) -> float:
-        """The smallest number of rays for which smaller cells save more time than the longer
-        construction takes."""
+        """The smallest number of rays for which smaller cells save more time than their longer
+        construction costs."""
         return _FINER_PAYS_PER_POINT * len(self.points)
 
     def prepare(self, backend: Backend) -> Self:
@@ -563,7 +632,12 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
         return prepared
 
     def _sample(self, on: _DipoleData, p: Vec3, detail: Real) -> Sample:
-        """The sample at p, from the data `on` of a backend, at the accuracy scale `detail`."""
+        """Compute a sample at points p (3, n): f, its gradient, error bounds, and proved bounds of
+        f near p.
+
+        on: the field's data on a backend.
+        detail: the accuracy scale; larger is more accurate.
+        """
         return on.sample(p, detail)
 
     def validate_levels(self, levels: tuple[float, ...]) -> None:
@@ -575,27 +649,31 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
                 )
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
-        """A box around the points that contains the level sets. At distance rho from all points
-        |f| <= (sum of areas)/rho^2, smoothed or not, as 1 + 5 q/2 <= (1 + q)^(5/2) with
-        q = h^2/rho^2."""
+        """Compute a box around the points that contains the level sets of f at these levels.
+
+        Proof. At a distance of at least rho from all points |f| <= (sum of areas)/rho^2. This holds
+        for the smoothed sum as well: with q = h^2/rho^2 each of its terms is the plain one times
+        (1 + 5 q/2)/(1 + q)^(5/2), which is at most 1 by Bernoulli's inequality.
+        """
         margin = 1.0001 * math.sqrt(float(self.areas.sum()) / min(abs(level) for level in levels))
         low, high = self._box
         return Box(low - margin, high + margin)
 
     @property
     def singular_points(self) -> FloatArray:
-        """The points (n, 3) at which f is singular: those with an area, if the sum is not
-        smoothed."""
+        """The points (n, 3) at which f is singular: all points whose area is positive, or none if
+        the sum is smoothed."""
         return np.zeros((0, 3)) if self.smoothing else self.points[self.areas > 0]
 
     @property
     def smoothing(self) -> float:
-        """The smoothing length of the surface. It cannot be set: the default level depends on
-        it."""
+        """The smoothing length h, in the points' unit; 0 for the plain sum. It cannot be set, as
+        the default level depends on it."""
         return self._smoothing
 
     def describe(self) -> dict[str, Any]:
-        """Facts about the field for users, as a dictionary of names and values."""
+        """Collect facts about the field for users: the number of points; whether normals and areas
+        were given or estimated; the report of the denoising; the cells; smoothing and level."""
         origins = ("estimated" if is_estimated else "given" for is_estimated in self.is_estimated)
         sources = dict(zip(("normals", "areas"), origins, strict=True))
         tree = None if self._device is None else self._device.tree
@@ -608,10 +686,18 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
 
 @dataclass(frozen=True)
 class _DipoleData(UnitFrame):
-    """The data of a potential on a backend. tree: the sum over the dipoles, plain or smoothed."""
+    """The data of a dipole potential on a backend, with the map from the user's coordinates to unit
+    coordinates (centered at 0, of size about one).
+
+    tree: the sum over the dipoles in unit coordinates, plain or smoothed.
+    """
 
     tree: DipoleTree | SmoothedSum
 
     def sample(self, p: Vec3, detail: Real) -> Sample:
-        """The sample at points p, in the user's unit. detail: the accuracy scale."""
+        """Compute a sample at points p (3, n): f, its gradient, error bounds, and proved bounds of
+        f near p, all in the user's unit.
+
+        detail: the accuracy scale; larger is more accurate.
+        """
         return space_scaled(self.tree.sample(self.to_unit(p), detail), self.size)

@@ -1,24 +1,26 @@
-"""FMM cells of dipoles or triangles: in each cell, a sum over all of them is a direct sum over a
-near list plus a local expansion, a harmonic polynomial, of all others.
-
-The cells are the leaves of an octree over a cube around these primitives. The near list of a cell
-has the primitives within 2.5 times the radius of the cell's ball from its center
-(`dipole_expansion`). So the cost of a sample depends only on the near list, and not on the number
-of all primitives.
+"""FMM cells of dipoles or triangles, which are called primitives. A triangle counts as a sheet of
+dipoles along its normal, and f is the sum of the potentials of all primitives. In each cell f is
+computed as a direct sum over the near primitives, plus a local expansion (a harmonic polynomial)
+for all far ones. The cells are the leaves of an octree over a cube around the primitives. The ball
+of a cell is a ball around the cell; a dipole is near if it is within 2.5 radii of the ball from the
+cell's center. So the cost of a sample depends only on the number of near primitives. All lengths
+are in unit coordinates, in which the data have a size of about one.
 
 - `DipoleCells`: the cells on a backend.
-- `build_cells`: builds the cells, one octree level at a time, from the moments of the tree.
+- `build_cells`: builds the cells, one octree level at a time, from the moments of a tree.
 
-The expansion has degree 6 and is computed from the moments of the tree. If sources are far from a
-cell that is split, they are added once, to the expansion that all cells inside it inherit. For this
-each cell has lists of the nodes and dipoles that no larger cell around it has added
-(`dipole_expansion`, `lane_lists`). Small leaves of the tree are split into dipoles, as the moments
-of a node cost as much as seven dipoles. The remainder of the expansion, bounded node by node, is
-the truncation error of accuracy scale 1; higher accuracy comes from the tree. Promises are about f
-and not about the expansion, so a step may lead into another cell. The remainder of an expansion of
-degree p is proportional to the power p + 1 of the distance from the cell's center, and so is its
-bound. This allows dipoles to count as near within 2.5 radii of a cell instead of 3, which gave half
-as many cells, and a third of the samples that the tree had to repeat.
+Construction. The expansions have degree 6 and are computed from the multipole moments of the nodes
+of a tree over the primitives. If sources (nodes or primitives) are far from a cell that is split,
+they are added once, to the expansion that all cells inside it inherit. For this, each cell has
+lists of the sources that no larger cell around it has added (`dipole_expansion`, `lane_lists`).
+Small leaves of the tree are replaced by their dipoles, as the moments of a node cost as much as
+seven dipoles.
+
+Errors. The remainder of the expansion is bounded node by node. It is the truncation error of
+accuracy scale 1; for larger scales the tree is used. It grows with the distance from the cell's
+center to the power 7, one more than the degree, and so does its bound. This allows a factor of 2.5
+instead of 3 for near dipoles, with half as many cells. The proved bounds of f near a point are
+about f and not about the expansion, so a ray's step may lead into another cell.
 """
 
 from __future__ import annotations
@@ -83,25 +85,28 @@ _MOST_NEAR, _MAX_NEAR, _MAX_NEAR_FRACTION = 64, 512, 1 / 8
 _FINER_FRACTION = 3 / 8
 # The number of cells that are built at once.
 _CHUNK_SIZE = 1 << 14
-# Numbers of a record before the coefficients, and the base in which the first index is stored:
-# single precision holds no integers above 2^24.
+# The number of entries of a record before the coefficients; and the base in which an index is
+# stored as two numbers, as single precision does not hold all integers above 2^24.
 _HEADER_SIZE, _INDEX_BASE = 14, 4096
 _UNLIMITED = 2**31 - 1
 
 
 @dataclass(frozen=True)
 class DipoleCells:
-    """Cells on a backend.
+    """The FMM cells of dipoles or triangles (the primitives) on a backend. A cell has a list of
+    near primitives, and for all far primitives a local expansion: a harmonic polynomial in the
+    offset from the cell's center. f is the sum over all primitives.
 
     lookup: the octree whose leaves are the cells.
-    records: one record per cell. In this order it holds: center (3,) and one over the radius;
-        `error`, `slope`, `tail` and `tail_slope` of `DipoleExpansions`; a bound of the rounding of
-        the value; `s4` and `min_distance` of `DipoleExpansions`; the index in `near` of the first
-        near primitive, as two numbers, and the number of near primitives; and the coefficients of
-        the expansion.
-    near: the near primitives of all cells, one list after the other, as rows of `primitives`.
-    primitives: records of all primitives, in the slots of their tree.
-    count, size: the number of cells, and the number of their bytes.
+    records: one record per cell. In this order it holds: the cell's center (3,), and one over the
+        radius of its ball; `error`, `slope`, `tail` and `tail_slope` of `DipoleExpansions`; a bound
+        of the rounding of the value; `s4` and `min_distance` of `DipoleExpansions`; the index in
+        `near` of the cell's first near primitive, as two numbers (low and high digit); the number
+        of its near primitives; and the coefficients of the expansion.
+    near: the near primitives of all cells, one list after the other. An entry is an index of a
+        record in `primitives`.
+    primitives: records of all primitives, in the slots of the leaves of their tree.
+    count, size: the number of cells, and the number of bytes that they take.
     """
 
     backend: Backend
@@ -115,14 +120,16 @@ class DipoleCells:
     def sums(
         self, x: Vec3, active: Mask, add: AddPrimitive, extra_state: tuple[Any, ...]
     ) -> tuple[SourceSums, tuple[Any, ...], Mask]:
-        """The sums over all primitives at points x, with gradients: from the near list and the
-        local expansion of the cell that contains x.
+        """Sum over all primitives at points x, with gradients: the local expansion of the cell that
+        contains x, plus its near primitives one by one.
 
+        x: (3, n), in unit coordinates.
+        active: the mask of the lanes to compute.
         add: a function that adds a near primitive to the sums (`treecode.AddPrimitive`).
         extra_state: a further state of the caller, which `add` updates.
 
-        Returns the sums, the caller's own state, and the mask of the lanes on which the sums hold.
-        These are the active lanes whose point lies in the cube.
+        Returns the sums, the new state of the caller, and the mask of the lanes on which the sums
+        are valid: the active lanes whose point lies in the cube.
 
         Proof of the bounds on far primitives. Let a be the distance of x from the cell's center,
         and let all far primitives be at distances D >= `least` from the center. Their distance from
@@ -130,14 +137,15 @@ class DipoleCells:
         value `fourth` at the center times (1 - a/least)^-4, and the sum of area/distance^5 at most
         that over least - a.
 
-        Rounding: the length by which x was rounded is less than 2 units; the center is exact. f
-        changes by at most the gradient times that length, plus 4 `s4` times its square
-        (`SourceSums.sample`).
+        Rounding. The length by which x was rounded is less than 2 units, where a unit is
+        `coordinate_rounding`; the center is exact. f changes by at most the gradient times that
+        length, plus 4 `s4` times its square (`SourceSums.sample`).
         """
         vector, index = self.backend.Array3f, self.backend.UInt32
         cell, inside = self.lookup.find_leaf(x)
         active = active & inside
         row = self.records.read_record(cell, active)
+        # u: the offset from the cell's center; y: the same in units of the ball's radius.
         u, inverse = x - vector(*row[:3]), row[3]
         y = u * inverse
         value, *slopes = evaluate_expansion(
@@ -146,12 +154,15 @@ class DipoleCells:
         error, slope_error, tail, tail_slope, rounding, fourth, least, low, high, count = row[
             4:_HEADER_SIZE
         ]
+        # distance: an upper bound of |x - center|; the truncation errors at this distance.
         distance = dr.norm(u) * (1 + SUM_MARGIN)
         error, slope_error = _truncation_at(
             distance * inverse, error, slope_error, tail, tail_slope
         )
-        free = least - distance
-        s4 = fourth * dr.square(dr.square(least / free))
+        # far_distance: a lower bound of the distance from x to the far primitives; s4 as in the
+        # proof.
+        far_distance = least - distance
+        s4 = fourth * dr.square(dr.square(least / far_distance))
         zero, gradient, shift = (
             self.backend.Float(0),
             inverse * vector(*slopes),
@@ -159,17 +170,29 @@ class DipoleCells:
         )
         rounding = dr.fma(shift, dr.norm(gradient) + slope_error + 4 * shift * s4, rounding)
         far = SourceSums(
-            value, gradient, None, error, slope_error, None, rounding, free, s4, s4 / free, zero
+            value,
+            gradient,
+            None,
+            error,
+            slope_error,
+            None,
+            rounding,
+            far_distance,
+            s4,
+            s4 / far_distance,
+            zero,
         )
+        # The cell's part of `near`: the index of its first entry, and the number of entries.
         first, count = index(low) + index(high) * _INDEX_BASE, dr.select(active, index(count), 0)
 
         def runs(i: Any, *_: Any) -> Mask:
-            """The mask of the lanes that have further near primitives."""
+            """Whether the loop goes on, for each lane: its cell has a near primitive i."""
             return i < count
 
         def step(i: Any, sums: Any, extra_state: Any) -> tuple[Any, ...]:
-            """Add primitive i of the near list to the state of the sums and to the caller's own
-            state."""
+            """Add near primitive i of the cell to the sums, given as a flat state, and update
+            `extra_state`, the state of the caller."""
+            # Other lanes in the loop have longer lists.
             in_list = i < count
             primitive = self.primitives.read_record(
                 dr.gather(index, self.near, first + i, in_list), in_list
@@ -181,8 +204,11 @@ class DipoleCells:
 
         start = (index(0), far.to_state(), extra_state)
         _, state, extra_state = dr.while_loop(start, runs, step, label="near primitives")
-        sums, n = SourceSums.from_state(state), self.backend.Float(count)
-        added = (_NEAR + 1) * self.backend.machine_epsilon * n * sums.s4 / inverse
+        sums, near_count = SourceSums.from_state(state), self.backend.Float(count)
+        # The rounding of the additions to the gradient: a near primitive of area a is at
+        # most `_NEAR` + 1 radii away, so its gradient, of order a/distance^3, is at most its part
+        # of s4 times this distance.
+        added = (_NEAR + 1) * self.backend.machine_epsilon * near_count * sums.s4 / inverse
         sums = dataclasses.replace(sums, gradient_truncation=sums.gradient_truncation + added)
         return sums, extra_state, active
 
@@ -190,15 +216,19 @@ class DipoleCells:
         self, tree: Treecode, x: Vec3, detail: Real, add: tuple[AddPrimitive, AddPrimitive],
         extra_state: tuple[Any, ...], active_lanes: Mask = True,
     ) -> tuple[SourceSums, tuple[Any, ...]]:  # fmt: skip
-        """The sums over all primitives at points x, with gradients, and the caller's own state. On
-        lanes on which `detail` is at most 1 and x is in the cube they come from the cells. On the
-        other lanes they come from a tree over the same primitives.
+        """Sum over all primitives at points x, with gradients: by the cells where they are accurate
+        enough, and by a tree elsewhere. The cells are used on lanes on which the accuracy scale is
+        at most 1 and x is in the cube.
 
-        detail: the accuracy scale.
+        tree: a tree over the same primitives.
+        x: (3, n), in unit coordinates.
+        detail: the accuracy scale; larger is more accurate.
         add: two functions that add a near primitive (`treecode.AddPrimitive`): the first to the
             sums of a cell, the second to the sums of the tree.
         extra_state: a further state of the caller, which `add` updates.
-        active_lanes: the mask of the active lanes.
+        active_lanes: the mask of the lanes to compute.
+
+        Returns the sums, and the new state of the caller.
         """
         in_cell, in_tree = add
         lanes, tree_detail = self.backend.Bool(active_lanes), fmax(detail, self.backend.Float(1))
@@ -212,14 +242,14 @@ class DipoleCells:
 def _truncation_at(
     q: Real, error: Real, slope: Real, tail: Real, tail_slope: Real
 ) -> tuple[Real, Real]:
-    """Bounds of the truncation errors of value and gradient at a point whose distance from the
-    cell's center is q times the radius of the cell's ball.
+    """Bound the truncation errors of the local expansion, of value and gradient, at a point whose
+    distance from the cell's center is q times the radius of the cell's ball.
 
-    error, slope: bounds of the parts of both errors that are the same in the whole ball.
-    tail, tail_slope: bounds of the other parts on the sphere; they fall towards the center, as in
-        `DipoleExpansions`.
+    error, slope: bounds of the part of each error that is the same in the whole ball.
+    tail, tail_slope: bounds of the other part at q = 1. It is proportional to q^(p+1) for the value
+        and to q^p for the gradient, with p = `DEGREE` (`DipoleExpansions`).
     """
-    power = 1.0 + 0 * q
+    power = 1.0 + 0 * q  # 1 on each lane of q
     for _ in range(DEGREE):
         power = power * q
     margin = 1 + SUM_MARGIN
@@ -228,12 +258,13 @@ def _truncation_at(
 
 @dataclass(frozen=True)
 class _CellLevel:
-    """The cells of one size: all cells at one depth of the octree.
+    """The cells at one depth of the octree, which all have the same size.
 
     centers: (n, 3) centers of the cells.
     radius: the radius of their balls.
     is_leaf: (n,) whether a cell is not split.
-    near: (n,) the number of near primitives. It is exact for cells that are not split.
+    near: (n,) the number of near primitives of each cell. For a cell that is split it is only a
+        number above the limit, as counting stops there.
     """
 
     centers: FloatArray
@@ -246,16 +277,19 @@ def build_cells(
     backend: Backend, tree: BalancedTree, levels: list[NodeMoments], rows: FloatArray,
     primitives: RecordTable, half: float, most_bytes: int, *, finer: bool = False,
 ) -> DipoleCells | None:  # fmt: skip
-    """Build the cells of a cube [-h, h]^3. h is at least `half`, and has so few digits that single
-    precision holds the centers of all cells exactly.
+    """Build the FMM cells of primitives (dipoles or triangles) that lie in a cube.
 
-    tree, levels, rows: a tree over the primitives, its moments, and the primitives in its slots
-        (`source_tree`).
-    primitives: records of the primitives on the backend, in the same slots.
+    tree: a tree over the primitives: which primitives are in which node.
+    levels: the multipole moments of its nodes, one entry for each level of the tree.
+    rows: the records of the primitives, in the slots of the tree's leaves (`source_tree`).
+    primitives: the same records on the backend.
+    half: half the side of the cube. The cells fill a slightly larger cube [-h, h]^3, in which h has
+        so few digits that single precision holds the centers of all cells exactly.
     most_bytes: the number of bytes that the cells may take. To build them takes several times as
         much memory, which is not counted. If small cells would take more bytes, cells are larger
         and have more near primitives.
-    finer: whether cells are for very many rays, so that smaller cells pay.
+    finer: whether to build smaller cells, which take longer to build and save time for very many
+        rays.
 
     Returns None if useful cells would need more than `most_bytes`.
 
@@ -266,12 +300,13 @@ def build_cells(
     left.
     """
     packed = source_tree(tree, levels, rows)
+    # h is a multiple of a power of two near half/256.
     step = 2.0 ** (math.ceil(math.log2(half)) - 8)
     half = math.ceil(half / step) * step
     start_near, max_near = _MOST_NEAR, _MAX_NEAR
     if finer:
         start_near = int(_FINER_FRACTION * start_near)
-    if packed.primitives.packets_per_record > 1:
+    if packed.primitives.packets_per_record > 1:  # triangles; the record of a dipole is one packet
         limit = int(_MAX_NEAR_FRACTION * (tree.leaf_slots != NO_PRIMITIVE).sum())
         max_near = max(_MOST_NEAR, min(_MAX_NEAR, limit))
     octree = _octree_within_memory(packed, half, backend, (start_near, max_near), most_bytes)
@@ -289,14 +324,17 @@ def build_cells(
     tables: list[npt.NDArray[Any]] = []
     near: list[npt.NDArray[Any]] = []
     split_count, leaf_count, near_count = 0, 0, 0
-    # Each pass adds the cells of one depth: first those that are not split, then those that are. A
-    # negative radius `none_stay` makes `split_far` replace every near node by its primitives.
+    # Each pass adds the cells of one depth: first the cells that are not split, then the others.
+    # `sources` has the sources that are left to each cell of this depth, `parents` the expansions
+    # that they inherit. With the negative radius `none_stay`, `split_far` replaces every near node
+    # by its primitives.
     for level in octree:
         leaves, split = np.flatnonzero(level.is_leaf), np.flatnonzero(~level.is_leaf)
         radius, none_stay = (dr.opaque(double.Float, number) for number in (level.radius, -1.0))
         for cells in _chunks(leaves):
             batch, c = (sources.subset(double, cells), to_vector3(double, level.centers[cells]))
             sums, nearby = batch.split_far(packed, c, radius, _NEAR, none_stay)
+            # Lengths and first indices of the lists of near primitives of these cells.
             lengths = to_numpy(nearby.primitives.count).astype(np.int64)
             first = near_count + np.cumsum(lengths) - lengths
             geometry = level.centers[cells], level.radius
@@ -306,6 +344,7 @@ def build_cells(
             near_count += int(lengths.sum())
         nodes.append(encode_nodes(level.is_leaf, leaf_count, split_count))
         leaf_count, split_count = leaf_count + len(leaves), split_count + len(split)
+        # A cell that is split hands its expansion and its remaining sources to its eight octants.
         split_sums: list[DipoleExpansions] = []
         pending: list[PendingSources] = []
         for cells in _chunks(split):
@@ -332,17 +371,19 @@ def build_cells(
 
 
 def _chunks(cells: IntArray) -> list[IntArray]:
-    """Divide an array of indices of cells into batches. A batch is so small that lists of the
-    sources far from its cells take little memory."""
+    """Divide an array of indices of cells into batches. A batch is so small that the lists of far
+    sources of its cells take little memory."""
     return [cells[start : start + _CHUNK_SIZE] for start in range(0, len(cells), _CHUNK_SIZE)]
 
 
 @dataclass(frozen=True)
 class _ParentExpansions:
-    """The sums that cells of one size inherit from their parents.
+    """The expansions that the cells of one depth inherit from their parents, the cells around them
+    at the depth above. Cells 8 i to 8 i + 7 are the octants of parent i.
 
-    sums: the sums of the parents. Cells 8 i to 8 i + 7 are the octants of parent i.
-    shifts: (8, COEFFICIENTS, COEFFICIENTS) matrices from `local_expansion.local_to_local_matrices`.
+    sums: the expansions of the parents, about the parents' centers.
+    shifts: (8, COEFFICIENTS, COEFFICIENTS) matrices that map the coefficients of a parent to those
+        about the centers of its octants (`local_expansion.local_to_local_matrices`).
     radius: the radius of the parents' balls; 0 for the root of the octree, which has no parent.
     """
 
@@ -351,8 +392,9 @@ class _ParentExpansions:
     radius: float
 
     def of(self, cells: IntArray) -> DipoleExpansions:
-        """The sums that the cells with these indices inherit from their parents."""
-        if not self.radius:  # the first level has no parents
+        """Compute the expansions that the cells with these indices inherit, about their own
+        centers."""
+        if not self.radius:  # the root inherits nothing: `sums` is zero
             return self.sums
         parents, parent_index = np.unique(cells // 8, return_inverse=True)
         octants = self.sums.subset(parents).to_octants(self.shifts, self.radius)
@@ -363,21 +405,25 @@ def _cell_records(
     backend: Backend, centers: FloatArray, radius: float, sums: DipoleExpansions, first: IntArray,
     lengths: IntArray,
 ) -> FloatArray:  # fmt: skip
-    """The records (n, k) of n cells that are not split, with the columns that `DipoleCells.records`
-    describes.
+    """Make the records (n, k) of n cells that are not split, with the columns that
+    `DipoleCells.records` describes.
 
-    centers, radius: centers (n, 3) of the cells, and the radius of their balls.
+    centers: (n, 3) the centers of the cells.
+    radius: the radius of their balls.
     sums: the sums over their far primitives.
-    first, lengths: (n,) where the list of near primitives of each cell begins, and its length.
+    first: (n,) the index of the first near primitive of each cell in the list of all cells.
+    lengths: (n,) the number of near primitives of each cell.
 
-    The rounding of the value is that of `rounding_tables`, for coordinates within a cell. The
-    rounding of positions is added during evaluation. The rounding of the gradient, which is
-    proportional to 1/radius, counts as truncation.
+    Rounding. Errors of the evaluated polynomial are bounded by `rounding_tables`, for points in the
+    cell. The error of the value has its own column; the error of the gradient, which is
+    proportional to 1/radius, is added to its truncation error. The rounding of the point x is added
+    when a sample is computed (`DipoleCells.sums`).
     """
     tables = rounding_tables(DEGREE, BALL_MARGIN / math.sqrt(3))
     rounding = backend.machine_epsilon * np.abs(sums.coefficients) @ tables
     slope = sums.slope + rounding[:, 1:].sum(axis=1) / radius
     margin, inverse = 1 + SUM_MARGIN, np.full(len(first), 1 / radius)
+    # A cell without far primitives has an infinite distance, which must not enter products.
     least = np.minimum(sums.min_distance, 1e3) / margin
     bounds = (sums.error, slope, sums.tail, sums.tail_slope, rounding[:, 0], sums.s4)
     near_range = first % _INDEX_BASE, first // _INDEX_BASE, lengths
@@ -388,21 +434,24 @@ def _cell_records(
 def _octree_within_memory(
     packed: PackedTree, half_side: float, backend: Backend, limits: tuple[int, int], most_bytes: int
 ) -> list[_CellLevel] | None:
-    """The cells of the cube [-half_side, half_side]^3, one entry for each depth of the octree.
-    Cells are split if they have more near primitives than a limit. The limit is the smallest one
-    for which the cells take at most `most_bytes` bytes. Returns None if no limit is large enough.
+    """Choose the cells of the cube [-half_side, half_side]^3 so that they take at most `most_bytes`
+    bytes. A cell is split if it has more near primitives than a limit. Limits are tried in turn,
+    each one twice the previous one, until the cells are small enough.
 
     packed: the tree of the primitives.
-    limits: the first limit to try, and the largest limit. In between the limit is doubled. Beyond
-        the largest limit, lists of near primitives take nearly as much memory, whatever the size
-        of the cells.
+    limits: the first limit to try, and the largest limit. Beyond the largest limit, lists of near
+        primitives take nearly as much memory, whatever the size of the cells.
+
+    Returns one entry for each depth of the octree; or None if the cells take too much memory even
+    with the largest limit.
     """
 
     def is_too_large(levels: list[_CellLevel]) -> bool:
-        """Whether the cells of these depths take more than `most_bytes` bytes."""
+        """Whether cells take more than `most_bytes` bytes. levels: the cells of each depth."""
         return _bytes(backend, levels) > most_bytes
 
     limit, max_near = limits
+    # Double the limit until the cells are small enough in memory.
     while (octree := _octree(packed, half_side, limit, is_too_large)) is None and limit < max_near:
         limit = min(2 * limit, max_near)
     return octree
@@ -414,13 +463,15 @@ def _octree(
     max_near: int,
     is_too_large: Callable[[list[_CellLevel]], bool],
 ) -> list[_CellLevel] | None:
-    """The cells of the cube [-half_side, half_side]^3, one entry for each depth of the octree.
+    """Divide the cube [-half_side, half_side]^3 into the cells of an octree. A cell is split if too
+    many primitives are near to it, that is, within `_NEAR` radii of its ball from its center. Cells
+    at the depth `MAX_DEPTH` are not split in any case.
 
     packed: the tree of the primitives.
-    max_near: a cell is split if more primitives than this are near to it, that is, within `_NEAR`
-        radii of its ball from its center.
-    is_too_large: a function that says whether the cells built so far take too much memory. If they
-        do, the result is None.
+    max_near: a cell is split if it has more near primitives than this.
+    is_too_large: a function that says whether the cells so far take too much memory.
+
+    Returns one entry for each depth of the octree, or None if the cells take too much memory.
     """
     backend = packed.backend
     root = PendingSources.of_root(backend)
@@ -430,8 +481,10 @@ def _octree(
         side = half_side / 2 ** len(levels)
         radius = math.sqrt(3) * side * BALL_MARGIN
         is_last = len(levels) == MAX_DEPTH
+        # Counting stops above the limit; cells of the last depth need the exact number.
         limit = dr.opaque(backend.UInt32, _UNLIMITED if is_last else max_near)
         near, none_stay = (dr.opaque(backend.Float, _NEAR * radius), dr.opaque(backend.Float, -1.0))
+        # Each cell searches the whole tree for its near primitives.
         roots, c = (
             root.subset(backend, np.zeros(len(centers), np.int64)),
             to_vector3(backend, centers),
@@ -447,13 +500,17 @@ def _octree(
 
 
 def _bytes(backend: Backend, levels: list[_CellLevel]) -> int:
-    """The number of bytes that cells take: their records, their lists of near primitives, and the
-    octree's nodes. levels: the cells of each depth of the octree. A cell at the last of these
-    depths that is still to be split counts as eight cells, as it becomes at least eight."""
+    """Compute the number of bytes that cells take: their records, their lists of near primitives,
+    and the octree's nodes.
+
+    levels: the cells of each depth of the octree. A cell at the last of these depths that is still
+        to be split counts as eight cells, as it becomes at least eight.
+    """
     leaves, near = 8 * int((~levels[-1].is_leaf).sum()), 0
     for level in levels:
         leaves += int(level.is_leaf.sum())
         near += int(level.near[level.is_leaf].sum())
     nodes = sum(len(level.is_leaf) for level in levels)
+    # A record takes a multiple of eight numbers.
     record = 8 * -(-(_HEADER_SIZE + COEFFICIENTS) // 8) * np.dtype(backend.dtype).itemsize
     return record * leaves + 4 * near + OctreeLookup.memory_bytes(nodes)

@@ -1,17 +1,19 @@
-"""Local expansions (harmonic polynomials) of the field of far dipoles and triangles in balls, and
-bounds of their truncation errors.
+"""Local expansions of far sources in balls, with bounds of their truncation errors. The primitives
+are dipoles, or triangles, each of which counts as a sheet of dipoles along its normal. f is the sum
+of the potentials of all primitives. A source is a primitive, or a node of a tree, which stands for
+all its primitives. The local expansion of sources is a harmonic polynomial that approximates their
+potential in a ball around a cell of an octree. It has a finite degree; the truncation error is the
+error from all terms of higher degree.
 
-- `source_tree`: a tree of primitives, dipoles or triangles, in double precision, with all data that
-  expansions need; `triangle_sources`: triangles as records.
-- `DipoleExpansions`: sums over far nodes and far primitives.
-- `PendingSources`: the primitives of balls, split into such sums and the sources that are left to
-  smaller balls.
+- `source_tree`: a tree of primitives in double precision, with all data that expansions need;
+  `triangle_sources`: triangles as records.
+- `DipoleExpansions`: the sums over the far sources of balls, as local expansions with error bounds.
+- `PendingSources`: the sources that balls have not yet added to their expansions.
 
 Sources are far from a ball of radius rho by these rules, with a factor k > 1. A node of radius R is
 far if its center is farther than k rho + `_NODE_RATIO` R from the ball's center. For a triangle of
 radius R this distance is k rho + `TRIANGLE_RATIO` R, for a dipole k rho. So all points of a far
-source are farther from the ball's center than k rho. A triangle counts as a sheet of dipoles along
-its normal.
+source are farther from the ball's center than k rho.
 """
 
 from __future__ import annotations
@@ -52,63 +54,70 @@ if TYPE_CHECKING:
 # Harmonics have degree l.
 # ruff: noqa: E741
 
-# The degree of local expansions, and the largest degree of the multipoles they are computed from.
+# The degree of local expansions; and the largest degree of the multipole terms from which they are
+# computed.
 DEGREE, _MULTIPOLE_DEGREE = 6, 4
 COEFFICIENTS = (DEGREE + 1) ** 2
+# A node is far from a ball of radius rho beyond k rho plus this many times the node's radius.
 _NODE_RATIO = 4.0
-# The same factor for triangles, by experiment; and the moments in their records, besides the first.
+# The same factor for triangles, by experiment; and the moments that a triangle's record has besides
+# the first one, as keys (degree, order, 0 for real or 1 for imaginary part).
 TRIANGLE_RATIO = 1.5
 _TRIANGLE_MOMENTS = tuple(key for key in coefficient_keys(_MULTIPOLE_DEGREE) if key[0] > 2)
-# Numbers of a record of a dipole, and of a triangle before its moments.
+# The number of entries of a dipole's record, and of a triangle's record before its moments.
 _DIPOLE_SIZE, _TRIANGLE_HEADER_SIZE = 8, 14
-# See `_ClusterExpansion.of`.
+# The relative rounding of a term, with the proof in `_ClusterExpansion.of`.
 _ROUNDING = 2.0**-20
-# Moments of a node, in order.
+# The keys of the moments in a node's record, in order.
 _MOMENTS = tuple(key for key in coefficient_keys(_MULTIPOLE_DEGREE) if key[0])
 # Factor by which sums of many positive numbers in double precision become bounds.
 _ROUNDED_UP = 1 + 1e-9
 
 
 def source_tree(tree: BalancedTree, levels: list[NodeMoments], rows: FloatArray) -> PackedTree:
-    """The tree of primitives on a backend in double precision, with the records that expansions
+    """Pack a tree of primitives for a backend in double precision, with the records that expansions
     need.
+
+    tree: the hierarchy of the tree: which primitives are in which node.
+    levels: the multipole moments of the tree's nodes, one entry for each level of the tree.
+    rows: the records of the primitives, in the slots of the tree's leaves: dipoles from
+        `treecode.dipole_records`, or triangles from `triangle_sources`.
 
     A node's record holds: center, `_NODE_RATIO` times the radius, radius, area; then its moments up
     to degree 4; the bounds E and G of the terms beyond degree 4 in value and gradient
     (`multipole.truncation_bounds`); and for each degree a bound of its term (`multipole.sup_norm`).
-
-    levels: the moments of the tree's nodes, one entry for each level of the tree.
-    rows: the records of the primitives, in the slots of the tree's leaves: dipoles from
-        `treecode.dipole_records`, or triangles from `triangle_sources`.
     """
-    numbers: list[FloatArray] = []
+    records: list[FloatArray] = []
     for level in levels:
+        # Points at which the node's moments are used are farther than `reach` from its center.
+        # An order of 3 means terms up to degree 4.
         reach = _NODE_RATIO * level.radius
         error, slope, _ = truncation_bounds(level, reach, _MULTIPOLE_DEGREE - 1)
         moments = _columns(level, _MOMENTS)
         norms = [sup_norm(level.moments, l) for l in range(1, _MULTIPOLE_DEGREE + 1)]
         head = [level.center, reach, level.radius, level.area]
-        numbers.append(np.column_stack([*head, *moments, error, slope, *norms]))
-    return pack_tree(choose_backend("double"), tree, numbers, rows)
+        records.append(np.column_stack([*head, *moments, error, slope, *norms]))
+    return pack_tree(choose_backend("double"), tree, records, rows)
 
 
 def _columns(level: NodeMoments, keys: Iterable[tuple[int, int, int]]) -> list[FloatArray]:
-    """The real or imaginary parts of the moments with these keys (degree, order, 0 for real or 1
-    for imaginary). For each key there is one array, with an entry for each node."""
+    """List the real or imaginary parts of the moments with these keys (degree, order, 0 for real or
+    1 for imaginary). For each key there is one array, with an entry for each node."""
     return [level.moments[l, m].imag if part else level.moments[l, m].real for l, m, part in keys]
 
 
 def triangle_sources(corners: FloatArray) -> FloatArray:
-    """Records (n, 30) of triangles (n, 3, 3).
+    """Make the records (n, 30) of triangles (n, 3, 3), with the data that expansions need.
 
-    A record holds: centroid, area times normal, area, `TRIANGLE_RATIO` times the radius; then
-    radius, (E, G) of `multipole.truncation_bounds`, the sup norms of the moments 1, 3 and 4, and
-    the moments 3 and 4.
+    A record holds: centroid, area times normal, area, `TRIANGLE_RATIO` times the radius; then the
+    radius, the bounds E and G of the terms beyond degree 4 (`multipole.truncation_bounds`), bounds
+    of the terms of degrees 1, 3 and 4 (`multipole.sup_norm`), and the moments of degrees 3 and 4.
 
-    The second moment about the centroid is a mean of offsets from the centroid, and so is 0. A
+    The moment of degree 2 about the centroid is a mean of offsets from the centroid, and so is 0. A
     triangle whose area is rounded to 0 gets an area of 1e-30, because a record without an area
     means an empty slot, but the edges of this triangle count.
     """
+    # A tree in which each leaf is one triangle, to compute its moments.
     leaves = BalancedTree(np.arange(len(corners), dtype=np.int64)[:, None], ())
     level = triangle_tree_moments(leaves, corners)[0]
     moments, reach = level.moments, TRIANGLE_RATIO * level.radius
@@ -122,16 +131,18 @@ def triangle_sources(corners: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class DipoleExpansions:
-    """Sums over the far primitives of n balls: a polynomial for each ball, and error bounds.
+    """Sums over the far primitives (dipoles or triangles) of n balls. For each ball their potential
+    is approximated by a local expansion, a harmonic polynomial, with bounds of its errors in the
+    ball.
 
     coefficients: (n, COEFFICIENTS) of the local expansion (`local_expansion.coefficient_keys`).
     error, slope: (n,) bounds of the truncation errors of value and gradient, anywhere in the ball.
-    tail, tail_slope: (n,) further truncation errors of value and gradient are at most q^(p+1)
-        `tail` and q^p `tail_slope` at a distance of q times the radius from the center, with
-        p = `DEGREE`.
-    s4: (n,) bounds of the sum of area/D^4, with D the smallest distance of a primitive from the
-        center.
-    min_distance: (n,) a lower bound of the distance of these primitives from the center.
+    tail, tail_slope: (n,) bounds of further truncation errors of value and gradient, which are
+        smaller near the center: at a distance of q times the ball's radius from the center they are
+        at most q^(p+1) `tail` and q^p `tail_slope`, with p = `DEGREE`.
+    s4: (n,) upper bounds of the sum of area/D^4 over the primitives, where D is the distance of the
+        primitive's nearest point from the ball's center.
+    min_distance: (n,) a lower bound of the distances D.
     """
 
     coefficients: FloatArray
@@ -144,12 +155,13 @@ class DipoleExpansions:
 
     @classmethod
     def zero(cls, n: int) -> DipoleExpansions:
-        """The sums of n balls over no primitives: zeros, and an infinite distance."""
+        """Make the sums of n balls that have no far primitives: zeros, with an infinite smallest
+        distance."""
         zero = np.zeros(n)
         return cls(np.zeros((n, COEFFICIENTS)), *(5 * [zero]), min_distance=np.full(n, np.inf))
 
     def plus(self, other: DipoleExpansions) -> DipoleExpansions:
-        """For each ball, the sum over the primitives of this object and those of `other`."""
+        """Add the sums over other primitives, for the same balls."""
         bounds = "error", "slope", "tail", "tail_slope", "s4"
         sums = (_ROUNDED_UP * (getattr(self, name) + getattr(other, name)) for name in bounds)
         min_distance = np.minimum(self.min_distance, other.min_distance)
@@ -158,31 +170,32 @@ class DipoleExpansions:
         )
 
     def subset(self, which: IntArray) -> DipoleExpansions:
-        """The sums of the balls with the indices `which`. An index may occur several times."""
+        """Select the sums of the balls with the indices `which`. An index may occur several
+        times."""
         return DipoleExpansions(*(values[which] for values in vars(self).values()))
 
     @classmethod
     def concatenate(cls, parts: list[DipoleExpansions]) -> DipoleExpansions:
-        """The sums of the balls of all parts, in the order of `parts`."""
+        """Join the sums of several groups of balls, in the order of `parts`."""
         columns = zip(*(vars(part).values() for part in parts), strict=True)
         return cls(*(np.concatenate(column) for column in columns))
 
     def to_octants(self, shifts: FloatArray, radius: float) -> DipoleExpansions:
-        """The same sums about the centers of the eight octants of each cell. The octants of a cell
-        follow each other in the result.
+        """Move the expansion of each cell to the centers of the cell's eight octants. The results
+        are 8 n sums; the octants of a cell follow each other.
 
         shifts: (8, COEFFICIENTS, COEFFICIENTS) matrices from
             `local_expansion.local_to_local_matrices`.
         radius: the radius of the cells' balls.
 
-        Proof. The ball of an octant lies in that of the cell, so that bounds of errors hold there
-        as well. But the truncation error of the polynomial is not small about an octant's center,
-        so `tail` is added to `error`. An octant's center is at most half a radius from the cell's
-        center, so that distances shrink by at most that, and 1/D^4 grows at most by the factor (1 -
-        radius/(2 d))^-4 for D >= d, with d = `min_distance`.
+        Proof. The ball of an octant lies in the ball of its cell, so that bounds of errors hold
+        there as well. But the truncation error of the polynomial is not small about an octant's
+        center, so `tail` is added to `error`. An octant's center is at most half a radius from the
+        cell's center, so that distances shrink by at most that. So 1/D^4 grows at most by the
+        factor (1 - radius/(2 d))^-4 for D >= d, with d = `min_distance`.
         """
         shifted = np.einsum("oab,kb->koa", shifts, self.coefficients)
-        ratio = 0.5 * radius / self.min_distance  # 0 where there is nothing
+        ratio = 0.5 * radius / self.min_distance  # 0 where there are no primitives
         error, slope = self.error + self.tail, self.slope + self.tail_slope
         far = self.s4 / (1 - ratio) ** 4, self.min_distance - 0.5 * radius
         bounds = _ROUNDED_UP * error, _ROUNDED_UP * slope, 0 * error, 0 * slope, *far
@@ -193,19 +206,24 @@ class DipoleExpansions:
     def over_nodes(
         cls, tree: PackedTree, lists: LaneLists, c: Vec3, radius: Real
     ) -> DipoleExpansions:
-        """Sums over all primitives of far nodes, from the moments of the nodes, for n balls of this
-        radius around the centers c (3, n).
+        """Sum over the far nodes of n balls: each node's moments give a local expansion in the
+        ball.
 
+        tree: the tree of the primitives (`source_tree`).
         lists: for each ball, the list of the indices of its far nodes in the tree.
+        c: (3, n) the centers of the balls.
+        radius: the radius of the balls.
         """
 
         def term(i: Any, active: Mask) -> list[Any]:
-            """What node i adds to the attributes of `DipoleExpansions`, as a list of numbers."""
+            """Compute what node i adds to the attributes of `DipoleExpansions`, in their order, as
+            a flat list of numbers."""
+            # The record of the node, in the order of `source_tree`.
             head, payload = tree.node_heads.read_record(i, active), tree.payload(i, active)
-            numbers = dict(zip(_MOMENTS, payload, strict=False))
+            moments = dict(zip(_MOMENTS, payload, strict=False))
             error, slope_error, *norms = payload[len(_MOMENTS) :]
             r = c - tree.backend.Array3f(*head[:3])
-            expansion = _ClusterExpansion.of(r, _pairs(numbers), norms, radius)
+            expansion = _ClusterExpansion.of(r, _pairs(moments), norms, radius)
             return expansion.of_cluster(error, slope_error, head[4], head[5], radius)
 
         return cls._accumulated(tree.backend, lists, term)
@@ -214,27 +232,37 @@ class DipoleExpansions:
     def over_primitives(
         cls, tree: PackedTree, lists: LaneLists, c: Vec3, radius: Real
     ) -> DipoleExpansions:
-        """Sums over single far primitives, for n balls of this radius around the centers c (3, n).
+        """Sum over the far primitives of n balls, one primitive at a time.
 
-        lists: for each ball, the list of its far primitives, as rows of the tree's primitives.
+        tree: the tree of the primitives (`source_tree`).
+        lists: for each ball, the list of the indices of its far primitives.
+        c: (3, n) the centers of the balls.
+        radius: the radius of the balls.
         """
 
         def term(i: Any, active: Mask) -> list[Any]:
-            """What primitive i, a dipole or a triangle, adds to the attributes of
-            `DipoleExpansions`, as a list of numbers."""
+            """Compute what primitive i, a dipole or a triangle, adds to the attributes of
+            `DipoleExpansions`, in their order, as a flat list of numbers."""
+            # row: position, area times normal, area; of a triangle all of `triangle_sources`.
             row = tree.primitives.read_record(i, active)
-            first = {(1, 0): (row[5], 0.0), (1, 1): (0.5 * row[3], 0.5 * row[4])}
+            # The moments of degree 1, from area times normal.
+            first_moments = {(1, 0): (row[5], 0.0), (1, 1): (0.5 * row[3], 0.5 * row[4])}
             r = c - tree.backend.Array3f(*row[:3])
-            if tree.primitives.packets_per_record == 1:
-                local = _ClusterExpansion.of(r, first, [row[6]], radius)
-                bounds = local.rounding, local.rounding / radius, local.tail, local.tail_slope
-                rest = row[6] * _fourth(local.inverse), dr.rcp(local.inverse)
-                return [*local.coefficients, *bounds, *rest]
+            if tree.primitives.packets_per_record == 1:  # a dipole, which has no further moments
+                expansion = _ClusterExpansion.of(r, first_moments, [row[6]], radius)
+                bounds = (
+                    expansion.rounding,
+                    expansion.rounding / radius,
+                    expansion.tail,
+                    expansion.tail_slope,
+                )
+                distance_terms = row[6] * _fourth(expansion.inverse), dr.rcp(expansion.inverse)
+                return [*expansion.coefficients, *bounds, *distance_terms]
             size, error, slope_error, *norms = row[_DIPOLE_SIZE:_TRIANGLE_HEADER_SIZE]
             higher = dict(zip(_TRIANGLE_MOMENTS, row[_TRIANGLE_HEADER_SIZE:], strict=False))
-            norms.insert(1, 0 * size)
-            local = _ClusterExpansion.of(r, first | _pairs(higher), norms, radius)
-            return local.of_cluster(error, slope_error, size, row[6], radius)
+            norms.insert(1, 0 * size)  # a triangle's moment of degree 2 is 0
+            expansion = _ClusterExpansion.of(r, first_moments | _pairs(higher), norms, radius)
+            return expansion.of_cluster(error, slope_error, size, row[6], radius)
 
         return cls._accumulated(tree.backend, lists, term)
 
@@ -242,17 +270,18 @@ class DipoleExpansions:
     def _accumulated(
         cls, backend: Backend, lists: LaneLists, term: Callable[[Any, Mask], list[Any]]
     ) -> DipoleExpansions:
-        """Add up `term` over the entries of each list.
+        """Add up the terms of all entries of each ball's list.
 
-        term: a function. From an entry of a list and a mask of active lanes it returns what the
-            entry adds to the attributes of `DipoleExpansions`. The last number, for `min_distance`,
-            is used in a minimum; all other numbers are added up.
+        lists: for each ball a list of sources.
+        term: a function that returns what a source adds to the attributes of `DipoleExpansions`, as
+            a flat list of numbers. Its arguments are the source's index and a mask of active lanes.
+            The last number, for `min_distance`, is used in a minimum; all others are added up.
         """
         zero = backend.Float(0)
 
         def add(i: Any, active: Mask, state: tuple[Any, ...]) -> tuple[Any, ...]:
-            """Add what `term` returns for entry i to the state, on active lanes. The last number of
-            the state is a minimum, all other numbers are sums."""
+            """Add the term of source i to the state, on active lanes. The last number of the state
+            is a minimum, all other numbers are sums."""
             *sums, minimum = state
             *added, nearest = term(i, active)
             pairs = zip(sums, added, strict=True)
@@ -265,19 +294,20 @@ class DipoleExpansions:
         n = dr.width(lists.count)
         columns = [np.broadcast_to(to_numpy(values), n) for values in totals]
         coefficients = np.stack(columns[:COEFFICIENTS], axis=1)
+        # Rounding must not make upper bounds smaller, nor the lower bound of distances larger.
         bounds = (values * _ROUNDED_UP for values in columns[COEFFICIENTS:-1])
         return cls(coefficients, *bounds, min_distance=columns[-1] / _ROUNDED_UP)
 
 
 def _fourth(number: Any) -> Any:
-    """The fourth power of a number."""
+    """Compute the fourth power of a number."""
     square = number * number
     return square * square
 
 
 def _pairs(numbers: dict[Any, Any]) -> dict[tuple[int, int], tuple[Any, Any]]:
-    """Moments as pairs of real and imaginary part, from their parts by (degree, order, 0 for real
-    or 1 for imaginary)."""
+    """Join the real and imaginary parts of moments. The keys of `numbers` are (degree, order, 0 for
+    real or 1 for imaginary); those of the result, whose values are pairs, are (degree, order)."""
     return {
         (l, m): (numbers[l, m, 0], numbers.get((l, m, 1), 0.0))
         for l, m, part in numbers
@@ -287,13 +317,14 @@ def _pairs(numbers: dict[Any, Any]) -> dict[tuple[int, int], tuple[Any, Any]]:
 
 @dataclass(frozen=True)
 class _ClusterExpansion:
-    """The local expansion, in a ball, of the field of one source that is given by its multipole
-    moments.
+    """The local expansion (a harmonic polynomial), in a ball, of the potential of one source: a
+    node, a triangle or a dipole, given by its multipole moments about its center.
 
-    coefficients: the coefficients of the polynomial, times powers of the ball's radius.
+    coefficients: the coefficients of the polynomial. That of a term of degree j is multiplied by
+        the ball's radius to the power j.
     tail, tail_slope: bounds of the truncation errors of value and gradient on the ball's sphere.
     rounding: a bound of the rounding of the value.
-    inverse: one over the distance of the multipole's center from the ball's center.
+    inverse: one over the distance of the source's center from the ball's center.
     """
 
     coefficients: list[Any]
@@ -304,17 +335,19 @@ class _ClusterExpansion:
 
     @classmethod
     def of(cls, r: Vec3, moments: Any, norms: list[Any], radius: Real) -> _ClusterExpansion:
-        """The expansion of multipole terms in the ball of this radius.
+        """Expand the multipole terms of a source in a ball.
 
-        r: the vector from the multipole's center to the ball's center.
-        moments: a dictionary of the moments, as pairs of real and imaginary part, by (degree,
-            order).
-        norms: norms[l-1] bounds the term of degree l = 1, 2, ...: at a distance d from the
-            multipole's center this term is at most norms[l-1]/d^(l+1).
+        r: (3, n) the vector from the source's center to the ball's center.
+        moments: a dictionary of the source's moments, as pairs of real and imaginary part, by
+            (degree, order).
+        norms: norms[l-1] bounds the multipole term of degree l = 1, 2, ...: at a distance d from
+            the source's center this term is at most norms[l-1]/d^(l+1).
+        radius: the radius of the ball.
 
-        The bounds are those of `tail_factors`, whose c grows with l. They bound all terms of degree
-        j > p. So at q times the radius, q <= 1, the truncation error is q^(p+1) times as much as on
-        the sphere, and that of the gradient q^p times as much.
+        Truncation. `tail_factors` bounds the terms of degree j > p of the polynomial, where
+        p = `DEGREE`; its ratio c grows with l, so the last one is used for all. At q times the
+        radius, q <= 1, the truncation error is at most q^(p+1) times as much as on the sphere, and
+        that of the gradient q^p times as much.
 
         Rounding, in double precision. Each product of a coefficient passes through fewer than 2^10
         roundings, including its shifts to smaller cells. The sum of the absolute values of all
@@ -322,6 +355,7 @@ class _ClusterExpansion:
         compute it). So the value, and the gradient times the radius, are off by at most 2^-20 of
         norms[l-1]/r^(l+1).
         """
+        # powers: of the radius. inverse_power: 1/|r|^(l+1) in the loop over l; q_power: q^(p+1).
         inverse = dr.rsqrt(dr.squared_norm(r))
         harmonics = irregular_harmonics(r.x, r.y, r.z, inverse, DEGREE + len(norms))
         powers, q = [1.0], radius * inverse
@@ -333,6 +367,7 @@ class _ClusterExpansion:
             coefficient_keys(DEGREE), multipole_to_local(moments, harmonics, DEGREE), strict=True
         )
         coefficients = [term * powers[j] for (j, _, _), term in terms]
+        # total: the sum over l of the factor times the term's bound; magnitude: without the factor.
         ratio = 1.0
         for l, norm in enumerate(norms, start=1):
             inverse_power = inverse_power * inverse
@@ -341,6 +376,9 @@ class _ClusterExpansion:
                 total + factor * norm * inverse_power,
                 magnitude + norm * inverse_power,
             )
+        # Geometric series. A term of degree j has a gradient of at most j/radius times its largest
+        # value on the sphere; j grows from each term to the next by at most the factor
+        # (p + 2)/(p + 1).
         slope_ratio = ratio * (DEGREE + 2) / (DEGREE + 1)
         tail = total * q_power / (1 - ratio * q)
         slope = (DEGREE + 1) * total * q_power / (1 - slope_ratio * q)
@@ -349,16 +387,19 @@ class _ClusterExpansion:
     def of_cluster(
         self, left_out: Real, slope_left_out: Real, size: Real, area: Real, radius: Real
     ) -> list[Any]:
-        """What a cluster of dipoles, expanded from its moments up to degree 4, adds to the
-        attributes of `DipoleExpansions`, as a list of numbers.
+        """Compute what a source with an extent (a node or a triangle) adds to the attributes of
+        `DipoleExpansions`, in their order, as a flat list of numbers. The source was expanded from
+        its moments up to degree 4.
 
         left_out, slope_left_out: the numbers E and G of `multipole.truncation_bounds`, which bound
-            the terms of higher degree in value and gradient, for points that are no nearer to the
-            cluster than the ball is.
-        size: the cluster's radius.
-        area: the area of its dipoles.
+            the multipole terms of higher degree in value and gradient, at the distances of the
+            points of the ball.
+        size: the source's radius.
+        area: the sum of the areas of its dipoles.
         radius: the radius of the ball.
         """
+        # The points of the ball are farther from the source's center than the gap distance -
+        # radius.
         distance = dr.rcp(self.inverse)
         inverse_gap = dr.rcp(distance - radius)
         power = inverse_gap
@@ -373,10 +414,12 @@ class _ClusterExpansion:
 
 @dataclass(frozen=True)
 class PendingSources:
-    """The sources that n balls have not yet added to their expansions.
+    """The sources (nodes of a tree, or single primitives) that n balls have not yet added to their
+    local expansions. A primitive is a dipole or a triangle; a node stands for all its primitives. A
+    ball adds the sources that are far from it, and leaves the others to the smaller balls in it.
 
-    nodes: for each ball a list of nodes, each of which stands for all its primitives.
-    primitives: for each ball a list of primitives, as rows of the tree's primitives.
+    nodes: for each ball a list of the indices of nodes.
+    primitives: for each ball a list of the indices of primitives.
     """
 
     nodes: LaneLists
@@ -384,40 +427,43 @@ class PendingSources:
 
     @classmethod
     def of_root(cls, backend: Backend) -> PendingSources:
-        """The sources of a single ball that has added none: the root of a tree, which stands for
-        all its primitives."""
+        """Make the sources of a single ball that has added nothing yet: the root of the tree, which
+        stands for all primitives."""
         return cls(LaneLists.of_root(backend), LaneLists.empty(backend))
 
     def subset(self, backend: Backend, lanes: IntArray) -> PendingSources:
-        """The sources of the balls with these indices. An index may occur several times."""
+        """Select the sources of the balls with the indices `lanes`. An index may occur several
+        times."""
         return PendingSources(
             self.nodes.subset(backend, lanes), self.primitives.subset(backend, lanes)
         )
 
     @classmethod
     def concatenate(cls, backend: Backend, parts: list[PendingSources]) -> PendingSources:
-        """The sources of the balls of all parts, in the order of `parts`."""
+        """Join the sources of several groups of balls, in the order of `parts`."""
         nodes = LaneLists.concatenate(backend, [part.nodes for part in parts])
         return cls(nodes, LaneLists.concatenate(backend, [part.primitives for part in parts]))
 
     def split_far(
         self, tree: PackedTree, c: Vec3, radius: Real, factor: float, max_node_radius: Real
     ) -> tuple[DipoleExpansions, PendingSources]:
-        """Split the sources of each ball into those that are far from it, which are added up, and
-        the remaining ones.
+        """Split the sources of each ball into far sources, which are added up, and the remaining
+        sources.
 
+        tree: the tree of the primitives.
         c: (3, n) the centers of the balls.
         radius: the radius of the balls.
         factor: k of this module: a dipole is far if it is farther than `factor` radii from the
             center.
-        max_node_radius: a node that is not far, and no leaf, stays a node if its radius is at most
-            this. A larger node is replaced by its children, and a leaf by its primitives, each of
-            which is far or near by itself.
+        max_node_radius: an inner node that is not far remains a node if its radius is at most this.
+            A larger one is replaced by its children, and a leaf by its primitives, each of which
+            is far or near by itself.
 
         Returns the sums over the far sources, and the remaining sources. Each primitive is in
         exactly one far node, or is itself far, or is among the remaining sources.
         """
         backend, far_radius = tree.backend, factor * radius
+        # `far=far` binds the value of this pass of the loop.
         far, pending = (
             build_lists(
                 backend,
@@ -452,56 +498,63 @@ class PendingSources:
         count_limit: Any = None,
     ) -> Any:
         """Count the far primitives of each ball, or with far=False its near primitives, and write
-        them to lists. `build_lists` calls this function twice, to count and to write. The
-        primitives are those in the list `primitives`, and those of the leaves below the listed
-        nodes that are not far.
+        their indices to lists. `build_lists` calls this function twice, to count and to write.
 
+        The search goes through two sets: the primitives in the list `primitives`; and the
+        primitives in leaves that are not far, in the subtrees of the nodes in the list `nodes`. A
+        node that is far or remains a node is not entered.
+
+        tree: the tree of the primitives.
         c: (3, n) the centers of the balls.
-
-        far_radius: k rho: a dipole is far if its distance from c is more than this. For a triangle
-            `TRIANGLE_RATIO` times its radius is added.
-        max_node_radius: nodes up to this radius stay nodes, so that their primitives are not
-            visited.
-        store: writes an entry; None to count only.
+        far_radius: a dipole is far if its distance from c is more than this, which is k times the
+            radius of the balls. For a triangle `TRIANGLE_RATIO` times its radius is added.
+        max_node_radius: inner nodes up to this radius remain nodes.
+        store: a function that writes an entry; None to count only.
+        far: whether far primitives are sought, and not near ones.
         count_limit: once a count exceeds this, the remaining primitives need not be counted.
 
         Returns the number of primitives on each lane.
 
-        A leaf that is far has no near primitives: a triangle's box lies in the ball of its node, of
-        radius R. So `TRIANGLE_RATIO` times the triangle's radius is at most 1.5 * 2 R = 3 R, while
-        its centroid is farther from c than far_radius + 4 R - R.
+        Proof that a far leaf has no near primitives. A triangle's box lies in the ball of its leaf,
+        of radius R. So `TRIANGLE_RATIO` times the triangle's radius is at most 1.5 * 2 R = 3 R,
+        while its centroid is farther from c than far_radius + 4 R - R.
         """
         uint_t, vector = tree.backend.UInt32, tree.backend.Array3f
         are_points = tree.primitives.packets_per_record == 1
 
         def is_chosen(row: list[Real], active: Mask) -> Mask:
-            """The mask of the lanes on which the primitive in the record `row` is to be counted: it
-            is far, or with far=False near, and its slot is not empty."""
+            """Decide on which active lanes a primitive is counted: it is far, or with far=False
+            near, and its slot is not empty (its area is positive). row: the primitive's record."""
             far_distance = far_radius if are_points else far_radius + row[7]
             is_far = dr.squared_norm(c - vector(*row[:3])) > dr.square(far_distance)
             return (is_far if far else ~is_far) & (row[6] > 0) & active
 
         def visit(node: VisitedNode, state: tuple[Any, ...]) -> tuple[Mask, tuple[Any, ...]]:
-            """Count, and store, the chosen primitives of a leaf that is not far.
+            """Visit a node of the tree. In a leaf that is not far, count and store the primitives
+            that are sought.
 
-            state: the number of primitives so far.
+            node: its `head` holds center, `_NODE_RATIO` times the radius, and radius.
+            state: a tuple with the number of primitives so far.
 
-            Returns whether the walk enters the node, and the new number.
+            Returns the mask of the lanes that enter the node, and the new number.
             """
             square = dr.squared_norm(c - vector(*node.head[:3]))
             enters = square <= dr.square(far_radius + node.head[3])
-            if are_points and not far:  # only nodes whose ball comes near have near points
+            # Only nodes whose ball comes near have near dipoles; the radius is increased a little
+            # against rounding.
+            if are_points and not far:
                 enters &= square <= dr.square(far_radius + node.head[4] * (1 + 1e-9) + 1e-12)
             enters &= node.is_leaf | (node.head[4] > max_node_radius)
             if count_limit is not None:
                 enters &= state[0] <= count_limit
 
             def runs(slot: Any, *_: Any) -> Mask:
-                """The mask of the lanes that enter the leaf and have further slots in it."""
+                """Whether the loop goes on, for each lane: it enters a leaf that has this slot."""
                 return enters & node.is_leaf & (slot < tree.leaf_size)
 
             def step(slot: Any, count: Any) -> tuple[Any, ...]:
-                """Count, and store, the primitive in a slot of the leaf if it is chosen."""
+                """Count and store the primitive in a slot of the leaf if it is sought. count: the
+                number so far."""
                 chosen = is_chosen(tree.primitive(node.leaf, slot, enters), enters)
                 if store is not None:
                     store(count, node.leaf * tree.leaf_size + slot, chosen)
@@ -512,8 +565,10 @@ class PendingSources:
             )
 
         def listed(i: Any, active: Mask, state: tuple[Any, ...]) -> tuple[Any, ...]:
-            """Count, and store, primitive i of the list if it is chosen. state: the number of
-            primitives so far. Returns the new number."""
+            """Count and store primitive i of the ball's list if it is sought.
+
+            state: a tuple with the number of primitives so far. Returns the new number.
+            """
             chosen = is_chosen(tree.primitives.read_record(i, active), active)
             if store is not None:
                 store(state[0], i, chosen)
@@ -533,31 +588,35 @@ def _count_nodes(
     *,
     far: bool,
 ) -> Any:
-    """Count the far nodes of each ball, or with far=False its pending nodes, and write them to
-    lists. `build_lists` calls this function twice, to count and to write. The nodes are those in
-    the subtrees of the nodes in `lists`.
+    """Count the far nodes of each ball, or with far=False its pending nodes, and write their
+    indices to lists. `build_lists` calls this function twice, to count and to write.
 
-    Pending nodes are inner nodes that are not far and have a radius of at most `max_node_radius`.
-    Other nodes that are not far are replaced by their children. Leaves that are not far are in
-    neither list.
+    The search goes through the subtrees of the nodes in `lists`. Pending nodes are inner nodes that
+    are not far and have a radius of at most `max_node_radius`. Other inner nodes that are not far
+    are replaced by their children. Leaves that are not far are neither far nor pending; their
+    primitives are counted by `PendingSources.primitives_of`.
 
+    tree: the tree of the primitives.
+    lists: for each ball, the nodes at which the search begins.
     c: (3, n) the centers of the balls.
-    far_radius: k rho, with rho the balls' radius and k > 1: a node of radius R is far if its center
-        is farther from c than far_radius + `_NODE_RATIO` R.
+    far_radius: k times the balls' radius, k > 1. A node of radius R is far if its center is farther
+        from c than far_radius + `_NODE_RATIO` R.
     store: a function that writes an entry to a list; None to count only.
+    far: whether far nodes are sought, and not pending ones.
 
     Returns the number of nodes on each lane.
     """
     uint_t, vector = tree.backend.UInt32, tree.backend.Array3f
 
     def visit(node: VisitedNode, state: tuple[Any, ...]) -> tuple[Mask, tuple[Any, ...]]:
-        """Count a node, and store its index, if it is of the kind that is sought. In `node.head`,
-        entry 3 is `_NODE_RATIO` times the radius of the node and entry 4 is the radius.
+        """Count a node, and store its index, if it is of the kind that is sought.
 
-        state: the number of nodes so far.
+        node: its `head` holds center, `_NODE_RATIO` times the radius, and radius.
+        state: a tuple with the number of nodes so far.
 
-        Returns whether the walk enters the node, and the new number.
+        Returns the mask of the lanes that enter the node, and the new number.
         """
+        # Nodes that are neither far nor pending are entered: the walk goes on to their children.
         is_far = dr.squared_norm(c - vector(*node.head[:3])) > dr.square(far_radius + node.head[3])
         is_pending = ~is_far & ~node.is_leaf & (node.head[4] <= max_node_radius)
         chosen = is_far if far else is_pending

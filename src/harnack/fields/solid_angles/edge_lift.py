@@ -1,17 +1,20 @@
-"""The lifted solid angle of boundary edges. It is a real number, not only known modulo 4 pi, and it
-has no jumps along a ray.
+"""The lifted solid angle of the boundary edges of a mesh. A solid angle is known only modulo 4 pi;
+the lifted one is a real number that has no jumps along a ray. It is the sum over the edges of the
+solid angle Omega_e of the triangle from the edge to an apex at infinity, opposite to the ray's
+direction d (the antipodal method, Martens, Trettner and Bessmeltsev 2026). Omega_e is twice the
+argument of a complex number, the edge's factor F_e, so that the sum is twice the argument of the
+product of all factors. x is a point on a ray.
 
-The antipodal method (Martens, Trettner and Bessmeltsev 2026) adds up triangles from every edge to
-an apex at infinity, opposite to a direction d. Let an edge e run from a to b, relative to x. Its
-triangle has the solid angle Omega_e = 2 arg F_e with F_e = (s_a s_b + a'.b') - i (a' x b'). Here a'
-is a projected along d (two numbers), and s_a = |a| - a.d. Then
+Let an edge e run from a to b, relative to x. Its factor is F_e = (s_a s_b + a'.b') - i (a' x b').
+Here a' is a projected along d (two numbers), and s_a = |a| - a.d. Then
 
     w(x) = sum of signs of all crossings of the ray from x along d  +  1/(4 pi) sum_e Omega_e(x)
 
-is the winding number of *any* triangles with these boundary edges. For F_e crosses the negative
-axis exactly where the ray from x along d passes through e, and there the sum of the signs changes
-by as much. As x moves along d itself, that ray only gets shorter. So sum_e Omega_e is continuous
-on the whole ray off the edges, and the jumps of w are those of the triangles passed.
+is the winding number of *any* triangles with these boundary edges. The crossings are those of the
+ray with these triangles. Proof: F_e crosses the negative axis exactly where the ray from x along d
+passes through e, and there the sum of the signs changes by as much. As x moves along d, its ray
+only gets shorter. So sum_e Omega_e is continuous on the whole ray off the edges, and w jumps only
+at the triangles that x passes.
 """
 
 from __future__ import annotations
@@ -36,8 +39,8 @@ if TYPE_CHECKING:
     from harnack.tree.balanced_tree import FloatArray, IntArray
     from harnack.tree.triangle_tree import RayFrame
 
-# The number of edges that each pass through the loop adds. Edges that pad the last pass have length
-# and direction 0.
+# The number of edges that each pass of the loop over edges adds. Edges that pad the last pass have
+# length and direction 0.
 _EDGES_PER_TRIP = 4
 # An imaginary part of a factor that would be zero is replaced by plus or minus this number.
 _TINY = 1e-36
@@ -48,39 +51,50 @@ _TINY = 1e-36
 # Proof. Errors of arguments add up, as each step is compared with the exact product of its rounded
 # inputs. (1) `times` multiplies by F: each part of the result is off by at most u times the size of
 # a single product and u times itself, the result by 2 u of its length, and scaling it by another u.
-# The factor common to both parts does not turn it. (2) F = <chi_a, chi_b>, with chi = (s, a') of
-# length sqrt(2 s |a|), and |F| = P c, P = |chi_a||chi_b|, c the cosine of half the angle that the
-# edge subtends. By Cauchy and Schwarz no partial sum is more than P. The real part has three
-# roundings, of at most u P each, the imaginary part two: F is off by sqrt(13) u P, and turned by
-# 3.61 u/c. Together Omega is off by 2 (3 + 3.61/c) u. If the edge subtends at most a right angle,
-# 1/c <= sqrt(2): by 16.3 u. If it subtends more, x lies in the ball over it: with length L = 2h and
-# distance d <= h, 1/c <= sqrt(d^2 + h^2)/d <= L e', e' = h/(d sqrt(d^2 + h^2)): by 7.3 u L e'
-# besides.
+# The error of the scale is common to both parts and does not turn the result.
+# (2) F = <chi_a, chi_b>, with chi = (s, a') of length sqrt(2 s |a|). Its length is |F| = P c, with
+# P = |chi_a||chi_b| and the cosine c of half the angle that the edge subtends. By Cauchy and
+# Schwarz no partial sum is more than P. The real part has three roundings, of at most u P each, the
+# imaginary part two: F is off by sqrt(13) u P, and turned by 3.61 u/c. Together Omega is off by
+# 2 (3 + 3.61/c) u. If the edge subtends at most a right angle, 1/c <= sqrt(2), and this is 16.3 u.
+# If it subtends more, x lies in the ball over it: with length L = 2h and distance d <= h,
+# 1/c <= sqrt(d^2 + h^2)/d <= L e' with e' = h/(d sqrt(d^2 + h^2)), so Omega is also off by
+# 7.3 u L e'.
 FACTOR_ROUNDINGS, STEEP_ROUNDINGS = 16.5, 7.5
 
 
 @dataclass(frozen=True)
 class LiftedEdges:
-    """Directed edges on a backend. Each has a record of both ends, its direction and its length
-    (`edge_records`)."""
+    """Directed boundary edges on a backend, for lifted solid angles: sums over edges that are real
+    numbers, not only known modulo 4 pi. Each edge has a record of its ends, its direction, and one
+    over its squared length (`edge_records`)."""
 
     records: RecordTable
 
     @classmethod
     def upload(cls, backend: Backend, vertices: FloatArray, edges: IntArray) -> LiftedEdges:
-        """Upload edges (k, 2) between vertices (n, 3). An edge of weight w is repeated w times."""
+        """Upload directed edges to a backend.
+
+        vertices: (n, 3).
+        edges: (k, 2) the indices of start and end of each edge. An edge that counts w times occurs
+            w times.
+        """
         table = edge_records(vertices, edges)
+        # An edge from a vertex to itself, with direction 0, adds nothing.
         padding = np.concatenate([table[0, :3], [0.0], table[0, :3], table[0, 7:]])
         return cls(RecordTable.upload(backend, table, padding, _EDGES_PER_TRIP))
 
 
 def edge_records(vertices: FloatArray, edges: IntArray) -> FloatArray:
-    """Records (k, 8) of directed edges (k, 2) between vertices (n, 3): lower end, direction, higher
-    end, 1/length^2.
+    """Make records (k, 8) of directed edges. A record holds the end with the lower vertex index
+    (3,), the direction, the end with the higher index (3,), and 1/length^2. The direction is 1 if
+    the edge runs from the lower to the higher index, and -1 if it runs back.
 
-    The lower end is the one with the lower vertex index. Edges of triangles have the same order of
-    ends (`tree.triangle_tree`), so that `edge_function` gives the same bits for both. The direction
-    is 1 if the edge runs from the lower to the higher index, and -1 if it runs back.
+    vertices: (n, 3).
+    edges: (k, 2) the indices of start and end of each edge.
+
+    The tree of triangles (`tree.triangle_tree`) has the same order of ends for the edges of its
+    triangles. So `edge_function` gives the same bits for an edge here and there.
     """
     low, high = vertices[edges.min(axis=1)], vertices[edges.max(axis=1)]
     direction = np.where(edges[:, 0] < edges[:, 1], 1.0, -1.0)
@@ -89,11 +103,14 @@ def edge_records(vertices: FloatArray, edges: IntArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class LiftedEdge:
-    """An edge relative to a point x, and to rays of a single direction.
+    """A boundary edge relative to a point x on a ray. Its solid angle Omega_e is that of the
+    triangle from the edge to an apex at infinity, opposite to the ray's direction. Its factor F_e
+    is a complex number whose argument is half of Omega_e.
 
     edge: the edge relative to x.
     ends: its end points in absolute coordinates, in the order of their indices.
-    frame: the frame of the rays, which gives coordinates across the rays and along them.
+    frame: the frame of rays of a single direction, which gives coordinates across the rays and
+        along them.
     direction: 1 if the boundary runs from the first end to the second, -1 if it runs back. All
         terms of the edge are multiplied by it.
     """
@@ -113,7 +130,7 @@ class LiftedEdge:
         frame: RayFrame | VerticalRayFrame,
         x: Vec3,
     ) -> LiftedEdge:
-        """The edge from p to q relative to a point x that lies on a ray of the frame.
+        """Make the edge from p to q relative to a point x that lies on a ray of the frame.
 
         direction: 1 if the boundary runs from p to q, -1 if it runs back.
         inverse: 1/|q-p|^2.
@@ -121,8 +138,9 @@ class LiftedEdge:
         return cls(Edge.between(p, q, inverse, x), (p, q), frame, direction)
 
     def factor(self) -> tuple[Real, Real]:
-        """Real and imaginary part of the factor F_e, whose argument is half the solid angle of the
-        edge's triangle (see the module)."""
+        """Compute the real and the imaginary part of the edge's factor F_e, whose argument is half
+        the solid angle of the edge's triangle."""
+        # a, b: the ends relative to x, as two coordinates across the ray and one along it.
         vector, frame, edge = cast("Any", type(self.edge.a)), self.frame, self.edge
         pairs = zip(self.ends, (edge.a, edge.b), strict=True)
         a, b = (vector(*frame.transverse(p), frame.component(a)) for p, a in pairs)
@@ -130,15 +148,21 @@ class LiftedEdge:
         return re, self.direction * im
 
     def terms(self, derivatives: int, active: Mask) -> SourceTerm:
-        """What the edge adds to the gradient (for `derivatives` >= 1) and to the Hessian (for
-        `derivatives` = 2) of the sum of solid angles. It adds 0 on lanes that are not active. The
-        value is None, because angles are added up by a product of factors."""
+        """Compute what the edge adds to the derivatives of the sum of solid angles, by Biot and
+        Savart's law.
+
+        derivatives: 0 for none, 1 for the gradient, 2 for the Hessian as well.
+        active: the mask of the lanes on which the edge counts; it adds 0 on the others.
+
+        The value of the result is None, because angles are added up by a product of factors.
+        """
         if derivatives == 0:
             return SourceTerm(None)
         weight, c = self.edge.biot_savart()
         gradient = dr.select(active, self.direction * weight, 0) * c
         if derivatives == 1:
             return SourceTerm(None, gradient)
+        # The term of the Hessian is (c rate^T + rate c^T)/2, as `add_outer_product` adds it.
         c, rate = self.edge.hessian_factors()
         c, rate = dr.select(active, self.direction * c, 0), dr.select(active, rate, 0)
         return SourceTerm(
@@ -146,7 +170,8 @@ class LiftedEdge:
         )
 
     def bounds(self, unit: Real) -> tuple[Real, Real, Real]:
-        """Bounds for this edge: of rounding, and of its share in Taylor's remainder.
+        """Compute bounds of what the edge adds to the rounding error of the sum of solid angles,
+        and to the remainder of its linear Taylor polynomial.
 
         unit: a bound of the rounding of a coordinate (`coordinate_rounding`). Coordinates that are
             correctly rounded are off by half of it.
@@ -160,12 +185,12 @@ class LiftedEdge:
         `half_integral`.
 
         Rounding. The ends of the edge, x, and their differences together are off by half a unit.
-        This changes the angle by at most that length times Biot and Savart's field, which is at
-        most 2e'. The rounding of the number s of an end (see the module) acts as if the end had
-        moved by another half unit. Both edges at an end use the same bits of s, so that this
+        This changes the angle by at most that length times the edge's Biot and Savart field, which
+        is at most 2e'. The rounding of the number s of an end (see the module) acts as if the end
+        had moved by another half unit. Both edges at an end use the same bits of s, so that this
         moves a single point of the boundary. The sums in the factor, and the product, add
-        `FACTOR_ROUNDINGS` unit roundoffs, and `STEEP_ROUNDINGS` L e' if the edge subtends more than
-        a right angle. The rounding is less than 4 pi in any case.
+        `FACTOR_ROUNDINGS` unit roundoffs, and `STEEP_ROUNDINGS` L e' unit roundoffs if the edge
+        subtends more than a right angle. An angle is off by less than 4 pi in any case.
 
         Remainder. Let rho be the distance from x to a point p of the edge. At the distance t from x
         the solid angle differs from its linear Taylor polynomial by at most 3/4 t^2 times the
@@ -174,6 +199,7 @@ class LiftedEdge:
         bounds 1/(1 - q), for q = t/rho up to its largest value b, by 1 + q/(1 - b), and adds up the
         two parts with the weights s4 and s5. So the terms e/2 and 3e/(8d) bound the edge's share.
         """
+        # factor_rounding is not multiplied by anything, steep_rounding by e'.
         distance = fmax(dr.sqrt(self.edge.squared_distance) - 2 * unit, 0)
         half_field, half_integral = edge_variation(
             distance * distance, self.edge.inverse_square_length
@@ -192,11 +218,12 @@ class LiftedEdge:
 
 @dataclass(frozen=True)
 class LiftedSums:
-    """Sums over edges and other sources. The angles of the edges are kept as a product of complex
-    factors, and are not yet part of the value.
+    """Sums at a point over boundary edges, and possibly over other sources. The value is a sum of
+    solid angles Omega_e of the edges. They are kept as a product of complex factors F_e, whose
+    argument is half the sum, and are added to the value at the end (`total`).
 
-    sums: the value without the angles of edges, the derivatives, and all bounds.
-    product: the product of the factors F_e of the edges, whose argument is half the sum of angles.
+    sums: the value without the angles of edges; the derivatives; and all bounds.
+    product: the product of the factors F_e of the edges.
     """
 
     sums: SourceSums
@@ -204,28 +231,31 @@ class LiftedSums:
 
     @classmethod
     def zero(cls, backend: Backend, derivatives: int) -> LiftedSums:
-        """Sums over nothing. derivatives: 0 for the value only, 1 with the gradient, 2 with the
-        Hessian."""
+        """Make the sums over no edges, to which edges can be added. derivatives: 0 for the value
+        only, 1 with the gradient, 2 with the Hessian."""
         return cls(
             SourceSums.zero(backend, dr.inf, derivatives), LiftedProduct.identity(backend.Float)
         )
 
     @classmethod
     def of(cls, parts: tuple[Any, ...]) -> LiftedSums:
-        """The sums from a state of a loop, as the method `parts` returns it."""
+        """Make the sums from the state of a recorded loop, as the method `parts` returns it."""
         return cls(SourceSums.from_state(parts[0]), LiftedProduct(*parts[1]))
 
     def parts(self) -> tuple[Any, ...]:
-        """The numbers of the sums and of the product as nested tuples, for the state of a loop."""
+        """List the numbers of the sums and of the product as nested tuples, for the state of a
+        recorded loop."""
         return self.sums.to_state(), self.product.parts()
 
     def add_edge(self, edge: LiftedEdge, unit: Real, active: Mask) -> LiftedSums:
-        """The sums with an edge added on active lanes. unit: a bound of the rounding of a
-        coordinate."""
+        """Add an edge on active lanes, and return the new sums.
+
+        unit: a bound of the rounding of a coordinate.
+        """
         (re, im), terms = edge.factor(), edge.terms(self.sums.derivatives, active)
         sums = self.sums.add_term(terms, True)
         rounding, s4, s5 = edge.bounds(unit)
-        # A factor of 1 scales the product, too.
+        # On other lanes the product is multiplied by 1; scaling it again may round it.
         rounding = dr.select(active, rounding, 2 * float(dr.epsilon(rounding)))
         distance = fmin(dr.sqrt(edge.edge.squared_distance), sums.singularity_distance)
         sums = dataclasses.replace(
@@ -240,17 +270,17 @@ class LiftedSums:
 
     @property
     def angle(self) -> Real:
-        """The sum of the solid angles Omega_e of the edges' triangles."""
+        """The sum of the solid angles Omega_e of all edges added so far, a real number."""
         return self.product.angle()
 
     def total(self) -> SourceSums:
-        """The sums, with the solid angles of the edges added to the value."""
+        """Complete the sums: add the solid angles of the edges to the value."""
         return self.sums.add_term(SourceTerm(self.angle), True)
 
 
 def lifted_sums(edges: LiftedEdges, x: Vec3, derivatives: int) -> LiftedSums:
-    """Sums over all edges at points x (3, n), in one loop: the solid angles of the edges' triangles
-    with their apex at infinity opposite to the direction d = z, derivatives, and bounds.
+    """Sum over all edges at points x (3, n), in one loop: the lifted solid angle for rays in the
+    direction d = z, its derivatives, and bounds of errors and remainder.
 
     derivatives: 0 for the angle only, 1 with the gradient, 2 with the Hessian. Results that are not
         used are not computed.
@@ -259,8 +289,9 @@ def lifted_sums(edges: LiftedEdges, x: Vec3, derivatives: int) -> LiftedSums:
     vector = backend.Array3f
 
     def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
-        """Add the edge in the record `row` to the state of the sums."""
+        """Add the edge in the record `row` to the sums, given as a state."""
         p, q = vector(*row[:3]), vector(*row[4:7])
+        # Padding has the direction row[3] = 0 and is not active.
         edge = LiftedEdge.between(p, q, row[3], row[7], VerticalRayFrame(x), x)
         return LiftedSums.of(state).add_edge(edge, unit, row[3] != 0).parts()
 
@@ -269,14 +300,19 @@ def lifted_sums(edges: LiftedEdges, x: Vec3, derivatives: int) -> LiftedSums:
 
 
 def edge_rates(edges: LiftedEdges, x: Vec3, derivatives: int) -> SourceSums:
-    """The gradient and, for derivatives = 2, the Hessian of the solid angle of closed edges at
-    points x (3, n), by Biot and Savart's law. The sums have no value, but the terms `s4` and `s5`,
-    by which their errors are bounded."""
+    """Compute the derivatives, without the value, of the solid angle of closed boundary edges at
+    points x (3, n), by Biot and Savart's law.
+
+    derivatives: 1 for the gradient, 2 with the Hessian.
+
+    Returns sums without a value; `s4` and `s5` bound the errors of the derivatives.
+    """
     backend, unit = edges.records.backend, coordinate_rounding(x)
     vector = backend.Array3f
 
     def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
-        """Add the edge in the record `row` to the state of the sums."""
+        """Add the edge in the record `row` to the sums, given as a state. Padding, of direction 0,
+        adds nothing."""
         p, q, active = vector(*row[:3]), vector(*row[4:7]), row[3] != 0
         edge = LiftedEdge.between(p, q, row[3], row[7], VerticalRayFrame(x), x)
         sums = SourceSums.from_state(state).add_term(edge.terms(derivatives, active), True)
@@ -290,7 +326,7 @@ def edge_rates(edges: LiftedEdges, x: Vec3, derivatives: int) -> SourceSums:
 
 @dataclass(frozen=True)
 class VertexView:
-    """A vertex as seen from a point x on a ray.
+    """A vertex of a boundary edge as seen from a point x on a ray.
 
     offset: the vector from x to the vertex.
     length: the length of the offset.
@@ -306,7 +342,7 @@ class VertexView:
 
 
 def view_vertex(p: Vec3, frame: RayFrame, x: Vec3) -> VertexView:
-    """The vertex p as seen from the point x on a ray of the frame."""
+    """Compute how the vertex p is seen from the point x on a ray of the frame."""
     offset = p - x
     length = dr.norm(offset)
     u, v = frame.transverse(p)
@@ -315,9 +351,11 @@ def view_vertex(p: Vec3, frame: RayFrame, x: Vec3) -> VertexView:
 
 
 def edge_factor_of_views(a: VertexView, b: VertexView, direction: Real) -> tuple[Real, Real]:
-    """Real and imaginary part of the factor F_e = (s_a s_b + a'.b') - i (a' x b') of the edge from
-    a to b, whose argument is half the solid angle of the edge's triangle (see the module).
+    """Compute the real and the imaginary part of the factor F_e = (s_a s_b + a'.b') - i (a' x b')
+    of the edge from a to b. Its argument is half the solid angle of the edge's triangle (see the
+    module).
 
+    a, b: the ends of the edge, as seen from x.
     direction: positive if a has the lower vertex index, else negative. The cross product a' x b' is
         computed from the ends in the order of their indices. So all computations of the same edge
         get the same bits, and agree on which side of the ray the edge passes.
@@ -331,8 +369,8 @@ def edge_factor_of_views(a: VertexView, b: VertexView, direction: Real) -> tuple
 
 
 def edge_factor(a: Vec3, b: Vec3, la: Real, lb: Real) -> tuple[Real, Real]:
-    """Real and imaginary part of the factor F_e of the edge from a to b, whose argument is half the
-    solid angle of the edge's triangle (see the module).
+    """Compute the real and the imaginary part of the factor F_e of the edge from a to b. Its
+    argument is half the solid angle of the edge's triangle (see the module).
 
     a, b: the ends relative to a point x, as (u, v, z), with two coordinates across the direction d
         and the coordinate along it.
@@ -344,38 +382,43 @@ def edge_factor(a: Vec3, b: Vec3, la: Real, lb: Real) -> tuple[Real, Real]:
 
 
 def _factor(a: tuple[Real, Real], b: tuple[Real, Real], sa: Real, sb: Real) -> tuple[Real, Real]:
-    """Real and imaginary part of the factor F_e = (sa sb + a.b) - i (a x b) of an edge.
+    """Compute the real and the imaginary part of the factor F_e = (sa sb + a.b) - i (a x b) of an
+    edge. Its argument is half the solid angle of the edge's triangle (see the module).
 
     a, b: the coordinates (u, v) of both ends relative to the ray, across its direction d.
     sa, sb: for both ends, the distance from x minus the component along d.
 
-    A ray that passes exactly through an edge or a vertex is treated as if its v were smaller by an
-    infinitesimal amount, and its u by a much smaller infinitesimal amount.
+    The imaginary part is never zero, so that its sign always tells on which side of the ray the
+    edge passes. A ray that passes exactly through an edge or a vertex is treated as if its v were
+    smaller by an infinitesimal amount, and its u by a much smaller infinitesimal amount.
     `tree.triangle_tree.signed_crossing` uses the same rule for crossings.
     """
     real, (au, av), (bu, bv) = cast("Any", type(sa)), a, b
+    # An end that lies on the ray is moved off it a little.
     on_ray = (au == 0) & (av == 0), (bu == 0) & (bv == 0)
     ax, bx = dr.select(on_ray[0], real(-1e-18), au), dr.select(on_ray[1], real(-1e-18), bu)
     im = -edge_function((ax, av), (bx, bv))
     re = dr.fma(sa, sb, dr.fma(ax, bx, av * bv))
+    # The sign of the imaginary part after the infinitesimal move of the ray, if it is zero now.
     tie = dr.select(av == bv, ax - bx, bv - av)
-    # Only the sign of a real factor matters. The factor may be so small that it would be no larger
-    # than the number that stands for its imaginary part.
+    # Only the sign of a real factor matters, and it may be smaller than `_TINY`. So it is replaced
+    # by 1 or -1; by 1 also if both ends lie on the ray.
     is_real = im == 0
     re = dr.select(is_real, dr.select((re < 0) & ~(on_ray[0] & on_ray[1]), real(-1), 1), re)
     return re, dr.select(is_real, dr.mulsign(real(_TINY), tie), im)
 
 
 def _length_less_axial(a: Vec3, length: Real) -> Real:
-    """s = |a| - a.d, without cancellation, of a vector a = (u, v, z) with z along the direction d.
-    length: |a|."""
+    """Compute s = |a| - a.d, without cancellation, for a vector a = (u, v, z), whose z is its
+    component a.d along the direction d. length: |a|."""
     square = dr.fma(a.x, a.x, a.y * a.y)
     return dr.select(a.z > 0, square / (length + a.z), length - a.z)
 
 
 @dataclass(frozen=True)
 class LiftedProduct:
-    """A product of complex factors, scaled to a length of about 1, with the sum of their arguments.
+    """A product of the complex factors of edges, together with the sum of their arguments, which is
+    a real number and not only known modulo 2 pi. The product is scaled to a length of about 1.
 
     re, im: real and imaginary part of the product.
     turns: the number of full turns by which the sum of the factors' arguments is larger than the
@@ -388,20 +431,21 @@ class LiftedProduct:
 
     @classmethod
     def identity(cls, real: Any) -> LiftedProduct:
-        """The product of no factors. real: the type of its numbers."""
+        """Make the product of no factors, which is 1. real: the type of its numbers."""
         return cls(real(1), real(0), real(0))
 
     def parts(self) -> tuple[Real, Real, Real]:
-        """The attributes in the order of the constructor, for the state of a loop."""
+        """List the attributes in the order of the constructor, for the state of a recorded loop."""
         return self.re, self.im, self.turns
 
     def times(self, re: Real, im: Real) -> LiftedProduct:
-        """The product with a further factor re + i im.
+        """Multiply by a further factor re + i im, and return the new product. If the product is 0
+        or overflows, so that it cannot be scaled, re and im of the old product are kept.
 
         Arguments lie in (-pi, pi]. If the arguments of both factors have different signs, the
         argument of the product is their sum. Otherwise the sum has left the interval exactly if the
-        product's imaginary part has the other sign. That is so for two factors of argument -pi/2:
-        their sum -pi counts as pi and one turn less.
+        product's imaginary part has the other sign. (So two factors of argument -pi/2 have the
+        product -1 of argument pi, with one turn less, as their arguments add up to -pi.)
         """
         new_re = dr.fma(self.re, re, -(self.im * im))
         new_im = dr.fma(self.re, im, self.im * re)
@@ -421,5 +465,6 @@ class LiftedProduct:
         )
 
     def angle(self) -> Real:
-        """Twice the sum of the factors' arguments: the sum of the edges' solid angles."""
+        """Compute twice the sum of the factors' arguments, which is the sum of the edges' solid
+        angles."""
         return 2 * dr.fma(2 * dr.pi, self.turns, dr.atan2(self.im, self.re))

@@ -1,4 +1,8 @@
-"""Local expansions: the field of dipoles outside of a ball as a harmonic polynomial in the ball.
+"""Local expansions: the potential f of dipoles outside of a ball as a harmonic polynomial in the
+ball. The coefficients L_jk are complex numbers of degree j and order k. They can be computed from
+multipole moments M_lm of the dipoles about another point (`multipole`), and can be moved to the
+centers of smaller balls. The ball has the center c and the radius rho. A complex number is a pair
+(real part, imaginary part).
 
 With the harmonics of `multipole` and coefficients L_jk about the center c of a ball of radius rho,
 every f that is harmonic in the ball is
@@ -33,9 +37,9 @@ if TYPE_CHECKING:
 
 
 def coefficient_keys(degree: int) -> list[tuple[int, int, int]]:
-    """The keys (j, k, part) of the (degree + 1)^2 coefficients of a local expansion, in the order
-    in which they are stored. A key stands for the real part (part = 0) or the imaginary part (part
-    = 1) of L_jk, with j <= degree and 0 <= k <= j; L_j0 is real."""
+    """List the keys (j, k, part) of the (degree + 1)^2 coefficients of a local expansion, in the
+    order in which they are stored. A key stands for the real part (part = 0) or the imaginary part
+    (part = 1) of L_jk, with j <= degree and 0 <= k <= j. L_j0 is real and has no second key."""
     return [
         (j, k, part)
         for j in range(degree + 1)
@@ -45,10 +49,12 @@ def coefficient_keys(degree: int) -> list[tuple[int, int, int]]:
 
 
 def irregular_harmonics(x: Any, y: Any, z: Any, inverse: Any, degree: int) -> Pairs:
-    """The irregular solid harmonics I_lm at the vector (x, y, z), for l <= degree and 0 <= m <= l,
-    as pairs of real and imaginary part.
+    """Compute the irregular solid harmonics I_lm at the vector (x, y, z), for l <= degree and
+    0 <= m <= l.
 
     inverse: 1/r, with r the length of (x, y, z).
+
+    Returns a dictionary of pairs (real part, imaginary part) by (l, m).
 
     With the regular solid harmonics R_lm of `multipole`, I_lm = (l+m)! (l-m)! R_lm / r^(2l+1) by
     definition, and R_lm(v / r^2) = R_lm(v) / r^(2l).
@@ -62,9 +68,12 @@ def irregular_harmonics(x: Any, y: Any, z: Any, inverse: Any, degree: int) -> Pa
 
 
 def _signed(values: Pairs, l: int, m: int) -> tuple[Any, Any]:
-    """The real and imaginary part of the entry (l, m) of harmonics or moments, for m of either
-    sign. `values` has the entries for m >= 0. For m < 0 the entry is (-1)^m times the conjugate of
-    the entry (l, -m)."""
+    """Look up the entry (l, m) of harmonics or moments, for m of either sign, as a pair (real part,
+    imaginary part).
+
+    values: the entries for m >= 0. For m < 0 the entry is (-1)^m times the conjugate of the entry
+        (l, -m).
+    """
     re, im = values[l, abs(m)]
     if m >= 0:
         return re, im
@@ -72,18 +81,23 @@ def _signed(values: Pairs, l: int, m: int) -> tuple[Any, Any]:
 
 
 def multipole_to_local(moments: Pairs, harmonics: Pairs, degree: int) -> list[Any]:
-    """The coefficients L_jk of the local expansion about a point c, up to `degree` and in the order
-    of `coefficient_keys`, of the field f of dipoles with given multipole moments.
+    """Compute the coefficients L_jk of the local expansion of the potential f of dipoles about a
+    point c, from the dipoles' multipole moments.
 
-    moments: the moments M_lm of the dipoles about a point y; moments of other degrees count as 0.
+    moments: the moments M_lm of the dipoles about a point y, by (l, m). Moments of degrees that are
+        missing count as 0.
     harmonics: I_lm (`irregular_harmonics`) at c - y, up to the degree `degree` plus the largest
         degree of the moments.
+    degree: the largest degree j.
+
+    Returns real and imaginary parts in the order of `coefficient_keys`, without powers of a radius.
 
     Proof. f(x) = -sum conj(M_lm) I_lm(x - y). The addition theorem of R, applied to both arguments
     of 1/|r + u - y| = sum conj(R_lm(y)) I_lm(r + u) = sum conj(R_lm(y - u)) I_lm(r), gives
     I_lm(r + u) = sum_jk conj(R_jk(-u)) I_(l+j),(m+k)(r), as the R_lm are linearly independent, and
     R_jk(-u) = (-1)^j R_jk(u). So L_jk = -(-1)^j sum_lm conj(M_lm) I_(l+j),(m+k)(c - y).
     """
+    # conj(a + ib)(u + iv) = (au + bv) + i (av - bu).
     coefficients: list[Any] = []
     degrees = sorted({l for l, _ in moments})
     for j in range(degree + 1):
@@ -102,15 +116,18 @@ def multipole_to_local(moments: Pairs, harmonics: Pairs, degree: int) -> list[An
 
 
 def local_to_local_matrices(degree: int, offset: float) -> FloatArray:
-    """Matrices T (8, n, n) that shift a local expansion from the center of a cube to the centers of
-    its eight octants. Octants are in the order of the cube's corners: z changes fastest, x slowest.
+    """Compute the matrices T (8, n, n) that move a local expansion from the center of a cube to the
+    centers of its eight octants. If L (n,) are the coefficients about the cube's center, T[i] @ L
+    are those about the center of octant i. They are in units of the radius of the octant's ball,
+    which is half the radius of the cube's ball.
 
-    If L are the n coefficients about the cube's center, T @ L are those about an octant's center.
-    They are in units of the octant's radius, which is half that of the cube.
+    degree: the degree of the expansion, with n = (degree + 1)^2 coefficients.
+    offset: the offset of an octant's center along each axis, in units of the radius of the cube's
+        ball.
 
-    offset: the offset of an octant's center along each axis, in units of the cube's radius.
+    Octants are in the order of the cube's corners: z changes fastest, x slowest.
 
-    For the offset s of the octant's center and the offset v of a point from there,
+    Proof. For the offset s of the octant's center and the offset v of a point from there,
     R_jk(s + v) = sum R_ab(v) R_(j-a),(k-b)(s). So L'_ab = sum_jk L_jk conj(R_(j-a),(k-b)(s)). This
     is exact, as all are polynomials.
     """
@@ -128,6 +145,7 @@ def local_to_local_matrices(degree: int, offset: float) -> FloatArray:
                 for a, b in {(a, b) for a, b, _ in order if a <= j}:
                     if abs(sign * k - b) > j - a:
                         continue
+                    # 0.5**a: the result is in units of half the radius.
                     re, im = _signed(shifted, j - a, sign * k - b)
                     term = phase * (re - 1j * im) * 0.5**a
                     matrices[octant, index[a, b, 0], column] += term.real
@@ -137,16 +155,16 @@ def local_to_local_matrices(degree: int, offset: float) -> FloatArray:
 
 
 def evaluate_expansion(coefficients: Sequence[Any], y: Sequence[Any], degree: int) -> list[Any]:
-    """The value and the three first derivatives of a local expansion at the point y, as a list of
-    four numbers.
+    """Evaluate a local expansion at a point y. Returns a list of four numbers: the value, and the
+    three first derivatives by the coordinates of y.
 
     coefficients: L_jk, in the order of `coefficient_keys`.
     y: the three coordinates of the point relative to the center, in units of the ball's radius.
-        The derivatives are by these coordinates.
+    degree: the degree of the expansion.
 
-    With A_jk = w_k conj L_jk, w_0 = 1 and w_k = 2 otherwise, f = Re sum A_jk R_jk over k >= 0.
-    R_j,-1 = -conj R_j1. So by the derivatives of R_jk (`multipole`), each derivative of f is Re sum
-    B_jk R_jk. For d/dz, B_jk = A_j+1,k. Up to factors 2 where k + 1 or k - 1 is 0, B_jk is
+    Formulas. With A_jk = w_k conj L_jk, w_0 = 1 and w_k = 2 otherwise, f = Re sum A_jk R_jk over k
+    >= 0. R_j,-1 = -conj R_j1. So by the derivatives of R_jk (`multipole`), each derivative of f is
+    Re sum B_jk R_jk. For d/dz, B_jk = A_j+1,k. Up to factors 2 where k + 1 or k - 1 is 0, B_jk is
     (A_j+1,k+1 - A_j+1,k-1)/2 for d/dx, and i (A_j+1,k+1 + A_j+1,k-1)/2 for d/dy.
     """
     r, a = (
@@ -161,6 +179,7 @@ def evaluate_expansion(coefficients: Sequence[Any], y: Sequence[Any], degree: in
         total[0] = total[0] + weight * (real * re + (imag * im if k else 0.0))
         if j == degree:
             continue
+        # up, iup: real and imaginary part of L_j+1,k+1; down, idown: of L_j+1,k-1.
         up, down = a[j + 1, k + 1, 0], a.get((j + 1, k - 1, 0), 0.0)
         iup, idown = a[j + 1, k + 1, 1], a.get((j + 1, k - 1, 1), 0.0)
         zr, zi = a[j + 1, k, 0], a.get((j + 1, k, 1), 0.0)
@@ -173,27 +192,27 @@ def evaluate_expansion(coefficients: Sequence[Any], y: Sequence[Any], degree: in
 
 
 class _AbsoluteValues:
-    """Arrays of nonnegative numbers. Their sums and differences are sums of absolute values, so
-    that an expression gives the sum of the absolute values of its terms."""
+    """An array of absolute values, with arithmetic in which signs do not count: differences are
+    sums. So an expression in such arrays gives the sum of the absolute values of its terms."""
 
     def __init__(self, number: Any) -> None:
-        """number: a number or an array, not negative."""
+        """number: the absolute values, as an array or a single number."""
         self.number = number
 
     def __add__(self, other: Any) -> _AbsoluteValues:
-        """The sum of absolute values; also for differences."""
+        """Add the absolute values of both operands; used for differences, too."""
         return _AbsoluteValues(
             self.number + np.abs(other.number if isinstance(other, _AbsoluteValues) else other)
         )
 
     def __mul__(self, other: Any) -> _AbsoluteValues:
-        """The product of absolute values."""
+        """Multiply the absolute values of both operands."""
         return _AbsoluteValues(
             self.number * np.abs(other.number if isinstance(other, _AbsoluteValues) else other)
         )
 
     def __neg__(self) -> _AbsoluteValues:
-        """This object itself, because signs do not count."""
+        """Return this object itself, because signs do not count."""
         return self
 
     __radd__ = __sub__ = __rsub__ = __add__
@@ -201,46 +220,51 @@ class _AbsoluteValues:
 
 
 def rounding_tables(degree: int, largest: float) -> FloatArray:
-    """Factors (n, 4) that bound the rounding of `evaluate_expansion`, for the n coefficients of an
-    expansion and for the value and the three derivatives.
+    """Compute factors (n, 4) that bound the rounding errors of `evaluate_expansion`. There is a row
+    for each of the n coefficients, and a column for the value and for each of the three
+    derivatives. An error is at most the backend's machine epsilon times the sum over the
+    coefficients of |L_jk| times the factor.
 
+    degree: the degree of the expansion, with n = (degree + 1)^2 coefficients.
     largest: the largest absolute value of a coordinate, in units of the ball's radius.
 
-    The rounding error of the value is at most epsilon, the backend's machine epsilon, times the sum
-    of the products of |L_jk| and the first column. The other columns give bounds for the three
-    derivatives in the same way.
-
     Proof. Value and derivatives are sums of products of coefficients, coordinates and constants.
-    Each product passes through at most n = 9 degree + 2 (degree + 1)^2 roundings: 6 per degree in
+    Each product passes through at most N = 9 degree + 2 (degree + 1)^2 roundings: 6 per degree in
     the recurrence of R_jk, 3 per degree of the coordinates, and the roundings of the sums. So they
-    are off by at most 1.01 n u times the sum of the absolute values of the products, with
+    are off by at most 1.01 N u times the sum of the absolute values of the products, where
     u = epsilon/2. This sum is the same expression with all signs positive, at the largest
     coordinates.
     """
     count = (degree + 1) ** 2
     coordinate = _AbsoluteValues(np.full(count, largest))
     units = [_AbsoluteValues(row) for row in np.eye(count)]
+    # Entry i of each result is for an expansion whose coefficient i is 1, all others 0.
     sums = evaluate_expansion(units, (coordinate, coordinate, coordinate), degree)
     roundings = 0.51 * (9 * degree + 2 * count)
     return roundings * np.stack([absolute.number for absolute in sums], axis=1)
 
 
 def tail_factors(degree: int, l: int) -> tuple[float, float]:
-    """Factors (b, c) of a bound of the truncation error of a local expansion.
+    """Compute the factors (b, c) of a bound of the truncation error of a local expansion.
 
-    Take a multipole term of degree l that is at most B/r^(l+1) at distance r from the multipole's
-    center. Expand it up to the degree p = `degree` in a ball of radius rho, whose center is at the
-    distance D. With q = rho/D, the sum of the omitted terms is in the ball at most
+    degree: p, the degree of the expansion.
+    l: the degree of the multipole term that is expanded.
+
+    Take a multipole term of degree l that is at most B/r^(l+1) at the distance r from the
+    multipole's center. Expand it up to the degree p in a ball of radius rho, whose center is at the
+    distance D from the multipole's center. With q = rho/D, the sum of the omitted terms is in the
+    ball at most
 
         B/D^(l+1) b q^(p+1)/(1 - c q),   b = C(l+p+1, p+1), c = (l+p+2)/(p+2),
 
-    with binomial coefficients C. The gradient of this sum is at most (p+1)/rho times that, with
-    (l+p+2)/(p+1) for c.
+    with binomial coefficients C. The gradient of this sum is at most (p+1)/rho times the same
+    formula, but with c = (l+p+2)/(p+1).
 
     Proof. At the ball's center, the derivative of order j along a line is at most
-    (l+j)!/l! B/D^(l+1+j) (`multipole.truncation_bounds`), so that the term of degree j is at most
-    C(l+j, j) q^j B/D^(l+1). From j = p+1 on, each of these is at most c q times the term before. By
-    Bernstein and Szego's inequality a harmonic polynomial of degree j has a gradient of at most
-    j/rho times its largest value on the sphere; and j C(l+j, j) grows by (l+j+1)/j at most.
+    (l+j)!/l! B/D^(l+1+j) (`multipole.truncation_bounds`). So the term of degree j of the expansion
+    is at most C(l+j, j) q^j B/D^(l+1). From j = p+1 on, the next of these bounds is at most c q
+    times the bound before: the sum is at most a geometric series. For the gradient, by Bernstein
+    and Szego's inequality, a harmonic polynomial of degree j has a gradient of at most j/rho times
+    its largest value on the sphere; and j C(l+j, j) grows from j to j+1 by the factor (l+j+1)/j.
     """
     return float(math.comb(l + degree + 1, degree + 1)), (l + degree + 2) / (degree + 2)

@@ -1,4 +1,8 @@
-"""Interpolation of two shapes, by slices of a solid angle in four dimensions."""
+"""Interpolation of two shapes, solids a and b bounded by meshes, by slices of a solid angle in four
+dimensions. Solid a lies at height 0 along the fourth axis, solid b at height gap. Space at a height
+w between them is a slice. The field f on the slice is the solid angle that both solids subtend, and
+its level set f = 1/2 is a shape between a and b.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +28,9 @@ if TYPE_CHECKING:
 
 
 class Morph(BatchedField):
-    """The slice at height w of a shape between solid a, at height 0, and solid b, at height `gap`.
+    """A shape between two solids a and b, as the level set f = 1/2. The solids are flat in four
+    dimensions: a lies at height 0 along the fourth axis, b at height `gap`, and f is defined on
+    space at the height w between them. For w = 0 the shape is a, for w = gap it is b.
 
     U_a(x, w) = w int_a dV/(|y-x|^2 + w^2)^2 is the solid angle that a, as a flat solid in four
     dimensions, subtends at (x, w). It is harmonic in (x, w). For w -> 0 it is pi^2, half of all
@@ -36,11 +42,12 @@ class Morph(BatchedField):
     four dimensions' of the talk on Gillespie et al. 2024, with level pi^2 of the sum.)
 
     For w = 0 and w = gap the field is the winding number of the mesh itself, with jumps across its
-    triangles. For w between these, the surface is that of a *quadrature*. Each mesh is replaced by
-    oriented points at the centroids of its triangles. Triangles are first cut so that their edges
-    are at most `spacing` times the height. If triangles are much smaller than that, a single point
-    stands for several triangles. The sum over these points is harmonic, like the integral, and the
-    surface of that sum is traced with proof. `quadrature_displacement` bounds its distance from the
+    triangles. For w between these, U_a and U_b are computed by a *quadrature*. Each mesh is
+    replaced by oriented points at the centroids of its triangles. Triangles are first cut so that
+    their edges are at most `spacing` times the height of the slice above or below their mesh. If
+    triangles are much smaller than that, a single point stands for several triangles. f is then the
+    sum over these points. It is harmonic in four dimensions, like the integral, and its level set
+    is traced with proof. `quadrature_displacement` bounds the distance of this level set from the
     surface that exact integration would give.
 
     mesh_a, mesh_b: pairs (vertices (n, 3), faces (m, 3)), counter-clockwise seen from outside.
@@ -49,13 +56,14 @@ class Morph(BatchedField):
         of level 1/2 spans the hole.
     gap: the distance between the solids, in the unit of the meshes. With a large gap the slices in
         the middle are small, or empty: for solids of half-diagonal 1, 0.1 to 0.2 is good.
-    w: in [0, gap]. Like `gap` it is a kernel parameter: other numbers compile nothing.
+    w: the height of the slice, in [0, gap]. Like `gap` it is a parameter of compiled kernels, which
+        are not compiled again for other numbers.
     spacing: see above, at most 2. A smaller spacing gives sharper surfaces, and needs 1/spacing^2
         times as many points. For real meshes surfaces were off by at most 0.02, 0.04 and 0.09 of w
         for 1, 1.4 and 2.
-    accuracy: for w between 0 and gap, the sum uses the moments of a cluster of points beyond
-        `accuracy` times its radius; at least 2. Bounds of the truncation error are part of every
-        promise, and tracing uses a higher accuracy where the tolerance needs it.
+    accuracy: for w between 0 and gap, the sum uses the multipole moments of a cluster of points
+        beyond `accuracy` times its radius; at least 2. The truncation error is part of all proved
+        bounds, and tracing uses a higher accuracy where the tolerance needs it.
 
     Raises:
         MeshError: a ValueError, as `validate_mesh`; or an argument is no pair.
@@ -85,6 +93,7 @@ class Morph(BatchedField):
             raise ValueError(f"accuracy must lie between 2 and 100, not {accuracy!r}")
         self.w, self.gap = float(w), float(gap)
         meshes = [_checked(mesh_a, "mesh_a"), _checked(mesh_b, "mesh_b")]
+        # At an end of the gap the field is the winding number of the mesh that lies there.
         self._slice: MorphSlice | WindingNumber
         if 0 < w < gap:
             corners = [vertices[faces] for vertices, faces in meshes]
@@ -101,19 +110,24 @@ class Morph(BatchedField):
     def quadrature_displacement(
         self, points: Any, *, precision: Precision | None = None
     ) -> FloatArray:
-        """A bound (n,), to first order, of the distance between this surface and the surface that
-        exact integration over the triangles would give, at points (n, 3) of this surface.
+        """Bound, to first order, how far the surface f = 1/2 is from the surface that exact
+        integration over the triangles would give, at points of the surface.
 
-        It is a length in the unit of the meshes: the bound of the quadrature's error, divided by
-        the length of the gradient. For meshes of regular triangles the true distance is far
-        smaller. The result is 0 if w is 0 or `gap`, because then no quadrature is used.
+        points: (n, 3).
+        precision: that of the computation; None for the default.
+
+        Returns (n,) lengths in the unit of the meshes: the bound of the quadrature's error of f,
+        divided by the length of the gradient. For meshes of regular triangles the true distance is
+        far smaller. The result is 0 if w is 0 or `gap`, because then no quadrature is used.
         """
         if isinstance(self._slice, MorphSlice):
             return self._slice.quadrature_displacement(points, precision)
         return np.zeros(len(np.asarray(points)))
 
     def describe(self) -> dict[str, Any]:
-        """Facts about the field for users, as a dictionary of names and values."""
+        """Collect facts about the field for users: w and gap, and the numbers of quadrature points
+        of both meshes; or, at an end of the gap, which mesh is shown, with the facts about its
+        winding number."""
         heights = {"w": self.w, "gap": self.gap}
         if isinstance(self._slice, WindingNumber):
             return {**heights, "shows": "mesh " + "ab"[self.w > 0], **self._slice.describe()}
@@ -169,10 +183,10 @@ class Morph(BatchedField):
 
 
 def _checked(mesh: Any, name: str) -> tuple[FloatArray, IntArray]:
-    """The mesh as checked arrays of vertices (n, 3) and faces (m, 3).
+    """Check a mesh, and return its vertices (n, 3) and faces (m, 3) as arrays.
 
-    mesh: the argument that the user gave for a mesh.
-    name: the name of that argument, for messages.
+    mesh: what the user gave: a pair of vertices and faces.
+    name: the name of that argument, "mesh_a" or "mesh_b", for messages.
 
     Raises:
         MeshError: the argument is no pair, or its mesh is not valid.

@@ -1,10 +1,15 @@
-"""The field of a `Morph`, an interpolation of two shapes, at a height strictly between its two
-ends. It is a slice of the sum of two solid angles in four dimensions.
+"""The field of a `Morph`, an interpolation of two shapes a and b, at a height strictly between its
+two ends. Space is a slice of four dimensions: mesh a lies at a height w below it, and mesh b at a
+height gap - w above it. The field f is the sum of the solid angles that the two solids subtend at a
+point of the slice, in four dimensions and divided by 2 pi^2. Each solid angle is an integral over
+the mesh, which is computed by a quadrature: a sum over dipoles at quadrature points, each of which
+stands for a piece of a triangle or for several small triangles. D is the distance in four
+dimensions from a point of the slice to a quadrature point.
 
 - `MorphSlice`: the field.
-- `SlicedKernel`: its kernel, with the proof of its bounds.
+- `SlicedKernel`: the potential of which its dipoles are derivatives, with the proof of its bounds.
 - `quadrature_points`: triangle meshes as oriented points. Large triangles are cut, small triangles
-are merged.
+  are merged.
 """
 
 from __future__ import annotations
@@ -52,8 +57,8 @@ if TYPE_CHECKING:
     from harnack.tree.empty_space import OccupancyGrid
 
 GRADIENT_BOUND = 1.1855
-"""Half the largest gradient of a dipole in four dimensions, times D^3. It is Q_2 of
-`SlicedKernel`."""
+"""Half the largest length of the gradient, in four dimensions, of the potential of a dipole of
+moment 1 at the distance D, times D^3. It is Q_2 of `SlicedKernel`."""
 
 # Degrees of the polynomial for the last i_n of `SlicedKernel`, by the number of bytes of a number.
 # The function is singular at c = -1, so that the coefficients of degree k fall as 5.8^-k.
@@ -61,8 +66,11 @@ _DEGREES = {4: 12, 8: 22}
 
 
 class SlicedKernel(RadialKernel):
-    """The kernel (4/pi) K(r, w) on a backend, at a height w > 0. It comes from the Newton kernel of
-    four dimensions, restricted to a slice of three dimensions.
+    """The kernel (4/pi) K(r, w) on a backend: a radial potential in space, at the distance r from a
+    point x to a source y that lies at a height w > 0 below space in four dimensions. It comes from
+    the Newton kernel 1/|X|^2 of four dimensions. A dipole of moment m has the potential -m.grad_y
+    of the kernel. D = sqrt(r^2 + w^2) is the distance in four dimensions, and the functions psi_k
+    of a kernel are psi_0 = kernel and psi_(k+1) = -psi_k'/r (`radial_kernel`).
 
     Kernel. 1/|X|^2 is harmonic in R^4. The solid angle of a flat solid A x {0} at (x, w) is
     U = w int_A dV/(r^2 + w^2)^2 with r = |y-x|. By the divergence theorem U is the integral over
@@ -81,40 +89,50 @@ class SlicedKernel(RadialKernel):
     The last i_n = int_0^1 (sin(phi t)/sin phi)^(2n-2) dt phi/sin phi, cos phi = c, is a function of
     c that is analytic except for c <= -1: on [0, 1] it is computed as a polynomial.
 
-    Bound. |d^m K[u_1, ..., u_m]| <= m!/D^(m+1) for unit vectors, as for 1/r at the distance D. The
-    bound is attained for w = 0. Proof. Equal vectors u are the worst (Banach 1938). The m-th
-    derivative of 1/|X|^2 along a line is (-1)^m m! U_m(cos)/|X|^(m+2), with Chebyshev's polynomial
-    U_m of the cosine of the angle between X and the line (Gegenbauer). Let z = y - x,
-    x = D/sqrt(r^2 + v^2) and a = u.z/D, |a| <= s. Then the derivative of K is +-m!/D^(m+1) times
-    (2/pi) I, with
+    Bound of derivatives in space. |d^m K[u_1, ..., u_m]| <= m!/D^(m+1) for the m-th derivative of
+    the scaled K in the directions of unit vectors u_i, as for 1/r at the distance D.
 
-        I = int_0^1 U_m(a x) x^m (1 - s^2 x^2)^(-1/2) dx.
+    Proof. Equal vectors u are the worst (Banach 1938). The m-th derivative of 1/|X|^2 along a line
+    is (-1)^m m! U_m(cos)/|X|^(m+2), with Chebyshev's polynomial U_m of the cosine of the angle
+    between X and the line (Gegenbauer). Let z = y - x and a = u.z/D, |a| <= s. In the integral over
+    v substitute t = D/sqrt(r^2 + v^2). Then the derivative of K is +-m!/D^(m+1) times (2/pi) I,
+    with
 
-    For s = 1, that is w = 0, it is (pi/2) P_m(a), at most pi/2. For s < 1 the weight is that for
-    s = 1 times a factor that falls from 1, so that I is the same integral for s = 1 up to a number
-    b <= 1 (Bonnet). The integral is largest for b = 1, or where U_m(a b) = 0 at an angle
-    k pi/(m+1), k >= 1. Lobes between such angles alternate and grow with x, as
-    x^m (1 - x^2)^(-1/2) does: the integral is at most its last lobe, which is the largest if it
-    ends at b = 1, where it is below 0.4 for m <= 7 (quadrature in `tests/fields/test_morph.py`).
+        I = int_0^1 U_m(a t) t^m (1 - s^2 t^2)^(-1/2) dt.
 
-    In four dimensions the gradient of n.grad_x K is at most 2 * 1.1855/D^3: its square is
-    cos^2 (K''^2 + (dw K')^2) + sin^2 (K'/r)^2, cos the cosine of the angle from n to z, and so at
-    most the larger of two functions of c alone (maximum at w = r; the same tests).
+    For s = 1, that is w = 0, I is (pi/2) P_m(a), at most pi/2: the bound is attained. For s < 1 the
+    weight is the weight for s = 1 times a factor that falls from 1. So I is the integral for s = 1,
+    but from 0 up to a number b <= 1 only (Bonnet's mean value theorem). As a function of b this is
+    largest for b = 1, or where the integrand changes its sign, that is where U_m(a b) = 0 at an
+    angle k pi/(m+1), k >= 1. Lobes of the integrand between such angles alternate in sign and grow
+    with t, as t^m (1 - t^2)^(-1/2) does. So the integral is at most its last lobe, which is the
+    largest if it ends at b = 1, where it is below 0.4 for m <= 7 (quadrature in
+    `tests/fields/test_morph.py`).
+
+    Bound of the gradient in four dimensions. The gradient of n.grad_x K, for a unit vector n, is at
+    most 2 * 1.1855/D^3. Its square is cos^2 (K''^2 + (dw K')^2) + sin^2 (K'/r)^2, where cos and sin
+    are those of the angle between n and z, K' is the derivative by r, and dw the derivative by w.
+    So it is at most the larger of the two functions of c alone that cos^2 and sin^2 multiply, whose
+    maximum is at w = r (the same tests).
     """
 
     def __init__(self, backend: Backend, height: float) -> None:
-        """height: w, in the unit of the distances."""
+        """height: the height w of the slice above the sources, in the unit of the distances."""
         self.height = dr.opaque(backend.Float, height)
         self.height_square = dr.opaque(backend.Float, height * height)
         self._degree = _DEGREES[np.dtype(backend.dtype).itemsize]
 
     def at(self, distance: Real, inverse: Real, last: int) -> KernelValues:
-        """The functions psi_0 to psi_last of the class, at the distance D in four dimensions. The
-        last of the integrals i_n comes from a polynomial, and the other ones from the recurrence.
+        """Compute the functions psi_0 to psi_last of the class at a distance D in four dimensions.
+        The integral i_n with the largest n comes from a polynomial, and all others from the
+        recurrence of the class, from larger to smaller n.
 
+        distance: D, which is not used.
         inverse: 1/D.
+        last: the largest index.
         """
         del distance
+        # c = w/D, s2 = (r/D)^2; moment: i_n, and theta_k = psi_k D^(2k+1).
         c = self.height * inverse
         s2 = dr.fma(-c, c, 1)
         moment = _horner(dr.fma(2, c, -1), moment_polynomial(last + 1, self._degree))
@@ -125,32 +143,42 @@ class SlicedKernel(RadialKernel):
         return KernelValues(inverse, thetas)
 
     def bounds(self, distance: Real, last: int) -> list[Real]:
-        """The numbers Q_2 to Q_last of the class: m! Q_m/D^(m+1) bounds m-th derivatives along
-        lines at distances D. They are the same for all distances."""
+        """List numbers Q_2, ..., Q_last, but at least Q_2 and Q_3: m! Q_m/D^(m+1) bounds the m-th
+        derivatives of the kernel along lines. Here they are the same for all distances. Q_2 bounds
+        the gradient of a dipole's potential in four dimensions as well."""
         del distance
         return [GRADIENT_BOUND, *(1.0 for _ in range(3, last + 1))]
 
     def growth(self, r: Real) -> Real:
         """A factor that bounds how much larger the numbers Q_m of `bounds` are at a distance that
-        is shorter by r."""
+        is shorter by r: 1, as they are the same for all distances."""
         del r
         return 1.0
 
     def accepting_distance(self, radius: FloatArray, accuracy: float) -> FloatArray:
-        """For clusters of dipoles with these radii (k,), the distances (k,) beyond which their
-        moments are used. accuracy: the larger it is, the larger are the distances."""
+        """Compute the distances (k,) beyond which the moments of clusters of dipoles are used.
+
+        radius: (k,) the radii of the clusters.
+        accuracy: a cluster is used from this many times its radius on.
+        """
         return accuracy * radius + 1e-5
 
 
 @functools.cache
 def moment_polynomial(n: int, degree: int) -> tuple[float, ...]:
-    """The coefficients, in ascending order, of a polynomial in 2c - 1 of this degree that
-    approximates the integral i_n(c) of `SlicedKernel` for c in [0, 1]."""
+    """Fit a polynomial to the integral i_n(c) of `SlicedKernel` for c in [0, 1].
+
+    n: the index of the integral.
+    degree: the degree of the polynomial, whose variable is 2c - 1.
+
+    Returns its coefficients in ascending order.
+    """
+    # Gauss's rule on [0, 1].
     t, weight = legendre.leggauss(48)
     t, weight = 0.5 * (t + 1), 0.5 * weight
 
     def moment(x: FloatArray) -> FloatArray:
-        """The values of i_n at x = 2c - 1. x: an array of numbers in [-1, 1]."""
+        """Compute the values of i_n at x = 2c - 1. x: (k,) numbers in [-1, 1]."""
         phi = np.arccos(0.5 * (x + 1))[:, None]
         ratio = np.sin(phi * t) / np.sin(phi)
         return phi[:, 0] / np.sin(phi[:, 0]) * (ratio ** (2 * n - 2) @ weight)
@@ -161,7 +189,7 @@ def moment_polynomial(n: int, degree: int) -> tuple[float, ...]:
 
 
 def _horner(x: Real, coefficients: tuple[float, ...]) -> Real:
-    """The value at x of the polynomial with these coefficients, in ascending order."""
+    """Evaluate at x the polynomial with these coefficients, in ascending order."""
     total: Real = coefficients[-1]
     for coefficient in coefficients[-2::-1]:
         total = dr.fma(total, x, coefficient)
@@ -169,12 +197,12 @@ def _horner(x: Real, coefficients: tuple[float, ...]) -> Real:
 
 
 def _psi_factor(k: int) -> float:
-    """The factor (2/pi) 2^k k! in the formula for psi_k of `SlicedKernel`."""
+    """Compute the factor (2/pi) 2^k k! in the formula of `SlicedKernel` for the function psi_k."""
     return 2 / math.pi * 2.0**k * math.factorial(k)
 
 
-# The size of the cells in which triangles are merged, and the longest edge of triangles that are
-# merged: both as a fraction of the longest edge that pieces may have.
+# Triangles are merged if their longest edge is at most this fraction of the longest edge that
+# pieces of triangles may have. The cells of space in which they are merged are as wide.
 _CELL_FRACTION = 0.54
 
 
@@ -204,23 +232,30 @@ class QuadraturePoints:
 
 
 def piece_counts(corners: FloatArray, longest: float) -> IntArray:
-    """The number of pieces (m,) into which each edge of the triangles (m, 3, 3) is cut, so that no
-    piece is longer than `longest`."""
+    """Compute into how many pieces (m,) the edges of each triangle must be cut.
+
+    corners: (m, 3, 3) of the triangles. All three edges of a triangle get the same number.
+    longest: the largest length of a piece of an edge.
+    """
     return np.maximum(np.ceil(_longest_edges(corners) / longest), 1).astype(np.int64)
 
 
 def quadrature_points(corners: FloatArray, longest: float) -> QuadraturePoints:
-    """Quadrature points for triangles (m, 3, 3).
+    """Make quadrature points for triangles (m, 3, 3).
 
-    longest: the length that edges of pieces may have. A larger triangle is cut into similar pieces,
-        each with a point at its centroid. Of much smaller triangles, all that lie in the same cell
-        of space and face the same way have a single point.
+    longest: the largest length of the edges of pieces. A larger triangle is cut into similar
+        pieces, each with a point at its centroid. Much smaller triangles that lie in the same cell
+        of space and face the same way are merged: they get a single point.
     """
+    # A kind of triangles that does not occur has no part.
     is_small = _longest_edges(corners) <= _CELL_FRACTION * longest
     parts = [
-        sample(rows, longest)
-        for sample, rows in ((_subdivide, corners[~is_small]), (_merge_small, corners[is_small]))
-        if len(rows)
+        make_points(triangles, longest)
+        for make_points, triangles in (
+            (_subdivide, corners[~is_small]),
+            (_merge_small, corners[is_small]),
+        )
+        if len(triangles)
     ]
     return QuadraturePoints(
         np.concatenate([part.points for part in parts]),
@@ -232,38 +267,45 @@ def quadrature_points(corners: FloatArray, longest: float) -> QuadraturePoints:
 
 
 def _longest_edges(corners: FloatArray) -> FloatArray:
-    """The lengths (m,) of the longest edges of triangles (m, 3, 3)."""
+    """Compute the length (m,) of the longest edge of each triangle (m, 3, 3)."""
     return np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
 
 
 def _corner_distances(corners: FloatArray, points: FloatArray) -> FloatArray:
-    """The largest distance (m,) of a corner of each triangle (m, 3, 3) from the point (m, 3) that
-    belongs to it."""
+    """Compute for each triangle (m, 3, 3) the distance (m,) of its farthest corner from the
+    triangle's own point (m, 3)."""
     return np.linalg.norm(corners - points[:, None], axis=2).max(axis=1)
 
 
 def _areas(corners: FloatArray) -> FloatArray:
-    """Area times normal (m, 3) of triangles (m, 3, 3)."""
+    """Compute area times normal (m, 3) of triangles (m, 3, 3)."""
     a, b, c = np.moveaxis(corners, 1, 0)
     return 0.5 * np.cross(b - a, c - a)
 
 
 def _mean_squares(corners: FloatArray) -> FloatArray:
-    """The mean square distance (m,) from the centroid over each triangle (m, 3, 3)."""
+    """Compute the mean (m,), over all points of each triangle (m, 3, 3), of the squared distance
+    from the triangle's centroid: a 36th of the sum of its squared edge lengths."""
     return ((corners - np.roll(corners, 1, axis=1)) ** 2).sum(axis=(1, 2)) / 36
 
 
 def _subdivide(corners: FloatArray, longest: float) -> QuadraturePoints:
-    """Quadrature points for triangles (m, 3, 3) with edges longer than `longest`: the centroids of
+    """Make quadrature points for triangles (m, 3, 3) that are not merged: the centroids of their
     pieces. A triangle is cut into count^2 similar pieces, where count is its number from
-    `piece_counts`. The first moments of the pieces about their centroids vanish."""
+    `piece_counts`.
+
+    longest: the largest length of the edges of pieces.
+
+    `first_moment_ratio` is 0, as each piece is a group of one triangle about its centroid.
+    """
     counts = piece_counts(corners, longest)
     points: list[FloatArray] = []
     moments: list[FloatArray] = []
     for count in np.unique(counts):
         triangles = corners[counts == count]
         a, b, c = np.moveaxis(triangles, 1, 0)
-        # Pieces with the orientation of the triangle, and the rotated ones between them.
+        # The centroids as a + u (b - a) + v (c - a). There are two kinds of pieces: those with the
+        # orientation of the triangle, and those between them, rotated by half a turn.
         i, j = np.indices((count, count)).reshape(2, -1)
         steps = [(i + j < count, 1 / 3), (i + j < count - 1, 2 / 3)]
         u, v = (
@@ -273,39 +315,55 @@ def _subdivide(corners: FloatArray, longest: float) -> QuadraturePoints:
         middle = a[:, None] + u[:, None] * (b - a)[:, None] + v[:, None] * (c - a)[:, None]
         points.append(middle.reshape(-1, 3))
         moments.append(np.repeat(_areas(triangles) / count**2, count**2, axis=0))
-    spread = float((_mean_squares(corners) / counts**2).max())
+    # A piece is 1/count times as large as its triangle, in all lengths.
+    second_ratio = float((_mean_squares(corners) / counts**2).max())
     farthest = float((_corner_distances(corners, corners.mean(axis=1)) / counts).max())
-    return QuadraturePoints(np.concatenate(points), np.concatenate(moments), farthest, spread, 0.0)
+    return QuadraturePoints(
+        np.concatenate(points), np.concatenate(moments), farthest, second_ratio, 0.0
+    )
 
 
 def _merge_small(corners: FloatArray, longest: float) -> QuadraturePoints:
-    """Quadrature points for small triangles (m, 3, 3). `longest` is the length that edges of pieces
-    may have; cells are a fraction of it wide. There is a single point for all triangles whose
-    centroids are in the same cell of space, and whose normals have the same largest component with
-    the same sign. So the length of their total moment is at least 1/sqrt(3) of their area."""
+    """Make quadrature points for small triangles (m, 3, 3). Triangles form a group, which has a
+    single point, if their centroids are in the same cell of space and their normals have the same
+    largest component with the same sign. So the length of the group's moment is at least 1/sqrt(3)
+    of its area.
+
+    longest: the largest length of the edges of pieces. Cells are `_CELL_FRACTION` times as wide.
+    """
+    # Two groups have different keys: the cell of space, the axis of the largest component of the
+    # normals, and its sign.
     moments, centroids = _areas(corners), corners.mean(axis=1)
     axis = np.abs(moments).argmax(axis=1)
     is_positive = np.take_along_axis(moments, axis[:, None], axis=1)[:, 0] > 0
     cells = np.floor(centroids / (_CELL_FRACTION * longest)).astype(np.int64)
     keys = np.column_stack([cells, 2 * axis + is_positive])
     _, group = np.unique(keys, axis=0, return_inverse=True)
+    # group: the index of each triangle's group. Its point is the centroid of the group.
     group = group.ravel()
     area = np.linalg.norm(moments, axis=1)
     points = _sums(group, area[:, None] * centroids) / _sums(group, area[:, None])
     offset = centroids - points[group]
-    total = _sums(group, moments)
-    length = np.linalg.norm(total, axis=1)
-    square = area * (_mean_squares(corners) + (offset * offset).sum(axis=1))
+    group_moments = _sums(group, moments)
+    moment_lengths = np.linalg.norm(group_moments, axis=1)
+    # square_integrals: of |d|^2 over each triangle; first_moment_lengths: |T|_F of each group.
+    square_integrals = area * (_mean_squares(corners) + (offset * offset).sum(axis=1))
     outer = np.einsum("ki,kj->kij", moments, offset).reshape(-1, 9)
-    first = np.linalg.norm(_sums(group, outer), axis=1)
-    spread = float((_sums(group, square[:, None])[:, 0] / length).max())
+    first_moment_lengths = np.linalg.norm(_sums(group, outer), axis=1)
+    second_ratio = float((_sums(group, square_integrals[:, None])[:, 0] / moment_lengths).max())
     farthest = float(_corner_distances(corners, points[group]).max())
-    return QuadraturePoints(points, total, farthest, spread, float((first / length).max()))
+    return QuadraturePoints(
+        points,
+        group_moments,
+        farthest,
+        second_ratio,
+        float((first_moment_lengths / moment_lengths).max()),
+    )
 
 
 def _sums(group: IntArray, values: FloatArray) -> FloatArray:
-    """The sums (groups, k) of the rows of `values` (m, k) that belong to the same group. group:
-    (m,) the index of each row's group."""
+    """Add up the rows of `values` (m, k) that belong to the same group. group: (m,) the index of
+    each row's group. Returns (number of groups, k)."""
     columns: list[FloatArray] = [
         np.bincount(group, column).astype(np.float64) for column in values.T
     ]
@@ -328,21 +386,24 @@ class MorphSlice(VariableAccuracyField["_SliceBuffers"]):
     mesh a, for w near gap it is near mesh b.
 
     U_a(x, w) is the solid angle that the flat solid inside mesh a subtends in four dimensions, seen
-    from the point x at the height w above it (see `Morph`). It is computed as a sum over oriented
-    points that stand for the triangles.
+    from the point x at the height w above it (see `Morph`). It is computed as a sum over dipoles at
+    quadrature points that stand for the triangles. In unit coordinates the meshes are centered at 0
+    and their size is about one.
 
     corners: the triangles of both meshes, as two arrays (m, 3, 3).
     w, gap: the height of the slice above mesh a, and the height of mesh b above mesh a.
     spacing: the largest length of the edges of pieces of triangles, in units of the height of the
         slice above (or below) their mesh.
-    accuracy: the moments of a cluster of points are used beyond this many times its radius.
+    accuracy: the multipole moments of a cluster of quadrature points are used beyond this many
+        times its radius.
 
-    Promises (proved bounds of f near a point). Let d be the smallest distance, in four dimensions,
-    of a quadrature point from x. The promises are a bound of the second derivatives within
-    0.45 d (`TaylorRemainder`), and a range of f on a ball in four dimensions of radius 0.35 d
-    (`HarmonicBall`). The steps that the latter proves are shorter. `SlicedKernel` has the proof of
-    the former: the second derivatives of a point's part of f are at most those of a dipole in three
-    dimensions, at a distance equal to the distance of x from the point in four dimensions.
+    Proved bounds of f near a point x. Let d be the smallest distance, in four dimensions, of a
+    quadrature point from x. There are two kinds: bounds of the second derivatives within 0.1 d,
+    0.25 d and 0.45 d (`TaylorRemainder`), and a range of f on a ball in four dimensions of radius
+    0.35 d (`HarmonicBall`). The march uses the bounds of the second derivatives, which prove longer
+    steps; the range is for callers that request it. `SlicedKernel` has the proof: at the distance D
+    in four dimensions, the second derivatives of a dipole's part of f are at most those of a dipole
+    in space at the same distance.
     """
 
     default_level = 0.5
@@ -354,7 +415,7 @@ class MorphSlice(VariableAccuracyField["_SliceBuffers"]):
         accuracy: float,
     ) -> None:  # fmt: skip
         super().__init__()
-        self.heights = (w, gap - w)
+        self.heights = (w, gap - w)  # of the slice above mesh a, and below mesh b
         self.spacing, self.accuracy = spacing, accuracy
         low = np.min([pair.min(axis=(0, 1)) for pair in corners], axis=0)
         high = np.max([pair.max(axis=(0, 1)) for pair in corners], axis=0)
@@ -362,6 +423,7 @@ class MorphSlice(VariableAccuracyField["_SliceBuffers"]):
         self._center = round_to_single(0.5 * (low + high))
         # A power of two, so that lengths are scaled without rounding.
         self._size = 2.0 ** math.ceil(math.log2(0.5 * float((high - low).max())))
+        # The longest edges of pieces, for each mesh.
         longest = [spacing * height for height in self.heights]
         _check_count([piece_counts(*pair) for pair in zip(corners, longest, strict=True)], w, gap)
         self._pieces = tuple(
@@ -372,33 +434,35 @@ class MorphSlice(VariableAccuracyField["_SliceBuffers"]):
         self._occupied: TransientCache[tuple[float, ...], OccupancyGrid] = TransientCache()
 
     def _dipole_tree(self, pieces: QuadraturePoints) -> ClusteredDipoles:
-        """The tree over the dipoles of the quadrature points of one of the two meshes, one dipole
-        for each point.
+        """Build the tree over the dipoles of one of the two meshes, one dipole for each quadrature
+        point, in unit coordinates.
 
-        pieces: the quadrature points, in the user's coordinates.
+        pieces: the quadrature points of the mesh, in the user's coordinates.
 
-        Positions are relative to the field's center and divided by its size. Moments are
-        scaled so that, with the scaled kernel of `SlicedKernel`, they contain the factor 1/(2 pi^2)
-        of f: f is the plain sum of the dipoles' potentials over both meshes.
+        Moments are scaled so that, with the scaled kernel of `SlicedKernel`, they contain the
+        factor 1/(2 pi^2) of f: f is the plain sum of the dipoles' potentials over both meshes.
         """
+        # By `SlicedKernel`, moments of area times normal over 4 pi give U/pi^2, and f has half.
         scale = 1 / (8 * math.pi * self._size**2)
         points = (pieces.points - self._center) / self._size
         return ClusteredDipoles.of(dipole_records(points, scale * pieces.moments))
 
     @property
     def point_counts(self) -> tuple[int, ...]:
-        """The numbers of quadrature points of both meshes."""
+        """The number of quadrature points of mesh a, and that of mesh b."""
         return tuple(len(dipoles.rows) for dipoles in self._dipoles)
 
     def values_at(self, x: Vec3, derivatives: int, closer: Real = 1.0) -> PointValues:
-        """Values and derivatives at points x (3, n), with error bounds (`BatchedField.values_at`).
+        """Compute f and its derivatives at points x (3, n), in the unit of the meshes, with error
+        bounds (`BatchedField.values_at`).
 
         derivatives: 0 for the value only, 1 with the gradient, 2 with the Hessian.
-        closer: the accuracy scale.
+        closer: the accuracy scale; larger is more accurate.
         """
         buffers = self._batch_data(backend_of(x))
         x = buffers.to_unit(x)
         sums = buffers.sums(x, closer, derivatives).sums
+        # rounding: of the last operations. weight: the sum of the lengths of all moments.
         rounding = 8 * buffers.backend.machine_epsilon * dr.abs(sums.value)
         values = sums.values(1.0, coordinate_rounding(x), rounding)
         weight = sum(float(dipoles.rows[:, 6].sum()) for dipoles in self._dipoles)
@@ -407,25 +471,34 @@ class MorphSlice(VariableAccuracyField["_SliceBuffers"]):
     def quadrature_displacement(
         self, points: Any, precision: Precision | None = None
     ) -> FloatArray:
-        """A bound (n,), to first order, of the distance between the surface of this field and the
-        surface that exact integration over the triangles would give, at points (n, 3) of the
-        surface. It is the bound of the quadrature's error, divided by the length of the gradient.
+        """Bound, to first order, how far the surface of this field is from the surface that exact
+        integration over the triangles would give. The bound is the error of the quadrature divided
+        by the length of the gradient.
 
-        Let a quadrature point at distance D stand for a part of the mesh with moment m, made of
-        triangles with moments m_i at offsets d_i from it. Its error is at most 2 |T|_*/D^3 plus the
-        remainder of Taylor's formula. Here T is the sum of the products m_i d_i^T, and |T|_* its
-        nuclear norm, at most sqrt(3) times the Frobenius norm. The remainder is at most |m| times
-        the mean of |d|^2 (3-2q)/((1-q)^2 D^4) with q = |d|/D (`RadialSums.remainder`). The bound is
-        infinite where a point of the part may be as far as D from the quadrature point.
+        points: (n, 3) points of the surface.
+        precision: that of the computation; None for the default.
+
+        Returns (n,) lengths in the unit of the meshes. They are infinite if a triangle of a mesh
+        reaches as far from its quadrature point as the slice is from that mesh.
+
+        Proof. Let a quadrature point at distance D stand for a group of triangles with the total
+        moment m (area times normal), made of triangles with moments m_i at offsets d_i from it. The
+        dipole at the quadrature point replaces the sum of the group's dipoles. By Taylor's formula
+        the error is at most 2 |T|_*/D^3 plus a remainder. Here T is the sum of the products
+        m_i d_i^T, and |T|_* its nuclear norm, at most sqrt(3) times the Frobenius norm. The
+        remainder is at most |m| times the mean of |d|^2 (3-2q)/((1-q)^2 D^4) with q = |d|/D
+        (`RadialSums.remainder`).
         """
 
         def kernel(backend: Backend, x: Vec3) -> tuple[Real]:
-            """The bound of the displacement at points x, as a length in the unit of the meshes."""
+            """Compute the bound at points x (3, n), as a length in the unit of the meshes."""
             data = self._batch_data(backend)
             x = data.to_unit(x)
+            # error: the bound of the quadrature's error of f, over both meshes.
             error, gradient = backend.Float(0), backend.Array3f(0)
             for cloud, piece, height in zip(data.clouds, self._pieces, self.heights, strict=True):
                 sums = cloud.sums(x, 1.0, 1)
+                # q is at most this ratio, as D is at least the height.
                 ratio = piece.farthest / height
                 remainder = dr.inf
                 if ratio < 1:
@@ -440,8 +513,8 @@ class MorphSlice(VariableAccuracyField["_SliceBuffers"]):
         return evaluate_points(points, kernel, precision)[0]
 
     def _upload(self, backend: Backend, *, traced: bool) -> _SliceBuffers:
-        """The quadrature points on a backend. They are the same for tracing and for values at
-        points."""
+        """Build the sums over the quadrature points of both meshes on a backend. They are the same
+        for tracing and for values at points, whatever `traced` is."""
         del traced
         clouds = tuple(
             RadialTreecode(
@@ -452,7 +525,12 @@ class MorphSlice(VariableAccuracyField["_SliceBuffers"]):
         return _SliceBuffers(*frame_parameters(backend, self._center, self._size), clouds)
 
     def _sample(self, on: _SliceBuffers, p: Vec3, detail: Real) -> Sample:
-        """The sample at p, from the data `on` of a backend, at the accuracy scale `detail`."""
+        """Compute a sample at points p (3, n): f, its gradient, error bounds, and proved bounds of
+        f near p.
+
+        on: the field's data on a backend.
+        detail: the accuracy scale; larger is more accurate.
+        """
         return on.sample(p, detail)
 
     def validate_levels(self, levels: tuple[float, ...]) -> None:
@@ -462,10 +540,12 @@ class MorphSlice(VariableAccuracyField["_SliceBuffers"]):
                 raise ValueError("level 0 of a morph reaches to infinity; the surface is at 0.5")
 
     def extent(self, levels: tuple[float, ...]) -> Volume:
-        """A volume that contains the level sets: a box without those of its cells that are proved
-        empty (`tight_extent`). At a distance rho from all points |f| is at most the sum of
-        their weights over rho^2, which gives the box."""
+        """Compute a volume that contains the level sets of f at these levels, once: a box without
+        cells that are proved to contain no point of them (`tight_extent`). The box holds since at a
+        distance of at least rho from all quadrature points |f| is at most the sum of the lengths of
+        all moments, over rho^2."""
         if levels not in self._extents:
+            # weight: the sum of the lengths of all moments.
             weight = sum(float(dipoles.rows[:, 6].sum()) for dipoles in self._dipoles)
             margin = 1.0001 * self._size * math.sqrt(weight / min(abs(level) for level in levels))
             low, high = self._box
@@ -475,8 +555,8 @@ class MorphSlice(VariableAccuracyField["_SliceBuffers"]):
         return self._extents[levels]
 
     def occupied_cells(self, levels: tuple[float, ...]) -> OccupancyGrid:
-        """Cells over the extent, without those that are proved to contain no level; computed
-        once."""
+        """Compute, once, the cells of a grid over the extent that may contain a point of a level
+        set. The other cells are proved to contain none; rays skip them."""
         if levels not in self._occupied:
             self._occupied[levels] = occupied_cells(
                 self, levels, self.extent(levels), _CELLS_ACROSS
@@ -486,15 +566,19 @@ class MorphSlice(VariableAccuracyField["_SliceBuffers"]):
 
 @dataclass(frozen=True)
 class _SliceBuffers(UnitFrame):
-    """The quadrature points of both meshes on a backend. clouds: the sum over the points of each
-    mesh, at its own height."""
+    """The data of a `MorphSlice` on a backend, with the map from the user's coordinates to unit
+    coordinates (centered at 0, of size about one).
+
+    clouds: for each of the two meshes, the sum over the dipoles at its quadrature points, with the
+        kernel at its own height.
+    """
 
     clouds: tuple[RadialTreecode, ...]
 
     def sums(self, x: Vec3, closer: Real, derivatives: int) -> RadialSums:
-        """The sums over the quadrature points of both meshes, at points x in unit coordinates.
+        """Sum over the quadrature points of both meshes, at points x (3, n) in unit coordinates.
 
-        closer: the accuracy scale.
+        closer: the accuracy scale; larger is more accurate.
         derivatives: 0 for the value only, 1 with the gradient, 2 with the Hessian.
         """
         sums = RadialSums.zero(self.backend, derivatives)
@@ -503,13 +587,19 @@ class _SliceBuffers(UnitFrame):
         return sums
 
     def sample(self, p: Vec3, detail: Real) -> Sample:
-        """The sample of f at points p, in the unit of the meshes. detail: the accuracy scale."""
+        """Compute a sample at points p (3, n): f, its gradient, error bounds, and proved bounds of
+        f near p, in the unit of the meshes.
+
+        detail: the accuracy scale; larger is more accurate.
+        """
         x = self.to_unit(p)
         radial = self.sums(x, detail, 1)
         sums = radial.sums
         slope_error = dr.fma(
             SLOPE_ROUNDINGS * coordinate_rounding(x), sums.s4, sums.gradient_truncation
         )
+        # A lower bound of the distance, in four dimensions, to the nearest quadrature point; and
+        # the range of f on the ball around x of radius r.
         nearest = sums.singularity_distance * (1 - SUM_MARGIN) - 8 * self.backend.machine_epsilon
         nearest = fmax(nearest, 0)
         r = BALL_FRACTION * nearest
@@ -527,8 +617,12 @@ class _SliceBuffers(UnitFrame):
 
 
 def _check_count(counts: Sequence[Any], w: float, gap: float) -> None:
-    """Raise ValueError if the quadrature would need more than `MOST_POINTS` points. counts: for
-    each mesh the numbers of `piece_counts`."""
+    """Raise ValueError if the quadrature would need more than `MOST_POINTS` points.
+
+    counts: for each mesh the result of `piece_counts`, an array with an entry for each triangle. A
+        triangle needs the square of its entry.
+    w, gap: the height of the slice and of mesh b, for the message.
+    """
     count = sum(int((pieces.astype(float) ** 2).sum()) for pieces in counts)
     if count > MOST_POINTS:
         raise ValueError(

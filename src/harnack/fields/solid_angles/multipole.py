@@ -1,6 +1,10 @@
-"""Multipole moments of dipoles, moments of the nodes of a tree, and bounds of truncated expansions.
+"""Multipole moments of dipoles and of the nodes of a tree, and bounds of truncated multipole
+expansions. A dipole has a position y_i, a unit normal n_i and an area a_i; f is the sum of the
+potentials of all dipoles. Dipoles near a center c are replaced by a series in x - c, whose
+coefficients are the moments M_lm, complex numbers of degree l and order m with 0 <= m <= l. A node
+of a tree stands for all its dipoles, and has moments about its own center.
 
-The potential of dipoles a_i n_i at y_i = c + d_i at a point x = c + r is
+Let d_i = y_i - c be the offset of a dipole from the center. At a point x = c + r
 
     f(x) = sum_i a_i n_i.(y_i - x)/|y_i - x|^3 = -sum_i a_i n_i.grad_y 1/|x - y_i|
          = -sum_{l>=1} sum_m conj(M_lm) I_lm(r),      M_lm = sum_i a_i n_i.grad R_lm(d_i)
@@ -15,10 +19,11 @@ and (d/dx - i d/dy) R_lm = R_l-1,m-1. Tests check all of these.
   and moments about another point.
 - `NodeMoments`, from `dipole_tree_moments` or `triangle_tree_moments`: the moments of all nodes of
   a tree.
-- `truncation_bounds`, `remainder_constants`: bounds of the terms beyond an order, and of the terms
-  up to it.
+- `truncation_bounds`: bounds of the terms that are left out if the series ends at a degree.
+- `remainder_constants`: bounds of the remainder of f's Taylor polynomial.
 
-Here a complex number is a pair of numbers or arrays of any kind, of NumPy or of Dr.Jit.
+Here a complex number is a pair (real part, imaginary part) of numbers or arrays of any kind, of
+NumPy or of Dr.Jit.
 """
 
 from __future__ import annotations
@@ -55,11 +60,18 @@ MOMENT_KEYS = tuple((l, m) for l in range(1, MAX_DEGREE + 1) for m in range(l + 
 
 
 def regular_harmonics(x: Any, y: Any, z: Any, order: int) -> Pairs:
-    """The regular solid harmonics R_lm at (x, y, z), for l <= order and 0 <= m <= l, as pairs of
-    real and imaginary part. The imaginary part is the number 0 if m = 0."""
+    """Compute the regular solid harmonics R_lm at (x, y, z), for l <= order and 0 <= m <= l.
+
+    Returns a dictionary of pairs (real part, imaginary part) by (l, m). The imaginary part is the
+    number 0 if m = 0.
+
+    Recurrences. R_mm = R_m-1,m-1 (x + iy)/(2m), and
+    R_lm = ((2l - 1) z R_l-1,m - r^2 R_l-2,m)/((l + m)(l - m)).
+    """
     r2 = x * x + y * y + z * z
-    harmonics: Pairs = {(0, 0): (0 * x + 1, 0.0)}
+    harmonics: Pairs = {(0, 0): (0 * x + 1, 0.0)}  # 1 for each entry of x
     for m in range(order + 1):
+        # The entry l = m by the first recurrence, then those with l > m by the second.
         if m:
             u, v = x * (1 / (2 * m)), y * (1 / (2 * m))
             re, im = harmonics[m - 1, m - 1]
@@ -77,12 +89,17 @@ def regular_harmonics(x: Any, y: Any, z: Any, order: int) -> Pairs:
 
 
 def dipole_moments(harmonics: Pairs, nx: Any, ny: Any, nz: Any) -> Pairs:
-    """The moments M_lm of a dipole at d, for l <= MAX_DEGREE.
+    """Compute the moments M_lm = n.grad R_lm(d) of a dipole at the offset d from the center, for
+    l <= MAX_DEGREE.
 
-    harmonics: R_lm(d) for l < MAX_DEGREE. For a dipole that is spread out over points, these are
-        the means of R_lm over the points.
-    nx, ny, nz: the dipole's normal, whose length is its area.
+    harmonics: R_lm(d) for l < MAX_DEGREE, as pairs by (l, m). For a dipole that is spread out over
+        points, these are the means of R_lm over the points.
+    nx, ny, nz: n, the dipole's normal times its area.
+
+    By the derivatives of R_lm in the module's description,
+    M_lm = nz R_l-1,m - (x - iy) R_l-1,m+1 + (x + iy) R_l-1,m-1 with x = nx/2 and y = ny/2.
     """
+    # A harmonic is a + ib; a product such as (x - iy)(a + ib) is written out in its two parts.
     r, x, y = _with_negative_orders(harmonics), 0.5 * nx, 0.5 * ny
     moments: Pairs = {}
     for l, m in MOMENT_KEYS:
@@ -98,7 +115,13 @@ def dipole_moments(harmonics: Pairs, nx: Any, ny: Any, nz: Any) -> Pairs:
 
 
 def multipole_to_multipole(moments: Pairs, x: Any, y: Any, z: Any) -> Pairs:
-    """The moments M_lm of dipoles about a point c, from their moments about c + (x, y, z)."""
+    """Move moments to another center: compute the moments M_lm of dipoles about a point c, from
+    their moments about c + s with s = (x, y, z). Moments are pairs by (l, m).
+
+    By the addition theorem of R_lm, M_lm is the sum over k and j of the old moment M_kj times
+    R_l-k,m-j(s). The term k = l is the old moment itself.
+    """
+    # The limits of j are those of |j| <= k and |m - j| <= l - k. Moments with m = 0 are real.
     r, old = (
         _with_negative_orders(regular_harmonics(x, y, z, MAX_DEGREE - 1)),
         _with_negative_orders(moments),
@@ -117,7 +140,8 @@ def multipole_to_multipole(moments: Pairs, x: Any, y: Any, z: Any) -> Pairs:
 
 
 def _with_negative_orders(values: Pairs) -> Pairs:
-    """Harmonics R_lm or moments M_lm, given for m >= 0, together with the entries for m < 0."""
+    """Add the entries for m < 0 to harmonics R_lm or moments M_lm: `values` has the entries for
+    m >= 0, as pairs by (l, m). The entry (l, -m) is (-1)^m times the conjugate of (l, m)."""
     negative = {
         (l, -m): (re, -im) if m % 2 == 0 else (-re, im) for (l, m), (re, im) in values.items() if m
     }
@@ -137,15 +161,18 @@ _POWER_COUNT = 10
 
 @dataclass(frozen=True)
 class NodeMoments:
-    """The moments of the k nodes at one level of a tree.
+    """The moments of the k nodes at one level of a tree. A node stands for all its dipoles i, with
+    areas a_i and offsets d_i from the node's center.
 
-    center: (k, 3) the point about which the moments are taken: the mean position of the dipoles,
-        weighted by area.
-    radius: (k,) the radius of a ball around the center that contains all dipoles.
+    center: (k, 3) the point about which the moments are taken: the mean position of the node's
+        dipoles, weighted by area, or the center of their box if the area is 0.
+    radius: (k,) the radius of a ball around the center that contains the node's primitives.
     area: (k,) the sum of the areas a_i.
-    second_moment, third_moment, fourth_moment: (k, 3, 3), (k, 3) and (k,) sums of a_i d_i d_i^T, of
-        a_i |d_i|^2 d_i and of a_i |d_i|^4, with d_i the offset of a dipole from the center.
-    moments: M_lm, (k,) each, for 1 <= l <= 5 and m >= 0.
+    second_moment: (k, 3, 3) the sum of a_i d_i d_i^T.
+    third_moment: (k, 3) the sum of a_i |d_i|^2 d_i.
+    fourth_moment: (k,) the sum of a_i |d_i|^4.
+    moments: the multipole moments M_lm for 1 <= l <= 5 and m >= 0, an array (k,) of complex numbers
+        for each (l, m).
     """
 
     center: FloatArray
@@ -160,18 +187,22 @@ class NodeMoments:
 def dipole_tree_moments(
     tree: BalancedTree, points: FloatArray, normals: FloatArray, low: FloatArray, high: FloatArray
 ) -> list[NodeMoments]:
-    """The moments of the nodes of a tree over primitives, each of which consists of dipoles. The
-    list has an entry for each level of the tree, from the leaves to the root.
+    """Compute the moments of the nodes of a tree over n primitives, each of which consists of s
+    dipoles.
 
-    points, normals: (n, s, 3) the s dipoles of each of n primitives. The length of a normal is its
-        area.
+    tree: the hierarchy of the tree: which primitives are in which node.
+    points: (n, s, 3) the positions of the dipoles.
+    normals: (n, s, 3) their normals, each times the dipole's area.
     low, high: (n, 3) corners of boxes that contain the primitives.
+
+    Returns one entry for each level of the tree, from the leaves to the root.
     """
+    # each: the number s of dipoles of a primitive.
     backend, each = choose_backend("double"), points.shape[1]
     p, n, lows, highs = (upload_floats(backend, x.ravel()) for x in (points, normals, low, high))
 
     def primitive(i: Any) -> _DipolePrimitive:
-        """The dipoles and the box of primitive i."""
+        """Read the dipoles and the box of primitive i from the buffers. i: an index per lane."""
         dipoles = [
             _Dipole(_row(backend, n, i * each + k), ((1.0, _row(backend, p, i * each + k)),))
             for k in range(each)
@@ -182,18 +213,22 @@ def dipole_tree_moments(
 
 
 def triangle_tree_moments(tree: BalancedTree, corners: FloatArray) -> list[NodeMoments]:
-    """The moments of the nodes of a tree over triangles, each of which counts as a sheet of dipoles
-    along its normal. They are exact up to rounding. The list has an entry for each level of the
-    tree, from the leaves to the root.
+    """Compute the moments of the nodes of a tree over triangles, each of which counts as a sheet of
+    dipoles along its normal. They are exact up to rounding.
 
-    corners: (n, 3, 3) of the triangles.
+    tree: the hierarchy of the tree: which triangles are in which node.
+    corners: (n, 3, 3) the corners of the triangles.
+
+    Returns one entry for each level of the tree, from the leaves to the root.
     """
     backend = choose_backend("double")
     buffer = upload_floats(backend, corners.ravel())
+    # Pairs of the barycentric coordinates of a point, and its weight.
     rule = tuple(zip(*(part.tolist() for part in triangle_rule()), strict=True))
 
     def primitive(i: Any) -> _DipolePrimitive:
-        """Triangle i as a dipole that is spread over the points of `triangle_rule`, and its box."""
+        """Read triangle i, as a dipole that is spread over the points of `triangle_rule`, with the
+        triangle's box. i: an index per lane."""
         a, b, c = (_row(backend, buffer, 3 * i + k) for k in range(3))
         points = [(weight, a * u + b * v + c * w) for (u, v, w), weight in rule]
         dipole = _Dipole(0.5 * dr.cross(b - a, c - a), points)
@@ -204,10 +239,10 @@ def triangle_tree_moments(tree: BalancedTree, corners: FloatArray) -> list[NodeM
 
 @dataclass(frozen=True)
 class _Dipole:
-    """A dipole that is spread over points.
+    """A dipole that is spread over points: each point has a fraction of its area.
 
-    normal: its direction, with its area as length.
-    points: pairs of a weight and a point; the weights add up to 1.
+    normal: the dipole's normal times its area.
+    points: pairs of a fraction and a point; the fractions add up to 1.
     """
 
     normal: Vec3
@@ -216,7 +251,8 @@ class _Dipole:
 
 @dataclass(frozen=True)
 class _DipolePrimitive:
-    """The dipoles of a primitive, and the lower and upper corner of a box that contains it."""
+    """A primitive of a tree, such as a triangle: its dipoles, and the lower and upper corner of a
+    box that contains it."""
 
     dipoles: Sequence[_Dipole]
     low: Vec3
@@ -224,20 +260,24 @@ class _DipolePrimitive:
 
 
 def _row(backend: Backend, buffer: Real, i: Any) -> Vec3:
-    """Vector i of a buffer that holds three numbers for each vector."""
+    """Read vector i from a buffer that holds three numbers for each vector. i: an index per
+    lane."""
     return backend.Array3f(*(dr.gather(backend.Float, buffer, 3 * i + k) for k in range(3)))
 
 
 def _all_levels(
     backend: Backend, tree: BalancedTree, primitive: Callable[[Any], _DipolePrimitive]
 ) -> list[NodeMoments]:
-    """The moments of the nodes of a tree. The list has an entry for each level of the tree, from
-    the leaves to the root.
+    """Compute the moments of all nodes of a tree: of the leaves from their primitives, of all other
+    nodes from their children.
 
-    primitive: a function that returns the dipoles of a primitive from its index.
+    primitive: a function that returns the dipoles and the box of a primitive from its index.
+
+    Returns one entry for each level of the tree, from the leaves to the root.
     """
     level, parts, low, high = _leaf_moments(backend, tree, primitive)
     levels = [level]
+    # arity: the number of children of each node at the next level.
     for arity in tree.arities:
         low = low.reshape(-1, arity, 3).min(axis=1)
         high = high.reshape(-1, arity, 3).max(axis=1)
@@ -249,49 +289,48 @@ def _all_levels(
 def _leaf_moments(
     backend: Backend, tree: BalancedTree, primitive: Callable[[Any], _DipolePrimitive]
 ) -> tuple[NodeMoments, list[Real], FloatArray, FloatArray]:
-    """The moments of the leaves of a tree.
+    """Compute the moments of the n leaves of a tree. Each lane is a leaf. It visits its primitives
+    twice: for its center, and for the moments about the center.
 
-    primitive: a function that returns the dipoles of a primitive from its index.
+    primitive: a function that returns the dipoles and the box of a primitive from its index.
 
-    Returns the moments as NumPy arrays; the real and imaginary parts of M_lm as a list of numbers
-    of the backend, in the order of `_MOMENT_PARTS`; and the lower and upper corners (n, 3) of boxes
-    around the leaves.
-
-    Each lane is a leaf, which visits its primitives twice: for the center, and for the moments
-    about it.
+    Returns the moments as NumPy arrays; the real and imaginary parts of M_lm once more, as a list
+    of arrays of the backend in the order of `_MOMENT_PARTS`; and the lower and the upper corners
+    (n, 3) of boxes around the leaves.
     """
     index, real, vector = backend.UInt32, backend.Float, backend.Array3f
     filled = tree.leaf_slots != NO_PRIMITIVE
+    # The slots of a leaf follow each other, filled slots first: from `first` up to `end`.
     slots = upload_integers(backend, np.where(filled, tree.leaf_slots, 0).ravel())
     leaf = dr.arange(index, len(filled))
     first = leaf * dr.opaque(index, tree.leaf_size)
     end = first + dr.gather(index, upload_integers(backend, filled.sum(axis=1)), leaf)
 
     def visit(body: Callable[..., tuple[Any, ...]], state: tuple[Any, ...]) -> tuple[Any, ...]:
-        """Apply `body` to the primitives of each leaf, one after another. Each lane is a leaf.
-        Returns the last state."""
+        """Loop over the primitives of each leaf: state = body(primitive, *state) for one after
+        another. Returns the last state."""
 
         def step(slot: Any, *state: Any) -> tuple[Any, ...]:
-            """Apply `body` to the primitive in a slot."""
+            """Update the state by the primitive in a slot, and go on to the next slot."""
             return slot + 1, *body(primitive(dr.gather(index, slots, slot)), *state)
 
         def more(slot: Any, *_: Any) -> Any:
-            """The mask of the leaves that have further slots."""
+            """Whether the loop goes on, for each lane: its leaf has this slot."""
             return slot < end
 
         return dr.while_loop((first, *state), more, step, label="slots")[1:]
 
     def measure(source: _DipolePrimitive, low: Vec3, high: Vec3, area: Real, weighted: Vec3) -> Any:
-        """Add a primitive to the box from low to high, to the area, and to the sum of positions
-        weighted by area."""
+        """Update a leaf's measures by the primitive `source`: the box from low to high, the area,
+        and `weighted`, the sum of area times position over the dipoles."""
         for dipole in source.dipoles:
             size = dr.norm(dipole.normal)
             area, weighted = area + size, weighted + size * sum(w * p for w, p in dipole.points)
         return fmin(low, source.low), fmax(high, source.high), area, weighted
 
     def sum_up(source: _DipolePrimitive, *parts: Real) -> tuple[Any, ...]:
-        """Add the terms of a primitive about the leaf's center to the sums `parts`: first those of
-        `_power_terms`, then the moments."""
+        """Add the primitive `source` to the sums `parts` about the leaf's center. The first sums
+        are those of `_power_terms`, the further ones the real and imaginary parts of M_lm."""
         for dipole in source.dipoles:
             offsets = [(weight, point - center) for weight, point in dipole.points]
             more = _power_terms(dr.norm(dipole.normal), offsets) + _flatten(
@@ -308,6 +347,7 @@ def _leaf_moments(
     powers, parts = sums[:_POWER_COUNT], sums[_POWER_COUNT:]
     dr.eval(low, high, area, center, *sums)
     boxes = to_numpy(low), to_numpy(high)
+    # As NumPy arrays; the second moments become symmetric matrices (n, 3, 3).
     middle, (xx, yy, zz, xy, xz, yz, *third, fourth) = to_numpy(center), map(to_numpy, powers)
     second = np.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], axis=1).reshape(-1, 3, 3)
     sizes = to_numpy(area), second, np.stack(third, axis=1), fourth
@@ -319,9 +359,13 @@ def _leaf_moments(
 
 
 def _power_terms(area: Real, points: Sequence[tuple[float, Vec3]]) -> list[Real]:
-    """The terms of a dipole in `second_moment` (xx, yy, zz, xy, xz, yz), `third_moment` and
-    `fourth_moment` of `NodeMoments`. points: pairs of a weight and an offset from the center."""
-    total: list[Real] = [area * 0] * _POWER_COUNT
+    """Compute what a spread dipole adds to the moments of its node: to the entries xx, yy, zz, xy,
+    xz, yz of `NodeMoments.second_moment`, then to `third_moment` and `fourth_moment`.
+
+    area: the area of the dipole.
+    points: pairs of a fraction of the area, and an offset from the node's center.
+    """
+    total: list[Real] = [area * 0] * _POWER_COUNT  # a zero for each lane
     for weight, d in points:
         square, weighted_area = dr.squared_norm(d), weight * area
         pairs = (d.x * d.x, d.y * d.y, d.z * d.z, d.x * d.y, d.x * d.z, d.y * d.z)
@@ -333,8 +377,11 @@ def _power_terms(area: Real, points: Sequence[tuple[float, Vec3]]) -> list[Real]
 
 
 def _spread_dipole_moments(normal: Vec3, points: Sequence[tuple[float, Vec3]]) -> Pairs:
-    """The moments of a dipole that is spread over points. points: pairs of a weight and an offset
-    from the center."""
+    """Compute the moments M_lm of a dipole that is spread over points.
+
+    normal: the dipole's normal times its area.
+    points: pairs of a fraction of the area, and an offset from the center.
+    """
     means: Pairs = {}
     for weight, d in points:
         for key, (re, im) in regular_harmonics(d.x, d.y, d.z, MAX_DEGREE - 1).items():
@@ -344,13 +391,14 @@ def _spread_dipole_moments(normal: Vec3, points: Sequence[tuple[float, Vec3]]) -
 
 
 def _flatten(moments: Pairs) -> list[Any]:
-    """The real and imaginary parts of moments, in the order of `_MOMENT_PARTS`."""
+    """List the real and imaginary parts of moments, in the order of `_MOMENT_PARTS`: by (l, m),
+    real before imaginary part."""
     return [moments[l, m][part] for l, m, part in _MOMENT_PARTS]
 
 
 def _moments_of(parts: Sequence[Real]) -> Moments:
-    """Complex moments by (l, m) in NumPy, from their parts on the backend in the order of
-    `_MOMENT_PARTS`."""
+    """Join real and imaginary parts, given as arrays of a backend in the order of `_MOMENT_PARTS`,
+    to complex moments M_lm by (l, m) in NumPy."""
     moments = {key: np.zeros(dr.width(parts[0]), np.complex128) for key in MOMENT_KEYS}
     for (l, m, part), values in zip(_MOMENT_PARTS, parts, strict=True):
         if part:
@@ -363,22 +411,24 @@ def _moments_of(parts: Sequence[Real]) -> Moments:
 def _parent_moments(
     backend: Backend, children: NodeMoments, parts: list[Real], low: FloatArray, high: FloatArray
 ) -> tuple[NodeMoments, list[Real]]:
-    """The moments of n parents in the tree, from the moments of their children, which are the nodes
-    of the tree's next level towards the leaves.
+    """Compute the moments of the n nodes at one level of a tree, the parents, from the moments of
+    their children at the next level towards the leaves. All parents have equally many children.
 
     children: the moments of the children, sorted by parents.
-    parts: the real and imaginary parts of the children's M_lm as a list of numbers of the backend,
-        in the order of `_MOMENT_PARTS`.
+    parts: the real and imaginary parts of the children's M_lm once more, as a list of arrays of the
+        backend in the order of `_MOMENT_PARTS`.
     low, high: (n, 3) corners of boxes around the parents.
 
-    Returns the parents' moments as NumPy arrays; and the real and imaginary parts of their M_lm as
-    a list of numbers of the backend, which the call for the grandparents takes as `parts`.
+    Returns the parents' moments as NumPy arrays; and the real and imaginary parts of their M_lm
+    once more, as a list of arrays of the backend, which is `parts` for the next level.
     """
+    # The center as for leaves: the mean position weighted by area, or the center of the box.
     count, arity = len(low), len(children.area) // len(low)
     area = children.area.reshape(-1, arity).sum(axis=1)
     weighted = (children.area[:, None] * children.center).reshape(-1, arity, 3).sum(axis=1)
     has_area = (area > 0)[:, None]
     center = np.where(has_area, weighted / np.where(has_area, area[:, None], 1), 0.5 * (low + high))
+    # The offset of each child's center from its parent's center.
     shift = children.center - np.repeat(center, arity, axis=0)
     pairs: Pairs = dict.fromkeys(MOMENT_KEYS, (0.0, 0.0))
     for (l, m, part), values in zip(_MOMENT_PARTS, parts, strict=True):
@@ -387,6 +437,7 @@ def _parent_moments(
         multipole_to_multipole(pairs, *(upload_floats(backend, column) for column in shift.T))
     )
     dr.eval(*shifted)
+    # Sum over the children of each parent, which follow each other.
     first = arity * dr.arange(backend.UInt32, count)
     sums = [
         sum(dr.gather(backend.Float, column, first + k) for k in range(arity)) for column in shifted
@@ -401,11 +452,16 @@ def _parent_moments(
 
 
 def _shifted_powers(level: NodeMoments, s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """The second, third and fourth moments of k nodes (the attributes of `NodeMoments`) about the
-    points center - s instead of their centers. Offsets d of dipoles become d + s.
+    """Compute the second, third and fourth moments of k nodes (as defined by `NodeMoments`) about
+    the points center - s instead of their centers. Each dipole's offset d becomes d + s.
 
-    s: (k, 3). The first moment of a node about its own center is 0.
+    level: the moments of the nodes.
+    s: (k, 3) the shift of each node.
+
+    The formulas follow from expanding the products of d + s; the sum of a_i d_i, about the node's
+    own center, is 0.
     """
+    # trace: the sum of a_i |d_i|^2; m2_s: the second moment times s.
     a, square = level.area[:, None], (s * s).sum(axis=1)
     trace, m2_s = (
         np.einsum("kii->k", level.second_moment),
@@ -418,17 +474,17 @@ def _shifted_powers(level: NodeMoments, s: FloatArray) -> tuple[FloatArray, Floa
 
 
 def _bounding_radius(center: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
-    """The distance (k,) from the center to the farthest corner of the box from low to high."""
+    """Compute the distances (k,) from points to the farthest corner of a box. center, low, high:
+    (k, 3) the points, and two opposite corners of each point's box."""
     return np.linalg.norm(np.maximum(high - center, center - low), axis=1)
 
 
 def cartesian_coefficients(moments: Moments, order: int = 2) -> FloatArray:
-    """Coefficients (k, 15) of the multipole terms of k nodes in Cartesian coordinates, for the
-    degrees l <= order + 1, as `treecode.multipole_terms` reads them. Coefficients of higher degree
-    are 0.
+    """Compute the coefficients (k, 15) of the multipole terms of k nodes as polynomials in x, y, z,
+    as `treecode.multipole_terms` reads them.
 
-    moments: the complex moments M_lm, (k,) each.
-    order: 0, 1 or 2.
+    moments: the complex moments M_lm by (l, m), each an array (k,).
+    order: 0, 1 or 2. Coefficients of terms of degree l > order + 1 are 0.
 
     The term of degree l is P_l(r)/r^(2l+1) with a harmonic polynomial P_l. P_1 = D.r with the
     coefficients D. P_2 has the coefficients of xx, yy, 2xy, 2xz, 2yz; that of zz follows, as the
@@ -437,6 +493,7 @@ def cartesian_coefficients(moments: Moments, order: int = 2) -> FloatArray:
     """
     real = {key: value.real for key, value in moments.items()}
     imag = {key: value.imag for key, value in moments.items()}
+    # r and i: real and imaginary part of M_lm, times the factor of its Cartesian form.
     dipole = [2 * real[1, 1], 2 * imag[1, 1], real[1, 0]]
     r20, r21, i21 = real[2, 0], 6 * real[2, 1], 6 * imag[2, 1]
     r22, i22 = 6 * real[2, 2], 6 * imag[2, 2]
@@ -454,16 +511,17 @@ def cartesian_coefficients(moments: Moments, order: int = 2) -> FloatArray:
         2 * i32,
     ]
     coefficients = -np.stack([*dipole, *quadrupole, *octupole], axis=1)
+    # The terms of degree 1, 2 and 3 have 3, 5 and 7 coefficients.
     coefficients[:, (3, 8, 15)[order] :] = 0
     return coefficients
 
 
 def triangle_rule() -> tuple[FloatArray, FloatArray]:
-    """Barycentric coordinates (6, 3) of points in a triangle, and their weights (6,), whose sum is
-    1.
+    """Return Dunavant's six-point quadrature rule for triangles (1985): the barycentric coordinates
+    (6, 3) of its points, and their weights (6,), whose sum is 1.
 
-    They integrate polynomials of degree at most four exactly, and so give exact moments for l <= 5.
-    This is Dunavant's six-point rule (1985).
+    The rule integrates polynomials of degree at most four exactly. So it gives exact moments for
+    l <= 5, which are integrals of polynomials of degree l - 1.
     """
     rule = ((0.445948490915965, 0.223381589678011), (0.091576213509771, 0.109951743655322))
     points: list[tuple[float, float, float]] = []
@@ -480,11 +538,13 @@ _ROUND_UP = 1 + 2.0**-20
 
 
 def sup_norm(moments: Moments, l: int) -> FloatArray:
-    """A bound (k,), for k nodes, of r^(l+1) times the absolute value of the multipole term of
-    degree l, over all directions. r is the distance from a node's center.
+    """Bound the multipole term of degree l of k nodes. In all directions, at the distance r from a
+    node's center, its absolute value is at most the returned number (k,) over r^(l+1).
 
-    For unit x, y the addition theorem gives sum_m |I_lm(x)|^2 / ((l+m)!(l-m)!) = P_l(1) = 1, so by
-    Cauchy and Schwarz |sum_m conj(M_lm) I_lm|^2 <= sum_m (l+m)! (l-m)! |M_lm|^2.
+    moments: the complex moments M_lm by (l, m), each an array (k,).
+
+    Proof. For unit x, y the addition theorem gives sum_m |I_lm(x)|^2 / ((l+m)!(l-m)!) = P_l(1) = 1,
+    so by Cauchy and Schwarz |sum_m conj(M_lm) I_lm|^2 <= sum_m (l+m)! (l-m)! |M_lm|^2.
     """
     total = 0.0
     for m in range(l + 1):
@@ -496,36 +556,46 @@ def sup_norm(moments: Moments, l: int) -> FloatArray:
 def truncation_bounds(
     level: NodeMoments, nearest: FloatArray, order: int = 2
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Bounds (E, G, H), each (n,), of the multipole terms of n nodes that are left out if only the
-    terms of degree up to order + 1 are used.
+    """Bound the multipole terms of n nodes that are left out if only the terms of degree up to
+    order + 1 are used.
 
-    level: the moments of the n nodes of a level of the tree.
+    level: the moments of the n nodes at one level of the tree.
+    nearest: (n,) the bounds hold at distances r >= nearest from the nodes' centers.
 
-    nearest: (n,) the bounds hold at distances r >= nearest from the centers of the nodes.
+    Returns (E, G, H), each (n,): the omitted terms, whose degrees are l >= k = order + 2, add at
+    most E/r^(k+1) to f, at most G/r^(k+2) to its gradient, and at most H/r^(k+3) to second
+    derivatives along lines.
 
-    At such distances the omitted terms, of degree l >= k = order + 2, add at most E/r^(k+1) to f,
-    at most G/r^(k+2) to its gradient, and at most H/r^(k+3) to second derivatives along lines.
+    Proof. Let R be the node's radius and q = R/r.
 
-    Proof. A dipole of area a at d gives the term l at most a l |d|^(l-1)/r^(l+1): on the sphere
-    rho^l P_l is a trigonometric polynomial of degree l along each great circle, so by Bernstein's
-    and Szego's inequality its gradient is at most l rho^(l-1). Terms up to 5 are known exactly and
-    bounded by `sup_norm`; for the rest |d|^(l-1) <= R^(l-5) |d|^4 and
-    sum_{l>=6} l q^(l-5) = q (6 - 5q)/(1-q)^2 with q = R/r. A harmonic function of degree
-    -(l+1) has, by the same inequality, a gradient of at most l+1 times its largest value on the
-    sphere through the point; the rest is then sum_{l>=6} l (l+1) q^(l-5)
-    = q (42 - 70q + 30q^2)/(1-q)^3. Its derivatives along lines are harmonic of degree -(l+2), so
-    that second derivatives are at most (l+1)(l+2) times it, and sum_{l>=6} l (l+1) (l+2) q^(l-5)
-    = q (336 - 840q + 720q^2 - 210q^3)/(1-q)^4. Each term times r^(k+1) (r^(k+2), r^(k+3)) does not
-    grow with r, so the value at `nearest` is a bound. The results are increased slightly for the
-    rounding to single precision.
+    1. Values. A dipole of area a at the offset d from the center gives a term of degree l of at
+       most a l |d|^(l-1)/r^(l+1): rho^l P_l is on the sphere of radius rho a trigonometric
+       polynomial of degree l along each great circle, so by Bernstein's and Szego's inequality its
+       gradient is at most l rho^(l-1).
+    2. Terms up to degree 5 are known exactly and bounded by `sup_norm`. For the terms l >= 6,
+       |d|^(l-1) <= R^(l-5) |d|^4, and sum_{l>=6} l q^(l-5) = q (6 - 5q)/(1-q)^2.
+    3. Gradients. The term of degree l is a harmonic function that is homogeneous of degree -(l+1)
+       in r. By the same inequality its gradient is at most (l+1)/r times its largest value on the
+       sphere through the point. And
+       sum_{l>=6} l (l+1) q^(l-5) = q (42 - 70q + 30q^2)/(1-q)^3.
+    4. Second derivatives. The derivatives of the term along lines are harmonic and homogeneous of
+       degree -(l+2), so that second derivatives are at most (l+1)(l+2)/r^2 times it. And
+       sum_{l>=6} l (l+1) (l+2) q^(l-5) = q (336 - 840q + 720q^2 - 210q^3)/(1-q)^4.
+    5. The bound of each term, times r^(k+1) for values, r^(k+2) for gradients or r^(k+3) for second
+       derivatives, does not grow with r. So its value at `nearest` is a bound.
+
+    The results are increased slightly for the rounding to single precision.
     """
     r = np.maximum(nearest, 1e-50)  # so that powers do not underflow
+    # Callers have `nearest` of at least 1.5 radii; the limit of q only prevents a division by 0.
     q = np.minimum(level.radius / r, 0.99)
     k = order + 2
+    # The terms of degree l >= 6 (steps 2 to 4), without their factor 1/r^(k+1) and so on.
     tail = level.fourth_moment * level.radius / r ** (6 - k)
     value = tail * (6 - 5 * q) / (1 - q) ** 2
     slope = tail * (42 - 70 * q + 30 * q * q) / (1 - q) ** 3
     second = tail * (336 - 840 * q + 720 * q * q - 210 * q**3) / (1 - q) ** 4
+    # The terms of degree k to 5.
     for l in range(k, MAX_DEGREE + 1):
         term = sup_norm(level.moments, l) / r ** (l - k)
         value, slope, second = (
@@ -537,23 +607,29 @@ def truncation_bounds(
 
 
 def remainder_constants(level: NodeMoments, rough: float) -> tuple[FloatArray, FloatArray]:
-    """Numbers A and K, each (k,), for k nodes of a tree. They bound the difference between the
-    field of a node's dipoles and its linear Taylor polynomial at a point.
+    """Compute numbers A and K, each (k,), for k nodes of a tree. They bound how much the potential
+    f of a node's dipoles differs from its linear Taylor polynomial at a point x.
 
-    They hold at points whose distance r from the node's center is at least r0, which is `rough`
-    times the node's radius R. Over a step of length t = q r with
-    q <= Q = `max_step_fraction(rough)`, the field differs from its linear part by at most
+    level: the moments of the k nodes at one level of the tree.
+    rough: the smallest distance of x from the node's center, as a multiple of the node's radius.
+
+    Let R be the node's radius, and r >= r0 = rough R the distance of x from its center. At the
+    distance t = q r from x, with q <= Q = `max_step_fraction(rough)`, f differs from the linear
+    polynomial by at most
 
         (A + K/r^2) t^2/r^4 Phi_1(q),   Phi_l(q) = ((1-q)^-(l+1) - 1 - (l+1)q)/q^2.
 
-    The term l, a harmonic function of degree -(l+1), is at most B_l/r^(l+1), and its k-th
-    derivative along a line (l+k)!/l! B_l/r^(l+1+k) (the argument of `truncation_bounds`, k times).
-    So Taylor's remainder is at most B_l Phi_l(q) t^2/r^(l+3). In Phi_l/Phi_1 the ratio of
-    coefficients, (l+k)!/(l! (k+1)!), grows with k, so that the quotient grows with q, and
-    W_l = Phi_l(Q)/Phi_1(Q) is a bound. With r >= r0: A = B_1 + W_2 B_2/r0 and K = sum_{l>=3} W_l
-    B_l/r0^(l-3), for l >= 6 of B_l <= l R^(l-5) sum a |d|^4, with Phi_l(Q) < (1-Q)^-(l+1)/Q^2.
+    Proof. The multipole term of degree l is at most B_l/r^(l+1), and its k-th derivative along a
+    line is at most (l+k)!/l! B_l/r^(l+1+k) (the argument of `truncation_bounds`, k times). So
+    Taylor's remainder is at most B_l Phi_l(q) t^2/r^(l+3). In Phi_l/Phi_1 the ratio of
+    coefficients, (l+k)!/(l! (k+1)!), grows with k. So the quotient grows with q, and
+    W_l = Phi_l(Q)/Phi_1(Q) is a bound. As r >= r0, the sum over all l is at most the formula with
+    A = B_1 + W_2 B_2/r0 and K = sum_{l>=3} W_l B_l/r0^(l-3). For l >= 6,
+    B_l <= l R^(l-5) sum a |d|^4 (a dipole has the area a and the offset d from the center) and
+    Phi_l(Q) < (1-Q)^-(l+1)/Q^2.
     """
     r0, q = np.maximum(rough * level.radius, 1e-50), max_step_fraction(rough)
+    # first: Q^2 Phi_1(Q). ratio[n]: W_n. terms[n - 1]: W_n B_n. tail: the sum over l >= 6.
     first = q * q * remainder_factor(q)
     ratio = [((1 - q) ** -(n + 1) - 1 - (n + 1) * q) / first for n in range(MAX_DEGREE + 1)]
     terms = [ratio[n] * sup_norm(level.moments, n) for n in range(1, MAX_DEGREE + 1)]

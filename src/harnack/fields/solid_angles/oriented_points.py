@@ -1,4 +1,5 @@
-"""The data of fields that are sums over oriented points."""
+"""The points, unit normals and areas of fields that are sums over oriented points. An oriented
+point stands for a small piece of a surface."""
 
 from __future__ import annotations
 
@@ -9,27 +10,27 @@ if TYPE_CHECKING:
 
 
 class OrientedPoints:
-    """Points (n, 3), unit normals (n, 3) and areas (n,). Subclasses set them once, by
-    `_set_points`. Users cannot set them, because all other data are computed from them once: other
-    points make another field."""
+    """Points (n, 3) of a surface with unit normals (n, 3), and the areas (n,) of the pieces of the
+    surface that they stand for. Subclasses set them once, by `_set_points`. Users cannot set them,
+    because all other data are computed from them once: other points make another field."""
 
     def _set_points(self, points: FloatArray, normals: FloatArray, areas: FloatArray) -> None:
-        """Set points, normals and areas, and make these arrays read-only."""
+        """Set the points (n, 3), normals (n, 3) and areas (n,), and make these arrays read-only."""
         for array in (points, normals, areas):
             array.setflags(write=False)
         self._points, self._normals, self._areas = points, normals, areas
 
     @property
     def points(self) -> FloatArray:
-        """The points (n, 3)."""
+        """The positions (n, 3) of the points."""
         return self._points
 
     @property
     def normals(self) -> FloatArray:
-        """The normals (n, 3), of unit length."""
+        """The normals (n, 3) at the points, of unit length."""
         return self._normals
 
     @property
     def areas(self) -> FloatArray:
-        """The areas (n,) that the points stand for."""
+        """The area (n,) of the piece of surface that each point stands for."""
         return self._areas

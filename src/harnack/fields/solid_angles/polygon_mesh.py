@@ -1,4 +1,8 @@
-"""Meshes of polygons that need not be flat, each spanned by a level set of its solid angle.
+"""Meshes of polygons that need not be flat. A *face* is a polygon, perhaps with holes; f is the
+solid angle of its boundary curve, with period 4 pi. The *surface of a face* is the level set f = 2
+pi, which spans this curve. Faces are traced one by one; which face is meant may differ from lane to
+lane. *Unit coordinates* of a face have their origin at its center, and its radius is 1. A *lane* is
+one entry of Dr.Jit's arrays, such as a point or a ray.
 
 - `PolygonMesh`: the field, with a patch for each face.
 - `FaceLoops`: the boundary curves of all faces on a backend; `FaceSolidAngle`: the solid angle of a
@@ -54,13 +58,15 @@ _MAX_RECORDS = 2**24
 
 @dataclass(frozen=True)
 class FaceLoops:
-    """Records of all faces of a mesh, and of their edges.
+    """The boundary curves of all faces of a mesh on a backend, as two tables of records (rows of
+    numbers that kernels read): one record for each face, and the records of edges.
 
-    heads: one record per face. In this order it holds: the center (3,) and the size of the face;
-        the index of the first record of its edges; the number of these records, negative if the
-        face is in convex position; and bounds of the rounding of a point, in units of the face, and
-        of the rounding of the value.
-    edges: the edges of all faces, each face in its own unit coordinates.
+    heads: one record for each face. In this order it holds: the center (3,) and the size of the
+        face; the index of the first record of its edges; the number of these records, with a minus
+        sign as a mark that the face's vertices are in convex position (on the boundary of their
+        convex hull); and bounds of the rounding of a point in the face's unit coordinates, and of
+        the rounding of its solid angle.
+    edges: the records of all edges, four to a record, each face in its own unit coordinates.
     """
 
     heads: RecordTable
@@ -68,7 +74,8 @@ class FaceLoops:
 
     @classmethod
     def upload(cls, backend: Backend, faces: PolygonFaces) -> FaceLoops:
-        """Upload all faces, each relative to its center and scaled to unit size.
+        """Upload all faces of a mesh to a backend, each relative to its center and scaled to unit
+        size.
 
         The backend's precision holds the centers exactly, so that subtracting them near a face is
         exact. Raises ValueError if there are too many corners.
@@ -76,12 +83,14 @@ class FaceLoops:
         low, high = faces.face_boxes()
         center = (0.5 * (low + high)).astype(backend.dtype).astype(np.float64)
         face = faces.face_of_corner
+        # The corners of all faces, one face after the other; later in unit coordinates.
         x = faces.vertices[faces.corners] - center[face]
-        first = np.flatnonzero(np.diff(face, prepend=-1))
-        size = np.maximum.reduceat(np.linalg.norm(x, axis=1), first)
+        first_corner = np.flatnonzero(np.diff(face, prepend=-1))
+        size = np.maximum.reduceat(np.linalg.norm(x, axis=1), first_corner)
         magnitude = np.maximum(np.abs(low), np.abs(high)).max(axis=1) / size
         x /= size[face][:, None]
         loops = tuple(np.split(x, faces.loop_starts[1:]))
+        # For each face, the number of records of its edges: of all its loops.
         counts = np.bincount(faces.face_of_loop, -(-faces.loop_sizes // EDGES_PER_RECORD)).astype(
             np.int64
         )
@@ -90,11 +99,11 @@ class FaceLoops:
                 f"{len(x):,} corners of faces are too many: cut the mesh into parts, and give "
                 "them as a list to draw"
             )
-        signed = np.where(faces.in_convex_position, -counts, counts)
+        signed_counts = np.where(faces.in_convex_position, -counts, counts)
         edges = LoopEdges.upload(backend, loops, EDGES_PER_RECORD)
         heads = np.column_stack(
             [
-                center, size, np.cumsum(counts) - counts, signed,
+                center, size, np.cumsum(counts) - counts, signed_counts,
                 backend.machine_epsilon * (6 + 2 * magnitude),
                 edges.rounding(counts),
             ]
@@ -102,7 +111,8 @@ class FaceLoops:
         return cls(RecordTable.upload(backend, heads), edges)
 
     def face(self, index: Any) -> FaceSolidAngle:
-        """The solid angle of the face with this index, which may differ from lane to lane."""
+        """The solid angle of the face with this index, as a field. The index may differ from lane
+        to lane."""
         row = self.heads.read_record(index)
         backend = self.heads.backend
         count = backend.UInt32
@@ -112,10 +122,10 @@ class FaceLoops:
 
 @dataclass(frozen=True)
 class FaceData(UnitFrame):
-    """One face of a polygon mesh, in coordinates that are relative to a center near the face and
-    divided by a size of it (unit coordinates). The face may differ from lane to lane.
+    """One face of a polygon mesh in unit coordinates: relative to a center near the face, and
+    divided by its size. The face may differ from lane to lane.
 
-    edges: the records of its boundary edges; a record holds several edges.
+    edges: the records of its boundary edges; a record holds four edges.
     signed_record_count: the number of these records, with a minus sign as a mark that the vertices
         of the face are in convex position (on the boundary of their convex hull).
     rounding: a bound of the rounding error of a point in unit coordinates.
@@ -129,30 +139,45 @@ class FaceData(UnitFrame):
 
 
 class FaceSolidAngle(Field):
-    """The solid angle of a face, which may differ from lane to lane.
+    """The solid angle f of the boundary of one face, as a field with period 4 pi. The face may
+    differ from lane to lane. The lift of f is the continuous function near a point that equals f
+    modulo 4 pi.
 
-    Its promises, proved bounds near a point, are those of `SolidAngle`, which has the proofs. They
-    include a ball and a range of the lifted solid angle on it. The range is that of
-    `lift_bound="convex"` if the face is in convex position, and that of "edges" otherwise.
+    Its promises, proved bounds of f near a point, are those of `SolidAngle`, which has the proofs.
+    They include a ball and a range of the lift on it. The range is that of `lift_bound="convex"` if
+    the face is in convex position, and that of "edges" otherwise.
     """
 
     period: ClassVar[float | None] = PERIOD
     default_level: float = 2 * math.pi
 
     def __init__(self, face: FaceData) -> None:
+        """Make the field. face: the face, on a backend."""
         self.face = face
 
     def evaluate(self, p: Vec3) -> Sample:
+        """A sample of f at points p: value, gradient, error bounds and proved bounds of f near
+        p."""
         return self._sample(p, None)
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
+        """A sample of f at the ray parameter t, with proved bounds of how f changes along the ray
+        in front of that point and behind it.
+
+        path: the ray.
+        ahead, back: the lengths in front and behind for which bounds are wanted. They are not used:
+            the bounds state their own lengths.
+        """
         del ahead, back
         return path.enclose(self._sample(path.point(t), path.direction))
 
     def _sample(self, p: Vec3, direction: Vec3 | None) -> Sample:
-        """The sample at points p: value, gradient, errors and promises (proved bounds of f near p).
+        """A sample of f at points p in user coordinates: value, gradient, errors and promises
+        (proved bounds of f near p). On the boundary curve itself the value is 0 and the gradient is
+        so steep that p counts as close to any level.
 
-        direction: (3,) a unit vector, along which the sample gets further promises; None for none.
+        direction: (3,) a unit vector. The sample gets further bounds along the line through p in
+            this direction; None for no such bounds.
         """
         face = self.face
         backend, x, rounding = face.backend, face.to_unit(p), face.rounding
@@ -160,30 +185,32 @@ class FaceSolidAngle(Field):
         distance = sums.distance * (1 - SUM_MARGIN) - rounding
         promises = remainder_promises(sums.inverse_cubes, sums.inverse_fourths, distance)
         lift = lift_ball(sums.angle, sums.gradient, sums.inverse_squares, promises)
+        # In convex position the lift stays in (-6 pi, 6 pi) on the ball up to the curve.
         is_convex = face.signed_record_count < 0
         ball = HarmonicBall(
             dr.select(is_convex, distance, lift.radius),
             dr.select(is_convex, -1.5 * PERIOD, lift.lower),
             dr.select(is_convex, 1.5 * PERIOD, lift.upper),
         )
-        # On the curve itself, up to rounding: as in `SolidAngle`.
-        on_curve = sums.distance <= 2 * rounding
+        # At the curve itself, up to rounding, f has all values: the gradient is so steep that the
+        # point counts as close to any level.
+        is_on_curve = sums.distance <= 2 * rounding
         steep_gradient = backend.Array3f(0, 0, 4 * PERIOD / rounding)
-        gradient = dr.select(on_curve, steep_gradient, sums.gradient)
+        gradient = dr.select(is_on_curve, steep_gradient, sums.gradient)
         error = vertex_rounding(backend.machine_epsilon, x, sums.inverse_squares)
-        error = dr.select(on_curve, 0, error) + face.value_rounding
-        error = dr.select(on_curve, 8 * PERIOD, error)
+        error = dr.select(is_on_curve, 0, error) + face.value_rounding
+        error = dr.select(is_on_curve, 8 * PERIOD, error)
         ray_promises: tuple[Lipschitz, ...] = ()
         if direction is not None:
             line = RayLine(x, backend.Array3f(direction), rounding)
 
             def rates(lengths: tuple[Real, ...], active: Mask) -> tuple[Real, ...]:
-                """For each length, a bound of the derivative along the line at points within that
-                length of x (`line_rates`)."""
+                """For each length T, a bound of the derivative of f along the line at its points
+                within T of x (`line_rates`)."""
                 return line_rates(face.edges, line, lengths, active)
 
             ray_promises = lipschitz_along(line, sums.gradient, sums.distance, rates)
-        value = dr.select(on_curve, 0, sums.angle)
+        value = dr.select(is_on_curve, 0, sums.angle)
         sample = Sample(
             value,
             gradient,
@@ -204,11 +231,13 @@ _CORNERS = np.array(list(itertools.product((0, 1), repeat=3)), dtype=np.float64)
 
 
 def face_boxes(faces: PolygonFaces, levels: tuple[float, ...]) -> tuple[FloatArray, FloatArray]:
-    """Lower and upper corners (m, 3) of boxes that contain the level sets of the faces' solid
-    angles.
+    """Boxes that are proved to contain the surfaces of faces: the level sets of each face's solid
+    angle f. They are computed in double precision, for all faces at once. `PolygonMesh.boxes`
+    computes them once for a mesh and its levels.
 
-    They are computed in double precision, for all faces at once. `PolygonMesh.boxes` computes them
-    once for a mesh and its levels.
+    levels: the values of f whose level sets are meant.
+
+    Returns the lower and the upper corners of the boxes of all m faces, both (m, 3).
 
     The 2 pi level of a face in convex position lies in its convex hull (paper, Theorem B.1), which
     lies in the box of its vertices. Other surfaces lie in the isoperimetric box of
@@ -216,9 +245,12 @@ def face_boxes(faces: PolygonFaces, levels: tuple[float, ...]) -> tuple[FloatArr
     result is the box around the other cells.
     """
     low, high = faces.face_boxes()
+    # The least distance of a level from the multiples of 4 pi.
     nearest = min(abs(math.remainder(level, PERIOD)) for level in levels)
+    # Half the diagonal of each face's box.
     size = 0.5 * np.linalg.norm(high - low, axis=1)[:, None]
     is_in_hull = faces.in_convex_position & (nearest > 2 * math.pi * (1 - 1e-9))
+    # The isoperimetric box: rho = L/sqrt(l (4 pi - l)) around the face.
     margin = 1.0001 * faces.face_perimeters()[:, None] / math.sqrt(nearest * (PERIOD - nearest))
     lower = np.where(is_in_hull[:, None], low, low - margin)
     upper = np.where(is_in_hull[:, None], high, high + margin)
@@ -232,13 +264,17 @@ def _carve_boxes(
     faces: PolygonFaces, carved: IntArray, lower: FloatArray, upper: FloatArray,
     levels: tuple[float, ...],
 ) -> tuple[FloatArray, FloatArray]:  # fmt: skip
-    """Lower and upper corners (k, 3) of smaller boxes for the faces of indices `carved`. They are
-    the boxes around the cells of the old boxes that are not proved empty.
+    """Make boxes of faces smaller: divide each into cells, remove cells that are proved to contain
+    no level set, and take the box around the rest.
 
+    carved: (k,) the indices of the faces whose boxes are made smaller.
     lower, upper: (m, 3) corners of the old boxes of all faces.
-    levels: the levels of the surfaces.
+    levels: the values of the solid angle whose level sets the boxes must contain.
 
-    Only cells at the faces of a box can make it smaller, so only these are split further.
+    Returns the lower and the upper corners of the new boxes, both (k, 3).
+
+    Only cells at the sides of a box can make it smaller. So all cells are split twice, and then
+    only those at the sides, until they are small or the work is too large.
     """
     curves = FaceLoops.upload(choose_backend("double"), faces)
     box_sizes, pair_count = upper - lower, 0
@@ -248,13 +284,15 @@ def _carve_boxes(
     for round_index in range(_ROUNDS):
         is_split = cells.depth < _MIN_DEPTH
         if round_index >= _MIN_DEPTH:
-            rows = np.searchsorted(carved, cells.face)
-            is_split = cells.touch(low[rows], high[rows], box_sizes) & (cells.depth < _MAX_DEPTH)
+            # For each cell, the place of its face among the faces `carved`.
+            place = np.searchsorted(carved, cells.face)
+            is_split = cells.touch(low[place], high[place], box_sizes) & (cells.depth < _MAX_DEPTH)
         pair_count += 8 * int(corner_counts[cells.face[is_split]].sum())
         if not is_split.any() or pair_count > _MAX_PAIRS:
             break
         octants = cells.subset(is_split).split(box_sizes)
         size = octants.sizes(box_sizes)
+        # The balls around the octants are tested.
         half = 0.5 * np.linalg.norm(size, axis=1)
         is_empty = _are_empty(curves, octants.face, octants.corner + 0.5 * size, half, levels)
         cells = cells.subset(~is_split).joined(octants.subset(~is_empty))
@@ -264,10 +302,11 @@ def _carve_boxes(
 
 @dataclass(frozen=True)
 class _FaceCells:
-    """Cells of the boxes of faces.
+    """Cells of the boxes of faces of a mesh with m faces. A cell comes from a box by splitting it
+    into eight equal octants, and these again.
 
-    face: (k,) the index of the face that each cell belongs to, in increasing order. Every face has
-        at least one cell.
+    face: (k,) the index of the face that each cell belongs to, in increasing order. Every face that
+        is considered has at least one cell.
     corner: (k, 3) the lower corners of the cells.
     depth: (k,) the number of splits of the face's box that gave the cell.
     """
@@ -277,22 +316,24 @@ class _FaceCells:
     depth: IntArray
 
     def sizes(self, sides: FloatArray) -> FloatArray:
-        """The sizes (k, 3) of the cells. sides: (m, 3) the sizes of the boxes of all faces."""
+        """The side lengths (k, 3) of the cells. sides: (m, 3) the side lengths of the original
+        boxes of all faces."""
         return sides[self.face] * (0.5**self.depth)[:, None]
 
     def boxes(self, sides: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """For each face that has cells, the lower and upper corner of the box around its cells, as
-        two arrays with three columns. sides: (m, 3) the sizes of the original boxes of all
-        faces."""
-        first = np.flatnonzero(np.diff(self.face, prepend=-1))
-        low = np.minimum.reduceat(self.corner, first)
-        return low, np.maximum.reduceat(self.corner + self.sizes(sides), first)
+        """For each face that has cells, the box around its cells: two arrays with three columns, of
+        the lower and of the upper corners. sides: (m, 3) the side lengths of the original boxes of
+        all faces."""
+        first_cell = np.flatnonzero(np.diff(self.face, prepend=-1))
+        low = np.minimum.reduceat(self.corner, first_cell)
+        return low, np.maximum.reduceat(self.corner + self.sizes(sides), first_cell)
 
     def touch(self, low: FloatArray, high: FloatArray, sides: FloatArray) -> BoolArray:
-        """A mask (k,) of the cells that lie at a side of a box, up to a quarter of the cell's size.
+        """A mask (k,) of the cells that lie at a side of the box around the cells of their face, up
+        to a quarter of the cell's size.
 
-        low, high: (k, 3) for each cell the corners of the box.
-        sides: (m, 3) the sizes of the original boxes of all faces.
+        low, high: (k, 3) for each cell the corners of that box.
+        sides: (m, 3) the side lengths of the original boxes of all faces.
         """
         size = self.sizes(sides)
         at_low = self.corner < low + 0.25 * size
@@ -304,8 +345,8 @@ class _FaceCells:
         return _FaceCells(self.face[chosen], self.corner[chosen], self.depth[chosen])
 
     def split(self, sides: FloatArray) -> _FaceCells:
-        """The eight octants of each cell. sides: (m, 3) the sizes of the original boxes of all
-        faces."""
+        """The eight octants of each cell. sides: (m, 3) the side lengths of the original boxes of
+        all faces."""
         depth = np.repeat(self.depth + 1, 8)
         face = np.repeat(self.face, 8)
         half = sides[face] * (0.5**depth)[:, None]
@@ -313,7 +354,7 @@ class _FaceCells:
         return _FaceCells(face, np.repeat(self.corner, 8, axis=0) + steps * half, depth)
 
     def joined(self, other: _FaceCells) -> _FaceCells:
-        """The cells of both operands, sorted by face."""
+        """The cells of this object and of `other` together, sorted by face."""
         face = np.concatenate([self.face, other.face])
         order = np.argsort(face, kind="stable")
         corner = np.concatenate([self.corner, other.corner])
@@ -324,26 +365,26 @@ def _are_empty(
     curves: FaceLoops, face: IntArray, centers: FloatArray, half: FloatArray,
     levels: tuple[float, ...],
 ) -> BoolArray:  # fmt: skip
-    """A mask (k,) of the balls that are proved to contain no level set of their face's solid angle
-    f.
+    """Which balls are proved to contain no level set of the solid angle f of a face: a mask (k,).
 
     curves: the boundary curves of all faces.
-    face: (k,) the face for each ball.
+    face: (k,) for each ball the index of the face.
     centers, half: (k, 3) centers and (k,) radii of the balls.
+    levels: the values of f whose level sets are meant.
 
     Proof. Let h be the radius, less than the distance d_e of the center from every edge e, of
     length 2a. There is no level in the ball if no level lies in [f - S, f + S], where f is the
     value at the center and S bounds the change of the lift within h. The smaller of two bounds is
     used:
 
-    - At distance s from the center, an edge's field is at most
-      2a/((d_e - s) sqrt((d_e - s)^2 + a^2)) (`LiftedEdge.bounds`), whose integral is
-      S = sum_e 2 [asinh(a/(d_e - h)) - asinh(a/d_e)].
+    - At distance s from the center, an edge's field is at most 2a/((d_e - s) sqrt((d_e - s)^2 +
+      a^2)) (`LiftedEdge.bounds`), whose integral is S = sum_e 2 [asinh(a/(d_e - h)) -
+      asinh(a/d_e)].
     - The second derivative along a line is at most 2 sum_e int rho^-3 over the edge, and that
       integral at most 2a/((d_e - h)^2 sqrt((d_e - h)^2 + a^2)) (`LiftedEdge.bounds`): with the
       gradient at the center, S = |grad f| h + h^2 sum_e 2a/((d_e - h)^2 sqrt((d_e - h)^2 + a^2)).
 
-    A cell that contains a point of the curve is never empty.
+    A ball that contains a point of the curve is never empty.
     """
     backend = curves.heads.backend
     real = backend.Float
@@ -353,15 +394,21 @@ def _are_empty(
     h = upload_floats(backend, half) / data.size
 
     def add(p: Vec3, q: Vec3, inverse: Real, state: tuple[Any, ...]) -> tuple[Any, ...]:
-        """Add the edge from p to q to the state: the product of spinors (zr, zi), the gradient, the
-        distance of the nearest edge, and the sums of both bounds."""
+        """Add the edge from p to q to the state: the product (zr, zi) of the factors whose
+        arguments are half the angles of edges, the gradient, the distance of the nearest edge, and
+        the sums of both bounds.
+
+        inverse: 1/|q - p|^2.
+        """
         zr, zi, gradient, nearest, change, second = state
         edge = Edge.between(p, q, inverse, x)
         re, im = inner_product(spinor(edge.a)[2], spinor(edge.b)[2])
         zr, zi = dr.fma(zr, re, -(zi * im)), dr.fma(zr, im, zi * re)
+        # Only the argument of the product matters: it is scaled to a length of about 1.
         scale = dr.rcp(dr.abs(zr) + dr.abs(zi))
         weight, c = edge.biot_savart()
         distance, a = dr.sqrt(edge.squared_distance), 0.5 * dr.rsqrt(inverse)
+        # The two sums of the proof, with gap = d_e - h.
         gap = distance - h
         change = change + 2 * (dr.asinh(a / gap) - dr.asinh(a / distance))
         second = second + 2 * a / (gap * gap * dr.sqrt(gap * gap + a * a))
@@ -374,6 +421,7 @@ def _are_empty(
     f, is_off_curve, max_change = (
         to_numpy(column) for column in (2 * dr.atan2(zi, zr), nearest > 1.001 * h, variation)
     )
+    # The distance from f to the nearest level, modulo the period.
     level_gap = np.full(len(f), math.inf)
     for level in levels:
         offset = np.remainder(f - level + 0.5 * PERIOD, PERIOD) - 0.5 * PERIOD
@@ -387,7 +435,9 @@ _LEVEL_MARGIN = 1e-9 * PERIOD
 
 class PolygonMesh(PatchField["_MeshBuffers"]):
     """Faces of any number of corners, flat or not, each spanned by a smooth surface: the level set
-    of the solid angle of its boundary curve (paper, Sections 4.2.1 and 4.2.4).
+    of the solid angle of its boundary curve (paper, Sections 4.2.1 and 4.2.4). The field has a
+    *patch* for each face, the solid angle of that face. Which face is meant may differ from lane to
+    lane.
 
     vertices: (n, 3).
     faces: a list of faces. A face is a list of at least three indices of vertices, in
@@ -398,7 +448,7 @@ class PolygonMesh(PatchField["_MeshBuffers"]):
     `level` the surface bulges to one side. The faces are separate surfaces that meet in their
     common edges. `Hits.primitive_index` is the index of the face that was hit; the normal is that
     of its surface, towards the positive side of the face. Each face is traced by itself, with the
-    proofs of `SolidAngle`, so that a ray pays only for faces whose boxes it enters
+    proofs of `SolidAngle`, so that a ray spends time only on faces whose boxes it enters
     (`harnack.fields.capabilities`). `face(k)` is the solid angle of face k.
 
     Raises:
@@ -410,6 +460,7 @@ class PolygonMesh(PatchField["_MeshBuffers"]):
     over_relaxation: float = 1.3  # as for `SolidAngle`
 
     def __init__(self, vertices: Any, faces: Any) -> None:
+        """Validate vertices and faces. The parameters are described at the class."""
         super().__init__()
         self.faces: PolygonFaces = validate_polygons(vertices, faces)
         if self.faces.face_count >= MAX_BOXES:
@@ -424,26 +475,27 @@ class PolygonMesh(PatchField["_MeshBuffers"]):
 
     @property
     def vertices(self) -> FloatArray:
-        """The vertices (n, 3)."""
+        """The positions (n, 3) of the vertices."""
         return self.faces.vertices
 
     @property
     def edges(self) -> IntArray:
-        """Pairs (e, 2) of vertices that an edge of some face joins. Each pair occurs once."""
+        """Pairs (e, 2) of indices of vertices that an edge of some face joins. Each pair occurs
+        once."""
         return self.faces.edges
 
     def face(self, index: int) -> SolidAngle:
-        """The solid angle of the boundary of the face with this index. Raises IndexError if there
-        is no such face."""
+        """The solid angle of the boundary of the face with this index, as a field of its own.
+        Raises IndexError if there is no such face."""
         if not 0 <= index < self.faces.face_count:
             last = self.faces.face_count - 1
             raise IndexError(f"there is no face {index}: they are counted from 0 to {last}")
         return SolidAngle(self.faces.loops(index))
 
     def boxes(self, levels: tuple[float, ...] | None = None) -> tuple[FloatArray, FloatArray]:
-        """Boxes proved to contain the surfaces of the m polygons: their lower and upper corners,
-        both (m, 3). The surface of a polygon consists of the level sets of the solid angle of its
-        boundary. The boxes are computed once for the same levels.
+        """Boxes proved to contain the surfaces of the m faces: their lower and upper corners, both
+        (m, 3). The surface of a face consists of the level sets of the solid angle of its boundary.
+        The boxes are computed once for the same levels.
 
         levels: values of the solid angle; None for the levels of this mesh.
         """
@@ -462,16 +514,18 @@ class PolygonMesh(PatchField["_MeshBuffers"]):
         )
 
     def _upload(self, backend: Backend) -> _MeshBuffers:
-        """The boxes of all faces and their boundary curves, on a backend."""
+        """Copy the boxes of all faces and their boundary curves to a backend."""
         boxes = PatchBoxes.upload(backend, *self.boxes())
         return _MeshBuffers(boxes, FaceLoops.upload(backend, self.faces))
 
     def patch(self, index: Any) -> Field:
-        """The solid angle of the face with this index, which may differ from lane to lane."""
+        """The solid angle of the face with this index, as a field on the device. The index may
+        differ from lane to lane."""
         return self._require_data().curves.face(index)
 
     def validate_levels(self, levels: tuple[float, ...]) -> None:
-        """Raise ValueError for a level that is a multiple of 4 pi."""
+        """Raise ValueError for a level that is a multiple of 4 pi: its surfaces would be
+        unbounded."""
         for level in levels:
             if abs(math.remainder(float(level), PERIOD)) < _LEVEL_MARGIN:
                 raise ValueError(
@@ -481,7 +535,8 @@ class PolygonMesh(PatchField["_MeshBuffers"]):
                 )
 
     def describe(self) -> dict[str, Any]:
-        """Facts about the field for users, as a dictionary of names and values."""
+        """Facts about the field for users, as a dictionary of names and values: the numbers of
+        faces, vertices and corners, and of faces in convex position."""
         return {
             "faces": self.faces.face_count,
             "vertices": len(self.vertices),
@@ -492,7 +547,11 @@ class PolygonMesh(PatchField["_MeshBuffers"]):
 
 @dataclass(frozen=True)
 class _MeshBuffers:
-    """The boxes of all faces and their boundary curves, on a backend."""
+    """What tracing a polygon mesh needs on a backend.
+
+    boxes: the boxes that contain the surfaces of faces.
+    curves: the boundary curves of all faces.
+    """
 
     boxes: PatchBoxes
     curves: FaceLoops

@@ -1,13 +1,16 @@
-"""The terms of a dipole, or of a cluster of dipoles, of a radial potential K(r) in a sum, and their
-bounds.
+"""Terms of dipoles and of clusters of dipoles in a sum, with bounds, for a potential that depends
+only on the distance: the *kernel* K(r). A *dipole* is an oriented point y with a vector m, its
+*moment*; its weight is |m|. At the point x it adds -m.grad_y K(|y - x|). A *cluster* of far dipoles
+is added as a single source. f is the sum over all dipoles. psi_0 = K, psi_1, psi_2, ... are
+functions of the distance, with psi_(k+1) = -psi_k'/r. The numbers Q_2, Q_3, ... bound the
+derivatives of K: the m-th derivative along lines is at most m! Q_m/D^(m+1) at the distance D.
 
-Let psi_0 = K and psi_(k+1) = -psi_k'/r. A dipole m at y = x + z has the term -m.grad_y K = m.z
-psi_1. A polynomial P(z) times psi_k has the gradient grad P psi_k - P psi_(k+1) z and, with the
-Hessian HP of P, the Hessian HP psi_k - (grad P z^T + z grad P^T) psi_(k+1) - P psi_(k+1) I + P
-psi_(k+2) z z^T. These are derivatives in z; the gradient in x has the opposite sign. A
-`RadialKernel` defines K and bounds of its derivatives. All else is shared by screened sums
-(`screened.YukawaKernel`), smoothed sums (`smoothed.SmoothedKernel`) and slices of four dimensions
-(`morph_slice.SlicedKernel`).
+A dipole m at y = x + z adds -m.grad_y K = m.z psi_1. A polynomial P(z) times psi_k has the gradient
+grad P psi_k - P psi_(k+1) z and, with the Hessian HP of P, the Hessian HP psi_k - (grad P z^T + z
+grad P^T) psi_(k+1) - P psi_(k+1) I + P psi_(k+2) z z^T. These are derivatives in z; the gradient in
+x has the opposite sign. A `RadialKernel` defines K and bounds of its derivatives. All else is
+shared by screened sums (`screened.YukawaKernel`), smoothed sums (`smoothed.SmoothedKernel`) and
+slices of four dimensions (`morph_slice.SlicedKernel`).
 
 Distances. A kernel may be regular at r = 0. Then it uses D = sqrt(r^2 + height^2) for all
 distances: the distance in four dimensions to a point at that height above the space of the dipoles.
@@ -45,7 +48,8 @@ BALL_FRACTION = 0.35
 
 @dataclass(frozen=True)
 class KernelValues:
-    """The functions psi_0, psi_1, ... of a kernel (see the module) at a distance D.
+    """The functions psi_0 = K, psi_1, ... of a kernel K at a distance D, where psi_(k+1) =
+    -psi_k'/r. They are stored without their large powers of D.
 
     scale: a common factor.
     thetas: one number for each k: psi_k is scale * thetas[k]/D^(2k).
@@ -56,7 +60,8 @@ class KernelValues:
 
 
 class RadialKernel(abc.ABC):
-    """A radial potential K on a backend, for sums over dipoles and their trees.
+    """A radial potential K on a backend, the kernel of a sum over dipoles: its values, and bounds
+    of its derivatives. K is a function of the distance D, and psi_0 = K, psi_(k+1) = -psi_k'/r.
 
     height_square: the square of the height of the points above the space of the dipoles, in four
         dimensions; 0 for points of that space.
@@ -66,13 +71,14 @@ class RadialKernel(abc.ABC):
 
     @abc.abstractmethod
     def at(self, distance: Real, inverse: Real, last: int) -> KernelValues:
-        """The numbers psi_0 to psi_last at the distance D = `distance`, where psi_0 = K and
+        """The values psi_0 to psi_last at the distance D = `distance`, where psi_0 = K and
         psi_(k+1) = -psi_k'/r. inverse: 1/D."""
 
     @abc.abstractmethod
     def bounds(self, distance: Real, last: int) -> list[Real]:
-        """The numbers Q_2, Q_3, ..., Q_last, but at least Q_2 and Q_3. The m-th derivatives of the
-        kernel along lines are at most m! Q_m/D^(m+1) at all distances D >= `distance`.
+        """The numbers Q_2, Q_3, ..., Q_last, but at least Q_2 and Q_3, which bound derivatives: the
+        m-th derivatives of K along lines are at most m! Q_m/D^(m+1) at all distances D >=
+        `distance`.
 
         last: at most 6.
         """
@@ -84,14 +90,15 @@ class RadialKernel(abc.ABC):
 
     @abc.abstractmethod
     def accepting_distance(self, radius: FloatArray, accuracy: float) -> FloatArray:
-        """For clusters of dipoles with these radii (k,), the distances (k,) beyond which their
-        moments are used. accuracy: the larger it is, the larger are the distances."""
+        """The distances (k,) beyond which k clusters of dipoles may be replaced by their moments.
+        radius: (k,) the radii of the clusters. accuracy: the larger it is, the larger are the
+        distances."""
 
 
 @dataclass(frozen=True)
 class PolynomialTerm:
-    """The polynomial P of a term P(z) psi_k of a source, at the vector z from a point to the
-    source. The number k = 1, 2, 3 is the position of the term in the source's list of terms.
+    """The polynomial P in a term P(z) psi_k of a source, evaluated at the vector z from a point to
+    the source. k = 1, 2, 3 is the position of the term in the source's list of terms.
 
     value, gradient, hessian: P, its gradient and its Hessian (xx, yy, zz, xy, xz, yz) by z, all
         times D^(-2k), with D the distance of the source. The Hessian is None if it is 0.
@@ -104,10 +111,12 @@ class PolynomialTerm:
 
 @dataclass(frozen=True)
 class RadialSums:
-    """Sums over all dipoles i, with weights w_i = |m_i| and distances d_i from x. A cluster adds
-    bounds of the sums over its dipoles.
+    """Sums over all dipoles i at a point x: the value f, its derivatives, and sums from which
+    bounds near x are computed. w_i = |m_i| is the weight of a dipole and d_i its distance from x.
+    For a cluster, bounds of the sums over its dipoles are added. The numbers Q_2 and Q_3 bound
+    second and third derivatives of the kernel (see the module).
 
-    sums: value, derivatives and bounds. Here s4 and s5 are the sums of w_i Q_3/d_i^4 and w_i
+    sums: value, derivatives and error bounds. Here s4 and s5 are the sums of w_i Q_3/d_i^4 and w_i
         Q_3/d_i^5, with Q_3 at d_i; for Q_3 = 1 these are those of `SourceSums`.
     q2_d3, q2_d4: the sums of w_i Q_2/d_i^3 and w_i Q_2/d_i^4, with Q_2 at d_i.
     """
@@ -125,7 +134,7 @@ class RadialSums:
 
     @classmethod
     def of(cls, parts: tuple[Any, ...]) -> RadialSums:
-        """The sums from a state of a loop, as the method `parts` returns it."""
+        """The sums from the state of a loop, as the method `parts` returns it."""
         return cls(SourceSums.from_state(parts[0]), *parts[1:])
 
     def parts(self) -> tuple[Any, ...]:
@@ -133,13 +142,14 @@ class RadialSums:
         return self.sums.to_state(), self.q2_d3, self.q2_d4
 
     def plus(self, source: SourceAtPoint, rounding: Real, active: Mask) -> RadialSums:
-        """The sums with a further dipole or cluster added on active lanes.
+        """The sums with a further dipole or cluster, `source`, added on active lanes.
 
         rounding: a bound of the rounding of its term, as a fraction of w Q_2/d^2, which is at least
             the term's absolute value. The rounding of positions adds 6 epsilon w Q_2/d^3;
             `SourceSums.add_term` counts the rounding of the sum.
         """
         tail, sums = source.tail, self.sums.add_term(source.terms, active)
+        # What the source adds to q2_d3, q2_d4, s4 and s5; then 0 on lanes that are not active.
         q2_d3 = source.weight * tail.second * tail.cube
         q3_d4 = source.weight * tail.third * tail.cube * tail.inverse
         bounds = q2_d3, q2_d3 * tail.inverse, q3_d4, q3_d4 * tail.inverse
@@ -182,14 +192,17 @@ class RadialSums:
     def curvatures(
         self, growth: Callable[[Real], Real], least_distance: Real, size: Real
     ) -> tuple[TaylorRemainder, ...]:
-        """Promises for several radii: on a ball around x, a bound of the difference between f and
-        its linear Taylor polynomial at x, from `remainder`.
+        """Proved bounds of second derivatives of f on balls around x, one for each of several
+        radii. Each bounds the difference between f and its linear Taylor polynomial at x, by
+        `remainder`.
 
         growth: the function `RadialKernel.growth`.
         least_distance: a lower bound of the distance to the nearest dipole.
-        size: the length, in the user's unit, that is 1 in the coordinates of the sums.
+        size: the length, in the user's unit, that is 1 in the coordinates of the sums. The results
+            are in the user's unit.
         """
         radii = [(fraction, fraction * least_distance) for fraction in _RADIUS_FRACTIONS]
+        # The constant of a `TaylorRemainder` is twice the bound of the remainder over |y-x|^2.
         return tuple(
             TaylorRemainder(2 * self.remainder(fraction, r, growth(r)) / (size * size), r * size)
             for fraction, r in radii
@@ -200,18 +213,18 @@ class RadialSums:
         distance to the nearest dipole. growth: the result of `RadialKernel.growth` for r.
 
         It is the sum over the dipoles of w_i times the integral of |K^(2)| = 2 Q_2/(d_i-s)^3 over s
-        from 0 to r. With q = r/d_i the integral contains 1/(1-q)^2 - 1 = 2q + c q^2. Its factor c
-        grows with q, and so is at most its value at q = `BALL_FRACTION`.
+        from 0 to r. With q = r/d_i the integral is Q_2/d_i^2 times 1/(1-q)^2 - 1 = 2q + c q^2. The
+        factor c grows with q, and so is at most its value at q = `BALL_FRACTION`.
         """
-        chord = (1 / (1 - BALL_FRACTION) ** 2 - 1 - 2 * BALL_FRACTION) / BALL_FRACTION**2
-        change = dr.fma(chord * r, self.q2_d4, 2 * self.q2_d3)
+        c = (1 / (1 - BALL_FRACTION) ** 2 - 1 - 2 * BALL_FRACTION) / BALL_FRACTION**2
+        change = dr.fma(c * r, self.q2_d4, 2 * self.q2_d3)
         return (1 + SUM_MARGIN) * growth * r * change
 
 
 @dataclass(frozen=True)
 class KernelBounds:
-    """A distance, its powers, and numbers that bound a kernel's derivatives there and beyond: the
-    m-th derivatives along lines are at most m! Q_m/D^(m+1) at distances D.
+    """A distance from a dipole, and numbers that bound the derivatives of a kernel K there and
+    beyond: the m-th derivatives along lines are at most m! Q_m/D^(m+1) at distances D.
 
     distance, inverse, cube: the distance, one over it, and one over its cube.
     second, third: Q_2 and Q_3.
@@ -225,19 +238,21 @@ class KernelBounds:
 
     @classmethod
     def of(cls, distance: Real, inverse: Real, bounds: Sequence[Real]) -> KernelBounds:
-        """The bounds at a distance. inverse: one over the distance. bounds: Q_2, Q_3, ... there."""
+        """The bounds at a distance. inverse: one over the distance. bounds: Q_2, Q_3, ... at this
+        distance."""
         return cls(distance, inverse, inverse * inverse * inverse, bounds[0], bounds[1])
 
 
 def _type_of(vector: object) -> Any:
-    """The type of a vector, as a constructor of vectors."""
+    """The type of a vector, by which other vectors of this type are made."""
     return type(vector)
 
 
 def combine_terms(
     parts: Sequence[PolynomialTerm], z: Vec3, inverse: Real, radial: KernelValues, derivatives: int
 ) -> SourceTerm:
-    """The potential of a source, and its derivatives: the sum of the terms P_k(z) psi_k.
+    """The potential of a source (a dipole or a cluster) at a point, and its derivatives by the
+    point: the sum of the terms P_k(z) psi_k.
 
     parts: the polynomials P_k for k = 1, 2, ...
     z: the vector from the point to the source.
@@ -245,51 +260,58 @@ def combine_terms(
     radial: the numbers psi_0 to psi_(len(parts) + derivatives) at the distance D.
     derivatives: 0 for the value, 1 with the gradient, 2 with the Hessian.
 
-    Powers of 1/D are spread over the factors, so that no factor overflows.
+    The module has the formulas. They contain the same sums over k with psi_k, psi_(k+1) and
+    psi_(k+2); the latter two are called `next` and `after_next` in the code. The common factor
+    `scale` and powers of 1/D, which `parts` and `radial` leave out, are multiplied at the end, so
+    that no factor overflows.
     """
     vector = _type_of(z)
     theta, scale, u2 = radial.thetas, radial.scale, inverse * inverse
-    value, radial_part, second_part = 0.0, 0.0, 0.0
-    gradient, gradients, matrix = vector(0), vector(0), [0.0] * 6
+    value, next_value, after_next_value = 0.0, 0.0, 0.0
+    gradient, next_gradient, matrix = vector(0), vector(0), [0.0] * 6
     for k, part in enumerate(parts, start=1):
         value = dr.fma(theta[k], part.value, value)
         if derivatives == 0:
             continue
-        radial_part = dr.fma(theta[k + 1], part.value, radial_part)
+        next_value = dr.fma(theta[k + 1], part.value, next_value)
         gradient = dr.fma(vector(theta[k]), part.gradient, gradient)
         if derivatives == 2:
-            second_part = dr.fma(theta[k + 2], part.value, second_part)
-            gradients = dr.fma(vector(theta[k + 1]), part.gradient, gradients)
+            after_next_value = dr.fma(theta[k + 2], part.value, after_next_value)
+            next_gradient = dr.fma(vector(theta[k + 1]), part.gradient, next_gradient)
             if part.hessian is not None:
                 matrix = [dr.fma(theta[k], h, m) for h, m in zip(part.hessian, matrix, strict=True)]
     if derivatives == 0:
         return SourceTerm(scale * value)
-    radial_part = radial_part * u2
-    slope = scale * dr.fma(vector(radial_part), z, -gradient)
+    next_value = next_value * u2
+    slope = scale * dr.fma(vector(next_value), z, -gradient)
     if derivatives < 2:
         return SourceTerm(scale * value, slope, None)
     hessian = SymmetricMatrix(*(scale * m for m in matrix))
-    row = dr.fma(vector(second_part * u2), z, -2 * gradients)
-    hessian = hessian.add_outer_product((scale * u2) * row, z)
-    radial_part = scale * radial_part
+    # The outer product of this vector with z, made symmetric, gives the terms with z z^T and with
+    # grad P z^T.
+    left_factor = dr.fma(vector(after_next_value * u2), z, -2 * next_gradient)
+    hessian = hessian.add_outer_product((scale * u2) * left_factor, z)
+    next_value = scale * next_value
+    # The term -P psi_(k+1) I.
     total = dataclasses.replace(
         hessian,
-        xx=hessian.xx - radial_part,
-        yy=hessian.yy - radial_part,
-        zz=hessian.zz - radial_part,
+        xx=hessian.xx - next_value,
+        yy=hessian.yy - next_value,
+        zz=hessian.zz - next_value,
     )
     return SourceTerm(scale * value, slope, total)
 
 
 @dataclass(frozen=True)
 class SourceAtPoint:
-    """What a dipole or a cluster of dipoles adds to a sum at a point x, and bounds of its
-    derivatives near x.
+    """What a source, a dipole or a cluster of dipoles, adds to a sum f at a point x, with bounds of
+    its derivatives near x.
 
     terms: value, gradient and Hessian.
-    weight: the sum of the weights of all its dipoles.
-    tail: bounds of the kernel at a lower bound of the distance to its nearest dipole.
-    error, gradient_error, hessian_error: the truncation errors of a cluster.
+    weight: the sum of the weights |m| of its dipoles.
+    tail: bounds of the kernel's derivatives at a lower bound of the distance to its nearest dipole.
+    error, gradient_error, hessian_error: bounds of the truncation errors of a cluster; 0 for a
+        dipole.
     """
 
     terms: SourceTerm
@@ -303,7 +325,7 @@ class SourceAtPoint:
 def dipole_source(
     row: Sequence[Real], x: Vec3, kernel: RadialKernel, derivatives: int
 ) -> SourceAtPoint:
-    """The value and the derivatives of a dipole at points x, with bounds.
+    """What a dipole adds at points x to the sum f: value and derivatives, with bounds.
 
     row: the dipole's record of eight numbers: position, moment, weight = |moment|, and 0.
     kernel: the radial potential.
@@ -325,8 +347,8 @@ def dipole_source(
 
 
 def cluster_parts(c: Sequence[Real], z: Vec3, inverse: Real) -> list[PolynomialTerm]:
-    """The polynomials P_k of the terms P_k(z) psi_k of a cluster of dipoles, for k = 1, 2, 3. z is
-    the vector from the point to the cluster's center.
+    """The polynomials P_k of a cluster of dipoles, for k = 1, 2, 3. The cluster is added as the sum
+    of P_k(z) psi_k, where z is the vector from the point to the cluster's center.
 
     c: the 23 coefficients of the cluster (`radial_tree.coefficients`).
     inverse: 1/D, with D the distance of the center.
@@ -342,6 +364,7 @@ def cluster_parts(c: Sequence[Real], z: Vec3, inverse: Real) -> list[PolynomialT
     axx, ayy, azz, axy, axz, ayz = c[4:10]
     az = _times((axx, ayy, azz, axy, axz, ayz), z)
     xxx, yyy, zzz, xxy, xxz, xyy, yyz, xzz, yzz, xyz = c[13:23]
+    # The matrix C[z] as (xx, yy, zz, xy, xz, yz), then the vector C[z, z].
     cz = tuple(
         dr.fma(i, z.x, dr.fma(j, z.y, k * z.z))
         for i, j, k in (
@@ -362,7 +385,7 @@ def cluster_parts(c: Sequence[Real], z: Vec3, inverse: Real) -> list[PolynomialT
 
 
 def _times(matrix: Sequence[Real], z: Vec3) -> Vec3:
-    """The product of z with a symmetric matrix (xx, yy, zz, xy, xz, yz)."""
+    """The product of the vector z with a symmetric matrix (xx, yy, zz, xy, xz, yz)."""
     xx, yy, zz, xy, xz, yz = matrix
     return _type_of(z)(
         dr.fma(xx, z.x, dr.fma(xy, z.y, xz * z.z)),

@@ -1,10 +1,13 @@
-"""Sums over dipoles of a radial potential K(r): direct sums, or sums by a tree in which a cluster
-of far dipoles counts as a single source.
+"""Sums f over dipoles of a radial potential K(r), the kernel: direct sums, or sums by a tree in
+which a cluster of far dipoles counts as a single source, given by its moments. A *dipole* is an
+oriented point with a vector m, its moment; its weight is |m|. A *record* is a row of numbers that
+describes a dipole or a node of the tree. A *node* stands for the cluster of all dipoles below it;
+its *accepting distance* is the distance beyond which its moments may be used.
 
 Expansion. A cluster consists of dipoles m_i at c + d_i with |d_i| <= R. At the point x = c - z, at
 the distance r = D of z, Taylor's formula in d_i gives
 
-    w = -sum_i m_i.grad K(z + d_i) = -(T1[D] + T2[D^2] + T3[D^3]/2) K(z) + (rest),
+    f = -sum_i m_i.grad K(z + d_i) = -(T1[D] + T2[D^2] + T3[D^3]/2) K(z) + (rest),
 
 with T1 = sum m_i, T2 = sym sum m_i d_i, T3 = sym sum m_i d_i d_i, where in brackets D stands for
 the derivative and sym for the symmetric part. With psi_k as in `radial_kernel`, D K = -z psi_1,
@@ -12,15 +15,15 @@ T2[D^2] K = T2[z,z] psi_2 - tr T2 psi_1, T3[D^3] K = 3 z.tr T3 psi_2 - T3[z,z,z]
 harmonic in three dimensions, so that traces count: there are 19 numbers instead of 15.
 
 Truncation. The rest of Taylor's formula is an integral of the fourth derivative of K along the
-segment from c to c + d_i. At the fraction s of the segment this derivative is at most 4!
-Q_4/(r - s |d_i|)^5. There Q_4 is at most its value at r - R. The integral of the other factor is
-the rest of the Taylor series of 1/(r - .)^2: with q = |d_i|/r
+segment from c to c + d_i. At the fraction s of the segment this derivative is at most 4! Q_4/(r - s
+|d_i|)^5. There Q_4 is at most its value at r - R. The integral of the other factor is the rest of
+the Taylor series of 1/(r - .)^2: with q = |d_i|/r
 
     |rest| <= Q_4 |m_i| (1/(1-q)^2 - 1 - 2q - 3q^2)/r^2 = Q_4 |m_i| |d_i|^3 (4-3q)/((1-q)^2 r^5).
 
 For Q_4 = 1 the bound is attained by a dipole on the line to x that points along it. (4-3q)/(1-q)^2
-grows with q, so that q = R/r gives a bound for all dipoles. For the gradient, likewise from
-2/(r - .)^3,
+grows with q, so that q = R/r gives a bound for all dipoles. For the gradient, likewise from 2/(r -
+.)^3,
 
     Q_5 |m_i| |d_i|^3 (20 - 30q + 12q^2)/((1-q)^3 r^6),
 
@@ -71,7 +74,8 @@ _DIPOLES_PER_TRIP = 4
 
 
 class RadialSum(abc.ABC):
-    """Dipoles of a radial potential on a backend, and sums over them.
+    """Dipoles on a backend, and the sum over them of a radial potential, the kernel, at points. The
+    sum may replace far clusters of dipoles by their moments.
 
     kernel: the radial potential.
     rounding: a bound of the rounding of a dipole's term, as a fraction of the bound of the term's
@@ -79,15 +83,17 @@ class RadialSum(abc.ABC):
     """
 
     def __init__(self, backend: Backend, rows: FloatArray, kernel: RadialKernel) -> None:
-        """rows: (n, 8) the records of the dipoles, from `dipole_records`."""
+        """Keep the kernel. rows: (n, 8) the records of the dipoles, from `dipole_records`, which
+        subclasses upload."""
         self.backend, self.kernel = backend, kernel
         self.rounding = dr.opaque(backend.Float, 12 * backend.machine_epsilon)
 
     def sums(self, x: Vec3, closer: Real, derivatives: int) -> RadialSums:
-        """Value, derivatives and error bounds of the sum over all dipoles, at points x (3, n).
+        """The sum over all dipoles at points x (3, n): value, derivatives and error bounds.
 
         closer: the moments of a cluster are used beyond `closer` times its accepting distance
-            (`RadialKernel.accepting_distance`).
+            (`RadialKernel.accepting_distance`). Larger is more accurate; numbers below 1 count as
+            1.
         derivatives: 0 for the value only, 1 with the gradient, 2 with the Hessian.
         """
         return self.accumulate(RadialSums.zero(self.backend, derivatives), x, closer)
@@ -98,12 +104,17 @@ class RadialSum(abc.ABC):
         dipoles. Returns the new sums.
 
         closer: the moments of a cluster are used beyond `closer` times its accepting distance.
+            Larger is more accurate.
         """
 
     def _with_dipole(
         self, row: list[Real], x: Vec3, derivatives: int, state: tuple[Any, ...]
     ) -> tuple[Any, ...]:
-        """The state of `RadialSums` in a loop, with the dipole of the record `row` at x added."""
+        """Add the dipole in the record `row` to the sums at points x. state: the parts of the sums
+        in a loop (`RadialSums.parts`). Returns the new state.
+
+        derivatives: 0 for the value only, 1 with the gradient, 2 with the Hessian.
+        """
         dipole = dipole_source(row, x, self.kernel, derivatives)
         return RadialSums.of(state).plus(dipole, self.rounding, True).parts()
 
@@ -112,6 +123,7 @@ class DirectSum(RadialSum):
     """The sum over dipoles, one by one. It has no truncation error."""
 
     def __init__(self, backend: Backend, rows: FloatArray, kernel: RadialKernel) -> None:
+        """Upload the dipoles. rows: (n, 8) their records. kernel: the radial potential."""
         super().__init__(backend, rows, kernel)
         self._records = RecordTable.upload(backend, rows, empty_record(rows[0]), _DIPOLES_PER_TRIP)
 
@@ -129,27 +141,37 @@ class DirectSum(RadialSum):
 
 
 class RadialTreecode(RadialSum):
-    """The sum by a tree: near dipoles are added one by one, far clusters by their moments. A
-    cluster is far beyond the kernel's `accepting_distance`."""
+    """The sum over dipoles by a tree: near dipoles are added one by one, far clusters by their
+    moments. A cluster is far from a point if its distance is larger than its accepting distance
+    (`RadialKernel.accepting_distance`)."""
 
     def __init__(
         self, backend: Backend, dipoles: ClusteredDipoles, kernel: RadialKernel, accuracy: float
     ) -> None:
-        """accuracy: the larger it is, the farther away a cluster must be for its moments to be used
-        (`RadialKernel.accepting_distance`)."""
+        """Upload a tree of dipoles.
+
+        dipoles: the tree with its moments.
+        kernel: the radial potential.
+        accuracy: the larger it is, the farther away a cluster must be for its moments to be used
+            (`RadialKernel.accepting_distance`).
+        """
         super().__init__(backend, dipoles.rows, kernel)
         self._tree = dipoles.packed(backend, kernel, accuracy)
 
     def accumulate(self, sums: RadialSums, x: Vec3, closer: Real) -> RadialSums:
         """Add the terms of near dipoles and far clusters at points x to `sums`. Returns the new
         sums.
-        closer: a cluster is far beyond this many times its accepting distance."""
+
+        closer: a cluster is far beyond this many times its accepting distance. Larger is more
+            accurate; numbers below 1 count as 1.
+        """
         closer = fmax(self.backend.Float(closer), self.backend.Float(1))
         derivatives = sums.sums.derivatives
 
         def near(row: list[Real], active: Mask, state: tuple[Any, ...]) -> tuple[Any, ...]:
             """Add the dipole in the record `row`, which is in a leaf that is not far, to the state
             of the sums."""
+            # Lanes on which the leaf is far do not take part in the loop over its dipoles.
             del active
             return self._with_dipole(row, x, derivatives, state)
 
@@ -172,8 +194,8 @@ def cluster_source(
     head: Sequence[Real], c: Sequence[Real], z: Vec3, length: Real, kernel: RadialKernel,
     derivatives: int,
 ) -> SourceAtPoint:  # fmt: skip
-    """The value and the derivatives of a cluster of dipoles at a point, with bounds of their
-    truncation errors. The formulas are those of the module.
+    """What a cluster of dipoles adds at a point to the sum f: value and derivatives, with bounds of
+    their truncation errors. The formulas are those of the module.
 
     head: the first six numbers of the cluster's record: center, accepting distance, radius, weight.
     c: the other numbers of its record: 23 coefficients, and the third moment (`node_records`).
@@ -193,6 +215,8 @@ def cluster_source(
     bounds = kernel.bounds(nearest, 6)
     tail = KernelBounds.of(nearest, inverse_nearest, bounds)
     fourth, fifth, sixth = bounds[2:]
+    # The errors of the module, with |m_i| |d_i|^3 summed to the third moment c[23], and with
+    # 1/((1-q)^j r^(j+3)) written as 1/r^3 times 1/nearest^j.
     q = radius * inverse
     common = c[23] * inverse * inverse * inverse * inverse_nearest * inverse_nearest
     error = common * fourth * dr.fma(-3, q, 4)
@@ -204,12 +228,12 @@ def cluster_source(
 
 @dataclass(frozen=True)
 class ClusteredDipoles:
-    """A tree over dipoles, with the moments of its nodes. These are the data of a sum by a tree
-    that do not depend on the kernel.
+    """A tree over dipoles, with the moments of its nodes: the data of a sum by a tree that do not
+    depend on the kernel.
 
     rows: (n, 8) the records of the dipoles, from `dipole_records`.
     tree: the hierarchy of the dipoles.
-    levels: the moments of the nodes of each level, from the leaves to the root.
+    levels: the moments of the nodes of each level of the tree, from the leaves to the root.
     """
 
     rows: FloatArray
@@ -218,7 +242,7 @@ class ClusteredDipoles:
 
     @classmethod
     def of(cls, rows: FloatArray) -> ClusteredDipoles:
-        """Build a tree over dipoles with these records."""
+        """Build a tree over dipoles. rows: (n, 8) their records."""
         tree = dipole_hierarchy(rows[:, :3])
         return cls(rows, tree, taylor_tree_moments(tree, rows))
 
@@ -235,13 +259,14 @@ class ClusteredDipoles:
 
 @dataclass(frozen=True)
 class TaylorMoments:
-    """The moments of the k nodes at one level of a tree.
+    """The moments of the k nodes at one level of a tree: sums over the dipoles below each node, of
+    which the node's Taylor expansion consists. m is the moment vector of a dipole and d its offset
+    from the node's center.
 
     center: (k, 3) the mean position of the dipoles, by weight.
-    radius, weight: (k,) the largest |d|, and the sum of the weights w = |m|, with d the offset of a
-        dipole m from the center.
+    radius, weight: (k,) the largest |d|, and the sum of the weights w = |m|.
     third: (k,) the sum of w |d|^3.
-    t1: (k, 3) the sum T1 of the dipoles m.
+    t1: (k, 3) the sum T1 of the vectors m.
     t2, t3: (k, 3, 3) and (k, 3, 3, 3) the symmetric parts T2 and T3 of the sums of the tensors m d
         and m d d.
     """
@@ -256,7 +281,7 @@ class TaylorMoments:
 
 
 def taylor_tree_moments(tree: BalancedTree, rows: FloatArray) -> list[TaylorMoments]:
-    """The moments of the nodes of a tree over dipoles. The list has an entry for each level of the
+    """The moments of the nodes of a tree over dipoles: a list with an entry for each level of the
     tree, from the leaves to the root.
 
     rows: (n, 8) the records of the dipoles.
@@ -268,12 +293,14 @@ def taylor_tree_moments(tree: BalancedTree, rows: FloatArray) -> list[TaylorMome
     slots = records_in_slots(tree, rows)
     levels: list[TaylorMoments] = []
     for count, arity in zip(tree.counts, (0, *tree.arities), strict=True):
+        # (count, dipoles below a node, ...): positions, moments, weights.
         position, moment, weights = np.split(
             slots.reshape(count, -1, slots.shape[2])[..., :7], [3, 6], axis=2
         )
         weight = weights.sum(axis=(1, 2))
         center = (weights * position).sum(axis=1) / np.where(weight > 0, weight, 1)[:, None]
         offset = position - center[:, None]
+        # Empty slots have weight 0.
         length = np.where(weights[..., 0] > 0, np.linalg.norm(offset, axis=2), 0)
         third = (weights[..., 0] * length**3).sum(axis=1)
         if not levels:
@@ -292,8 +319,8 @@ def taylor_tree_moments(tree: BalancedTree, rows: FloatArray) -> list[TaylorMome
 def _moved_to_parents(
     children: TaylorMoments, center: FloatArray, arity: int
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """The moments T1 (k, 3), T2 (k, 3, 3), T3 (k, 3, 3, 3) of k parents, each of which has `arity`
-    consecutive children, about the parents' centers (k, 3).
+    """The moments T1 (k, 3), T2 (k, 3, 3), T3 (k, 3, 3, 3) of k parents, from the moments of their
+    children, `arity` consecutive ones for each parent. center: (k, 3) the parents' centers.
 
     Let s be the offset of a child's center from that of its parent. The parent's moments are the
     sums over its children of T1, sym(T2 + T1 s) and sym(T3 + 2 T2 s + T1 s s), where sym is the
@@ -323,6 +350,7 @@ def coefficients(level: TaylorMoments) -> FloatArray:
     reads them: T1; tr T2; -T2; -3/2 tr T3; T3/2. Of symmetric tensors, each different entry occurs
     once."""
     t2, t3 = -level.t2, 0.5 * level.t3
+    # The indices of the entries xx, yy, zz, xy, xz, yz, and of xxx, yyy, zzz, xxy, ...
     i, j = np.array([(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)]).T
     a, b, c = np.array(
         [(0, 0, 0), (1, 1, 1), (2, 2, 2), (0, 0, 1), (0, 0, 2), (0, 1, 1), (1, 1, 2), (0, 2, 2),
@@ -334,8 +362,8 @@ def coefficients(level: TaylorMoments) -> FloatArray:
 
 
 def node_records(level: TaylorMoments, accept: FloatArray) -> FloatArray:
-    """Records (k, 30) of the k nodes of a level: center, accepting distance, radius, weight; then
-    the 23 numbers of `coefficients`, and the third moment.
+    """Records (k, 30) of the k nodes of a level of a tree: center, accepting distance, radius,
+    weight; then the 23 numbers of `coefficients`, and the third moment.
 
     accept: (k,) for each node, the distance beyond which its moments are used.
     """

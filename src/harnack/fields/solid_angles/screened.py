@@ -1,4 +1,8 @@
-"""The winding number of oriented points with a screened (Yukawa) kernel.
+"""The winding number w of oriented points with a screened kernel: the influence of a point falls
+off exponentially beyond the screening length l. An oriented point, or *dipole*, has a position, a
+unit normal and the area for which it stands. The kernel is the Yukawa potential K = exp(-kappa
+r)/r, kappa = 1/l. The numbers Q_m bound its derivatives: the m-th derivative along lines is at most
+m! Q_m/r^(m+1). In unit coordinates the points have a size of about one.
 
 - `ScreenedWindingNumber`: the field.
 - `YukawaKernel`: its kernel, with the proof of its bounds.
@@ -67,24 +71,24 @@ _MAX_LEVEL_PAIRS, _MAX_LEVEL_POINTS, _MIN_LEVEL_POINTS = 8_000_000, 512, 24
 
 
 class YukawaKernel(RadialKernel):
-    """The kernel exp(-kappa r)/r on a backend, with kappa one over the screening length.
+    """The kernel K = exp(-kappa r)/r on a backend, with kappa one over the screening length. psi_0
+    = K, psi_(k+1) = -psi_k'/r. The numbers Q_m bound its derivatives: the m-th derivative along
+    lines is at most m! Q_m/r^(m+1).
 
     Kernel. K(rho) = exp(-kappa rho)/rho is the Yukawa potential: Delta K = kappa^2 K away from 0.
-    With psi_0 = K and psi_(k+1) = -psi_k'/rho one has psi_k = theta_k(kappa rho) exp(-kappa rho)/
-    rho^(2k+1), where theta_0 = 1, theta_1 = 1 + t, theta_k = (2k-1) theta_(k-1) + t^2 theta_(k-2)
-    are the reverse Bessel polynomials: sums of positive terms, which lose no digits for any t. A
-    dipole m at y = x + z gives
+    One has psi_k = theta_k(kappa rho) exp(-kappa rho)/rho^(2k+1), where theta_0 = 1, theta_1 = 1 +
+    t, theta_k = (2k-1) theta_(k-1) + t^2 theta_(k-2) are the reverse Bessel polynomials: sums of
+    positive terms, which lose no digits for any t. A dipole m at y = x + z gives
 
         -m.grad_y K = m.z psi_1 = (1 + kappa rho) exp(-kappa rho) m.z/rho^3.
 
     Bound. |d^m K[u_1, ..., u_m]| <= |K^(m)(rho)| for unit vectors: a derivative of K along a line
     is no larger than along the line to its pole. Proof: d^m K is a symmetric form, so equal vectors
-    u are the worst (Banach 1938). Write s^m as sum_j b_mj P_j(s) in Legendre polynomials,
-    b_mj >= 0; then (u.grad)^m = sum_j b_mj |grad|^(m-j) Y_j(grad) with j = m, m-2, ... and solid
-    harmonics Y_j about u. Applied to K, |grad|^2 is kappa^2, and
-    Y_j(grad) K = (-1)^j psi_j Y_j(z) = (-1)^j rho^j psi_j P_j(cos) (Hobson 1892), with cos the
-    cosine of the angle between u and z. Every coefficient has the sign (-1)^m, and
-    |P_j| <= 1 = P_j(1).
+    u are the worst (Banach 1938). Write s^m as sum_j b_mj P_j(s) in Legendre polynomials, b_mj >=
+    0; then (u.grad)^m = sum_j b_mj |grad|^(m-j) Y_j(grad) with j = m, m-2, ... and solid harmonics
+    Y_j about u. Applied to K, |grad|^2 is kappa^2, and Y_j(grad) K = (-1)^j psi_j Y_j(z) = (-1)^j
+    rho^j psi_j P_j(cos) (Hobson 1892), with cos the cosine of the angle between u and z. Every
+    coefficient has the sign (-1)^m, and |P_j| <= 1 = P_j(1).
 
         |K^(m)(rho)| = m! Q_m(kappa rho)/rho^(m+1),   Q_m(t) = exp(-t) sum_(j<=m) t^j/j!,
 
@@ -93,20 +97,21 @@ class YukawaKernel(RadialKernel):
     """
 
     def __init__(self, backend: Backend, kappa: float) -> None:
-        """kappa: one over the screening length, in the unit of the distances."""
+        """Upload the kernel. kappa: one over the screening length, in the unit of the distances."""
         self._number = kappa
         self.kappa = dr.opaque(backend.Float, kappa)
 
     def at(self, distance: Real, inverse: Real, last: int) -> KernelValues:
-        """The functions psi_0 to psi_last of the class at a distance, by the polynomials theta_k.
+        """The values psi_0 to psi_last of the class at a distance, by the polynomials theta_k.
         inverse: 1/distance."""
+        # Farther away exponentials are not computed, as they would underflow.
         t = fmin(self.kappa * distance, MAX_LENGTHS)
         return KernelValues(dr.exp(-t) * inverse, thetas(t, last))
 
     def bounds(self, distance: Real, last: int) -> list[Real]:
-        """The numbers Q_2(t) to Q_last(t) of the class for t = kappa times the distance, which
-        bound derivatives of the kernel at this distance and beyond. They are sums of powers of
-        t."""
+        """The numbers Q_2(t) to Q_last(t) of the class for t = kappa times `distance`, which bound
+        derivatives of the kernel at this distance and beyond: exp(-t) times a sum of powers of t.
+        """
         t = fmin(self.kappa * distance, MAX_LENGTHS)
         decay = dr.exp(-t)
         sum2 = dr.fma(t, dr.fma(t, 0.5, 1), 1)
@@ -124,14 +129,15 @@ class YukawaKernel(RadialKernel):
         return dr.exp(self.kappa * r)
 
     def accepting_distance(self, radius: FloatArray, accuracy: float) -> FloatArray:
-        """For clusters of dipoles with these radii (k,), the distances (k,) beyond which their
-        moments are used. accuracy: the larger it is, the larger are the distances."""
+        """The distances (k,) beyond which k clusters of dipoles may be replaced by their moments.
+        radius: (k,) the radii of the clusters. accuracy: the larger it is, the larger are the
+        distances."""
         return accepting_distance(radius, self._number, accuracy)
 
 
 def thetas(t: Real, last: int) -> list[Real]:
-    """The values theta_0(t), ..., theta_last(t) of the reverse Bessel polynomials of
-    `YukawaKernel`."""
+    """The values theta_0(t), ..., theta_last(t) of the reverse Bessel polynomials: theta_0 = 1,
+    theta_1 = 1 + t, theta_k = (2k-1) theta_(k-1) + t^2 theta_(k-2)."""
     square = t * t
     values: list[Real] = [1.0, 1 + t]
     for k in range(2, last + 1):
@@ -142,12 +148,15 @@ def thetas(t: Real, last: int) -> list[Real]:
 def screened_promises(
     radial: RadialSums, f: Real, gradient: Vec3, kernel: YukawaKernel, size: Real, epsilon: float
 ) -> tuple[tuple[TaylorRemainder, ...], HarmonicBall]:
-    """The promises of `ScreenedWindingNumber`, proved bounds of f near a point x: several bounds of
-    second derivatives on balls around x; and a ball with a range of f, which proves shorter steps.
+    """Proved bounds of f, a sum over screened dipoles, near a point x: several bounds of second
+    derivatives on balls around x; and a ball with a range of f, which proves shorter steps.
+    `ScreenedWindingNumber` has the proofs.
 
-    radial: the sums at the point.
-    f, gradient: value and gradient at the point, in units of `size`.
-    size: the length, in the user's unit, that is 1 in the coordinates of the sums.
+    radial: the sums at x, in unit coordinates.
+    f, gradient: value and gradient at x, in units of `size`.
+    kernel: the kernel of the sum.
+    size: the length, in the user's unit, that is 1 in unit coordinates. The results are in the
+        user's unit.
     epsilon: the machine epsilon of the backend.
 
     Radii stay below 36 screening lengths. So exp(kappa r) times sums in which exponentials are at
@@ -157,13 +166,17 @@ def screened_promises(
     nearest = fmax(sums.singularity_distance * (1 - SUM_MARGIN) - 8 * epsilon, 0)
     max_radius = fmin(nearest, MAX_LENGTHS / kappa)
     promises = radial.curvatures(kernel.growth, max_radius, size)
+    # The radius R of the ball with a range. S is the smaller of two bounds of the change of f.
     r = BALL_FRACTION * max_radius / dr.fma(_BALL_SHRINKAGE * kappa, max_radius, 1)
     growth = kernel.growth(r)
     slope = dr.norm(gradient) + sums.gradient_truncation
-    taylor = (1 + SUM_MARGIN) * r * dr.fma(r, radial.remainder(BALL_FRACTION, r, growth), slope)
-    change = fmin(radial.variation(r, growth), taylor)
+    change_by_taylor = (
+        (1 + SUM_MARGIN) * r * dr.fma(r, radial.remainder(BALL_FRACTION, r, growth), slope)
+    )
+    max_change = fmin(radial.variation(r, growth), change_by_taylor)
+    # The products of f - S and f + S with the least cosine and with 1.
     min_cosine = dr.cos(fmin(kappa * r, math.pi))
-    ends = (f - change, f + change)
+    ends = (f - max_change, f + max_change)
     products = [end * min_cosine for end in ends]
     lower, upper = fmin(ends[0], products[0]), fmax(ends[1], products[1])
     # A negative cosine exchanges the ends of the interval.
@@ -172,13 +185,17 @@ def screened_promises(
 
 
 def accepting_distance(radius: FloatArray, kappa: float, accuracy: float) -> FloatArray:
-    """The distances (k,) beyond which the moments of clusters with the radii R (k,) are used: the
-    smallest r with accuracy R Q_4(kappa (r-R))^(1/5) <= r. Here Q_4 is that of `YukawaKernel`, and
-    kappa is one over the screening length.
+    """The distances (k,) beyond which k clusters of screened dipoles may be replaced by their
+    moments: for a cluster of radius R, the smallest r with accuracy R Q_4(kappa (r-R))^(1/5) <= r.
+    Here Q_4 bounds fourth derivatives (`YukawaKernel`).
 
-    For each unit of area, clusters of radius R on a surface cost 1/R^2 and have an error of R^3/r^5
-    Q_4. The sum of errors is smallest at a fixed cost if R is proportional to r Q_4^(-1/5). r is
-    computed by bisection, and is never too small.
+    radius: (k,) the radii R.
+    kappa: one over the screening length.
+    accuracy: the larger it is, the larger are the distances.
+
+    Why this distance: for each unit of area, clusters of radius R on a surface cost 1/R^2 and have
+    an error of R^3/r^5 Q_4. The sum of errors is smallest at a fixed cost if R is proportional to r
+    Q_4^(-1/5). r is computed by bisection, and is never too small.
     """
     low, high = _MIN_ACCEPTANCE * radius, accuracy * radius
     for _ in range(40):
@@ -191,16 +208,23 @@ def accepting_distance(radius: FloatArray, kappa: float, accuracy: float) -> Flo
 
 
 def mean_at_dipoles(rows: FloatArray, kappa: float) -> float:
-    """The mean, weighted by area, of w at the positions of the dipoles, or of some of them. Each
-    value is computed without the dipoles at its own position. rows: the records of the dipoles."""
+    """The mean, weighted by area, of the screened winding number w at the positions of the dipoles,
+    or of some of them if there are many. The value at a position leaves out the dipoles at the
+    position itself.
+
+    rows: (n, 8) the records of the dipoles: position, moment, area, 0.
+    kappa: one over the screening length.
+    """
     n = len(rows)
     count = min(n, max(_MIN_LEVEL_POINTS, min(_MAX_LEVEL_POINTS, _MAX_LEVEL_PAIRS // n)))
     probes = np.unique(np.linspace(0, n - 1, count).astype(np.int64))
+    # Some positions, evenly spaced in the order of the records; and all coordinates and moments.
     x, y, z, *moment = np.ascontiguousarray(rows[:, :6].T)
     values: list[float] = []
     for i in probes:
         d = (x - x[i], y - y[i], z - z[i])
         square = d[0] * d[0] + d[1] * d[1] + d[2] * d[2]
+        # Dipoles at the position itself, too, get weight 0.
         is_apart = square > 0
         rho = np.sqrt(np.where(is_apart, square, 1))
         weight = np.where(is_apart, (1 + kappa * rho) * np.exp(-kappa * rho) / rho**3, 0)
@@ -222,22 +246,24 @@ _ON_DIPOLE, _ANY_LEVEL = 32, 1e5
 
 
 class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuffers"]):
-    """w(x) = (1/4 pi) sum_i a_i n_i.(y_i - x) (1 + rho_i/l) exp(-rho_i/l)/rho_i^3, rho_i = |y_i-x|.
+    """The screened winding number w of oriented points y_i, as a field: w(x) = (1/4 pi) sum_i a_i
+    n_i.(y_i - x) (1 + rho_i/l) exp(-rho_i/l)/rho_i^3, rho_i = |y_i - x|. Points y_i with unit
+    normals n_i, also called dipoles, stand for areas a_i of a surface, and l is the screening
+    length.
 
-    Points y_i with unit normals n_i stand for areas a_i of a surface, and l is the screening
-    length. A term is minus the derivative of the Yukawa kernel exp(-rho/l)/rho along n_i at y_i. As
-    l grows, w becomes the winding number of the points (Barill et al. 2018). The kernel is
-    sometimes written without the factor 1 + rho/l; then w would solve no screened equation. Away
-    from the points
+    A term is minus the derivative of the Yukawa kernel exp(-rho/l)/rho along n_i at y_i. As l
+    grows, w becomes the winding number of the points (Barill et al. 2018). The kernel is sometimes
+    written without the factor 1 + rho/l; then w would solve no screened equation. Away from the
+    points
 
         Laplacian w = w/l^2:   w is not harmonic.
 
-    Meaning. For dense samples of a closed surface with outward normals, w is 1 - u inside and
-    -u outside. Here u, between 0 and 1, is the blurred indicator of the inside: u - l^2 Laplacian u
-    is 1 inside and 0 outside (Green's second identity). So w falls from 1 - u to -u at the surface
-    and decays like exp(-distance/l) on both sides. Far points have no effect, holes wider than a
-    few l stay open, and deep inside w is near 0 again. The level that lies on the surface is the
-    mean of 1 - u and -u there: 1/2 for l much larger than the surface, 0 for l much smaller.
+    Meaning. For dense samples of a closed surface with outward normals, w is 1 - u inside and -u
+    outside. Here u, between 0 and 1, is the blurred indicator of the inside: u - l^2 Laplacian u is
+    1 inside and 0 outside (Green's second identity). So w falls from 1 - u to -u at the surface and
+    decays like exp(-distance/l) on both sides. Far points have no effect, holes wider than a few l
+    stay open, and deep inside w is near 0 again. The level that lies on the surface is the mean of
+    1 - u and -u there: 1/2 for l much larger than the surface, 0 for l much smaller.
     `default_level` is the mean of w, weighted by area, over all points or some of them, where the
     value at a point leaves out its own term; Kazhdan et al. 2006 choose their level in this way. l
     should be longer than the distance between neighboring points: else the level sets are those of
@@ -249,23 +275,22 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
     method: "sum" (all dipoles), "tree" (clusters of far dipoles), "auto".
     accuracy: for the tree, the moments of a cluster of radius R are used where its screened error
         is as small as that of an unscreened cluster at distance accuracy * R. The error is bounded
-        and part of every promise. Tracing uses a higher accuracy where the tolerance needs it.
+        and part of every proved bound. Tracing uses a higher accuracy where the tolerance needs it.
 
-    Promises (`screened_promises` has the formulas). Let d_i be the distances of the points from x,
-    and d the smallest of them.
+    Promises, proved bounds of w near a point x (`screened_promises` has the formulas). Let d_i be
+    the distances of the points from x, and d the smallest of them.
 
     - `TaylorRemainder` bounds second derivatives. On the ball B(x, r) with r < d, each term's
-      second derivatives at distance s from x are at most
-      |K'''|(d_i - s) = 6 Q_3(kappa (d_i-s))/(d_i-s)^4, with `YukawaKernel` K and kappa = 1/l. By
-      Taylor the integral of (t-s) times that bounds w(y) - w(x) - grad w.(y-x), t = |y-x|. With
-      Q_3(kappa (d_i-s)) <= exp(kappa r) Q_3(kappa d_i) and q = t/d_i it is at most
-      exp(kappa r) Q_3(kappa d_i) (3-2q)/(1-q)^2 t^2/d_i^4. The function (3-2q)/(1-q)^2 is convex,
-      and so at most its chord on [0, r/d].
-    - `HarmonicBall` of dimension 4. w(y) cos(s/l) is harmonic in (y, s). For
-      |y-x|^2 + s^2 < R^2 < d^2 it is the product of a number in [w(x)-S, w(x)+S] and a number in
-      [cos(min(R/l, pi)), 1]. So it lies between the smallest and the largest product of the ends
-      of these intervals. S bounds the change of w on B(x, R), by the integral of
-      |K''|(d_i-s) = 2 Q_2/(d_i-s)^3, where 1/(1-q)^2 - 1 = 2q + ... is bounded by its chord, too.
+      second derivatives at distance s from x are at most |K'''|(d_i - s) = 6 Q_3(kappa
+      (d_i-s))/(d_i-s)^4, with `YukawaKernel` K and kappa = 1/l. By Taylor the integral of (t-s)
+      times that bounds w(y) - w(x) - grad w.(y-x), t = |y-x|. With Q_3(kappa (d_i-s)) <= exp(kappa
+      r) Q_3(kappa d_i) and q = t/d_i it is at most exp(kappa r) Q_3(kappa d_i) (3-2q)/(1-q)^2
+      t^2/d_i^4. The function (3-2q)/(1-q)^2 is convex, and so at most its chord on [0, r/d].
+    - `HarmonicBall` of dimension 4. w(y) cos(s/l) is harmonic in (y, s). For |y-x|^2 + s^2 < R^2 <
+      d^2 it is the product of a number in [w(x)-S, w(x)+S] and a number in [cos(min(R/l, pi)), 1].
+      So it lies between the smallest and the largest product of the ends of these intervals. S
+      bounds the change of w on B(x, R), by the integral of |K''|(d_i-s) = 2 Q_2/(d_i-s)^3, where
+      1/(1-q)^2 - 1 = 2q + ... is bounded by its chord, too.
 
     By default only the first promise is used: it took 14 to 30 evaluations per ray, and the second
     took 20 to 65 (spheres and tori of 270 to 2000 points, l from 0.03 to 100).
@@ -287,6 +312,8 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
         method: MethodName = "auto",
         accuracy: float = 6.0,
     ) -> None:
+        """Validate the points, choose the method, scale the points to unit coordinates, and compute
+        the default level. The parameters are described at the class."""
         super().__init__()
         length = as_positive(length, "length")
         if method not in ("auto", "sum", "tree"):
@@ -304,6 +331,7 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
         )
         self.has_variable_accuracy = self.method == "tree"
         low, high = self.points.min(axis=0), self.points.max(axis=0)
+        # Half the longest side of the box; more for few points that stand for large areas.
         extent = max(0.5 * float((high - low).max()), math.sqrt(float(self.areas.max())))
         self._center = round_to_single(0.5 * (low + high))
         # A power of two, so that lengths are scaled without rounding.
@@ -325,8 +353,10 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
         method: MethodName = "auto",
         accuracy: float = 6.0,
     ) -> ScreenedWindingNumber:
-        """The field of dipoles at the centroids of the triangles of a mesh.
+        """The field of dipoles at the centroids of the triangles of a mesh, each with the
+        triangle's normal and area.
 
+        vertices, faces: (n, 3) and (m, 3), the mesh.
         subdivide: how many times each triangle is cut into 4 triangles first.
         length: the screening length l, in the mesh's unit.
         method: "sum" (all dipoles), "tree" (clusters of far dipoles), or "auto".
@@ -335,8 +365,8 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
 
         This is quadrature by the midpoint rule, not the integral over the triangles. Let R be the
         distance from the centroid to the farthest corner of a triangle of area a and edges of
-        lengths e1, e2, e3. At a distance r > R the triangle contributes an error of at most
-        a (e1^2+e2^2+e3^2)/36 (3-2q)/((1-q)^2 r^4)/(4 pi) with q = R/r. (The first moment about the
+        lengths e1, e2, e3. At a distance r > R the triangle contributes an error of at most a
+        (e1^2+e2^2+e3^2)/36 (3-2q)/((1-q)^2 r^4)/(4 pi) with q = R/r. (The first moment about the
         centroid vanishes; the proof is that of `radial_tree`, with one order less.) Nearer than
         about an edge's length the result is not that of the mesh at all: w is smooth where a
         triangle would make it jump, and infinite at the centroids. Each subdivision divides that
@@ -350,6 +380,7 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
         corners = x[triangles]
         for _ in range(subdivide):
             a, b, c = np.moveaxis(corners, 1, 0)
+            # The midpoints of the sides.
             u, v, w = 0.5 * (b + c), 0.5 * (c + a), 0.5 * (a + b)
             parts = ((a, w, v), (w, b, u), (v, u, c), (u, v, w))
             corners = np.concatenate([np.stack(part, axis=1) for part in parts])
@@ -361,10 +392,11 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
         )
 
     def values_at(self, x: Vec3, derivatives: int, closer: Real = 1.0) -> PointValues:
-        """Values and derivatives at points x (3, n), with error bounds (`BatchedField.values_at`).
+        """w and its derivatives at points x (3, n) in user coordinates, with error bounds
+        (`BatchedField.values_at`).
 
         derivatives: 0 for the value only, 1 with the gradient, 2 with the Hessian.
-        closer: the accuracy scale.
+        closer: the accuracy scale; larger is more accurate.
         """
         data = self._batch_data(backend_of(x))
         x = data.to_unit(x)
@@ -377,21 +409,24 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
             gradient_error=values.gradient_error + slope,
             hessian_error=values.hessian_error + second,
         )
+        # The sum of the dipoles' weights in unit coordinates.
         weight = float(self.areas.sum()) / (4 * math.pi * self._size**2)
         return values.with_far_field_errors(x, 64, weight).rescaled(data.size)
 
     def _cutoff_errors(
         self, data: _ScreenedBuffers, sums: SourceSums, unit: Real
     ) -> tuple[Real, Real, Real]:
-        """Bounds of the additional errors of value, gradient and second derivatives that screening
-        causes.
+        """Bounds of the errors of value, gradient and second derivatives that screening causes, in
+        addition to those of plain dipoles. All is in unit coordinates.
 
+        data: the kernel and the dipoles on a backend.
         sums: the sums at the points.
         unit: the rounding of a coordinate.
 
-        Exponentials are at least exp(-80) = 2e-35 (`MAX_LENGTHS`), times at most Q_3(80)
-        exp(80) = 9e4. Fourth derivatives of the kernel have Q_4(t) <= (1 + t/4) Q_3(t), and a
-        coordinate is off by `unit`.
+        Exponentials are replaced by exp(-80) = 2e-35 where they are smaller (`MAX_LENGTHS`). They
+        are multiplied by at most Q_3(80) exp(80) = 9e4. Fourth derivatives of the kernel have
+        Q_4(t) <= (1 + t/4) Q_3(t), and a coordinate is off by `unit`: this adds to the error of
+        second derivatives.
         """
         inverse = dr.rcp(sums.singularity_distance)
         value_error = 2e-30 * float(self._rows[:, 6].sum()) * inverse * inverse
@@ -400,8 +435,8 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
         return value_error, 2 * value_error * inverse, hessian_error
 
     def _upload(self, backend: Backend, *, traced: bool) -> _ScreenedBuffers:
-        """The kernel and the dipoles on a backend. They are the same for tracing and for values at
-        points."""
+        """Copy the kernel and the dipoles to a backend. They are the same for tracing and for
+        values at points."""
         del traced
         kernel = YukawaKernel(backend, self._kappa)
         if self.method == "sum":
@@ -415,7 +450,13 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
         )
 
     def _sample(self, on: _ScreenedBuffers, p: Vec3, detail: Real) -> Sample:
-        """The sample at p, from the data `on` of a backend, at the accuracy scale `detail`."""
+        """A sample of w at points p in user coordinates: value, gradient, errors and proved bounds
+        of w near p. At a dipole itself the value is 0 and the gradient is so steep that p counts as
+        close to any level.
+
+        on: the kernel and the dipoles on a backend.
+        detail: the accuracy scale; larger is more accurate.
+        """
         x = on.to_unit(p)
         screened, epsilon = on.dipoles.sums(x, detail, 1), on.backend.machine_epsilon
         sums, unit = screened.sums, coordinate_rounding(x)
@@ -440,7 +481,7 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
         )
 
     def validate_levels(self, levels: tuple[float, ...]) -> None:
-        """Raises ValueError for a level that is too small to be told from 0 by its rounding. All
+        """Raise ValueError for a level that is too small to be told from 0 by its rounding. All
         other levels are valid, as they occur next to every dipole."""
         for level in levels:
             if 0 < abs(level) < _SMALLEST_LEVEL:
@@ -458,7 +499,8 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
         return self._extents[levels]
 
     def _extent(self, levels: tuple[float, ...]) -> Volume | None:
-        """The volume that `extent` returns, without the cache."""
+        """Compute the volume that `extent` returns and caches. The distance D of the proof is found
+        by bisection, in unit coordinates."""
         min_level = min(abs(level) for level in levels)
         if min_level < _SMALLEST_LEVEL:
             return None
@@ -474,7 +516,8 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
         return tight_extent(self, levels, lower, upper, _MAX_CELLS)
 
     def describe(self) -> dict[str, Any]:
-        """Facts about the field for users, as a dictionary of names and values."""
+        """Facts about the field for users, as a dictionary of names and values: the number of
+        points, the screening length, the default level and the method."""
         return {
             "points": len(self.points),
             "length": self.length,
@@ -485,8 +528,11 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
 
 @dataclass(frozen=True)
 class _ScreenedBuffers(UnitFrame):
-    """The data of a screened winding number on a backend: the kernel, and the sum over the
-    dipoles."""
+    """The data of a screened winding number on a backend.
+
+    kernel: the Yukawa kernel, with kappa in unit coordinates.
+    dipoles: the sum over the dipoles.
+    """
 
     kernel: YukawaKernel
     dipoles: RadialSum

@@ -1,4 +1,7 @@
-"""Smoothed dipoles: sums over points of clouds with noise, without their singularities.
+"""Sums over smoothed dipoles, for clouds of oriented points with noise: the field of a point has no
+singularity there. rho is the distance from a dipole, h the smoothing length and D = sqrt(rho^2 +
+h^2). The kernel is K = 1/D + h^2/(2 D^3); psi_0 = K, psi_(k+1) = -psi_k'/rho, and the numbers Q_m
+bound its m-th derivatives, by m! Q_m/D^(m+1).
 
 - `SmoothedKernel`: the kernel, with the proof of its bounds.
 - `SmoothedSum`: the sum by a tree.
@@ -33,72 +36,73 @@ _BOUND_FRACTION = 0.55
 
 
 class SmoothedKernel(RadialKernel):
-    """The kernel K = 1/D + h^2/(2 D^3) on a backend, with D = sqrt(rho^2 + h^2) and the smoothing
-    length h.
+    """The kernel K = 1/D + h^2/(2 D^3) on a backend, where rho is the distance from a dipole, h the
+    smoothing length and D = sqrt(rho^2 + h^2). psi_0 = K, psi_(k+1) = -psi_k'/rho. The numbers Q_m
+    bound derivatives of K: the m-th derivative along lines is at most m! Q_m/D^(m+1).
 
-    Kernel. K consists of the first two terms of 1/rho = (D^2 - h^2)^(-1/2) in powers of h^2. With
-    psi_0 = K and psi_(k+1) = -psi_k'/rho
+    Kernel. K consists of the first two terms of 1/rho = (D^2 - h^2)^(-1/2) in powers of h^2. It has
 
         psi_k = (2k-1)!! (1 + (2k+1) q/2)/D^(2k+1),   q = h^2/D^2,
 
     sums of positive terms; a dipole m at y = x + z gives -m.grad_y K = m.z (rho^2 + 5 h^2/2)/D^5.
-    Since Laplacian D^p = p D^(p-2) (p + 1 - (p-2) q) in three dimensions,
-    -Laplacian K/(4 pi) = 15 h^4/(8 pi D^7). This is positive, with integral 1 and second moment
-    3 h^2/2. So a sum over these dipoles is the sum over plain dipoles, averaged with this weight.
-    (The kernel 1/D has the weight 3 h^2/(4 pi D^5), which has an infinite second moment: at equal
-    noise its surfaces were farther off.)
+    Since Laplacian D^p = p D^(p-2) (p + 1 - (p-2) q) in three dimensions, -Laplacian K/(4 pi) = 15
+    h^4/(8 pi D^7). This is positive, with integral 1 and second moment 3 h^2/2. So a sum over these
+    dipoles is the sum over plain dipoles, averaged with this weight. (The kernel 1/D has the weight
+    3 h^2/(4 pi D^5), which has an infinite second moment: at equal noise its surfaces were farther
+    off.)
 
     Bound. |d^m K[u_1, ..., u_m]| <= m! Q_m/D^(m+1), Q_m = 1 + q (m+1)(m+2)/4, for unit vectors.
     Proof. Equal vectors u are the worst (Banach 1938). D is the length of Z = (z, h), and along a
     line in direction u at an angle phi from Z 1/|Z + t u|^(2 l) is the generating function of
     Gegenbauer's polynomials: its m-th derivative is m! C_m^l(-cos phi)/D^(m + 2 l), at most m!
     C_m^l(1)/D^(m + 2 l). That is m!/D^(m+1) for l = 1/2, and m! (m+1)(m+2)/(2 D^(m+3)) for l = 3/2.
-    As D >= h always, q <= 1. The bounds at a distance hold from 0.55 of it on, so that promises,
-    which hold up to 0.45 of it, need no growth factor (`growth`).
+    As D >= h always, q <= 1. The bounds at a distance hold from 0.55 of it on, so that proved
+    bounds on balls, which reach up to 0.45 of it, need no growth factor (`growth`).
     """
 
     def __init__(self, backend: Backend, height: float) -> None:
-        """height: the smoothing length h."""
+        """Upload the kernel. height: the smoothing length h, in the unit of the distances."""
         self.height_square = dr.opaque(backend.Float, height * height)
 
     def at(self, distance: Real, inverse: Real, last: int) -> KernelValues:
-        """The functions psi_0 to psi_last of the class at the distance D, by their closed form. In
-        the code, `factor` is (2k-1)!! and `half` is q/2.
+        """The values psi_0 to psi_last of the class at the distance D, by their closed form.
 
         inverse: 1/D.
         """
         del distance
-        half = 0.5 * self.height_square * inverse * inverse
+        half_q = 0.5 * self.height_square * inverse * inverse
         thetas: list[Real] = []
-        factor = 1.0
+        double_factorial = 1.0  # (2k-1)!!
         for k in range(last + 1):
-            thetas.append(dr.fma((2 * k + 1) * factor, half, factor))
-            factor *= 2 * k + 1
+            thetas.append(dr.fma((2 * k + 1) * double_factorial, half_q, double_factorial))
+            double_factorial *= 2 * k + 1
         return KernelValues(inverse, thetas)
 
     def bounds(self, distance: Real, last: int) -> list[Real]:
         """The numbers Q_2 to Q_last of the class, which bound derivatives of the kernel. They hold
-        at all distances of at least `_BOUND_FRACTION` times `distance`."""
+        at all distances D of at least 0.55 (`_BOUND_FRACTION`) times `distance`."""
+        # h/D at the least of these distances; its square is q.
         ratio = dr.sqrt(self.height_square) / (_BOUND_FRACTION * fmax(distance, 1e-30))
         q = fmin(ratio * ratio, 1)
         return [dr.fma(0.25 * (m + 1) * (m + 2), q, 1) for m in range(2, last + 1)]
 
     def growth(self, r: Real) -> Real:
-        """A factor that bounds how much larger the numbers Q_m of `bounds` are at a distance that
-        is shorter by r."""
+        """The factor by which the numbers Q_m may be larger at a distance that is shorter by r: 1,
+        as `bounds` already holds at shorter distances."""
         del r
         return 1.0
 
     def accepting_distance(self, radius: FloatArray, accuracy: float) -> FloatArray:
-        """For clusters of dipoles with these radii (k,), the distances (k,) beyond which their
-        moments are used. accuracy: the larger it is, the larger are the distances."""
+        """The distances (k,) beyond which k clusters of dipoles may be replaced by their moments:
+        `accuracy` times their radii (k,)."""
         return accuracy * radius + 1e-5
 
 
 @dataclass(frozen=True)
 class SmoothedSum:
-    """The sum of m_i.z_i (rho_i^2 + 5 h^2/2)/(rho_i^2 + h^2)^(5/2) over dipoles m_i at y_i, with
-    z_i = y_i - x and rho_i = |z_i|.
+    """The sum f of m_i.z_i (rho_i^2 + 5 h^2/2)/(rho_i^2 + h^2)^(5/2) over smoothed dipoles, at
+    points x. m_i is the moment of the dipole at y_i, z_i = y_i - x, rho_i = |z_i|, and h is the
+    smoothing length. The accuracy scale of an evaluation is a factor: larger is more accurate.
 
     dipoles: the sum by a tree.
     """
@@ -109,12 +113,12 @@ class SmoothedSum:
     def of(
         cls, backend: Backend, tree: BalancedTree, rows: FloatArray, height: float, accuracy: float
     ) -> SmoothedSum:
-        """The sum over dipoles.
+        """Upload the dipoles and their tree.
 
         tree: the result of `dipole_hierarchy` for their points, or for the same points at earlier
             positions.
-        rows: (n, 8), from `dipole_records`.
-        height: the smoothing length, in the units of the dipoles.
+        rows: (n, 8) the records of the dipoles, from `dipole_records`.
+        height: the smoothing length h, in the units of the dipoles.
         accuracy: the moments of a node are used beyond this many times its radius.
         """
         clustered = ClusteredDipoles(rows, tree, taylor_tree_moments(tree, rows))
@@ -122,26 +126,27 @@ class SmoothedSum:
 
     @property
     def coarsest_accuracy(self) -> float:
-        """The accuracy scale of coarse samples (`Field.coarsest_accuracy`). It is 1, as there are
-        no coarse samples."""
+        """The smallest accuracy scale that makes a difference (`Field.coarsest_accuracy`): 1."""
         return 1.0
 
     def values(self, x: Vec3, derivatives: int, closer: Real) -> PointValues:
-        """Value and derivatives of the sum up to order `derivatives` at points x (3, n), with error
-        bounds. closer: the accuracy scale, at least 1."""
+        """f and its derivatives up to order `derivatives` at points x (3, n), with error bounds.
+        closer: the accuracy scale; larger is more accurate. Values below 1 count as 1."""
         sums = self.dipoles.sums(x, closer, derivatives).sums
         rounding = 8 * self.dipoles.backend.machine_epsilon * dr.abs(sums.value)
         return sums.values(1.0, coordinate_rounding(x), rounding)
 
     def sample(self, x: Vec3, detail: Real) -> Sample:
-        """The sample at points x: value, gradient, errors and promises (proved bounds near x).
-        detail: the accuracy scale."""
+        """A sample of f at points x: value, gradient, errors and proved bounds of second
+        derivatives near x. detail: the accuracy scale; larger is more accurate."""
         radial = self.dipoles.sums(x, detail, 1)
         sums = radial.sums
+        # The error of the gradient: of positions, and of truncation.
         slope_error = dr.fma(
             SLOPE_ROUNDINGS * coordinate_rounding(x), sums.s4, sums.gradient_truncation
         )
         epsilon = self.dipoles.backend.machine_epsilon
+        # A lower bound of the distance to the nearest dipole, also after rounding.
         nearest = fmax(sums.singularity_distance * (1 - SUM_MARGIN) - 8 * epsilon, 0)
         return Sample(
             sums.value,

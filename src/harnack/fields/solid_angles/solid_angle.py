@@ -1,4 +1,13 @@
-"""The solid angle of closed curves: nonplanar polygons, holes, knots, links, coils."""
+"""The field f of this module is the signed solid angle of closed curves: the area that the curves
+enclose on the unit sphere around a point, modulo 4 pi. "The curve" means all closed curves of a
+field together: polygons that need not be plane, and circles. They may have holes, knots, links or
+many turns. The *lift* of f is the continuous function near a point that equals f modulo 4 pi.
+*Promises* are proved bounds of the lift near a point, by which rays take steps that cannot miss a
+level set. In unit coordinates the curve has its center at 0 and a radius of 1. In an *FMM cell*
+(fast multipole method) near edges are summed directly, and all others are replaced by one
+polynomial. A sample's *accuracy scale* is a number: larger is more accurate. A *lane* is one entry
+of Dr.Jit's arrays, such as a point or a ray; a *backend* is what Dr.Jit computes on, and in which
+precision."""
 
 from __future__ import annotations
 
@@ -15,6 +24,7 @@ import numpy as np
 from harnack.backend import FloatArray, backend_of, choose_backend, to_numpy
 from harnack.backend.elementary import fmin
 from harnack.backend.tensors import is_tensor, tensor_to_vectors
+from harnack.backend.validation import check_length_range
 from harnack.cluster.serialization import TransientCache
 from harnack.enclosures import HarmonicBall, Lipschitz
 from harnack.fields.batch_evaluation import map_batches
@@ -85,25 +95,29 @@ _MAX_PLANES = 48
 
 
 class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
-    """The signed solid angle of closed curves, in steradians, with period 4 pi (paper, Eq. 10).
+    """The signed solid angle f of closed curves, in steradians, with period 4 pi (paper, Eq. 10).
+    "The curve" means all loops together. Promises are proved bounds of f near a point.
 
     loops: one (n, 3) array-like of vertices, n >= 3, a `Circle`, or a list of these. Every loop is
         closed by itself. Orientation matters: a hole runs against its outer loop. A loop may be a
         Dr.Jit 3-vector of n lanes or a tensor (n, 3): hits and values can be differentiated by its
-        vertices. Circles are exact, and cost about as much as nine vertices.
+        vertices. Circles are exact, and cost about as much time as nine vertices.
 
     Edges that are traversed in both directions, by one loop or by two neighbors, are removed before
-    anything is computed (`cancel_opposite_edges`): they do not contribute to f. If none is left, f
-    is 0 everywhere, every ray a proved miss, and levels that are multiples of 4 pi are refused.
+    anything is computed (`cancel_opposite_edges`): they do not contribute to f. If no edge is left,
+    f is 0 everywhere, every ray is a proved miss, and levels that are multiples of 4 pi are
+    refused.
 
-    Promises. Second derivatives are bounded near every curve (`curve_queries.remainder_promises`),
-    and steps are proved by that bound. The other proofs, chosen by `enclosures`, need the range of
-    the lift on a ball. On wavy polygons and knots they take 1.4 to 2 times as many evaluations.
+    Proofs of steps. Second derivatives of f are bounded near every curve
+    (`curve_queries.remainder_promises`), and steps are proved by that bound. The other proofs,
+    chosen by the trace option `enclosures`, need a range of the lift on a ball, that is, of the
+    continuous function that equals f modulo 4 pi. On wavy polygons and knots they take 1.4 to 2
+    times as many evaluations.
 
     lift_bound: how the range of the lift on a ball is bounded. "auto" chooses "planar" if the
-    hypothesis of that bound is checked to hold, else "convex" if its hypothesis holds, else
-    "edges". If loops are Dr.Jit arrays it always chooses "edges", so that curves that are moved
-    step by step do not change kernels.
+        hypothesis of that bound is checked to hold, else "convex" if its hypothesis holds, else
+        "edges". If loops are Dr.Jit arrays it always chooses "edges", so that curves that are moved
+        step by step do not change kernels.
 
     - "edges" holds for **every** curve: |grad f| and the bound of second derivatives bound the
       change of f (`lift_ball`).
@@ -117,18 +131,19 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
     - "paper" assumes that range for any curve and promises nothing else, as the paper does. This is
       false for coils and links, so that hits can be missed. It exists for comparisons.
 
-    cells: whether to build FMM cells, for many rays and curves of many vertices. In a cell, near
-    edges are summed directly, and all others are one polynomial with a proved remainder. So an
-    evaluation for tracing costs about the same whatever the number of edges. Where the result
-    depends on the remainder, all edges are summed. None builds cells where they pay
-    (`for_ray_count`), True always, False never. They take some 2 to 10 MB, at most the number of
-    megabytes of this argument (True: 256). If that is too small, there are no cells, and `describe`
-    of a prepared field reports this. They are built at the first trace, for each precision, which
-    takes as long as tracing some 200,000 to 600,000 camera rays without cells. Circles have no
-    cells. Values and derivatives at points are those of all edges.
+    cells: whether to build FMM cells (fast multipole method), for many rays and curves of many
+        vertices. In a cell, near edges are summed directly, and all others are one polynomial with
+        a proved remainder. So an evaluation for tracing costs about the same time whatever the
+        number of edges. Where the result depends on the remainder, all edges are summed. None
+        builds cells where they save time (`for_ray_count`), True always, False never. They take
+        some 2 to 10 MB, at most the number of megabytes of this argument (True: 256). If that is
+        too small, there are no cells, and `describe` of a prepared field reports this. They are
+        built at the first trace, for each precision, which takes as long as tracing some 200,000 to
+        600,000 camera rays without cells. Circles have no cells. Values and derivatives at points
+        are those of all edges.
 
-    Raises CurveError for loops that are not closed curves, ValueError for "convex" if the
-    hypothesis fails, and for cells if a loop is a Dr.Jit array, as its vertices may move.
+    Raises CurveError for loops that are not closed curves, ValueError for "convex" or "planar" if
+    the hypothesis fails, and for cells if a loop is a Dr.Jit array, as its vertices may move.
     """
 
     period: ClassVar[float | None] = _PERIOD
@@ -142,8 +157,11 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         lift_bound: LiftBoundName = "auto",
         cells: bool | float | None = None,
     ) -> None:
+        """Validate the curve, remove edges that cancel each other, and decide how the range of the
+        lift is bounded. The parameters are described at the class."""
         super().__init__()
         self.circles: tuple[Circle, ...]
+        # Loops that are Dr.Jit arrays are kept besides, for derivatives by their vertices.
         curves, self._differentiable_loops = _movable_loops(loops)
         net, self.circles = validate_curves(curves)
         self._loops: Loops = tuple(_read_only(loop) for loop in net)
@@ -158,6 +176,7 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
             self._region = planar_region(self._net_loops, self._net_circles)
         self.lift_bound_option: LiftBoundName = lift_bound
         self.lift_bound = self._resolve_lift_bound(lift_bound)
+        # Unit coordinates: the center of the box around the curve, and the radius around it.
         points = self._points_around()
         self._center = 0.5 * (points.min(axis=0) + points.max(axis=0))
         self._size = float(np.linalg.norm(points - self._center, axis=1).max())
@@ -173,25 +192,27 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
 
     @property
     def loops(self) -> Loops:
-        """The loops of vertices, as in the argument. They cannot be set, because all other data are
-        computed from them once: another curve is another field."""
+        """The polygons of the curve: one array (n, 3) of vertices for each loop of the argument
+        `loops` that is not a circle. They cannot be set, because all other data are computed from
+        them once: another curve is another field."""
         return self._loops
 
     @property
     def _all_cancel(self) -> bool:
-        """Whether all edges and circles cancel each other."""
+        """Whether every edge and every circle is also traversed in the opposite direction. Then f
+        is 0 everywhere."""
         return not self._net_loops and not self._net_circles
 
     @property
     def boundary_curves(self) -> tuple[FloatArray, ...]:
-        """The curves as polygons (n, 3), without edges that cancel each other. Circles become
-        polygons with many sides."""
+        """The curve as a tuple of closed polygons (n, 3), without edges that cancel each other.
+        Each circle is replaced by a polygon with many sides."""
         return (*self._net_loops, *(circle.polygon(_CIRCLE_SIDES) for circle in self._net_circles))
 
     def _points_around(self) -> FloatArray:
-        """Points (n, 3) whose convex hull contains the curves: vertices, and corners of polygons
-        around circles. If all curves cancel each other, the points of the curves of the
-        arguments."""
+        """Points (n, 3) whose convex hull contains the curve: the vertices of loops, and the
+        corners of polygons around circles. If all edges and circles cancel each other, the points
+        are those of the loops and circles that the user gave."""
         loops, circles = self._net_loops, self._net_circles
         if self._all_cancel:
             loops, circles = self.loops, self.circles
@@ -200,13 +221,15 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         )
 
     def _resolve_lift_bound(self, option: LiftBoundName) -> Literal["edges", "planar", "range"]:
-        """The kind of bound by which the range of the lifted solid angle on a ball is computed,
-        from the option `lift_bound`. "auto" becomes the best bound whose assumption about the curve
-        is known to hold; "convex" and "paper" become "range".
+        """Choose the way in which the range of the lift on a ball is computed.
+
+        option: the argument `lift_bound` of the class. "auto" becomes the best way whose assumption
+            about the curve is known to hold. "convex" and "paper" both become "range": the fixed
+            range (-6 pi, 6 pi).
 
         Raises:
             ValueError: the option is unknown; or it is "convex" or "planar", and the curve does not
-                satisfy the assumption of that bound.
+            satisfy the assumption of that bound.
         """
         if option == "auto":
             if self._differentiable_loops:
@@ -235,15 +258,22 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         return "edges" if option == "edges" else "range"
 
     def _upload(self, backend: Backend, *, traced: bool) -> _CurveData:
-        """The data on a backend. traced: whether they are for tracing, which may use cells, or for
-        values at points."""
+        """Copy the curve to a backend, in unit coordinates: its center at 0, its radius 1.
+
+        traced: True for tracing rays, for which FMM cells are built if the field has them; False
+            for values at points, which come from all edges.
+
+        Raises ValueError if coordinates are so large that they could overflow in the backend's
+        precision.
+        """
         # Centered and scaled to unit size: products of eight lengths stay far from overflow. The
         # backend's precision holds the center exactly, so that subtracting it near the curve is
         # exact.
         dtype = np.float64 if backend.precision == "double" else np.float32
-        if (size := float(np.abs(self._center).max()) + self._size) > 0.1 * float(
-            np.finfo(dtype).max
-        ):
+        box = self._center - self._size, self._center + self._size
+        if traced:
+            check_length_range(box, backend.precision, "the curve has")
+        elif (size := float(np.abs(box).max())) > 0.1 * float(np.finfo(dtype).max):
             raise ValueError(
                 f"coordinates up to {size:g} are too large for {backend.precision} precision: "
                 "choose units nearer to 1"
@@ -256,9 +286,11 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
             circles = CircleSet.upload(backend, self._net_circles, center, self._size)
         plane = None
         if self._region is not None:
+            # The plane n.x = offset in unit coordinates.
             height = (self._region.offset - float(self._region.normal @ center)) / self._size
             numbers = (*self._region.normal.tolist(), height)
             plane = tuple(dr.opaque(backend.Float, number) for number in numbers)
+        # The largest coordinate in units of the curve's size: by it positions are rounded.
         magnitude = float(np.abs(self._points_around()).max() / self._size)
         records = (
             0 if edges is None else sum(-(-len(loop) // edges.edges_per_record) for loop in unit)
@@ -279,8 +311,11 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         )
 
     def _box(self, center: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """The corners of a box that contains the curve and the surface of the default level, in
-        unit coordinates. center: (3,) the center of these coordinates."""
+        """The lower and upper corners (3,) of a box that contains the curve and the surface of the
+        default level, in unit coordinates. FMM cells are built in this box.
+
+        center: (3,) the origin of the unit coordinates, in user coordinates.
+        """
         volume = self.extent((self.default_level,))
         corners = [] if volume is None else [np.stack(volume.bounds())]
         points = np.concatenate([*self._net_loops, *corners]) - center
@@ -288,14 +323,14 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
 
     @functools.cached_property
     def _without_cells(self) -> SolidAngle:
-        """This field if it has no cells; otherwise the same field without cells."""
+        """The same field without FMM cells; this field itself if it has none."""
         if not self.has_variable_accuracy:
             return self
         return SolidAngle([*self.loops, *self.circles], lift_bound=self.lift_bound_option)
 
     def _data_for(self, p: Vec3) -> _CurveData:
-        """The data of the curves on the device. If `prepare` was not called, they are uploaded now,
-        without cells, to the backend of p."""
+        """The curve on the device, for points p in user coordinates. If `prepare` was not called,
+        the curve is uploaded now, without FMM cells, to the backend of p."""
         if self._device is None:
             return self._upload(backend_of(p), traced=False)
         return self._device
@@ -303,41 +338,50 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
     def _evaluate_points(
         self, points: Any, precision: Precision | None, choose: Callable[[Sample], Any]
     ) -> npt.NDArray[Any]:
-        """Evaluate the field at points (n, 3), and return what `choose` takes from the samples. A
-        field with cells uses the same field without cells, because values at points are sums over
-        all edges."""
+        """Evaluate the field at points (n, 3), and return what the function `choose` takes from
+        each sample, such as its value. A field with FMM cells uses the same field without cells,
+        because values at points are sums over all edges."""
         if self.has_variable_accuracy:
             return self._without_cells._evaluate_points(points, precision, choose)
         return super()._evaluate_points(points, precision, choose)
 
     def exact(self, backend: Backend) -> Field:
+        """The same field with samples from all edges, without the truncation error of FMM cells."""
         return self.at_accuracy(backend.Float(EXACT)) if self.has_variable_accuracy else self
 
     def at_accuracy(self, detail: Real) -> Field:
+        """The same field with samples of this accuracy scale. Samples come from FMM cells at scales
+        up to 1, and from all edges at larger ones, which are more accurate."""
         field = copy.copy(self)
         field._detail = detail
         return field
 
     def evaluate(self, p: Vec3) -> Sample:
+        """A sample of f at points p in user coordinates: value, gradient, error bounds and proved
+        bounds of f near p."""
         return self._sample(p, None)
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
-        """The sample of f at the ray parameter t, with proved bounds of how f changes along the
-        ray, ahead of that point and behind it. If the ray runs along an edge of the curve, bounds
-        for the line of the ray prove much longer steps than bounds for a ball around the point.
+        """A sample of f at the ray parameter t, with proved bounds of how f changes along the ray
+        in front of that point and behind it. If the ray runs along an edge of the curve, bounds for
+        the line of the ray prove much longer steps than bounds for a ball around the point.
 
         path: the ray.
-        ahead, back: the lengths for which bounds are wanted; not used.
+        ahead, back: the lengths of the ray in front of the point and behind it for which bounds are
+            wanted. They are not used: the bounds state their own lengths.
         """
         del ahead, back
-        has_line_promises = not self._all_cancel and self.lift_bound_option != "paper"
-        direction = path.direction if has_line_promises else None
+        has_line_bounds = not self._all_cancel and self.lift_bound_option != "paper"
+        direction = path.direction if has_line_bounds else None
         return path.enclose(self._sample(path.point(t), direction))
 
     def _sample(self, p: Vec3, direction: Vec3 | None) -> Sample:
-        """The sample at points p: value, gradient, errors and promises (proved bounds of f near p).
+        """A sample of f at points p in user coordinates: value, gradient, error bounds, and
+        promises (proved bounds of f near p). At the curve itself, where f has no single value, the
+        value is 0 and the gradient is so steep that p counts as close to any level.
 
-        direction: (3,) a unit vector, along which the sample gets further promises; None for none.
+        direction: (3,) a unit vector. The sample gets further bounds along the line through p in
+            this direction; None for no such bounds.
         """
         data = self._data_for(p)
         if self._all_cancel:
@@ -346,6 +390,7 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         sums, errors = data.at_detail(x, self._detail)
         epsilon = data.backend.machine_epsilon
         rounding = data.rounding
+        # A lower bound of the distance to the curve, also after rounding.
         distance = sums.distance * (1 - SUM_MARGIN) - rounding
         promises = remainder_promises(sums.inverse_cubes, sums.inverse_fourths, distance)
         value_rounding = errors.rounding + vertex_rounding(epsilon, x, sums.inverse_squares)
@@ -360,29 +405,30 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         # At the curve itself, up to rounding, f has all values (`remaining_edges`) and no gradient:
         # the sample has a gradient so steep that the point counts as close to any level. Anywhere
         # else NaN stays NaN, and the tracer accepts no such point.
-        on_curve = sums.distance <= 2 * rounding
+        is_on_curve = sums.distance <= 2 * rounding
         steep_gradient = data.backend.Array3f(0, 0, 4 * _PERIOD / rounding)
-        gradient = dr.select(on_curve, steep_gradient, sums.gradient)
+        gradient = dr.select(is_on_curve, steep_gradient, sums.gradient)
         gradient_error = errors.slope
-        truncation = dr.select(on_curve, 0, errors.value)
-        error = truncation + dr.select(on_curve, errors.rounding, value_rounding)
+        truncation = dr.select(is_on_curve, 0, errors.value)
+        error = truncation + dr.select(is_on_curve, errors.rounding, value_rounding)
         if sums.circles is not None:
             circles = sums.circles
             # Measured: 15 units in the last place of a circle's angle and 60 of its gradient (near
             # it, 10 elsewhere). Its position is rounded by a few units too.
             point_error = epsilon * (4 + 4 * dr.max(dr.abs(x)))
             value = 16 * epsilon * len(self._net_circles) + point_error * circles.inverse_squares
-            error = error + dr.select(on_curve, 0, value)
-            slope = (
+            error = error + dr.select(is_on_curve, 0, value)
+            circle_gradient_error = (
                 32 * epsilon * circles.inverse_squares + 1.5 * point_error * circles.inverse_cubes
             )
-            gradient_error = gradient_error + slope
-        gradient_error = dr.select(on_curve, 0, gradient_error)
-        error = dr.select(on_curve, 8 * _PERIOD, error)  # the steep gradient times 2 rounding
+            gradient_error = gradient_error + circle_gradient_error
+        gradient_error = dr.select(is_on_curve, 0, gradient_error)
+        error = dr.select(is_on_curve, 8 * _PERIOD, error)  # the steep gradient times 2 rounding
         ray_promises = _line_bounds(data, x, sums, errors, direction)
         if self.lift_bound_option == "paper":
             promises = (ball,)
-        value = dr.select(on_curve, 0, sums.angle)
+        value = dr.select(is_on_curve, 0, sums.angle)
+        # All of this is in unit coordinates; `space_scaled` converts it to user coordinates.
         sample = Sample(
             value,
             gradient,
@@ -398,28 +444,31 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
     def _planar_ball(
         self, data: _CurveData, x: Vec3, sums: CurveSums, distance: Real, error: Real
     ) -> HarmonicBall:
-        """A ball around each point, and a range of the lifted solid angle on it, for
-        `lift_bound="planar"`. They come from the region of a plane that the curves bound, or from
-        the circles if there are only circles.
+        """A ball around each point x that meets no curve, and a range of the lift of f on it, for
+        `lift_bound="planar"`. The range comes from the region of a plane that the curve bounds, or
+        from the circles if there are only circles.
 
-        data: the curves on a backend.
-        x: the points in unit coordinates.
-        sums: the sums at x.
-        distance: a lower bound of the distance to the curve.
-        error: a bound of the truncation error of the angle.
+        data: the curve on a backend.
+        x: the points, in unit coordinates.
+        sums: the sums over edges and circles at x.
+        distance: a lower bound of the distance from x to the curve, in unit coordinates.
+        error: a bound of the truncation error of f.
         """
         if self._region is None:
             circles = sums.circles
             assert circles is not None
             return HarmonicBall(distance, circles.lower, circles.upper)
-        slack = data.rounding + data.backend.machine_epsilon * 4 * dr.max(dr.abs(x))
-        return self._region.lift_range(sums.angle, data.height(x), distance, slack, error)
+        height_rounding = data.rounding + data.backend.machine_epsilon * 4 * dr.max(dr.abs(x))
+        return self._region.lift_range(sums.angle, data.height(x), distance, height_rounding, error)
 
     def _zero_sample(self, data: _CurveData, p: Vec3) -> Sample:
         """The sample of the constant 0 at points p, for curves whose edges all cancel each other.
-        Its promise is a range on a large ball. The range has a positive width, because formulas
-        divide by the width. It contains no level, because levels that are multiples of 4 pi are
-        refused (`validate_levels`)."""
+        It promises a range of f on a ball much larger than the curve. The range has a positive
+        width, because formulas divide by the width. It contains no level, because levels that are
+        multiples of 4 pi are refused (`validate_levels`).
+
+        data: the curve on a backend, whose size gives the unit of length.
+        """
         x = data.to_unit(p)
         radius = 1e6 * (1 + dr.norm(x)) * data.size
         zero = dr.zeros(data.backend.Float, dr.width(p))
@@ -427,13 +476,14 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         return Sample(zero, data.backend.Array3f(zero), (ball,))
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
-        """The three rows of the Hessian of the solid angle at points p. Its trace is 0 up to
-        rounding. It grows without limit towards the curve."""
+        """The Hessian of f at points p, as three vectors: its rows. Its trace is 0 up to rounding.
+        Its entries grow without limit towards the curve."""
         data = self._data_for(p)
         if self._all_cancel:
             zero = dr.zeros(data.backend.Array3f, dr.width(p))
             return zero, zero, zero
         x, scale = data.to_unit(p), 1 / (data.size * data.size)
+        # Second derivatives in unit coordinates; `scale` converts them to user coordinates.
         rows = data.backend.Array3f(0), data.backend.Array3f(0), data.backend.Array3f(0)
         if data.edges is not None:
             rows = hessian_over_edges(data.edges, x)
@@ -447,10 +497,13 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         return first, second, third
 
     def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
-        """Bounds of the errors of the gradient and of the second derivatives at points p. The
-        errors come from the rounding of positions. The bounds are those of sums over boundary edges
-        (`source_sums.SLOPE_ROUNDINGS`), with distances reduced by their rounding. They are infinite
-        at the curve."""
+        """Two proved bounds of rounding errors at points p: of the length of the gradient's error,
+        and of the error of each second derivative. The errors come from the rounding of positions.
+        The bounds are those of sums over boundary edges (`source_sums.SLOPE_ROUNDINGS`), with
+        distances reduced by their rounding. They are infinite at the curve.
+
+        sample: not used; the sums are computed again.
+        """
         del sample
         data = self._data_for(p)
         if self._all_cancel:
@@ -459,14 +512,15 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         sums, unit = data.sums(x), coordinate_rounding(x)
         distance = sums.distance - 4 * unit
         is_off_curve = (distance > 0) & (sums.distance > 2 * data.rounding)  # see `evaluate`
+        # By this factor |dp|/D^4 can grow if the distance D is reduced by its rounding.
         growth = dr.select(is_off_curve, dr.square(dr.square(sums.distance / distance)), dr.inf)
-        slope = SLOPE_ROUNDINGS / 3 * unit * sums.inverse_cubes * growth / data.size
-        second = 0.25 * SECOND_ROUNDINGS * unit * sums.inverse_cubes / sums.distance * growth
-        return slope, second / (data.size * data.size)
+        gradient_error = SLOPE_ROUNDINGS / 3 * unit * sums.inverse_cubes * growth / data.size
+        second_error = 0.25 * SECOND_ROUNDINGS * unit * sums.inverse_cubes / sums.distance * growth
+        return gradient_error, second_error / (data.size * data.size)
 
     def gradient_change_bound(self, p: Vec3, radius: Real) -> Real:
-        """A bound of the change of the gradient within the distance `radius` of points p. The bound
-        is that of `curve_queries.gradient_change_bound`, and includes the rounding of positions."""
+        """A proved bound of |grad f(q) - grad f(p)| for all points q within the distance `radius`
+        of p (`curve_queries.gradient_change_bound`). It includes the rounding of positions."""
         data = self._data_for(p)
         if self._all_cancel:
             return 0 * p.x
@@ -479,12 +533,13 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         )
 
     def closest_boundary_point(self, p: Vec3) -> Vec3 | None:
-        """The closest point of the curve, without edges that cancel each other (`remaining_edges`);
-        None if no edge is left."""
+        """The point of the curve that is closest to p, in user coordinates. Edges that cancel each
+        other do not count (`remaining_edges`); None if no edge is left."""
         if self._all_cancel:
             return None
         data = self._data_for(p)
         x = data.to_unit(p)
+        # The closest point so far, in unit coordinates, and its squared distance.
         nearest, square = data.backend.Array3f(0), data.backend.Float(dr.inf)
         if self._net_loops:
             center = to_numpy(data.center).reshape(3).astype(np.float64)
@@ -497,11 +552,12 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         return nearest * data.size + data.center
 
     def parameters(self) -> tuple[Any, ...]:
+        """The loops that are Dr.Jit arrays, by whose vertices values can be differentiated."""
         return tuple(loop for loop in self._differentiable_loops if _is_drjit(loop))
 
     def differentiable_value(self, p: Vec3) -> Real:
-        """f at p as an expression that Dr.Jit can differentiate by p and by the vertices of
-        loops."""
+        """f at points p, modulo 4 pi, as an expression that Dr.Jit can differentiate by p and by
+        the vertices of loops."""
         backend = backend_of(p)
         # If vertices can move one by one, all edges are summed: after a move they may not cancel.
         loops = self._differentiable_loops or self._net_loops
@@ -509,15 +565,16 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         data = self._data_for(p)
         if data.circles is None:
             return angle
-        # To first order in p, as reverse mode cannot pass a recorded loop.
+        # The part of the circles, to first order in p: reverse mode cannot pass a recorded loop.
+        # Its value is right, as q has the coordinates of p.
         with dr.suspend_grad():
             q = dr.detach(p)
             sums = data.circles.sums(data.to_unit(q))
         return angle + sums.angle + dr.dot(sums.gradient / data.size, p - q)
 
     def continuous_change(self, p: FloatArray, q: FloatArray) -> FloatArray | None:
-        """The change (n,) of the solid angle, followed continuously along the segments from points
-        p (n, 3) to q (n, 3). None if there are circles."""
+        """The change (n,) of the solid angle along the segments from points p (n, 3) to q (n, 3),
+        followed continuously, so that it may exceed 4 pi. None if there are circles."""
         if self._net_circles:
             return None
         backend = choose_backend("double")
@@ -527,14 +584,15 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         edges = data.edges
 
         def changes(start: Vec3, end: Vec3) -> tuple[Real]:
-            """The change of the solid angle from start to end, in user coordinates."""
+            """The change of the solid angle along the segment from start to end, which are in user
+            coordinates."""
             return (continuous_change(edges, data.to_unit(start), data.to_unit(end)),)
 
         return map_batches(backend, changes, p, q)[0]
 
     def validate_levels(self, levels: tuple[float, ...]) -> None:
-        """Raise ValueError for a level that is a multiple of 4 pi, if all edges cancel each
-        other."""
+        """Raise ValueError for a level that is a multiple of 4 pi, if all edges of the curve cancel
+        each other. Then f is 0 everywhere, so that such a level would be all of space."""
         for level in levels:
             if self._all_cancel and abs(math.remainder(float(level), _PERIOD)) < _LEVEL_MARGIN:
                 raise ValueError(
@@ -544,25 +602,33 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
                 )
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
-        """A volume that contains the level sets; None for a level that is a multiple of 4 pi.
+        """A volume that is proved to contain the level sets; None if a level is a multiple of 4 pi,
+        whose level set is unbounded.
 
         The 2 pi level of a curve in convex position lies in its convex hull (paper, Theorem B.1).
         For any curves of total length L, let x be at the distance rho from all of them. Seen from
         x, loop i of length L_i has an angular length t_i of at most L_i/rho. A closed spherical
         curve of length t < 2 pi, cut into simple loops, bounds |area| <= 2 pi - sqrt(4 pi^2 - t^2)
-        =: phi(t), by isoperimetry on the sphere. phi is convex with phi(0) = 0, so the pieces add
-        up to at most phi of the whole. So |Omega| < l wherever L/rho < sqrt(l (4 pi - l)). It
-        follows that a level at distance l from the multiples of 4 pi lies within
-        rho = L/sqrt(l (4 pi - l)) of the curves. Cells of the box with this margin that are proved
-        to contain no level are then cut away (`tight_extent`).
+        =: phi(t), by isoperimetry on the sphere. phi is convex with phi(0) = 0, so the areas of all
+        loops add up to at most phi of the sum of the t_i. So |f| < l wherever L/rho < sqrt(l (4 pi
+        - l)). It follows that a level at distance l from the multiples of 4 pi lies within rho =
+        L/sqrt(l (4 pi - l)) of the curves. Cells of the box with this margin that are proved to
+        contain no level are then cut away (`tight_extent`).
         """
         if levels not in self._extents:
             self._extents[levels] = self._extent(levels)
         return self._extents[levels]
 
     def _extent(self, levels: tuple[float, ...]) -> Volume | None:
-        """The volume that `extent` returns, without the cache."""
+        """Compute the volume that `extent` returns and caches.
+
+        Curves in convex position whose levels are all at 2 pi (modulo 4 pi) get their convex hull,
+        padded by 1e-4 of their size. Otherwise the volume is the box of the proof in `extent`, from
+        which empty cells are cut away. If all edges cancel each other, there is no surface, and the
+        volume is the hull of the points.
+        """
         points = self._points_around()
+        # The distances l of the levels from the multiples of 4 pi.
         gaps = [abs(math.remainder(float(level), _PERIOD)) for level in levels]
         nearest = min(gaps)
         if nearest < _LEVEL_MARGIN:
@@ -582,6 +648,7 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
             return ConvexHull.from_points(points).padded(1e-4 * self._size)
         length = sum(circle.length for circle in self._net_circles)
         length += total_length(self._net_loops) if self._net_loops else 0.0
+        # The bound rho of `extent`.
         margin = 1.0001 * length / math.sqrt(nearest * (_PERIOD - nearest))
         lower, upper = points.min(axis=0) - margin, points.max(axis=0) + margin
         loops = [*self._net_loops, *self._net_circles]
@@ -590,20 +657,22 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         return tight_extent(proved, levels, lower, upper, max(8, _MAX_PAIRS // vertices))
 
     def with_cells(self, cells: bool = True) -> Self:
+        """The same field with FMM cells, or without them if `cells` is False."""
         field = super().with_cells(cells)
         field.has_variable_accuracy, field._extents = cells, TransientCache()
         return field
 
     def cells_pay_from(self) -> float:
-        """The smallest number of rays for which cells pay; infinite if they never pay, or if there
-        can be no cells."""
+        """The smallest number of rays for which FMM cells save more time than it takes to build
+        them. It is infinite if they never do, or if there can be no cells."""
         edges = sum(map(len, self._net_loops))
         is_fixed = not self._differentiable_loops and self.lift_bound_option != "paper"
         never_pays = not is_fixed or edges < _MIN_EDGES
         return math.inf if never_pays else max(_MIN_RAYS, _MIN_WORK / edges)
 
     def describe(self) -> dict[str, Any]:
-        """Facts about the field for users, as a dictionary of names and values."""
+        """Facts about the field for users, as a dictionary of names and values: the numbers of
+        loops, vertices and removed edges, the chosen `lift_bound`, and the FMM cells."""
         return {
             "loops": len(self.loops) + len(self.circles),
             **({"circles": len(self.circles)} if self.circles else {}),
@@ -617,17 +686,19 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
 
 @dataclass(frozen=True)
 class _CurveData(UnitFrame):
-    """The data of curves on a backend.
+    """A closed curve (all loops and circles of a `SolidAngle`) on a backend, in unit coordinates:
+    its center at 0, its radius 1.
 
-    edges, circles: the edges and the circles; None if there are none.
-    plane: normal (x, y, z) and offset of the `PlanarRegion`, in unit coordinates; None without a
-        region.
-    rounding: a bound of the rounding of a point's position, in units of the curve. Near the curve
-        p - center is exact, division and the curve's own coordinates have a few roundings of
-        size 1, and p itself was rounded once, at the curve's distance from 0.
-    value_rounding: a bound of the rounding of the angle, which depends on the number of edges
+    edges, circles: the edges of its polygons and its circles; None if there are none.
+    plane: the normal (x, y, z) and the offset of the plane in which the curve bounds a
+        `PlanarRegion`; None if there is no such region.
+    rounding: a bound of the rounding of a point's position. Near the curve p - center is exact,
+        division and the curve's own coordinates have a few roundings of size 1, and p itself was
+        rounded once, at the curve's distance from 0.
+    value_rounding: a bound of the rounding of the solid angle, which depends on the number of edges
         (`LoopEdges.rounding`).
-    cells: the FMM cells; None for none.
+    cells: the FMM cells, each with its near edges and a polynomial for all other edges; None for no
+        cells.
     """
 
     edges: LoopEdges | None
@@ -638,21 +709,23 @@ class _CurveData(UnitFrame):
     cells: CurveCells | None = None
 
     def at_detail(self, x: Vec3, detail: Real) -> tuple[CurveSums, CellErrors]:
-        """The sums over edges and circles at points x, in unit coordinates, and their errors. They
-        come from the cells on lanes on which x is in a cell and the accuracy scale `detail` is at
-        most 1. On all other lanes, and if there are no cells, they come from all edges."""
+        """The sums over all edges and circles at points x in unit coordinates, and bounds of their
+        errors. On lanes on which x is in an FMM cell and the accuracy scale `detail` is at most 1,
+        the sums over edges come from that cell. On all other lanes, and if there are no cells, all
+        edges are summed. A larger accuracy scale is more accurate."""
         if self.cells is None or self.edges is None:
             return self.sums(x), CellErrors(0.0, 0.0, self.value_rounding)
-        cell_sums, in_cells = self.cells.sums(x, detail <= 1)
-        edge_sums = sum_over_edges(self.edges, x, ~in_cells)
+        cell_sums, is_in_cell = self.cells.sums(x, detail <= 1)
+        edge_sums = sum_over_edges(self.edges, x, ~is_in_cell)
+        # Both objects have the same attributes, in the order of the parameters of `CurveSums`.
         pairs = zip(vars(cell_sums.sums).values(), vars(edge_sums).values(), strict=True)
-        sums = CurveSums(*(dr.select(in_cells, inner, outer) for inner, outer in pairs))
+        sums = CurveSums(*(dr.select(is_in_cell, inner, outer) for inner, outer in pairs))
         errors = CellErrors(
-            dr.select(in_cells, cell_sums.error, 0),
-            dr.select(in_cells, cell_sums.slope_error, 0),
-            dr.select(in_cells, cell_sums.rounding, self.value_rounding),
+            dr.select(is_in_cell, cell_sums.error, 0),
+            dr.select(is_in_cell, cell_sums.slope_error, 0),
+            dr.select(is_in_cell, cell_sums.rounding, self.value_rounding),
             cell_sums,
-            in_cells,
+            is_in_cell,
         )
         if self.circles is not None:
             circles = self.circles.sums(x)
@@ -662,31 +735,40 @@ class _CurveData(UnitFrame):
     def edge_rates(
         self, left_out: CellErrors, line: RayLine, lengths: tuple[Real, ...], active: Mask
     ) -> tuple[Real, ...]:
-        """For each length T, a bound of the derivative of the edges' solid angle along a line, at
-        all points of the line within T of x = line.x (see `trail_sums.line_rates`). On lanes whose
-        sums come from the cells, the bounds come from the cells, too.
+        """For each length T, a proved bound of |df/ds| along the line x + s v at all |s| <= T,
+        where f is the solid angle of the edges without the circles (`trail_sums.line_rates`). On
+        lanes whose sums come from FMM cells, the bound is the smaller of the cells' bound and the
+        bound from all edges, which is infinite there.
 
-        left_out: the errors of the sums at x, as `at_detail` returned them.
-        lengths: the lengths T.
+        left_out: the error bounds of the sums at x, as `at_detail` returned them.
+        line: the lines, with their points x and directions v.
+        lengths: the lengths T, in unit coordinates.
+        active: mask of the lanes on which bounds are wanted. On other lanes they are infinite.
+
+        Returns a tuple with one bound for each length.
         """
         assert self.edges is not None
         if self.cells is None or left_out.cell is None:
             return line_rates(self.edges, line, lengths, active)
-        inside = left_out.in_cells
-        outside_rates = line_rates(self.edges, line, lengths, active & ~inside)
-        cell_rates = self.cells.rates_along(left_out.cell, line, lengths, active & inside)
+        is_in_cell = left_out.in_cells
+        # Each call returns infinity on the lanes of the other one.
+        outside_rates = line_rates(self.edges, line, lengths, active & ~is_in_cell)
+        cell_rates = self.cells.rates_along(left_out.cell, line, lengths, active & is_in_cell)
         return tuple(
-            fmin(first, second) for first, second in zip(cell_rates, outside_rates, strict=True)
+            fmin(cell_rate, edge_rate)
+            for cell_rate, edge_rate in zip(cell_rates, outside_rates, strict=True)
         )
 
     def height(self, x: Vec3) -> Real:
-        """The signed height of points x above the plane of the `PlanarRegion`, in unit coordinates.
-        There must be a region."""
+        """The signed distance of points x from the plane in which the curve bounds a
+        `PlanarRegion`, positive on the side of the plane's normal. All is in unit coordinates.
+        There must be such a region."""
         assert self.plane is not None
         return dr.dot(self.backend.Array3f(*self.plane[:3]), x) - self.plane[3]
 
     def sums(self, x: Vec3) -> CurveSums:
-        """The sums over all edges and circles at points x, in unit coordinates."""
+        """The sums over all edges and circles at points x in unit coordinates, without FMM
+        cells."""
         parts: list[CurveSums] = []
         if self.edges is not None:
             parts.append(CurveSums.of(sum_over_edges(self.edges, x)))
@@ -698,10 +780,13 @@ class _CurveData(UnitFrame):
 
 @dataclass(frozen=True)
 class CellErrors:
-    """The errors of sums that come from cells on some lanes, and from all edges on other lanes.
+    """Error bounds of the sums over a curve at points x. On some lanes the sums come from FMM
+    cells, in which far edges are approximated by a polynomial; on the other lanes all edges are
+    summed.
 
-    value, slope: bounds of the truncation errors of value and gradient.
-    rounding: a bound of the rounding of the value.
+    value, slope: bounds of the truncation errors of the solid angle and of its gradient. They are 0
+        on lanes on which all edges are summed.
+    rounding: a bound of the rounding of the solid angle.
     cell: the sums that the cells gave; None without cells.
     in_cells: the mask of the lanes on which the sums of the cells were used; False without cells.
     """
@@ -715,12 +800,14 @@ class CellErrors:
 
 @dataclass(frozen=True)
 class CurveSums:
-    """Quantities of edges and circles at a point x, summed over both.
+    """Sums over the edges and circles of a curve at points x, from which the solid angle f and its
+    proved bounds are computed.
 
-    angle, gradient: the solid angle, modulo 4 pi, and its gradient.
+    angle, gradient: f, modulo 4 pi, and its gradient.
     distance: the distance from x to the nearest edge or circle, or a lower bound of it.
-    inverse_squares, inverse_cubes, inverse_fourths: the integrals of |dp|/D^k along the curves for
-        k = 2, 3 and 4, with D the distance from x to the point p; or upper bounds of them.
+    inverse_squares, inverse_cubes, inverse_fourths: the integrals of |dp|/D^k along the curve for k
+        = 2, 3 and 4, with D the distance from x to the point p of the curve; or upper bounds of
+        them.
     circles: the sums over circles only; None if there are no circles.
     """
 
@@ -734,12 +821,13 @@ class CurveSums:
 
     @classmethod
     def of(cls, sums: EdgeSums | CircleSums) -> CurveSums:
-        """The sums of a set of curves, from the sums over its edges or over its circles."""
+        """Take the sums over the edges, or over the circles, as the sums over a whole curve."""
         integrals = sums.inverse_squares, sums.inverse_cubes, sums.inverse_fourths
         return cls(sums.angle, sums.gradient, sums.distance, *integrals)
 
     def plus(self, other: CurveSums) -> CurveSums:
-        """The sums over the curves of this object and those of `other`."""
+        """The sums over two curves together: of this object, and of `other`. The smaller of both
+        distances is kept."""
         return CurveSums(
             self.angle + other.angle,
             self.gradient + other.gradient,
@@ -752,40 +840,48 @@ class CurveSums:
 
 
 def _convex_ball(angle: Real, distance: Real, error: Real) -> HarmonicBall:
-    """A ball, and a range of the lifted solid angle on it, for a curve in convex position, that is,
-    on the boundary of its convex hull. If the value at the center is the principal value, in
-    (-2 pi, 2 pi), the lift stays in (-6 pi, 6 pi).
+    """A ball around each point, and a range of the lift of f on it, for a curve in convex position
+    (on the boundary of its convex hull). If f at the center is the principal value, in (-2 pi, 2
+    pi), the lift stays in (-6 pi, 6 pi) on the ball.
 
-    angle: the value at the center. It may differ from the principal value by a multiple of 4 pi.
-    distance: the radius of the ball.
-    error: a bound of the error of the angle. If it allows two principal values, the range contains
-        the ranges of both.
+    angle: f at the center. It may differ from the principal value by a multiple of 4 pi, by which
+        the range is moved, too.
+    distance: the radius of the ball, at most the distance to the curve.
+    error: a bound of the error of `angle`. If the true value may be beyond -2 pi or 2 pi, there are
+        two possible principal values, and the range contains the ranges of both.
     """
     principal = angle - _PERIOD * dr.round(angle / _PERIOD)
     branch = angle - principal
-    extra = dr.select(dr.abs(principal) > 0.5 * _PERIOD - error, _PERIOD, 0)
-    below, above = (dr.select(principal < 0, extra, 0), dr.select(principal > 0, extra, 0))
-    return HarmonicBall(distance, branch - 1.5 * _PERIOD - below, branch + 1.5 * _PERIOD + above)
+    # If rounding may have put the value on the wrong side of +-2 pi, its principal value may be one
+    # period away, and the range grows by a period to that side.
+    possible_shift = dr.select(dr.abs(principal) > 0.5 * _PERIOD - error, _PERIOD, 0)
+    shift_below, shift_above = (
+        dr.select(principal < 0, possible_shift, 0),
+        dr.select(principal > 0, possible_shift, 0),
+    )
+    return HarmonicBall(
+        distance, branch - 1.5 * _PERIOD - shift_below, branch + 1.5 * _PERIOD + shift_above
+    )
 
 
 def _line_bounds(
     data: _CurveData, x: Vec3, sums: CurveSums, errors: CellErrors, direction: Vec3 | None
 ) -> tuple[Lipschitz, ...]:
     """Proved bounds of how fast f changes along a line through each point x. For each of several
-    lengths s there is a Lipschitz constant of f on the part of the line within s of x. Lengths are
-    in unit coordinates.
+    lengths s there is a Lipschitz constant of f on the part of the line within s of x.
 
-    data: the curves on a backend.
-    sums, errors: the sums at x, and their errors.
-    direction: (3,) the unit direction of the line; None to get no bounds, an empty tuple.
+    data: the curve on a backend. All lengths are in its unit coordinates.
+    x: the points.
+    sums, errors: the sums over edges and circles at x, and their error bounds.
+    direction: (3,) the unit direction of the line. If it is None, the result is an empty tuple.
     """
     if direction is None:
         return ()
     line = RayLine(x, data.backend.Array3f(direction), data.rounding)
 
     def rates(lengths: tuple[Real, ...], active: Mask) -> tuple[Real, ...]:
-        """For each length, a bound of the derivative along the line at points within that length of
-        x, for edges and circles together."""
+        """For each length T, a bound of |df/ds| at the points x + s v of the line with |s| <= T,
+        summed over edges and circles. It is infinite on lanes that are not active."""
         summands: list[tuple[Real, ...]] = []
         if data.edges is not None:
             summands.append(data.edge_rates(errors, line, lengths, active))
@@ -797,7 +893,7 @@ def _line_bounds(
 
 
 def _read_only(loop: FloatArray) -> FloatArray:
-    """A view of a loop that cannot be written to."""
+    """A view of the array `loop` that cannot be written to."""
     view = loop.view()
     view.flags.writeable = False
     return view
@@ -806,9 +902,10 @@ def _read_only(loop: FloatArray) -> FloatArray:
 def _movable_loops(loops: Any) -> tuple[Any, tuple[Any, ...]]:
     """Convert the argument `loops` of `SolidAngle` into two forms.
 
-    Returns the curves as `validate_curves` takes them, with NumPy arrays in place of Dr.Jit arrays;
+    Returns the curves with NumPy arrays in place of Dr.Jit arrays, as `validate_curves` takes them;
     and a tuple for derivatives by vertices. If any loop is a Dr.Jit array, this tuple has all loops
-    of vertices, with tensors converted to 3-vectors. If none is, it is empty.
+    except circles, with tensors converted to 3-vectors. If none is, it is empty, and the curves are
+    returned as they were given.
     """
     is_list = isinstance(loops, list | tuple)
     parts: list[Any] = [*loops] if is_list else [loops]

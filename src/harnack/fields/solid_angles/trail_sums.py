@@ -1,15 +1,21 @@
-"""Sums over the edges of closed curves, for rays that run along edges and for many points. A trail
-is a sequence of edges that ends at the vertex where it begins.
+"""Sums over the edges of closed curves that give a solid angle: bounds of its change along a line,
+and its values and derivatives at points and along rays. A *trail* is a sequence of edges, each from
+the end of the one before, that ends at the vertex where it begins. The solid angle f of all edges
+together is known modulo 4 pi; the *factor* F_e of an edge is a complex number whose argument is
+half the solid angle Omega_e of the triangle from the edge to an apex at infinity (`edge_lift`). The
+sum of all Omega_e is a real number, not only known modulo 4 pi. A *record* is a row of numbers that
+kernels read, here of a few consecutive edges. A *lane* is one entry of Dr.Jit's arrays, such as a
+point or a ray.
 
 - `line_rates`: bounds of the change of a solid angle along a line, also along an edge.
-- `TrailValues`: boundary parts of winding numbers at many points; values only, fast.
+- `TrailValues`: the sum of all Omega_e at many points; values only, fast.
 - `LiftedTrails`: the same along rays, with derivatives and bounds.
 
-Promises on balls are poor for a ray that runs along a long edge: the balls are small, and the ray
-would need thousands of them. But along a fixed line, an edge's term of the derivative of f has
+Proved bounds on balls are poor for a ray that runs along a long edge: the balls are small, and the
+ray would need thousands of them. But along a fixed line, an edge's term of the derivative of f has
 constant sign, and it vanishes if edge and line are in one plane. The sums of these terms, over
-curves and over the trees of meshes alike, are computed only near the curve, on rays along which f
-hardly changes.
+curves and over the trees of meshes alike, are computed only near the curve, and on rays along which
+f hardly changes.
 """
 
 from __future__ import annotations
@@ -60,7 +66,8 @@ Rates: TypeAlias = "Callable[[tuple[Real, ...], Mask], tuple[Real, ...]]"
 
 @dataclass(frozen=True)
 class RayLine:
-    """Lines x + s v, one for each lane, in coordinates in which lengths are of order one.
+    """Straight lines x + s v, one for each lane, along which the change of a solid angle is
+    bounded. Lengths are in units in which the curve has a size of about one.
 
     x: a point of each line.
     v: the unit direction of each line.
@@ -73,21 +80,22 @@ class RayLine:
 
     @property
     def slack(self) -> Real:
-        """A bound of the rounding of points of the line and of differences p - x, which are about
-        as long as x."""
+        """A length that bounds the rounding of points of the line, and of differences p - x of
+        points p of the curve and x, which are about as long as x."""
         return dr.fma(8 * float(dr.epsilon(self.x)), dr.norm(self.x), self.rounding)
 
 
 def lipschitz_along(
     line: RayLine, gradient: Vec3, distance: Real, rates: Rates
 ) -> tuple[Lipschitz, ...]:
-    """Promises for the solid angle f of a curve along lines: for several lengths T, a Lipschitz
-    constant of f on the points of a line within T of its point x. The lengths begin with half the
-    distance to the curve and grow towards the size of the curve. The constants are finite only on
-    lanes on which they may be worth their cost.
+    """Proved bounds of the change of the solid angle f of a curve along lines: for several lengths
+    T, a Lipschitz constant of f on the points of a line within T of its point x. The lengths begin
+    with half the distance to the curve and grow towards the size of the curve. The constants are
+    finite only on lanes on which they may save more time than they take: near the curve if the line
+    is not steep for f, elsewhere if f hardly changes along the line.
 
-    line: the lines.
-    gradient: the gradient of f at x = line.x.
+    line: the lines, with their points x.
+    gradient: the gradient of f at x.
     distance: the distance from x to the curve.
     rates: a function that computes the constants, from the lengths and a mask of active lanes.
 
@@ -96,8 +104,9 @@ def lipschitz_along(
     """
     slope, norm = dr.dot(gradient, line.v), dr.norm(gradient)
     max_slope = dr.select(distance < _NEAR_CURVE, _NEAR_SLOPE, _FAR_SLOPE) * norm
-    first = 0.5 * fmax(distance, type(distance)(1e-30))
-    ratio, lengths = dr.power(first, -1 / _LENGTHS), [first]
+    shortest = 0.5 * fmax(distance, type(distance)(1e-30))
+    # After `_LENGTHS` steps of this ratio the length would be 1, the size of the curve.
+    ratio, lengths = dr.power(shortest, -1 / _LENGTHS), [shortest]
     for _ in range(_LENGTHS - 1):
         lengths.append(lengths[-1] * ratio)
     rate_bounds = rates(tuple(lengths), dr.abs(slope) < max_slope)
@@ -111,16 +120,18 @@ def line_rates(
     """For each length T, a constant K with |f(x + s v) - f(x)| <= |s| K for |s| <= T, where f is
     the solid angle of the edges and x + s v are points of the line.
 
+    edges: the edges of closed curves.
     lengths: the lengths T.
+    active: mask of the lanes on which constants are wanted.
 
     Returns a tuple with one constant for each length. It is infinite where the line meets the curve
-    within T, up to rounding, and on lanes that are not active. These cost nothing if their
+    within T, up to rounding, and on lanes that are not active. These cost no time if their
     neighbors are not active either.
 
     A ball around a point near the curve is as small as the distance to it, so a ray that runs along
-    a long edge would need thousands of balls. Along a *fixed* line there are better bounds. With
-    a = p - x, e the vector of the edge from p to q, and v the unit direction, an edge's term of
-    df/ds at x + s v is
+    a long edge would need thousands of balls. Along a *fixed* line there are better bounds. With a
+    = p - x, e the vector of the edge from p to q, and v the unit direction, an edge's term of df/ds
+    at x + s v is
 
         v . (a - s v) x e  w(s) = c w(s),   c = v . (a x e),   w(s) = integral over [0, 1] of
                                                                |a - s v + t e|^-3 dt:
@@ -142,7 +153,8 @@ def line_rates(
     """
 
     def add(p: Vec3, q: Vec3, inverse: Real, rates: tuple[Real, ...]) -> tuple[Real, ...]:
-        """Add the term of the edge from p to q to the constants `rates`, one for each length."""
+        """Add the term of the edge from p to q to the constants `rates`, one for each length.
+        inverse: 1/|q - p|^2."""
         return add_edge_rates(line, Edge.between(p, q, inverse, line.x), lengths, rates)
 
     start = tuple(edges.backend.Float(0) for _ in lengths)
@@ -153,32 +165,37 @@ def line_rates(
 def add_edge_rates(
     line: RayLine, edge: Edge, lengths: tuple[Real, ...], rates: tuple[Real, ...]
 ) -> tuple[Real, ...]:
-    """Add the term of an edge to the constants K of `line_rates`, which bound the change of the
+    """Add the term of one edge to the constants K of `line_rates`, which bound the change of the
     solid angle along a line within each of several lengths of the line's point x.
 
+    line: the line, with its point x and its direction v.
     edge: the edge, relative to x.
-    lengths: the lengths.
+    lengths: the lengths T.
     rates: the constants so far, one for each length.
 
-    Returns the new constants.
+    Returns the new constants. They are infinite where the line may meet the edge within T.
 
-    Let the edge run from x + a to x + a + e, and let v be the direction of the line. m = a x v and
-    n = e x v are a and e projected along the line and rotated by a right angle. Distances in the
-    plane perpendicular to the line are computed from them, and so is c = v . m x n. So c is small
-    if m and n are, whatever the lengths of a and e: its error is at most 8 epsilon |m| |e| plus
-    slack |n|.
+    Let the edge run from x + a to x + a + e. The symbols c, h, d_e, rho' and rho" are those of
+    `line_rates`. m = a x v and n = e x v are a and e projected along the line and rotated by a
+    right angle. So the edge, seen along the line, runs from m to m + n, and the line is seen as the
+    point 0: rho' is the distance of this segment from 0. Also c = v . (m x n). So c is small if m
+    and n are, whatever the lengths of a and e: its error is at most 8 epsilon |m| |e| plus slack
+    |n|. Twice that is added.
     """
     a, e, inverse, slack = edge.a, edge.e, edge.inverse_square_length, line.slack
     epsilon = float(dr.epsilon(type(inverse)))
     m, n = dr.cross(a, line.v), dr.cross(e, line.v)
     c = dr.abs(dr.dot(line.v, dr.cross(m, n)))
     quarter = 0.25 * dr.rcp(inverse)  # h^2
+    # Enlarged by twice its error.
     c += 16 * epsilon * dr.norm(m) * dr.sqrt(quarter) + 2 * slack * dr.norm(n)
     square = dr.squared_norm(n)
+    # rho': the point m + t n of the segment that is nearest to 0.
     t = dr.select(square > 0, clamp(-dr.dot(m, n) / square, 0, 1), 0)
     line_distance = dr.norm(dr.fma(type(a)(t), n, m)) - slack
-    distance = dr.sqrt(edge.squared_distance) - slack
-    # (a - s v) x e = area + s n, of length |e| times the distance from the line through the edge.
+    distance = dr.sqrt(edge.squared_distance) - slack  # d_e
+    # rho": (a - s v) x e = area + s n has the length |e| times the distance of x + s v from the
+    # line through the edge. It is shortest at s_nearest.
     area, per_length = dr.cross(a, e), dr.sqrt(inverse)
     s_nearest = dr.select(square > 0, -dr.dot(area, n) / square, 0)
     new_rates: list[Real] = []
@@ -218,9 +235,10 @@ Seen: TypeAlias = "tuple[Real, Real, Real]"
 
 @dataclass(frozen=True)
 class _FloatFormat:
-    """A floating-point format, for operations on the bits of its numbers.
+    """A floating-point format, for operations on the bits of its numbers. They give signs and
+    powers of two faster than arithmetic, and distinguish -0 from 0.
 
-    integer: the type of integers of the same size.
+    integer: the type of integers with as many bits.
     mantissa: the number of bits of the mantissa.
     bias: the bias of the exponent.
     """
@@ -231,29 +249,32 @@ class _FloatFormat:
 
     @classmethod
     def of(cls, backend: Backend) -> _FloatFormat:
-        """The format of a backend's numbers."""
+        """The format of a backend's floating-point numbers."""
         mantissa, bias = (23, 127) if backend.precision == "single" else (52, 1023)
         return cls(dr.int_array_t(backend.Float), mantissa, bias)
 
     def sign(self, x: Real) -> Any:
         """An integer for each number x: -1 if the sign bit of x is set, as it is for -0, else 0."""
         bits = dr.reinterpret_array(self.integer, x)
+        # A shift of a signed integer by all bits but the sign repeats the sign bit.
         return bits >> (self.mantissa + self.bias.bit_length() + 1)
 
     def reciprocal_power_of_two(self, x: Real) -> Real:
         """The power of two by which x > 0 has to be multiplied to lie between one and two."""
+        # The stored exponent is the exponent plus the bias; 2 bias minus it is that of the
+        # reciprocal.
         exponent = dr.reinterpret_array(self.integer, x) & ((2 * self.bias + 1) << self.mantissa)
         return dr.reinterpret_array(type(x), (2 * self.bias << self.mantissa) - exponent)
 
 
 @dataclass(frozen=True)
 class _AngleProduct:
-    """A product z = x + iy of complex factors, with the sum of their arguments. The length |z| is
-    arbitrary, as only arguments matter.
+    """A product z = x + iy of complex factors, together with theta, the sum of their arguments,
+    which may be several turns. The length |z| is arbitrary, as only arguments matter.
 
-    x, y: real and imaginary part.
-    half: the number of half turns. The sum theta of the factors' principal arguments lies in [half
-        pi, (half + 1) pi], and the sign bit of y is the parity of `half`.
+    x, y: the real and the imaginary part of z.
+    half: a count of half turns: theta lies in [half pi, (half + 1) pi]. The argument of each factor
+        is taken in [-pi, pi]. The sign bit of y is the parity of `half`.
     """
 
     x: Real
@@ -262,28 +283,32 @@ class _AngleProduct:
 
     @classmethod
     def of(cls, bits: _FloatFormat, factor: Complex) -> _AngleProduct:
-        """The product of a single factor."""
+        """The product of the single complex factor `factor`. bits: the format of its numbers."""
         return cls(*factor, bits.sign(factor[1]))
 
     def times(self, bits: _FloatFormat, factor: Complex) -> _AngleProduct:
-        """The product with a further factor.
+        """The product with a further complex factor x' + iy'. bits: the format of the numbers.
 
         The factor's argument lies in [-pi, pi]. So it moves theta at most one half plane forward,
-        or, if the sign bit of its imaginary part is set, at most one back; and it does so exactly
-        if the sign of y changes. That holds for the computed y as well. Its sign differs from that
-        of the exact value only if the two terms of y cancel. Then the exact theta is close to the
-        same multiple of pi that the count of half turns has crossed: about +-pi for arguments of
-        like signs and y x' < 0, with x' the real part of the factor, and about 0 for arguments of
-        unlike signs. A term that underflows keeps its sign bit.
+        or, if the sign bit of y' is set, at most one back; and it does so exactly if the sign of y
+        changes. That holds for the computed y as well. Its sign differs from that of the exact
+        value only if the two terms of y cancel. Then the exact theta is close to the same multiple
+        of pi that the count of half turns has crossed: about +-pi for arguments of like signs and y
+        x' < 0, and about 0 for arguments of unlike signs. A term that underflows keeps its sign
+        bit.
         """
         x = dr.fma(self.x, factor[0], -(self.y * factor[1]))
         y = dr.fma(self.x, factor[1], self.y * factor[0])
-        changes = bits.sign(self.y) ^ bits.sign(y)
-        return _AngleProduct(x, y, self.half + (changes & (bits.sign(factor[1]) | 1)))
+        # -1 if the sign of y changes, else 0. The number ANDed with it is -1 for a factor that
+        # turns back, else 1.
+        sign_change = bits.sign(self.y) ^ bits.sign(y)
+        return _AngleProduct(x, y, self.half + (sign_change & (bits.sign(factor[1]) | 1)))
 
     def times_product(self, bits: _FloatFormat, other: _AngleProduct) -> _AngleProduct:
-        """The product of this product and another product. The sums of arguments of both, which may
-        be several turns, are added."""
+        """The product of this product and another one. The sums theta of arguments are added. bits:
+        the format of the numbers."""
+        # `times` takes the principal argument of the other product. The whole turns by which its
+        # theta differs from that are an even number of half turns.
         z = self.times(bits, (other.x, other.y))
         return _AngleProduct(z.x, z.y, z.half + ((other.half + 1) & -2))
 
@@ -295,17 +320,19 @@ class _AngleProduct:
         return _AngleProduct(self.x * scale, self.y * scale, self.half), length
 
     def turns(self) -> Real:
-        """The sum of the factors' arguments as a number of turns, that is, divided by 2 pi."""
+        """The sum theta of the factors' arguments as a number of turns, that is, divided by 2
+        pi."""
         real = cast("Any", type(self.x))
-        # atan2 ignores the sign of a zero.
+        # atan2 may ignore the sign of a zero, so that a zero becomes a tiny number of its sign.
         y = dr.copysign(fmax(dr.abs(self.y), real(1e-30)), self.y)
         return dr.fma(dr.atan2(y, self.x), 0.5 / dr.pi, real((self.half + 1) >> 1))
 
 
 @dataclass(frozen=True)
 class TrailValues:
-    """Directed edges on a backend, as records of consecutive edges of closed trails. They give
-    values of the sum of `edge_lift` at many points.
+    """Directed edges on a backend, as records of consecutive edges of closed trails, for values at
+    many points: the sum of the solid angles Omega_e of all edges' triangles (`edge_lift`), without
+    derivatives.
 
     The formula is that of `edge_lift`, arranged so that little is computed twice. The boundary of
     any set of triangles enters every vertex as often as it leaves it, so that its edges form closed
@@ -319,13 +346,18 @@ class TrailValues:
 
     @classmethod
     def upload(cls, backend: Backend, vertices: FloatArray, edges: IntArray) -> TrailValues:
-        """Upload edges (k, 2) between vertices (n, 3). The edges must leave each vertex as often as
-        they enter it."""
+        """Sort directed edges into trails and upload them to a backend, four edges to a record.
+
+        vertices: (n, 3).
+        edges: (k, 2) indices of vertices. The edges must leave each vertex as often as they enter
+            it.
+        """
         rows: list[FloatArray] = []
         for trail in closed_trails(edges):
             count = len(trail) - 1
             record_count = -(-count // _EDGES_PER_RECORD)
             first = _EDGES_PER_RECORD * np.arange(record_count)[:, None]
+            # The last record repeats the last vertex: its remaining edges have length 0.
             index = np.minimum(first + np.arange(_EDGES_PER_RECORD + 1), count)
             edge_counts = np.minimum(count - first, _EDGES_PER_RECORD)
             rows.append(
@@ -337,17 +369,19 @@ class TrailValues:
         """The sum of the solid angles Omega_e of the edges' triangles (`edge_lift`) at points x,
         divided by 4 pi; and a mask (n,) of the points at which it must be computed again.
 
-        ray_sign: 1 for the direction d = z; -1 if x and the edges are to be mirrored in a plane
-            z = const.
+        x: (3, n) the points, in units in which the mesh has a size of about one.
+        ray_sign: (n,) 1 for triangles whose apex is opposite to the direction d = z; -1 if x and
+            the edges are first mirrored in a plane z = const.
 
         Each lane of the kernel computes several points. The mask is true in three cases: rounding
         could have changed the sign of an imaginary part; a product of factors nearly underflows
-        (near an edge or at a short edge); or a coordinate of x is larger than 1024 mesh sizes.
+        (near an edge or at a short edge); or a coordinate of x is larger than 1024.
         """
         dr.eval(x, ray_sign)
         backend, n = self.records.backend, dr.width(x)
         real, index = backend.Float, backend.UInt32
         lanes = -(-n // _POINTS_PER_LANE)
+        # Lane j computes the points j, j + lanes, ...; the last lanes repeat the last point.
         lane = dr.arange(index, lanes)
         stride, last = dr.opaque(index, lanes), dr.opaque(index, n - 1)  # for any n one kernel
         point_ids = [dr.minimum(lane + k * stride, last) for k in range(_POINTS_PER_LANE)]
@@ -366,19 +400,21 @@ class TrailValues:
         return all_turns, (all_margins <= 0) | is_far
 
     def _over_records(self, points: list[Point]) -> tuple[list[_AngleProduct], list[Real]]:
-        """Loop over all records of edges. points: the points of a lane.
+        """Multiply the factors of all edges, for each of the points of a lane, in a loop over
+        records.
 
-        Returns two lists with an entry for each point: the product of the factors of all edges; and
-        a number that is at most 0 if rounding could have changed a sign, or if the product nearly
-        underflowed.
+        Returns two lists with an entry for each point: the product; and a margin, a number that is
+        at most 0 if rounding could have changed a sign, or if the product nearly underflowed.
         """
         backend = self.records.backend
         real, bits = backend.Float, _FloatFormat.of(backend)
         slack = real(-_SIGN_ROUNDINGS * 0.5 * backend.machine_epsilon)
 
         def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
-            """The products and numbers `state` of all points, with the edges of a record added."""
-            # Edges that pad a record lead from a vertex to itself: they are never uncertain.
+            """The products and margins of all points, which `state` holds, with the edges of the
+            record `row` added."""
+            # Column 15, behind five vertices, is the number of edges that are no padding. Padding
+            # leads from a vertex to itself: it is never uncertain.
             slacks = [dr.select(row[15] > k, slack, 1) for k in range(_EDGES_PER_RECORD)]
             pairs = zip(points, state, strict=True)
             return tuple(
@@ -396,16 +432,18 @@ def _multiplied_by_record(
     """Multiply the product of a point by the factors of the four edges of a record. Returns the new
     state of the point.
 
+    bits: the format of the numbers.
     row: the record: five vertices, and the number of edges that are no padding.
     slacks: for each edge, minus the relative error of the products in a factor's imaginary part, or
         1 if it is padding.
     x: the point, with the direction of its ray.
-    state: the product (x, y, half) and the number of `_over_records`.
+    state: the product (x, y, half), and its margin, which is at most 0 if the product is uncertain.
 
     The four factors are multiplied with each other first. Their product has an argument of nearly
     zero, where rounding has the least effect.
     """
     z, margin = _AngleProduct(*state[:3]), state[3]
+    # Products shorter than this count as nearly underflowed.
     min_length = 2.0**-100 if bits.mantissa < 50 else 2.0**-800
     a = _relative_vertex(bits, row[0:3], x)
     record_product: _AngleProduct | None = None
@@ -418,6 +456,7 @@ def _multiplied_by_record(
             if record_product is None
             else record_product.times(bits, factor)
         )
+        # Two factors can be multiplied without scaling, four could underflow or overflow.
         if k == 1:
             record_product, length = record_product.scaled(bits)
             margin = fmin(length - min_length, margin)
@@ -427,23 +466,31 @@ def _multiplied_by_record(
 
 
 def _relative_vertex(bits: _FloatFormat, vertex: list[Real], point: Point) -> Seen:
-    """The vector a = (u, v, z) from a point to a vertex, in the form (u t, v t, s t) with
-    t = |a| + |z| and s = |a| - ray_sign z, where ray_sign is the direction of the point's ray.
+    """A vertex relative to a point, in the form that the factors of edges need. For the vector a =
+    (u, v, z) from the point to the vertex it is (u t, v t, s t), with t = |a| + |z| and s = |a| -
+    ray_sign z.
 
-    s t is (|a| + |z|)^2 or u^2 + v^2, so that no difference cancels.
+    bits: the format of the numbers.
+    vertex: the coordinates of the vertex.
+    point: the point and ray_sign, 1 or -1 for the direction of its ray along z.
+
+    s t is t^2 if z and ray_sign have different signs, and u^2 + v^2 if they have the same sign. So
+    no difference cancels.
     """
     x, ray_sign = point
     u, v, z = vertex[0] - x[0], vertex[1] - x[1], vertex[2] - x[2]
     square = dr.fma(u, u, v * v)
     t = dr.sqrt(dr.fma(z, z, square)) + dr.abs(z)
+    # Negative if the sign bits of z and ray_sign differ.
     signs = dr.reinterpret_array(bits.integer, z) ^ dr.reinterpret_array(bits.integer, ray_sign)
-    s = dr.select(signs < 0, t * t, square)
-    return u * t, v * t, s
+    product = dr.select(signs < 0, t * t, square)  # s t
+    return u * t, v * t, product
 
 
 def _factor(a: Seen, b: Seen, slack: Real) -> tuple[Complex, Real]:
-    """Two results for an edge: the conjugate of its factor F_e (`edge_lift`), times a positive
-    number; and a number that is at most 0 if the sign of the imaginary part is uncertain.
+    """The factor of an edge, and whether its sign is certain. Returns two results: the complex
+    conjugate of the factor F_e (`edge_lift`), times a positive number, as real and imaginary part;
+    and a margin, which is at most 0 if rounding could have changed the sign of the imaginary part.
 
     a, b: the ends of the edge, from `_relative_vertex`.
     slack: minus the relative error of the products in the imaginary part, or 1 for an edge that is
@@ -456,8 +503,9 @@ def _factor(a: Seen, b: Seen, slack: Real) -> tuple[Complex, Real]:
 
 
 def closed_trails(edges: IntArray) -> list[IntArray]:
-    """Divide directed edges (k, 2) into closed trails. A trail is an array of vertex indices that
-    ends with the vertex with which it begins. Each edge is in exactly one trail, once.
+    """Divide directed edges (k, 2) into closed trails. A trail is an array of vertex indices in
+    which each vertex is joined to the next by an edge, and which ends with the vertex with which it
+    begins. Each edge is in exactly one trail, once.
 
     Raises:
         ValueError: an edge leads to a vertex that no further edge leaves.
@@ -485,11 +533,13 @@ _RECORD_SIZES = 3, 4
 
 @dataclass(frozen=True)
 class LiftedTrails:
-    """Closed trails of edges on a backend, in records of `edges_per_record` consecutive edges.
+    """Closed trails of directed edges on a backend, in records of `edges_per_record` consecutive
+    edges, for sums along rays: of the solid angles Omega_e of the edges' triangles (`edge_lift`),
+    with the gradient and bounds.
 
-    They give the sum of `edge_lift` along rays, edge by edge, with decisions from the same bits.
-    The part of a factor that belongs to a vertex is computed once, and not for each of its edges.
-    Roots and divisions cost most; several edges share them where a bound allows it.
+    Signs are decided by the same bits as in `edge_lift`. The part of a factor that belongs to a
+    vertex is computed once, and not for each of its edges. Roots and divisions take most time;
+    several edges share them where a bound allows it.
 
     A record holds `edges_per_record` + 1 vertices; then 1/length^2 of each edge; then the length of
     each edge, negative if the edge runs from a higher to a lower index, and 0 if there is no edge.
@@ -500,32 +550,35 @@ class LiftedTrails:
 
     @classmethod
     def upload(cls, backend: Backend, vertices: FloatArray, trails: list[IntArray]) -> LiftedTrails:
-        """Upload closed trails of edges to a backend.
+        """Upload closed trails of edges to a backend, in records of three or four edges, whichever
+        needs less memory.
 
         vertices: (n, 3).
         trails: arrays of indices of vertices; each ends with the vertex with which it begins
             (`closed_trails`).
         """
+        # The number of records, times a number proportional to the memory of one.
         run = min(
             _RECORD_SIZES,
             key=lambda run: sum(-(-(len(t) - 1) // run) for t in trails) * (run + 0.5),
         )
+        # Lengths must be those of the edges between rounded vertices.
         rounded = vertices.astype(backend.dtype).astype(np.float64)
         rows = [_trail_records(rounded, trail, run) for trail in trails]
         return cls(RecordTable.upload(backend, np.concatenate(rows)), run)
 
     def sum(self, frame: RayFrame, x: Vec3, active: Mask = True) -> SourceSums:
         """The sum of the solid angles Omega_e of the edges' triangles (`edge_lift`) at points x of
-        rays, on active lanes; with the gradient, and the sums by which errors and promises (proved
-        bounds near x) are computed.
+        rays, on active lanes; with the gradient, and the sums by which errors and proved bounds
+        near x are computed.
 
-        frame: the frame of the rays.
+        frame: the rays, with points x on them.
 
-        Derivatives. Let L be the length of an edge, d the distance to it, and w that of `Edge`. L w
-        is the integral of |dp|/rho^3 over the edge, and 1/d times that bounds the integral of
-        |dp|/rho^4. For all edges of a record the d of the nearest edge gives a bound. So the terms
-        s4 += L w/4 and s5 += 3 L w/(16 d) bound the part of the remainder that these edges cause
-        (`LiftedEdge.bounds`).
+        Bounds of derivatives. Let L be the length of an edge, d the distance to it, and w that of
+        `Edge`. L w is the integral of |dp|/rho^3 over the edge, and 1/d times that bounds the
+        integral of |dp|/rho^4. For all edges of a record the d of the nearest edge gives a bound.
+        So the terms s4 += L w/4 and s5 += 3 L w/(16 d) bound the part of the remainder that these
+        edges cause (`LiftedEdge.bounds`).
 
         Rounding is bounded as in `LiftedEdge.bounds`, with Biot and Savart's field itself in place
         of 2 e'. The field is at most d L w, because |a x e| is L times the distance from the line
@@ -538,8 +591,8 @@ class LiftedTrails:
         steep_rounding = 0.5 * backend.machine_epsilon * STEEP_ROUNDINGS
 
         def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
-            """The state with the edges of a record added: the product of factors, the gradient, the
-            least squared distance, the bound of the rounding, s4 and s5."""
+            """The state with the edges of the record `row` added: the product of factors, the
+            gradient, the least squared distance, the bound of the rounding, s4 and s5."""
             product, g, min_square, rounding, s4, s5 = state
             product = LiftedProduct(*product)
             a = view_vertex(self._vertex(row, 0), frame, x)
@@ -596,8 +649,13 @@ class LiftedTrails:
 
 
 def _trail_records(vertices: FloatArray, trail: IntArray, run: int) -> FloatArray:
-    """The records of a closed trail of vertices (n, 3), with `run` edges in each record, as
-    `LiftedTrails` describes them. Edges of length 0 pad the last record."""
+    """The records of a closed trail, as `LiftedTrails` describes them. Edges of length 0 pad the
+    last record.
+
+    vertices: (n, 3) positions, rounded to the backend's precision.
+    trail: indices of vertices, the last equal to the first.
+    run: the number of edges in a record.
+    """
     count = len(trail) - 1
     record_count = -(-count // run)
     index = np.minimum(run * np.arange(record_count)[:, None] + np.arange(run + 1), count)
@@ -607,5 +665,6 @@ def _trail_records(vertices: FloatArray, trail: IntArray, run: int) -> FloatArra
         record_count, run
     )
     length = np.where(start < end, 1, -1) / np.sqrt(inverse)
+    # Padding, where `index` stays at the end of the trail, has length 0.
     length = np.where(index[:, :-1] < index[:, 1:], length, 0)
     return np.concatenate([vertices[path].reshape(record_count, -1), inverse, length], axis=1)

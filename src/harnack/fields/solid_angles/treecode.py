@@ -1,8 +1,14 @@
-"""Sums over a tree of dipoles: multipole moments of far clusters, direct sums over near primitives.
+"""Sums over a tree of sources: far clusters are replaced by multipole moments, near sources are
+summed directly. A *source* is a dipole (an oriented point) or a triangle, one of the tree's
+primitives. A *node* of the tree stands for the cluster of all sources below it. Where a node is far
+from the point x, it counts as a single source, given by its moments. A *record* is a row of numbers
+that kernels read, for a node or a source. In a leaf every source has a *slot*; some slots are
+empty. A *lane* is one entry of Dr.Jit's arrays, such as a point; each lane walks through the tree
+by itself.
 
 - `traverse_clusters`: a traversal of a tree that visits its far clusters.
 - `Treecode`: the sums over such a tree, shared by triangles and points. The caller adds the
-primitives of near leaves.
+  primitives of near leaves.
 - `multipole_terms`: the terms of a far node in value, gradient and Hessian.
 - `dipole_records`, `records_in_slots`: oriented points as records, also in the leaves of a tree.
 """
@@ -50,12 +56,12 @@ State: TypeAlias = "tuple[Any, ...]"
 
 @dataclass(frozen=True)
 class ClusterView:
-    """A node of a tree of dipoles, as seen from points x.
+    """A node of a tree of sources, as seen from points x.
 
-    head: the numbers of the node that every visit reads.
+    head: the numbers of the node's record that every visit reads.
     payload: its other numbers, which are read only on lanes on which the node is far.
     r: the vector from the node's center to x.
-    square: |r|^2, plus the square of the height (`traverse_clusters`).
+    square: |r|^2, plus the argument `height_square` of `traverse_clusters`.
     inverse: 1/sqrt(square), or 0 where the node is not far.
     far: the mask of the lanes on which the node is far enough for its moments to be used.
     """
@@ -80,20 +86,24 @@ def traverse_clusters(
 
     tree: a packed tree. A node's record begins with its center and its accepting distance, beyond
         which its moments may be used.
-    closer: the moments of nodes are used beyond this many times the accepting distance.
+    x: the points, one for each lane.
+    closer: the moments of nodes are used beyond this many times the accepting distance; at least 1.
+        Larger is more accurate.
     add_cluster: a function (node, state) that returns the state with a node added on the lanes on
         which it is far.
     add_primitive: a function (record, mask of active lanes, state) that returns the state with the
         primitive of a near leaf added.
     state: the first state.
-    height_square: added to the squares of all distances. In four dimensions it is the square of the
-        distance of the point from the space of the tree.
+    active: the mask of the active lanes.
+    height_square: a number added to the squares of all distances. For points in four dimensions it
+        is the square of their distance from the three-dimensional space of the tree.
     """
     vector = tree.backend.Array3f
 
     def visit(node: VisitedNode, state: State) -> tuple[Mask, State]:
         """Add the node on lanes on which it is far; on other lanes, add its primitives if it is a
         leaf. Returns the mask of the lanes on which the walk enters the node, and the new state."""
+        # A record begins with the center and the accepting distance.
         r = x - vector(*node.head[:3])
         square = dr.squared_norm(r) + height_square
         is_far = square > dr.square(node.head[3] * closer)
@@ -116,8 +126,10 @@ def dipole_hierarchy(points: FloatArray) -> BalancedTree:
 
 
 def dipole_records(points: FloatArray, moments: FloatArray) -> FloatArray:
-    """Records (n, 8) of dipoles: position, moment, length of the moment, 0.
+    """Records (n, 8) of dipoles, the sources of a field of oriented points: position, moment,
+    length of the moment, 0.
 
+    points: (n, 3) the positions.
     moments: (n, 3) area times normal.
     """
     weight = np.linalg.norm(moments, axis=1, keepdims=True)
@@ -125,16 +137,16 @@ def dipole_records(points: FloatArray, moments: FloatArray) -> FloatArray:
 
 
 def empty_record(row: FloatArray) -> FloatArray:
-    """Records (..., 8) at the positions of the dipoles `row` (..., 8), with moment 0, so that they
-    add nothing."""
+    """Records for empty slots of a leaf: (..., 8), with the positions of the dipoles in `row` (...,
+    8) and moment 0, so that they add nothing to sums."""
     empty = np.zeros_like(row)
     empty[..., :3] = row[..., :3]
     return empty
 
 
 def records_in_slots(tree: BalancedTree, rows: FloatArray) -> FloatArray:
-    """The records of dipoles in the slots of the leaves of a tree: (leaves, leaf_size, 8). Empty
-    slots hold a record with moment 0 at the position of the leaf's first dipole.
+    """Arrange the records of dipoles in the slots of the leaves of a tree: (leaves, leaf_size, 8).
+    Empty slots hold a record with moment 0 at the position of the leaf's first dipole.
 
     rows: (n, 8) the records of all dipoles.
     """
@@ -145,8 +157,8 @@ def records_in_slots(tree: BalancedTree, rows: FloatArray) -> FloatArray:
 
 
 def multipole_terms(c: Sequence[Real], r: Vec3, inverse: Real, derivatives: int) -> SourceTerm:
-    """The potential f of a far node: the sum of P_l(r)/|r|^(2l+1) over l = 1, 2, 3, with harmonic
-    polynomials P_l of degree l; and its derivatives.
+    """The potential f of a far node at a point, and its derivatives. f is the sum of
+    P_l(r)/|r|^(2l+1) over l = 1, 2, 3, with harmonic polynomials P_l of degree l.
 
     c: the coefficients of the polynomials P_l, in the order of `multipole.cartesian_coefficients`.
     r: the vector from the node's center to the point.
@@ -159,12 +171,17 @@ def multipole_terms(c: Sequence[Real], r: Vec3, inverse: Real, derivatives: int)
         grad f = sum G_l u^(2l+1) - s r,           s = sum (2l+1) P_l u^(2l+3)
         Hess f = sum H_l u^(2l+1) - (V r^T + r V^T) - s I + w r r^T,
                  V = sum (2l+1) G_l u^(2l+3),      w = sum (2l+1)(2l+3) P_l u^(2l+5).
+
+    In the code a common factor u^3 is left out of all terms and multiplied at the end. So p1, p2,
+    p3 are P_l u^(2l-2), and g1, g2, g3 are G_l u^(2l-2).
     """
     vector = cast("Any", type(r))
     x, y, z = r
     u2 = inverse * inverse
     u3 = inverse * u2
     g1 = vector(c[0], c[1], c[2])
+    # P_2 has the coefficients of x^2, y^2 (and z^2, as its trace is 0), xy, xz, yz. `half` is half
+    # of its gradient.
     czz = -(c[3] + c[4])
     half = vector(
         dr.fma(c[3], x, dr.fma(c[5], y, c[6] * z)),
@@ -197,13 +214,14 @@ def multipole_terms(c: Sequence[Real], r: Vec3, inverse: Real, derivatives: int)
 def _hessian(
     c: Sequence[Real], r: Vec3, g: tuple[Vec3, ...], p: tuple[Real, ...], u: tuple[Real, Real]
 ) -> SymmetricMatrix:
-    """The Hessian of the sum f of P_l(r)/|r|^(2l+1) over l = 1, 2, 3 (`multipole_terms`).
+    """The Hessian of the sum f of P_l(r)/|r|^(2l+1) over l = 1, 2, 3 (`multipole_terms` has the
+    formula).
 
     c: the coefficients of the polynomials P_l.
     r: the vector from the node's center to the point.
-    g, p: the gradients G_l and the values P_l, times u^(2l-2), which makes them as large as those
-        of l = 1.
-    u: u^2 and u^3, with u = 1/|r|.
+    g, p: for l = 1, 2, 3 the gradients G_l and the values P_l, times u^(2l-2), with u = 1/|r|.
+        These products are of the same size for all l.
+    u: u^2 and u^3.
     """
     x, y, z = r
     (g1, g2, g3), (p1, p2, p3), (u2, u3) = g, p, u
@@ -213,6 +231,7 @@ def _hessian(
     xyy, xzz, xxy, yzz, xxz, yyz, xyz = c[8:15]
     v = dr.fma(3, g1, dr.fma(5, g2, 7 * g3)) * u2
     w = dr.fma(15, p1, dr.fma(35, p2, 63 * p3)) * u4
+    # The entries xx, yy, zz, xy, xz, yz of the Hessians of P_3 and P_2.
     p3_entries = (
         -2 * dr.fma(xyy + xzz, x, -dr.fma(xxy, y, xxz * z)),
         -2 * dr.fma(xxy + yzz, y, -dr.fma(xyy, x, yyz * z)),
@@ -223,10 +242,12 @@ def _hessian(
     )
     p2_entries = (2 * c[3], 2 * c[4], 2 * czz, 2 * c[5], 2 * c[6], 2 * c[7])
     pairs = ((x, x), (y, y), (z, z), (x, y), (x, z), (y, z))
+    # The entries of V r^T and of r V^T.
     crossed = (
         (v.x * x, v.x * x), (v.y * y, v.y * y), (v.z * z, v.z * z),
         (v.x * y, v.y * x), (v.x * z, v.z * x), (v.y * z, v.z * y),
     )  # fmt: skip
+    # The first three entries, on the diagonal, contain s I.
     parts = [
         (square * u2 + cube * u4 - left - right + w * a * b - (s if k < 3 else 0)) * u3
         for k, (square, cube, (left, right), (a, b)) in enumerate(
@@ -257,17 +278,18 @@ AddPrimitive: TypeAlias = (
 def node_records(
     level: NodeMoments, order: int, acceptance_ratio: float, error: FloatArray
 ) -> FloatArray:
-    """The records of the k nodes of one level of a tree, as `Treecode` reads them.
+    """The records of the k nodes of one level of a tree, as `Treecode` reads them: (k, 22).
 
-    A record holds the center, the smallest accepting distance, remainder constants A and K
-    (`remainder_constants`), 15 coefficients of the moments, and the error bound E. A point that is
-    farther from the center than the accepting distance may use the moments of the node instead of
-    its children. Coefficients of moments above the order are 0.
+    A record holds the node's center c, its accepting distance, two constants A and K that bound the
+    remainder of Taylor's formula for the node's field (`remainder_constants`), 15 coefficients of
+    the moments, and the error bound E. A point that is farther from c than the accepting distance
+    may use the moments of the node instead of its children. Coefficients of moments above the order
+    are 0.
 
     level: the moments of the nodes.
     order: 0, 1 or 2, the order of the multipole moments that are used.
     acceptance_ratio: the accepting distance of a node, in radii of the node.
-    error: (k,) E, the bound of the truncation error of the value.
+    error: (k,) E: at the distance r the truncation error of the value is at most E r^-(order + 3).
     """
     head = [acceptance_ratio * level.radius, *remainder_constants(level, acceptance_ratio)]
     parts = (level.center, *head, cartesian_coefficients(level.moments, order), error)
@@ -276,13 +298,15 @@ def node_records(
 
 @dataclass(frozen=True)
 class Treecode:
-    """Sums over sources by a tree on a backend. A node that is far from a point counts as a single
-    source, given by its multipole moments.
+    """A tree of sources on a backend, which computes sums over all sources at points. A node that
+    is far from a point counts as a single source, given by its multipole moments. The accuracy
+    scale of an evaluation says how far: the larger, the more accurate. Evaluations at the smallest
+    scale are called coarse.
 
     tree: the nodes, with the records of `node_records`.
     accuracy: at accuracy scale 1, nodes are far beyond this many times their radius.
     coarse_ratio: the same number for coarse evaluations.
-    order: the order of the multipole moments.
+    order: the order of the multipole moments: 0, 1 or 2.
     coarse_error_ratio: the truncation error of a coarse evaluation is at most this many times the
         stored bound.
     gradient_error_ratio, hessian_error_ratio: at distance r, the truncation error of the gradient
@@ -311,19 +335,26 @@ class Treecode:
     ) -> Treecode:
         """Upload a tree with its moments and sources.
 
-        levels: the moments of the nodes of all levels.
+        levels: the moments of the nodes, one entry for each level of the tree, from the leaves to
+            the root.
         primitives: the records of the sources in their slots, as `tree.pack_tree` takes them.
+        accuracy: at accuracy scale 1, nodes are far beyond this many times their radius.
+        order: the order of the multipole moments: 0, 1 or 2.
 
-        Each node has a single bound E for both kinds of evaluation. E is at least the bound at
-        accuracy scale 1, and at least the bound of the coarse evaluation divided by
-        `coarse_error_ratio`. This ratio is the median, over the leaves, of the ratio of the two
-        bounds.
+        Each node stores a single bound E of its truncation error for both kinds of evaluation. E is
+        at least the bound at accuracy scale 1, and at least the bound of the coarse evaluation
+        divided by `coarse_error_ratio`. This ratio is the median, over the leaves, of the ratio of
+        the two bounds.
         """
-        rough = min(accuracy, _COARSE_RATIO)
+        coarse_ratio = min(accuracy, _COARSE_RATIO)
         fine_bounds = [truncation_bounds(level, accuracy * level.radius, order) for level in levels]
-        coarse_bounds = [truncation_bounds(level, rough * level.radius, order) for level in levels]
+        coarse_bounds = [
+            truncation_bounds(level, coarse_ratio * level.radius, order) for level in levels
+        ]
         error_ratio = _median_ratio(coarse_bounds[0][0], fine_bounds[0][0])
         nodes: list[FloatArray] = []
+        # The largest ratios, over all nodes, of the error of the gradient and of second derivatives
+        # to that of the value.
         slope_ratio = second_ratio = 0.0
         for level, *bounds in zip(levels, fine_bounds, coarse_bounds, strict=True):
             error, slope, second = (
@@ -336,33 +367,35 @@ class Treecode:
             second_ratio = max(
                 second_ratio, float((second[nonzero] / error[nonzero]).max(initial=0.0))
             )
-            nodes.append(node_records(level, order, rough, error))
+            nodes.append(node_records(level, order, coarse_ratio, error))
         packed = pack_tree(backend, tree, nodes, primitives)
         ratios = error_ratio, slope_ratio * (1 + 1e-6), second_ratio * (1 + 1e-6)
         uploaded = (dr.opaque(backend.Float, ratio) for ratio in ratios)
-        return cls(backend, packed, accuracy, rough, order, *uploaded)
+        return cls(backend, packed, accuracy, coarse_ratio, order, *uploaded)
 
     @property
     def coarsest_accuracy(self) -> float:
-        """The accuracy scale of the coarsest evaluations, as a fraction of that of an ordinary one,
-        1. Smaller accuracy scales have the same effect (`acceptance_ratio`)."""
+        """The smallest accuracy scale that makes a difference: that of coarse evaluations, where 1
+        is that of an ordinary evaluation. At smaller scales results are the same
+        (`acceptance_ratio`)."""
         return self.coarse_ratio / self.accuracy
 
     def acceptance_ratio(self, detail: Real) -> Real:
-        """The distance beyond which the moments of a node are used, in radii of the node. detail:
-        the accuracy scale."""
+        """The distance beyond which the moments of a node are used, in radii of the node. It grows
+        with the accuracy scale `detail`, and is at least `coarse_ratio`."""
         return fmax(self.accuracy * detail, self.backend.Float(self.coarse_ratio))
 
     def sums(
         self, x: Vec3, detail: Real, add: AddPrimitive, extra_state: ExtraState = (),
         active: Mask = True, derivatives: int = 1,
     ) -> tuple[SourceSums, ExtraState]:  # fmt: skip
-        """The sums over all sources at points x, and the caller's own state.
+        """The sums over all sources at points x, with error bounds; and the caller's last state.
 
-        detail: the accuracy scale of `Field.at_accuracy`. The larger it is, the farther away nodes
-            must be to count as one source; infinity gives the direct sum.
+        detail: the accuracy scale. The larger it is, the farther away nodes must be to count as one
+            source; infinity gives the direct sum.
         add: a function that adds a primitive of a near leaf (`AddPrimitive`).
         extra_state: a further state of the caller, which `add` updates.
+        active: the mask of the active lanes.
         derivatives: 0 for the value only, 1 with the gradient, 2 with the Hessian.
         """
         free_fraction, closer = (
@@ -374,9 +407,13 @@ class Treecode:
         def add_cluster(node: ClusterView, state: ExtraState) -> ExtraState:
             """Add a node to the state on lanes on which it is far. The state consists of the state
             of the sums and the caller's own state."""
+            # 15 coefficients and E.
             c, inverse = node.payload, node.inverse
             error = c[15] * self._decay(inverse)
             slope = error * inverse
+            # Its terms; where it is far; 1/r; the factor A + K/r^2 of the remainder; truncation
+            # errors of value, gradient and Hessian, the latter two without their constant ratios;
+            # the radius of a ball around x that is free of its sources; the rounding.
             sums = SourceSums.from_state(state[0]).add_far_node(
                 multipole_terms(c, node.r, inverse, derivatives),
                 node.far,
@@ -389,10 +426,12 @@ class Treecode:
             return sums.to_state(), state[1]
 
         def add_primitive(row: list[Real], active: Mask, state: ExtraState) -> ExtraState:
-            """Add the primitive of a near leaf to the state, on active lanes."""
+            """Add the primitive in the record `row` of a near leaf to the state, on active
+            lanes."""
             sums, extra_state = add(row, active, SourceSums.from_state(state[0]), state[1])
             return sums.to_state(), extra_state
 
+        # The distance that is taken to be free of sources if no node bounds it.
         no_source = _NO_SOURCE_DISTANCE * (1 + dr.max(dr.abs(x)))
         start = (SourceSums.zero(self.backend, no_source, derivatives).to_state(), extra_state)
         state = traverse_clusters(self.tree, x, closer, add_cluster, add_primitive, start, active)
@@ -400,6 +439,7 @@ class Treecode:
             SourceSums.from_state(state[0]),
             dr.select(detail < 1, self.coarse_error_ratio, 1),
         )
+        # The loop has added up error bounds without the ratios, which are the same for all nodes.
         second = sums.hessian_truncation
         sums = dataclasses.replace(
             sums,
@@ -412,9 +452,8 @@ class Treecode:
         return sums, state[1]
 
     def values(self, sums: SourceSums, share: float, unit: Real, rounding: Real) -> PointValues:
-        """Value and derivatives with error bounds, from sums over the tree.
+        """Value and derivatives with error bounds, from the result `sums` of the method `sums`.
 
-        sums: the result of the method `sums`.
         share: the factor by which all results are multiplied.
         unit: a bound of the rounding of a coordinate.
         rounding: a bound of the rounding of the final operations on the value.
@@ -422,8 +461,9 @@ class Treecode:
         return sums.values(share, unit, rounding, _FAR_GRADIENT_ROUNDINGS)
 
     def _decay(self, inverse: Real) -> Real:
-        """The number r^-(order + 3) at the distance r from a node, for inverse = 1/r. The first
-        multipole term beyond the order is proportional to it."""
+        """The number r^-(order + 3) at the distance r from a node, for inverse = 1/r. The
+        truncation error of the value at this distance is the node's bound E times it: the first
+        multipole term beyond the order falls off like that."""
         decay = inverse * inverse * inverse
         for _ in range(self.order):
             decay = decay * inverse
@@ -431,7 +471,7 @@ class Treecode:
 
 
 def _median_ratio(larger: FloatArray, smaller: FloatArray) -> float:
-    """The median of the ratios of the entries of two arrays, larger/smaller; but at least 1.
-    Entries with smaller = 0 do not count."""
+    """The median of the ratios larger/smaller of the entries of two arrays; but at least 1. Entries
+    with smaller = 0 do not count; if there are no others, the result is 1."""
     nonzero = smaller > 0
     return max(1.0, float(np.median(larger[nonzero] / smaller[nonzero]))) if nonzero.any() else 1.0

@@ -1,9 +1,9 @@
-"""Winding numbers without truncation: crossings of a ray, and the boundary edges.
-
-`ExactWinding` is the winding number of a mesh, at points and along rays.
-
-See `edge_lift` for the formula. A value at a point costs as much as one ray through a tree of boxes
-plus one pass over the edges at which the triangles do not cancel, whatever the number of triangles.
+"""The winding number w of a mesh without truncation error: from the crossings of one ray with
+triangles, and from the boundary edges, at which triangles do not cancel. The signs of all crossings
+of the ray add up to an integer, and the solid angles of edges add the rest (`edge_lift` has the
+formula). A value at a point takes as long as one ray through a tree of boxes plus one pass over the
+boundary edges, whatever the number of triangles. A *lane* is one entry of Dr.Jit's arrays, such as
+a point or a ray.
 
 Winding numbers have two evaluators. `winding_exact` adds the crossings of one ray and the boundary
 edges (the antipodal method), without truncation. `winding_tree` uses multipoles, for triangle
@@ -49,10 +49,11 @@ _PER_SPHERE = 1 / (4 * math.pi)
 
 @dataclass(frozen=True)
 class ExactWinding:
-    """The winding number w of a mesh on a backend, in units in which the mesh has a size of about
-    one.
+    """The winding number w of a mesh on a backend, evaluated from crossings of rays and from the
+    boundary edges, at which triangles do not cancel. Lengths are in units in which the mesh has a
+    size of about one.
 
-    rays: the tree of the triangles, in which crossings are counted.
+    rays: a tree of the triangles, in which crossings are counted.
     edges, trails: the boundary edges, for values at points; None for a closed mesh.
     ray_trails, loops: the boundary edges, for samples along rays; None for a closed mesh or without
         tracing.
@@ -72,11 +73,15 @@ class ExactWinding:
     def of(
         cls, backend: Backend, mesh: WindingMesh, rays: TriangleTree, traced: bool
     ) -> ExactWinding:
-        """Upload the data of a mesh. traced: whether `sample_interval` will be called, which needs
-        further data."""
+        """Upload a mesh to a backend.
+
+        rays: a tree of its triangles, on the same backend.
+        traced: whether `sample_interval` will be called, for tracing, which needs further data.
+        """
         if not len(mesh.singular_edges):
             return cls(backend, rays, None, None, None, None, final_rounding(backend))
         vertices, edges = mesh.unit_vertices, mesh.singular_edges
+        # The same edges in three forms: for values, fast values, and samples along rays.
         ray_trails, loops = None, None
         if traced:
             trails = closed_trails(edges)
@@ -93,14 +98,15 @@ class ExactWinding:
         )
 
     has_detail: ClassVar[bool] = False
-    """Whether coarse samples cost less."""
+    """Whether samples at small accuracy scales take less time. They do not: all are exact."""
 
     coarsest_detail: ClassVar[float] = 0.5
-    """`Field.coarsest_accuracy` of the boundary's cells: any number below 1 (`boundary_cells`)."""
+    """The smallest accuracy scale that makes a difference (`Field.coarsest_accuracy`). Only FMM
+    cells of the boundary distinguish it from 1, so that any number below 1 will do."""
 
     def fast_values(self, x: Vec3) -> Real:
-        """The winding number w (n,) at points x (3, n). It takes a third of the time of `values`,
-        and cannot be called while Dr.Jit records a loop.
+        """The winding number w (n,) at points x (3, n), without error bounds. It takes a third of
+        the time of `values`, and cannot be called while Dr.Jit records a loop.
 
         Crossings are decided by `tree.triangle_tree.signed_crossing`. Where `TrailValues` is
         uncertain about an edge, the sum over edges is computed again by `lifted_sums`, which
@@ -109,6 +115,7 @@ class ExactWinding:
         # Rays lead away from the middle of the mesh, so that less of it lies ahead. For a mirrored
         # mesh the winding number changes its sign.
         ray_sign = dr.select(x.z >= 0, self.backend.Float(1), -1)
+        # The signed number of crossings of the ray from each x.
         turns = self.rays.signed_crossings_vertical(x, ray_sign)
         if self.trails is None or self.edges is None:
             return dr.select(ray_sign > 0, turns, 0 - turns)  # no zero with a sign
@@ -125,50 +132,52 @@ class ExactWinding:
 
     def values(self, x: Vec3, derivatives: int) -> PointValues:
         """The winding number w and its derivatives up to order `derivatives` at points x (3, n),
-        with error bounds."""
+        with error bounds. For a closed mesh all derivatives are 0."""
         real = self.backend.Float
         turns = self.rays.signed_crossings_vertical(x, real(1))
         if self.edges is None:
             zeros = self.backend.Array3f(0), SymmetricMatrix.zero(real)
             return PointValues(turns, real(self.rounding), *zeros, real(0), real(0))
         sums, unit = lifted_sums(self.edges, x, derivatives).total(), coordinate_rounding(x)
+        # The sums are solid angles: 4 pi w.
         sums = sums.add_term(SourceTerm(4 * math.pi * turns), True)
         return sums.values(_PER_SPHERE, unit, self.rounding)
 
     def crossings_ahead(self, frame: RayFrame, t: Real, active: Mask) -> Real:
         """The sum (n,) of the signs of all crossings of triangles by rays of the frame, beyond the
-        parameter t. It is the part of w that `sample_interval` takes as `turns`."""
+        ray parameter t. It is the integer that `sample_interval` takes as `turns`."""
         return self.rays.signed_crossings_ahead(frame, t, active)
 
     def sample_interval(
         self, frame: RayFrame, x: Vec3, behind: JumpCrossing, turns: Real, detail: Real,
         active: Mask = True,
     ) -> Sample:  # fmt: skip
-        """The sample of w at points x of a ray interval between two crossings of triangles, on
-        active
-        lanes: value, gradient, errors, and promises (proved bounds near x, see
-        `SourceSums.sample`). w is continued smoothly along the interval.
+        """A sample of w at points x of a ray interval between two crossings of triangles, on active
+        lanes: value, gradient, errors, and proved bounds of w near x (`SourceSums.sample`) and
+        along the ray. w is continued smoothly along the interval.
 
-        frame: the frame of the rays on which the points x lie.
+        frame: the rays, with points x on them.
         turns: the sum of the signs of all crossings ahead of the interval's start.
         behind, detail: not used here, as no triangles are summed and every sample has full
             accuracy.
         """
         del behind, detail
         if self.edges is None:
+            # A closed mesh: w is constant on the interval.
             zero = self.backend.Array3f(0)
             return Sample(self.backend.Float(turns), zero, (Lipschitz(0.0),), 0.0)
         if self.ray_trails is None or self.loops is None:
             raise RuntimeError("uploaded for points and not for rays")
+        # 4 pi w: the solid angles of edges, and 4 pi for each crossing ahead.
         sums = self.ray_trails.sum(frame, x, active)
         sums = sums.add_term(SourceTerm(4 * math.pi * turns), True)
         unit = fmax(coordinate_rounding(frame.o), coordinate_rounding(x))
         line, loops = RayLine(x, frame.d, 8 * unit), self.loops
 
         def rates(lengths: tuple[Real, ...], lanes: Mask) -> tuple[Real, ...]:
-            """For each length, a bound of the derivative along the line at points within that
-            length of x (`line_rates`)."""
+            """For each length T, a bound of the derivative of 4 pi w along the line at its points
+            within T of x (`line_rates`); infinite where `lanes` is False."""
             return line_rates(loops, line, lengths, lanes & active)
 
-        promises = lipschitz_along(line, sums.gradient, sums.singularity_distance, rates)
-        return sums.sample(_PER_SPHERE, unit, self.rounding, along=promises)
+        bounds_along = lipschitz_along(line, sums.gradient, sums.singularity_distance, rates)
+        return sums.sample(_PER_SPHERE, unit, self.rounding, along=bounds_along)

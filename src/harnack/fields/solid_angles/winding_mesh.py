@@ -1,5 +1,9 @@
-"""Meshes prepared for winding numbers: vertices are welded, faces and their reversed copies are
-canceled, lengths are scaled, and triangles are sorted into a tree."""
+"""Triangle meshes prepared for winding numbers: vertices at the same place are joined (welded),
+faces and their reversed copies are canceled, lengths are scaled, and triangles are sorted into a
+tree. A *singular edge* is an edge at which the triangles do not cancel; these edges are the
+boundary of the mesh. The *multiplicity* of a face is the number of its copies minus the number of
+its reversed copies. *Unit coordinates* have their origin at the center of the mesh, and the mesh
+has a size of about one in them."""
 
 from __future__ import annotations
 
@@ -28,8 +32,9 @@ _KEPT_PROPERTIES = ("triangles", "tree", "ray_tree", "singular_flags")
 
 @dataclass(frozen=True)
 class WindingMesh:
-    """The data from which the evaluators of a winding number are built, in double precision, in
-    NumPy.
+    """A triangle mesh with all data from which a winding number is evaluated, in double precision,
+    in NumPy. *Faces* are different from each other; *triangles* are the faces, each repeated by its
+    multiplicity. A singular edge is one at which triangles do not cancel.
 
     vertices: (n, 3), in the order of the input.
     faces: (m, 3) indices of welded vertices. No two faces are equal.
@@ -62,10 +67,12 @@ class WindingMesh:
         """Prepare the mesh of vertices (n, 3) and faces (m, 3).
 
         Raises:
-            MeshError: as `validate_mesh`; or all faces cancel each other; or there are too many.
+            MeshError: as `validate_mesh`; or all faces cancel each other; or there are too many
+            triangles.
         """
         x, f = validate_mesh(vertices, faces)
         welded = Welded.of(x, f)
+        # The faces that are left after copies and reversed copies have been added up.
         net = welded.net
         if len(net.faces) == 0:
             raise MeshError("faces: every face is canceled by its own copy turned round")
@@ -92,7 +99,7 @@ class WindingMesh:
 
         Raises:
             MeshError: as `validate_mesh`; or there is another number of vertices; or vertices that
-                coincided, so that faces were joined there, come apart.
+            coincided, so that faces were joined there, come apart.
         """
         x, faces = validate_mesh(vertices, self.input_faces)
         if len(x) != len(self.vertices):
@@ -100,7 +107,9 @@ class WindingMesh:
                 f"vertices: {len(x)} of them, where {len(self.vertices)} were before: moving "
                 "vertices keeps their number and their order"
             )
+        # Vertices that are no longer at the place of the vertex that stands for them.
         has_moved = (x != x[self.weld_map]).any(axis=1)
+        # If positions that differed by rounding were joined, they may differ by rounding again.
         if self.rounded and has_moved.any():
             has_moved = np.abs(x - x[self.weld_map]).max(axis=1) > rounding_of(x)
         if has_moved.any():
@@ -122,30 +131,31 @@ class WindingMesh:
 
     @functools.cached_property
     def unit_vertices(self) -> FloatArray:
-        """The vertices (n, 3) in unit coordinates, with the origin at the center and a size of
-        about one."""
+        """The vertices (n, 3) in unit coordinates, with the origin at the center of the mesh and a
+        size of about one."""
         return (self.vertices - self.center) / self.size
 
     @functools.cached_property
     def triangles(self) -> IntArray:
-        """The faces (k, 3), each repeated by its multiplicity."""
+        """Indices (k, 3) of the vertices of all triangles: the faces, each repeated by its
+        multiplicity."""
         return np.repeat(self.faces, self.multiplicity, axis=0)
 
     @functools.cached_property
     def corners(self) -> FloatArray:
-        """The corners (k, 3, 3) of the triangles, in unit coordinates."""
+        """The positions (k, 3, 3) of the three corners of each triangle, in unit coordinates."""
         return self.unit_vertices[self.triangles]
 
     @functools.cached_property
     def tree(self) -> BalancedTree:
-        """The tree over the triangles' centroids."""
+        """A balanced tree over the centroids of the triangles, for sums over triangles."""
         a, b, c = np.moveaxis(self.corners, 1, 0)
         return build_balanced_tree((a + b + c) / 3, leaf_size=_LEAF_SIZE, arity=_ARITY)
 
     @functools.cached_property
     def ray_tree(self) -> BalancedTree:
-        """The tree over the centroids of faces, each face once, because a ray crosses all copies of
-        a face at once."""
+        """A balanced tree over the centroids of the faces, for rays. It has each face once, because
+        a ray crosses all copies of a face at once."""
         if len(self.faces) == len(self.triangles):
             return self.tree
         centroids = self.unit_vertices[self.faces].mean(axis=1)
@@ -153,16 +163,18 @@ class WindingMesh:
 
     @functools.cached_property
     def ray_records(self) -> FloatArray:
-        """Records (m, 14) of the faces (`tree.triangle_tree`). The sign of crossings in a record is
-        multiplied by the multiplicity."""
+        """Records (m, 14) of the faces, the rows of numbers that kernels read
+        (`tree.triangle_tree`). The sign of crossings in a record is multiplied by the face's
+        multiplicity."""
         records = triangle_records(self.unit_vertices, self.faces)
         records[:, PARITY_COLUMN] *= self.multiplicity
         return records
 
     @functools.cached_property
     def records(self) -> FloatArray:
-        """Records (k, 14) of the triangles (`tree.triangle_tree`). Each copy of a face has a record
-        of its own, with the index of the face."""
+        """Records (k, 14) of the triangles, the rows of numbers that kernels read
+        (`tree.triangle_tree`). Each copy of a face has a record of its own, with the index of the
+        face."""
         if len(self.faces) == len(self.triangles):
             return self.ray_records
         return np.repeat(
@@ -171,13 +183,15 @@ class WindingMesh:
 
     @functools.cached_property
     def levels(self) -> list[NodeMoments]:
-        """Moments of the nodes of all levels of the tree, from the leaves to the root."""
+        """Multipole moments of the nodes of `tree`, one entry for each level, from the leaves to
+        the root."""
         return triangle_tree_moments(self.tree, self.corners)
 
     @functools.cached_property
     def singular_flags(self) -> FloatArray:
-        """Numbers (k, 3), for the edges 01, 12 and 02 of each triangle's record: 1 if the edge is
-        singular, else 0."""
+        """For each triangle (k, 3), three numbers for the edges from corner 0 to 1, 1 to 2 and 0 to
+        2 of its record: 1 if the edge is singular, else 0. A record orders the corners by vertex
+        index."""
         # An edge has the key low * count + high, with the indices of its ends. Only edges between
         # two ends of singular edges need to be looked up.
         count = len(self.vertices)
@@ -187,27 +201,28 @@ class WindingMesh:
         flags = np.zeros((len(self.triangles), 3))
         ends = np.sort(self.triangles, axis=1)
         for k, (i, j) in enumerate(((0, 1), (1, 2), (0, 2))):
-            rows = np.flatnonzero(is_end[ends[:, i]] & is_end[ends[:, j]])
-            edges: IntArray = ends[rows, i] * count + ends[rows, j]
-            flags[rows, k] = keys.take(np.searchsorted(keys, edges), mode="clip") == edges
+            candidates = np.flatnonzero(is_end[ends[:, i]] & is_end[ends[:, j]])
+            edges: IntArray = ends[candidates, i] * count + ends[candidates, j]
+            # The key at the place of an edge in the sorted keys is the edge's own, or it has none.
+            flags[candidates, k] = keys.take(np.searchsorted(keys, edges), mode="clip") == edges
         return flags
 
     @functools.cached_property
     def box(self) -> tuple[Any, Any]:
-        """The lower and the upper corner (3,) of the box around the triangles, in the user's
+        """The lower and the upper corner (3,) of the box around the faces, in the user's
         coordinates."""
         return _box(self.vertices, self.faces)
 
     @functools.cached_property
     def area(self) -> float:
-        """The area of all triangles, in the unit of the input."""
+        """The total area of all triangles, in the square of the user's unit."""
         p, q, r = np.moveaxis(self.corners, 1, 0)
         cross = np.linalg.norm(np.cross(q - p, r - p), axis=1)
         return float(0.5 * cross.sum() * self.size**2)
 
     @functools.cached_property
     def boundary_length(self) -> float:
-        """The length of all singular edges, in the unit of the input."""
+        """The total length of all singular edges, in the user's unit."""
         ends = self.vertices[self.singular_edges]
         return float(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).sum())
 
@@ -220,9 +235,9 @@ def _box(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray, FloatArray]
 
 
 def _center_and_size(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray, float]:
-    """The center (3,) and the size of the unit coordinates of a mesh: the center of the box around
-    its faces, rounded to single precision; and the smallest power of two that is at least half of
-    the box's longest side."""
+    """The center (3,) and the size that define the unit coordinates of a mesh. The center is that
+    of the box around its faces, rounded to single precision. The size is the smallest power of two
+    that is at least half of the box's longest side."""
     low, high = _box(vertices, faces)
     size = 2.0 ** np.ceil(np.log2(0.5 * float((high - low).max())))
     return round_to_single(0.5 * (low + high)), float(size)

@@ -1,14 +1,19 @@
-"""The generalized winding number of triangle meshes. Its level set closes holes, and repairs
-triangle soups and overlaps.
+"""The generalized winding number w of triangle meshes: how many times a mesh winds around a point.
+Its level set w = 1/2 is the mesh where the mesh is sound; it closes holes, and repairs triangle
+soups and overlaps. w jumps by an integer across each triangle. So w *modulo 1* (w minus an unknown
+integer) is smooth across triangles. It is determined by the *singular edges*, the edges at which
+triangles do not cancel. *Promises* are proved bounds of w near a point. In unit coordinates the
+mesh has a size of about one. A sample's *accuracy scale* is a number: larger is more accurate. In
+an *FMM cell* (fast multipole method) near edges or triangles are summed directly, and all others
+are replaced by one polynomial. A *lane* is one entry of Dr.Jit's arrays, such as a point or a ray;
+a *backend* is what Dr.Jit computes on, and in which precision.
 
 - `WindingNumber`: the field.
 - `winding_extent`, `winding_cells`: the volume and the cells that are proved to contain its level
-sets, on its triangles and on the surfaces that span its holes.
+  sets, on its triangles and on the surfaces that span its holes.
 
-Modulo 1 a winding number does not jump, and it takes a level only on the surfaces that span holes.
-A cell counts as empty if the winding number is proved to take no level modulo 1 in it, whether or
-not it contains triangles. In empty cells rays sample the winding number only where they cross
-triangles.
+A cell counts as empty if w modulo 1 is proved to take no level in it, whether or not the cell
+contains triangles. In empty cells rays sample w only where they cross triangles.
 """
 
 from __future__ import annotations
@@ -73,68 +78,80 @@ _CELLS_ACROSS = 192
 
 
 class ModuloOneEvaluable(Protocol):
-    """An object that evaluates a winding number modulo 1, as `WindingNumber` does: the methods that
-    proofs about its level sets use."""
+    """An object that evaluates a winding number w modulo 1 (w minus an unknown integer), as
+    `WindingNumber` does: the methods that proofs about its level sets use."""
 
     def prepare(self, backend: Backend) -> ModuloOneEvaluable:
         """A copy with its data on a backend, for tracing."""
         ...
 
     def evaluate_modulo_one(self, p: Vec3, detail: Real = 0.0) -> Sample:
-        """A sample of w minus an unknown integer, at points p. detail: the accuracy scale."""
+        """A sample of w minus an unknown integer at points p: value, gradient, errors and proved
+        bounds of w near p. detail: the accuracy scale; larger is more accurate, 0 is the coarsest.
+        """
         ...
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
-        """A volume that contains the level sets of w; None if there is no bounded one."""
+        """A volume that is proved to contain the level sets of w; None if there is no bounded
+        one."""
         ...
 
 
 class WindingModuloOne(Field):
-    """The winding number w of a mesh modulo 1, as a field. It is continuous off the singular edges,
-    also across the triangles.
+    """The winding number w of a mesh modulo 1, as a field with period 1. It is continuous off the
+    singular edges, also across the triangles. Where w takes a level off its triangles, this field
+    takes it, too; the converse does not hold.
 
-    winding: the winding number. The promises of its samples hold for a function that differs from w
-        by integers: the smooth continuation of w through all triangles. Samples are coarse, which
-        costs half as much. Accuracy scale 1 would give only 2 % fewer occupied cells.
+    winding: the object that evaluates w. The proved bounds in its samples hold for a function that
+        differs from w by integers: the smooth continuation of w through all triangles.
 
-    Where w takes a level off its triangles this field takes it, too. The converse does not hold.
+    Samples are the coarsest ones by default, which take half the time of ordinary ones. Ordinary
+    samples would prove only 2 % more cells empty.
     """
 
     period: ClassVar[float | None] = 1.0
     has_variable_accuracy = True
 
     def __init__(self, winding: ModuloOneEvaluable) -> None:
+        """The parameter is described at the class."""
         self._winding = winding
 
     def prepare(self, backend: Backend) -> Self:
+        """A copy with its data on a backend, for tracing."""
         prepared = copy.copy(self)
         prepared._winding = self._winding.prepare(backend)
         return prepared
 
     def evaluate(self, p: Vec3) -> Sample:
+        """A coarsest sample of w minus an unknown integer at points p."""
         return self._winding.evaluate_modulo_one(p)
 
     def at_accuracy(self, detail: Real) -> Field:
-        """The same field with samples of this accuracy scale."""
+        """The same field with samples of the accuracy scale `detail`; larger is more accurate."""
         return EvaluateOnly(lambda p: self._winding.evaluate_modulo_one(p, detail))
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
+        """A volume that is proved to contain the level sets of w."""
         return self._winding.extent(levels)
 
 
 def winding_cells(
     winding: ModuloOneEvaluable, extent: Volume, levels: tuple[float, ...]
 ) -> OccupancyGrid:
-    """Cells over an extent. A cell is empty if w modulo 1 is proved to take none of the levels in
-    it."""
+    """A grid of cells over the volume `extent`, each marked as occupied or empty. A cell is empty
+    if the winding number w modulo 1 is proved to take none of the levels in it; triangles do not
+    matter."""
     return occupied_cells(WindingModuloOne(winding), levels, extent, _CELLS_ACROSS)
 
 
 def winding_extent(
     winding: ModuloOneEvaluable, mesh: WindingMesh, levels: tuple[float, ...]
 ) -> Volume | None:
-    """A polytope that contains the level sets of the winding number of a mesh. For a closed mesh it
-    is a box.
+    """A polytope that is proved to contain the level sets of the winding number w of a mesh. For a
+    closed mesh it is a box.
+
+    winding: an object that evaluates w of the mesh modulo 1.
+    levels: the values of w whose level sets are meant.
 
     Proof. A point of a level set lies on a triangle, where w jumps over the level; or it lies off
     the triangles, and then w modulo 1 has the level there, too. The polytope contains all
@@ -144,6 +161,7 @@ def winding_extent(
     box = winding_box(mesh, levels)
     if not len(mesh.singular_edges):
         return box
+    # The polytope must also contain these points.
     corners = mesh.vertices[mesh.faces].reshape(-1, 3)
     lower, upper = box.bounds()
     return tight_extent(
@@ -152,22 +170,25 @@ def winding_extent(
 
 
 def winding_box(mesh: WindingMesh, levels: tuple[float, ...]) -> Box:
-    """A box around the mesh that contains the level sets. Its margin around the mesh is the smaller
-    of two distances.
+    """A box that is proved to contain the level sets of the winding number w of a mesh. It contains
+    the mesh, and reaches beyond it at most by margin (a), nor farther from the singular edges than
+    margin (b).
 
-    (a) At distance rho from the mesh |w| <= area/(4 pi rho^2). (b) Off the triangles 4 pi w is,
-    modulo 4 pi, the solid angle of the singular edges. A level of this angle at distance l from the
-    multiples of 4 pi lies within L/sqrt(l (4 pi - l)) of edges of total length L (isoperimetry on
-    the sphere: see `SolidAngle.extent`).
+    (a) At distance rho from a mesh of this area |w| <= area/(4 pi rho^2). So a level lies within
+    rho = sqrt(area/(4 pi |level|)) of the mesh. (b) Off the triangles 4 pi w is, modulo 4 pi, the
+    solid angle of the singular edges. A level of this angle at distance l from the multiples of 4
+    pi lies within L/sqrt(l (4 pi - l)) of edges of total length L (isoperimetry on the sphere: see
+    `SolidAngle.extent`).
     """
     low, high = mesh.box
     slack = 1e-4 * float((high - low).max())
     min_level = min(abs(level) for level in levels)
     area_margin = math.sqrt(mesh.area / (4 * math.pi * max(min_level, 1e-12)))
-    level_gap = min(abs(math.remainder(level, 1.0)) for level in levels) * 4 * math.pi
+    level_gap = min(abs(math.remainder(level, 1.0)) for level in levels) * 4 * math.pi  # l
     edge_margin = mesh.boundary_length / math.sqrt(
         max(level_gap * (4 * math.pi - level_gap), 1e-12)
     )
+    # Off the triangles a closed mesh has no level: then the box of the mesh is enough.
     box = low, high
     if len(mesh.singular_edges):
         ends = mesh.vertices[mesh.singular_edges].reshape(-1, 3)
@@ -206,7 +227,10 @@ _TRIANGLE_ROUNDINGS = 8.0
 
 
 class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
-    """The winding number w of a triangle mesh around a point (Jacobson et al. 2013).
+    """The winding number w of a triangle mesh around a point, as a field (Jacobson et al. 2013). It
+    can be computed exactly, from one ray through the triangles and the singular edges, at which
+    triangles do not cancel; or by a tree with multipoles. Promises are proved bounds of w near a
+    point.
 
     For a closed mesh w is 1 inside and 0 outside. For a mesh with holes, cracks, duplicated or
     flipped faces or self-intersections, or for a triangle soup, w is harmonic off the triangles and
@@ -215,25 +239,26 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
 
     vertices: (n, 3).
     faces: (m, 3) indices into them.
-    method: "exact" (`edge_lift`: no truncation, cost by boundary edges), "tree" (`winding_tree`),
-        or "auto": exact up to 2048 boundary edges.
+    method: "exact" (`edge_lift`: no truncation, time by the number of singular edges), "tree"
+        (`winding_tree`), or "auto": exact up to 2048 singular edges.
     accuracy: for the tree, the moments of a cluster of triangles are used beyond `accuracy` times
         its radius; at least 1.5. A larger accuracy is slower and has smaller errors. By default it
         is 2 for values at points and 4 for tracing. Tracing uses a higher accuracy where the
         tolerance needs it. By default gradients and Hessians at points do not come from this tree.
-        For up to 32,768 boundary edges they come from sums over these edges, exact up to rounding.
+        For up to 32,768 singular edges they come from sums over these edges, exact up to rounding.
         For more edges, the accuracy of gradients is increased until their error is about 1 % of
         their length in most places (`gradient_error_bound` bounds it).
     order: the order of the multipoles of the tree: 0 (dipoles), 1 or 2 (octupoles).
-    cells: whether to build FMM cells, for many rays. In a cell w is, up to an integer, the solid
-        angle of a few near edges plus one polynomial for all others, with a proved remainder
-        (`boundary_cells`). So a sample costs the same whatever the number of edges. In a soup,
-        where triangles have hardly an edge in common, near triangles take the place of edges if the
-        method is "tree" (`dipole_cells`). None builds cells if they pay (`for_ray_count`), True
-        always, False never. They take at most the number of megabytes of this argument (True: 256),
-        and several times as much while they are built. If the user requested the cells of a soup,
-        they also give values and gradients at points, which pays for more than some 2,000 points
-        per triangle. All other values and derivatives at points are computed by `method`.
+    cells: whether to build FMM cells (fast multipole method), for many rays. In a cell w is, up to
+        an integer, the solid angle of a few near edges plus one polynomial for all others, with a
+        proved remainder (`boundary_cells`). So a sample takes the same time whatever the number of
+        edges. In a soup, where triangles have hardly an edge in common, near triangles take the
+        place of edges if the method is "tree" (`dipole_cells`). None builds cells if they save time
+        (`for_ray_count`), True always, False never. They take at most the number of megabytes of
+        this argument (True: 256), and several times as much while they are built. If the user
+        requested the cells of a soup, they also give values and gradients at points, which saves
+        time for more than some 2,000 points per triangle. All other values and derivatives at
+        points are computed by `method`.
 
     Some meshes lie on their own spanning surface, such as any flat mesh, or a file that `mesh`
     wrote of a `SolidAngle`. Such a mesh has the level right beside all of its triangles, and
@@ -263,6 +288,8 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         order: int = 2,
         cells: bool | float | None = None,
     ) -> None:
+        """Validate the mesh and the options, and choose the method. The parameters are described at
+        the class."""
         super().__init__()
         if not is_one_of(method, ("auto", "exact", "tree")):
             hint = did_you_mean(method, ("auto", "exact", "tree"))
@@ -277,6 +304,7 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         )
         self.accuracy, self.order = accuracy, order
         self.configure_cells(cells)
+        # What is computed once for a tuple of levels.
         self._extents: TransientCache[tuple[float, ...], Volume | None] = TransientCache()
         self._occupied: TransientCache[tuple[float, ...], OccupancyGrid] = TransientCache()
         self._own_levels: TransientCache[tuple[float, ...], bool] = TransientCache()
@@ -286,11 +314,11 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
     @no_derivatives
     def with_vertices(self, vertices: Any) -> WindingNumber:
         """The winding number of the same faces with other positions of their vertices (n, 3). This
-        takes less work than a new field.
+        takes less time than a new field.
 
         Faces are not joined and sorted into a tree again. The new tree has the same hierarchy of
-        triangles, with new centers, radii, moments and bounds. All promises are computed from the
-        new positions. So a tree whose vertices moved far is slower than a new tree, but never
+        triangles, with new centers, radii, moments and bounds. All proved bounds are computed from
+        the new positions. So a tree whose vertices moved far is slower than a new tree, but never
         wrong.
 
         Raises MeshError as for a new mesh, and for vertices that coincided and come apart.
@@ -305,18 +333,21 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
 
     @property
     def method(self) -> Literal["exact", "tree"]:
-        """The method by which w is computed, which is decided once."""
+        """How w is computed: "exact" (one ray and the singular edges) or "tree" (multipoles). It is
+        decided once, at construction."""
         return self._method
 
     @property
     def mesh(self) -> WindingMesh:
-        """The triangles of the mesh, prepared for sums. They cannot be set, because all other data
-        are computed from them once; `with_vertices` makes a field with moved vertices."""
+        """The mesh, prepared for sums: welded vertices, triangles, singular edges. It cannot be
+        set, because all other data are computed from it once; `with_vertices` makes a field with
+        moved vertices."""
         return self._mesh
 
     @property
     def facet_faces(self) -> npt.NDArray[np.int64]:
-        """The index of the face, in the user's order, to which each facet belongs."""
+        """For each facet (a triangle that rays can hit, numbered as in `Hits.primitive_index`), the
+        index of the user's face from which it comes."""
         return self.mesh.input_face
 
     def prepare(self, backend: Backend) -> Self:
@@ -326,8 +357,12 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         return prepared
 
     def values_at(self, x: Vec3, derivatives: int, closer: Real = 1.0) -> PointValues:
-        """Values and derivatives at points x (3, n), with error bounds. With a tree, second
-        derivatives come from the boundary, unless the user chose the accuracy."""
+        """w at points x (3, n) in user coordinates, and its derivatives up to order `derivatives`
+        (0, 1 or 2), with error bounds. With a tree, second derivatives come from the singular edges
+        (`winding_rates`), unless the user chose the accuracy.
+
+        closer: the accuracy scale, for a tree; larger is more accurate.
+        """
         data = self._batch_data(backend_of(x))
         winding, x = data.winding, data.to_unit(x)
         if isinstance(winding, TreeWinding):
@@ -338,13 +373,15 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
                 values = winding.values(x, derivatives, closer)
         else:
             values = winding.values(x, derivatives)
+            # The error bound is kept, and the value replaced by that of a faster way.
             if derivatives == 0:
                 values = dataclasses.replace(values, value=winding.fast_values(x))
         return self._stated(data, x, values)
 
     def sharp_values_at(self, x: Vec3) -> PointValues:
-        """Values and gradients at points x. With a tree, gradients come from the boundary, unless
-        the user chose the accuracy."""
+        """w and its gradient at points x (3, n) in user coordinates, with error bounds. With a
+        tree, gradients come from the singular edges (`winding_rates`), unless the user chose the
+        accuracy. Their error is then about 1 % of their length in most places, or far less."""
         data = self._batch_data(backend_of(x))
         winding = data.winding
         if not isinstance(winding, TreeWinding) or self.accuracy is not None:
@@ -353,13 +390,19 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         dr.eval(x)
         rates = self._boundary_rates(data, winding)
         values = rates.sharp(x)
+        # If the derivatives come from the tree over the triangles, so does the value. Otherwise
+        # the result has derivatives only, and the value is computed by the tree.
         if rates.summed is not winding:
             values = with_rates(winding.values(x, 0, data.backend.Float(1)), values)
         return self._stated(data, x, values)
 
     def _boundary_rates(self, data: _WindingData, winding: TreeWinding) -> BoundaryRates:
-        """The object that evaluates derivatives at points from the boundary only; made once for a
-        backend."""
+        """The object that evaluates the derivatives of w at points from the singular edges only
+        (`winding_rates`). It is made once for a backend.
+
+        data: the mesh on that backend.
+        winding: the tree over the mesh's triangles, which is used where the edges are of no use.
+        """
         if data.backend not in self._rates:
             self._rates[data.backend] = BoundaryRates.of(
                 data.backend, self.mesh, self.order, winding
@@ -367,19 +410,27 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         return self._rates[data.backend]
 
     def _stated(self, data: _WindingData, x: Vec3, values: PointValues) -> PointValues:
-        """Values at points x in unit coordinates, converted to the user's units, with all parts of
-        their errors."""
+        """Complete results at points: add the remaining parts of their errors, and convert them to
+        the user's units. The parts are the jump of a triangle so near that rounding hides on which
+        side of it x is, and errors far from the mesh.
+
+        x: (3, n) the points in unit coordinates.
+        values: w and its derivatives in unit coordinates, with error bounds.
+        """
         # If a triangle is within rounding of x, it is not known on which side of it x is.
-        on_triangle = jump_sum_within(data.rays, x, _TRIANGLE_ROUNDINGS * coordinate_rounding(x))
-        values = dataclasses.replace(values, error=values.error + on_triangle)
+        possible_jump = jump_sum_within(data.rays, x, _TRIANGLE_ROUNDINGS * coordinate_rounding(x))
+        values = dataclasses.replace(values, error=values.error + possible_jump)
         weight = self.mesh.area / (4 * math.pi * self.mesh.size**2)
         return values.with_far_field_errors(x, 64 + len(self.mesh.singular_edges), weight).rescaled(
             data.size
         )
 
     def _upload(self, backend: Backend, *, traced: bool) -> _WindingData:
-        """Upload the data to a backend. traced: whether they are for tracing, and not for values at
-        points."""
+        """Copy the mesh to a backend, in unit coordinates.
+
+        traced: True for tracing rays; False for values at points. It decides the default accuracy
+            of a tree, and whether FMM cells are built.
+        """
         accuracy = self.accuracy or (_TRACING_ACCURACY if traced else _VALUES_ACCURACY)
         mesh = self.mesh
         rays = TriangleTree.of(backend, mesh.ray_tree, mesh.ray_records)
@@ -393,13 +444,20 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         return self._add_cells(data, traced=traced)
 
     def _add_cells(self, data: _WindingData, *, traced: bool) -> _WindingData:
-        """The data with cells: cells of triangles for a soup; otherwise, for tracing, cells of
-        edges. If the cells would take too much memory, there are none."""
+        """Return `data` with FMM cells, or unchanged if they would take too much memory. For a soup
+        these are cells of triangles. Otherwise, and if a soup's cells take too much memory, they
+        are cells of singular edges, which are built for tracing only.
+
+        data: the mesh on a backend.
+        traced: whether the data are for tracing rays, and not for values at points.
+        """
         mesh, most_bytes, winding = self.mesh, self.max_bytes(), data.winding
         extent = self.extent((self.default_level,))
         assert extent is not None
         low, high = extent.bounds()
         if self._is_soup and isinstance(winding, TreeWinding):
+            # Half the edge of the cube around the origin of the unit coordinates that contains the
+            # extent.
             reach = float(np.maximum(high - mesh.center, mesh.center - low).max()) / mesh.size
             cells = self.build_cached(
                 data.backend, lambda: winding.build_cells(mesh, _CUBE_FACTOR * reach, most_bytes)
@@ -413,14 +471,15 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
 
     @property
     def _is_soup(self) -> bool:
-        """Whether triangles have so few edges in common that cells sum over triangles."""
+        """Whether triangles have so few edges in common that FMM cells sum over near triangles, and
+        not over near edges. Only for the method "tree"."""
         edges, triangles = len(self.mesh.singular_edges), len(self.mesh.triangles)
         return self.method == "tree" and edges > _SOUP_RATIO * triangles
 
     def _center_values(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """w at points (n, 3), and bounds (n,) of its error. The exact sum is computed in double
-        precision, at points that are many roundings of single precision off triangles; so its
-        rounding is far below the bound."""
+        """w at the centers (n, 3) of FMM cells, and proved bounds (n,) of its error. For the exact
+        method the sum is computed in double precision, at points that are many roundings of single
+        precision off the triangles; so its rounding is far below the bound."""
         field = self.with_cells(False)  # with cells, this would call itself
         value = np.array(field.value(points, precision="double"))
         if self.method == "exact":
@@ -429,23 +488,25 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
 
     @property
     def has_unknown_branch(self) -> bool:
-        """Whether samples along rays may know w only up to an integer. Samples from cells of edges
-        do."""
+        """Whether samples along rays may give w only up to an unknown integer. Samples from FMM
+        cells of edges do."""
         return self._device is not None and self._device.cells is not None
 
     def cells_pay_from(self) -> float:
-        """The smallest number of rays for which cells pay; infinite if they never pay."""
+        """The smallest number of rays for which FMM cells save more time than it takes to build
+        them; infinite if they never do."""
         edges, triangles = len(self.mesh.singular_edges), len(self.mesh.triangles)
         if self._is_soup:
             is_small = triangles <= _MOST_OF_SOUP
             return max(_MIN_RAYS, _PAYS_PER_TRIANGLE * triangles) if is_small else math.inf
-        pays = _MIN_CELL_EDGES <= edges <= _MAX_CELL_EDGES
-        return max(_MIN_RAYS, _PAYS_PER_EDGE * edges) if pays else math.inf
+        saves_time = _MIN_CELL_EDGES <= edges <= _MAX_CELL_EDGES
+        return max(_MIN_RAYS, _PAYS_PER_EDGE * edges) if saves_time else math.inf
 
     def occupied_cells(self, levels: tuple[float, ...]) -> OccupancyGrid | None:
-        """A grid over the extent, in which a cell is empty if w modulo 1 is proved to take none of
-        the levels in it (`winding_cells`). None if there are few edges, if the surface is the mesh
-        itself, or for the method "tree" without FMM cells."""
+        """A grid over the extent, computed once for these levels. A cell is empty if w modulo 1 is
+        proved to take none of the levels in it (`winding_cells`); rays then sample w there only
+        where they cross triangles. None in three cases: the mesh has few singular edges; the
+        surface is the mesh itself; or the method is "tree" and there are no FMM cells."""
         is_small = len(self.mesh.singular_edges) < _MIN_CELL_EDGES
         if (
             is_small
@@ -461,31 +522,37 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         return self._occupied[levels]
 
     def evaluate(self, p: Vec3) -> Sample:
-        """A sample of w itself, jumps included. Its promises hold for the smooth continuation of w
-        through all triangles."""
+        """A sample of w itself at points p, jumps included: value, gradient, errors and proved
+        bounds near p. The bounds hold for the smooth continuation of w through all triangles."""
         data, frame = self._upward_rays(p)
         return _sample_at_start(data, frame, data.winding.crossings_ahead(frame, 0, True), 1.0)
 
     def without_jumps(self) -> Field | None:
+        """This winding number modulo 1, which is continuous across triangles."""
         return WindingModuloOne(self)
 
     def evaluate_modulo_one(self, p: Vec3, detail: Real = 0.0) -> Sample:
         """A sample of w minus an unknown integer at points p. The integer may differ from point to
-        point. detail: the accuracy scale; by default the sample is the coarsest one."""
+        point.
+
+        detail: the accuracy scale; larger is more accurate. At 0, the default, the sample comes
+            from an FMM cell where there is one.
+        """
         data, frame = self._upward_rays(p)
         detail = data.backend.Float(detail)
         if data.cells is None:
             return _sample_at_start(data, frame, data.backend.Float(0), detail)
-        in_cells, inside = data.cells.sample(
+        from_cells, is_in_cell = data.cells.sample(
             frame.o, None, coordinate_rounding(frame.o), detail <= 0
         )
-        outside = _sample_at_start(data, frame, data.backend.Float(0), detail, ~inside)
-        return outside.select(inside, space_scaled(in_cells, data.size))
+        # The number of crossings ahead is an integer, so that 0 may stand for it.
+        from_all = _sample_at_start(data, frame, data.backend.Float(0), detail, ~is_in_cell)
+        return from_all.select(is_in_cell, space_scaled(from_cells, data.size))
 
     def value_if_cheap(self, p: Vec3, rounding: Real, active: Mask) -> Real:
-        """The winding number w at points p, with its integer, on active lanes on which it follows
-        from the FMM cell that contains p; NaN on other lanes. rounding: a bound of the rounding of
-        a coordinate of p."""
+        """w at points p, with its integer, on active lanes on which the FMM cell that contains p
+        determines it; NaN on all other lanes. rounding: a bound of the rounding of a coordinate of
+        p."""
         data = self._data_for(p)
         if data.cells is None:
             return data.backend.Float(dr.nan)
@@ -495,15 +562,16 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         )
 
     def _upward_rays(self, p: Vec3) -> tuple[_WindingData, RayFrame]:
-        """The data on the device, and the frame of rays from p along z."""
+        """The mesh on the device; and rays from the points p along z, in unit coordinates. With an
+        exact method their crossings with triangles give the integer part of w."""
         data = self._data_for(p)
         return data, RayFrame.along(data.backend, data.to_unit(p), data.backend.Array3f(0, 0, 1))
 
     def next_jump(
         self, o: Vec3, d: Vec3, after: JumpCrossing, t_max: Real, active: Mask
     ) -> JumpCrossing:
-        """The next crossing of a triangle on each ray o + t d, after the crossing `after` and up to
-        t = t_max, with the jump of w there."""
+        """The next crossing of each ray o + t d with a triangle, after the crossing `after` and up
+        to t = t_max, with the jump of w there along the ray."""
         data = self._data_for(o)
         frame = RayFrame.along(data.backend, data.to_unit(o), d)
         behind = (after.t / data.size, after.facet)
@@ -512,8 +580,9 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         return JumpCrossing(t * data.size, facet, -sign, -normal)
 
     def initial_offset(self, o: Vec3, d: Vec3, t_min: Real, active: Mask) -> Real:
-        """For the exact method, the sum of the signs of all crossings of triangles beyond t_min on
-        each ray o + t d. It is 0 for the tree, which needs no such sum."""
+        """The signed number of triangles that each ray o + t d crosses beyond t_min: the number
+        from which the exact method follows w along the ray. It is 0 for the tree, which needs no
+        such number, and if the surface is the mesh itself."""
         data = self._data_for(o)
         if self.only_sheets:
             return data.backend.Float(0)
@@ -521,7 +590,9 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         return data.winding.crossings_ahead(frame, t_min / data.size, active)
 
     def is_of_sheets_alone(self, levels: tuple[float, ...]) -> bool:
-        """Whether the surface of these levels is the mesh itself (`own_sheet`); computed once."""
+        """Whether the surface of these levels is the mesh itself, all triangles and nothing else,
+        because the mesh lies on its own level set (`own_sheet`). It is computed once. It is False
+        for several levels."""
         if len(levels) != 1:
             return False
         if levels not in self._own_levels:
@@ -529,8 +600,8 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         return self._own_levels[levels]
 
     def with_levels(self, levels: tuple[float, ...]) -> WindingNumber:
-        """The field by which these levels are traced. If the surface is the mesh itself, this is a
-        copy that has the level only at its triangles."""
+        """The field by which these levels are traced. If the surface is the mesh itself
+        (`is_of_sheets_alone`), this is a copy that has the level only at its triangles."""
         if not self.is_of_sheets_alone(levels):
             return self
         field = self.with_cells(False)
@@ -540,8 +611,9 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
     def continuation(
         self, o: Vec3, d: Vec3, behind: JumpCrossing, ahead: JumpCrossing, offset: Real
     ) -> Field:
-        """The winding number w on each ray o + t d between the crossings `behind` and `ahead`, as a
-        field without jumps. offset: the sum of the signs of all crossings ahead of `behind`."""
+        """The winding number w on each ray o + t d between the crossings `behind` and `ahead` with
+        triangles, as a field without jumps. offset: the signed number of all crossings beyond
+        `behind` on the ray."""
         if self.only_sheets:
             return _BesideSheets(self._data_for(o).backend, self._level_of_sheets, behind, ahead)
         data = self._data_for(o)
@@ -550,15 +622,18 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         return _WindingOnInterval(data, frame, start, offset)
 
     def distance_to_jumps(self, p: Vec3) -> Real:
-        """A lower bound of the distance from p to the triangles."""
+        """A lower bound of the distance from p to the triangles, at which w jumps."""
         data = self._data_for(p)
         return distance_lower_bound(data.rays, data.to_unit(p)) * data.size
 
     def nearest_facet(
         self, p: Vec3, after: tuple[Real, Any], limit: Real, active: Mask
     ) -> NearestFacet:
-        """The triangle that follows the one given by `after` in the order of distance from p,
-        within the distance `limit`."""
+        """The next triangle in the order of distance from p, after the triangle given by `after`,
+        within the distance `limit`. Called repeatedly, it lists the triangles by distance.
+
+        after: the squared distance and the index of the previous triangle.
+        """
         data = self._data_for(p)
         facet = next_closest_triangle(
             data.rays, data.to_unit(p), after, dr.square(limit / data.size), active
@@ -572,24 +647,27 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         )
 
     def jump_mesh(self) -> tuple[FloatArray, IntArray, bool] | None:
-        """Vertices, triangles, and whether the mesh is closed."""
+        """The mesh at which w jumps: vertices (n, 3), triangles (k, 3), and whether the mesh is
+        closed."""
         return self.mesh.vertices, self.mesh.triangles, not len(self.mesh.singular_edges)
 
     def validate_levels(self, levels: tuple[float, ...]) -> None:
-        """Raise ValueError for level 0, which is no surface."""
+        """Raise ValueError for level 0, the value of w outside a closed mesh, which is no
+        surface."""
         for level in levels:
             if abs(level) < 1e-6:
                 raise ValueError("level 0 of a winding number is no surface; try 0.5")
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
-        """A volume that contains the level sets: all triangles, and cells around them that are not
-        proved empty (`winding_extent`)."""
+        """A volume that is proved to contain the level sets: all triangles, and the cells around
+        them that are not proved empty (`winding_extent`). It is computed once for these levels."""
         if levels not in self._extents:
             self._extents[levels] = winding_extent(self.with_cells(False), self.mesh, levels)
         return self._extents[levels]
 
     def describe(self) -> dict[str, Any]:
-        """Facts about the field for users, as a dictionary of names and values."""
+        """Facts about the field for users, as a dictionary of names and values: the numbers of
+        triangles and singular edges, the method, and the FMM cells."""
         mesh = self.mesh
         return {
             "triangles": len(mesh.triangles),
@@ -602,11 +680,11 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
 
 @dataclass(frozen=True)
 class _WindingData(UnitFrame):
-    """The data of a winding number on a backend.
+    """The mesh of a winding number w on a backend, in unit coordinates.
 
-    winding: the sum that gives w.
-    rays: the tree of the triangles, for rays and distances.
-    cells: the cells of edges; None for none.
+    winding: the object that evaluates w, exactly or by a tree.
+    rays: a tree of the triangles, for crossings with rays and for distances.
+    cells: the FMM cells of edges; None if there are none.
     """
 
     winding: ExactWinding | TreeWinding
@@ -615,7 +693,7 @@ class _WindingData(UnitFrame):
 
     @property
     def built(self) -> BuiltCells | None:
-        """The FMM cells, which are cells of edges or of triangles; None if there are none."""
+        """The FMM cells that were built, of edges or of triangles; None if there are none."""
         if self.cells is None and isinstance(self.winding, TreeWinding):
             return self.winding.cells
         return self.cells
@@ -624,12 +702,16 @@ class _WindingData(UnitFrame):
 def _sample_at_start(
     data: _WindingData, frame: RayFrame, turns: Real, detail: Real, active: Mask = True
 ) -> Sample:
-    """The sample of w at the starts of rays, on active lanes, without promises along the rays.
+    """A sample of w at the origins of rays, on active lanes, in the user's units. It has proved
+    bounds near the origins, but none along the rays.
 
-    frame: the frame of the rays.
-    turns: the sum of the signs of all crossings ahead.
-    detail: the accuracy scale.
+    data: the mesh on a backend.
+    frame: the rays, in unit coordinates.
+    turns: the signed number of triangles that each ray crosses, or 0 for w up to an integer; only
+        the exact method uses it.
+    detail: the accuracy scale; larger is more accurate.
     """
+    # A crossing at t = 0 with no triangle: all crossings at t > 0 are ahead of it.
     start = JumpCrossing(0.0, data.backend.UInt32(NO_FACET), 0.0, data.backend.Array3f(0, 0, 1))
     detail = data.backend.Float(detail)
     sample = data.winding.sample_interval(frame, frame.o, start, turns, detail, active)
@@ -637,14 +719,15 @@ def _sample_at_start(
 
 
 class _WindingOnInterval(Field):
-    """The winding number w on a ray interval between two crossings of triangles, continued smoothly
-    to both ends.
+    """The winding number w of a mesh on an interval of each ray, between two crossings of
+    triangles, continued smoothly to both ends. A crossing is a point at which the ray passes
+    through a triangle.
 
-    on: the data of the winding number.
-    frame: the frame of the rays.
+    on: the mesh on a backend.
+    frame: the rays, in unit coordinates.
     behind: the crossing at the start of the interval, with its position in unit coordinates.
-    offset: the sum of the signs of all crossings ahead of the start; only the exact method uses it.
-    detail: the accuracy scale.
+    offset: the signed number of crossings beyond the start; only the exact method uses it.
+    detail: the accuracy scale; larger is more accurate.
     """
 
     def __init__(
@@ -655,7 +738,7 @@ class _WindingOnInterval(Field):
         offset: Real,
         detail: Real = 1.0,
     ) -> None:
-        """For the arguments see the class."""
+        """The parameters are described at the class."""
         self.has_variable_accuracy = on.winding.has_detail or on.cells is not None
         self.coarsest_accuracy = on.winding.coarsest_detail
         self._on, self._frame, self._detail = on, frame, on.backend.Float(detail)
@@ -663,16 +746,18 @@ class _WindingOnInterval(Field):
 
     @property
     def has_unknown_branch(self) -> bool:
-        """Whether samples may know w only up to an integer."""
+        """Whether samples may give w only up to an unknown integer: whether there are FMM cells of
+        edges."""
         return self._on.cells is not None
 
     def at_accuracy(self, detail: Real) -> Field:
-        """The same function with samples of this accuracy scale."""
+        """The same function with samples of the accuracy scale `detail`; larger is more
+        accurate."""
         return _WindingOnInterval(self._on, self._frame, self._behind, self._offset, detail)
 
     def evaluate(self, p: Vec3) -> Sample:
-        """A sample of w at points p of the interval. On lanes on which it comes from the cells, it
-        is w up to an unknown integer, and marked as such (`branch_unknown`)."""
+        """A sample of w at points p of the interval. On lanes on which it comes from an FMM cell of
+        edges, it is w up to an unknown integer, and marked as such (`branch_unknown`)."""
         data, frame = self._on, self._frame
         x, detail = data.to_unit(p), self._detail
         if data.cells is None:
@@ -680,19 +765,23 @@ class _WindingOnInterval(Field):
             return space_scaled(sample, data.size)
         unit = fmax(coordinate_rounding(frame.o), coordinate_rounding(x))
         # Cells are coarser than the coarsest samples whose branch is known.
-        in_cells, inside = data.cells.sample(x, frame.d, unit, detail < self.coarsest_accuracy)
-        sample = data.winding.sample_interval(frame, x, self._behind, self._offset, detail, ~inside)
-        sample = dataclasses.replace(sample.select(inside, in_cells), branch_unknown=inside)
+        from_cells, is_in_cell = data.cells.sample(
+            x, frame.d, unit, detail < self.coarsest_accuracy
+        )
+        sample = data.winding.sample_interval(
+            frame, x, self._behind, self._offset, detail, ~is_in_cell
+        )
+        sample = dataclasses.replace(
+            sample.select(is_in_cell, from_cells), branch_unknown=is_in_cell
+        )
         return space_scaled(sample, data.size)
 
 
 class _BesideSheets(Field):
-    """The field on a ray interval between two crossings of a mesh that lies on its own level set
-    (`own_sheet`), so that its triangles are the whole surface.
-
-    The field is constant: the level plus 1/2 or minus 1/2. The sign is such that the jump at the
-    triangle ahead passes the level. If no triangle is ahead, the jump at the triangle behind
-    decides.
+    """The field on an interval of each ray between two crossings of a mesh that lies on its own
+    level set (`own_sheet`), so that its triangles are the whole surface. On the interval the field
+    is constant: the level plus 1/2 or minus 1/2. The sign is such that the jump at the triangle
+    ahead passes the level. If no triangle is ahead, the jump at the triangle behind decides.
 
     level: the level of the surface.
     behind, ahead: the crossings at the ends of the interval.
@@ -701,10 +790,13 @@ class _BesideSheets(Field):
     def __init__(
         self, backend: Backend, level: float, behind: JumpCrossing, ahead: JumpCrossing
     ) -> None:
+        """The parameters are described at the class."""
         real = backend.Float
+        # A positive jump ahead leads up through the level, so that the field is below it before.
+        # After a positive jump behind the field is above it.
         jump = dr.select(real(ahead.jump) != 0, -real(ahead.jump), real(behind.jump))
         self._value = dr.select(jump > 0, real(level + 0.5), level - 0.5)
 
     def evaluate(self, p: Vec3) -> Sample:
-        """The sample of the constant, which holds at any points p."""
+        """The sample of the constant at points p of the interval."""
         return Sample(self._value, 0 * p, (Lipschitz(0.0),), 0.0)

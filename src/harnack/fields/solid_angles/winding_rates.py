@@ -1,9 +1,10 @@
-"""Gradients and Hessians of winding numbers at points, from the boundary only.
+"""Gradients and Hessians of the winding number w of a mesh at points, from the mesh's boundary
+only. The boundary consists of the *singular edges*, at which triangles do not cancel. Off the
+triangles w is, up to an integer, the solid angle of these edges over 4 pi. So all surfaces with the
+same boundary have the same derivatives. "Rates" are these derivatives.
 
-Off the triangles the winding number w of a mesh is, up to an integer, the solid angle of its
-boundary edges over 4 pi. So all surfaces with these edges have the same derivatives. If a mesh has
-only small holes, the terms of its triangles nearly cancel, and the truncation error of a tree over
-them is many times the gradient. Two other sums have no such error:
+If a mesh has only small holes, the terms of its triangles nearly cancel, and the truncation error
+of a tree over them is many times the gradient. Two other sums have no such error:
 
 - a direct sum over the edges (Biot and Savart's law), for few edges;
 - a sum by a tree over *caps*, fans of triangles over the loops that the edges form.
@@ -43,10 +44,12 @@ _MAX_AREA_RATIO = 0.5
 
 @dataclass(frozen=True)
 class BoundaryRates:
-    """The derivatives of w off the triangles, in units in which the mesh has a size of about one.
+    """An object that evaluates the derivatives of the winding number w of a mesh off its triangles,
+    in units in which the mesh has a size of about one.
 
-    summed: what is summed: the edges, or a tree of caps, or a tree of the triangles themselves;
-        None for a closed mesh.
+    summed: what is summed: the singular edges; or a tree of caps (triangles that close the loops of
+        these edges); or a tree of the mesh's triangles; None for a closed mesh, where derivatives
+        are 0.
     """
 
     summed: LiftedEdges | TreeWinding | None
@@ -55,11 +58,13 @@ class BoundaryRates:
     def of(
         cls, backend: Backend, mesh: WindingMesh, order: int, whole: TreeWinding
     ) -> BoundaryRates:
-        """The derivatives of the winding number of a mesh.
+        """Choose and upload what is summed for the derivatives of w.
 
         order: the order of the multipoles of a tree over caps.
-        whole: a tree over the mesh's triangles. It is used if it has cells, and if caps would be no
-            smaller than the mesh, as for a triangle soup.
+        whole: a tree over the mesh's triangles. It is used in three cases: it has FMM cells; there
+            are more singular edges than triangles, as in a triangle soup; or caps would have more
+            than half of the mesh's area. Otherwise up to 32,768 edges are summed directly, and more
+            by a tree over caps.
         """
         if not len(mesh.singular_edges):
             return cls(None)
@@ -75,8 +80,11 @@ class BoundaryRates:
         return cls(TreeWinding.of(backend, caps, _CAPS_ACCURACY, order))
 
     def at(self, x: Vec3, derivatives: int, closer: Real) -> PointValues:
-        """The derivatives of w up to order `derivatives` at points x (3, n), with error bounds. The
-        value in the result has no meaning. closer: the accuracy scale."""
+        """The derivatives of w up to order `derivatives` (1 or 2) at points x (3, n), with error
+        bounds. The value in the result has no meaning, unless the mesh's own triangles are summed.
+
+        closer: the accuracy scale of a tree; larger is more accurate.
+        """
         if isinstance(self.summed, TreeWinding):
             return self.summed.values(x, derivatives, closer)
         real = cast("Any", type(x.x))
@@ -88,8 +96,8 @@ class BoundaryRates:
         return sums.values(1 / (4 * math.pi), coordinate_rounding(x), real(0))
 
     def sharp(self, x: Vec3) -> PointValues:
-        """The gradient of w at points x (3, n), with an error of about 1 % of its length in most
-        places. If it comes from a tree, the accuracy is increased until that is so
+        """The gradient of w at points x (3, n), with error bounds. Its error is about 1 % of its
+        length in most places: if it comes from a tree, the accuracy is increased until that is so
         (`sharpened`)."""
         if isinstance(self.summed, TreeWinding):
             return sharpened(lambda points, accuracy: self.at(points, 1, accuracy), x)
@@ -97,18 +105,19 @@ class BoundaryRates:
 
 
 def with_rates(value: PointValues, rates: PointValues) -> PointValues:
-    """The value of the first argument with the derivatives of the second, each with its error
+    """Combine two results: the value of `value` and the derivatives of `rates`, each with its error
     bounds."""
     return dataclasses.replace(rates, value=value.value, error=value.error)
 
 
 def caps_of(mesh: WindingMesh) -> WindingMesh:
-    """Triangles with the same boundary as a mesh, in the same unit coordinates. They form a fan
-    over each of the loops that the mesh's singular edges form; the apex of a fan is the mean of the
-    loop's vertices."""
+    """A mesh of triangles with the same boundary as `mesh`, in the same unit coordinates. They form
+    a fan over each of the loops that the singular edges form. The apex of a fan is the mean of the
+    loop's vertices; a loop of three vertices is one triangle without apex."""
     loops = simple_loops(mesh.singular_edges)
     centers = [mesh.vertices[loop].mean(axis=0) for loop in loops]
     vertices = np.concatenate([mesh.vertices, centers])
+    # The apex of loop k is the vertex len(mesh.vertices) + k.
     fans = [
         loop[None]
         if len(loop) == 3
@@ -124,20 +133,22 @@ def caps_of(mesh: WindingMesh) -> WindingMesh:
 
 
 def simple_loops(edges: IntArray) -> list[IntArray]:
-    """Closed directed edges (k, 2) as loops, each an array of different vertices. A walk along the
-    edges cuts off a loop as soon as it comes back to a vertex."""
+    """Divide directed edges (k, 2), which enter each vertex as often as they leave it, into closed
+    loops. Each loop is an array of vertex indices without repetition. A walk along the edges cuts
+    off a loop as soon as it comes back to a vertex."""
     loops: list[IntArray] = []
     for trail in closed_trails(edges):
-        path: list[int] = []
-        position: dict[int, int] = {}
+        walk: list[int] = []
+        place_in_walk: dict[int, int] = {}
         for vertex in trail.tolist():
-            if vertex not in position:
-                position[vertex] = len(path)
-                path.append(vertex)
+            if vertex not in place_in_walk:
+                place_in_walk[vertex] = len(walk)
+                walk.append(vertex)
                 continue
-            start = position[vertex]
-            loops.append(np.array(path[start:], np.int64))
-            for dropped in path[start + 1 :]:
-                del position[dropped]
-            path = path[: start + 1]
+            # The walk is back at a vertex: cut the loop off, and go on from that vertex.
+            start = place_in_walk[vertex]
+            loops.append(np.array(walk[start:], np.int64))
+            for dropped in walk[start + 1 :]:
+                del place_in_walk[dropped]
+            walk = walk[: start + 1]
     return loops

@@ -1,19 +1,25 @@
-"""Winding numbers by a tree: multipole moments of clusters of far triangles, near triangles
-exactly.
+"""The winding number w of a mesh by a tree over its triangles: clusters of far triangles are
+replaced by multipole moments, and near triangles are summed exactly. By Stokes' theorem the field
+of near triangles is that of the boundary of their union. So only their *open* edges are summed, at
+which near triangles do not cancel. An edge is *singular* if the triangles of the whole mesh do not
+cancel at it. A near triangle is given by its record, the row of numbers that describes it in the
+tree. A node of the tree is *far* from a point if its distance is more than a certain multiple of
+its radius; triangles in no far node are *near*. A *lane* is one entry of Dr.Jit's arrays, such as a
+point or a ray.
 
-Barill et al. 2018 ("Fast winding numbers for soups and clouds") with orders 0 to 2, gradients and
-Hessians from the same moments, a bound of the truncation, and promises.
+The method is that of Barill et al. 2018 ("Fast winding numbers for soups and clouds") with orders 0
+to 2, gradients and Hessians from the same moments, a bound of the truncation error, and proved
+bounds of w near a point.
 
-Near triangles. By Stokes' theorem the field of a set of triangles is that of the boundary of their
-union, so only the edges at which they do not cancel are summed. `edge_lift` explains how crossings
-and edges together give the winding number. Both are decided by the same bits, so that an edge that
-two triangles share contributes no rounding error.
+`edge_lift` explains how crossings of a ray and edges together give the winding number. Both are
+decided by the same bits, so that an edge that two triangles share contributes no rounding error.
 
-Cells. If triangles have hardly an edge in common (a soup), cells of edges would have three near
-edges for each triangle. So soups have the same cells as clouds. Near triangles are added as in the
-leaves of the tree, and far triangles are sheets of dipoles with two more moments. So a sample in a
-cell gives all of w, including its integer. These cells are built in a quarter of the time of cells
-of edges. Soups of few triangles, each as large as the whole soup, have cells of edges.
+FMM cells (fast multipole method). If triangles have hardly an edge in common (a soup), cells of
+edges would have three near edges for each triangle. So soups have the same cells as clouds. Near
+triangles are added as in the leaves of the tree, and far triangles are sheets of dipoles with two
+more moments. So a sample in a cell gives all of w, including its integer. These cells are built in
+a quarter of the time of cells of edges. Soups of few triangles, each as large as the whole soup,
+have cells of edges.
 """
 
 from __future__ import annotations
@@ -66,44 +72,51 @@ _EDGES = ((0, 1, 1.0), (1, 2, 1.0), (0, 2, -1.0))
 
 @dataclass(frozen=True)
 class NearEdge:
-    """An edge of a near triangle.
+    """An edge of a near triangle, that is, of a triangle that is in no far node of the tree as seen
+    from the point x.
 
-    edge: the edge relative to a point.
-    is_singular: whether the triangles at this edge do not cancel.
+    edge: the edge relative to x.
+    is_singular: whether the triangles of the whole mesh do not cancel at this edge.
     """
 
     edge: LiftedEdge
     is_singular: Mask
 
     def is_open(self, reach: Real) -> Mask:
-        """Mask of the lanes on which the edge may be part of the boundary of the set of near
-        triangles. These are the triangles that are not in a far node of the tree, as seen from the
-        point x. The boundary consists of the edges at which near triangles do not cancel.
+        """Mask of the lanes on which the edge may be part of the boundary of the near triangles, so
+        that it must be summed. Edges of length 0, which stand in empty slots, are not open.
 
-        reach: a node is far if its distance from x is more than `reach` times its radius.
+        reach: a node of the tree is far if its distance from x is more than `reach` times its
+            radius.
 
-        The edge is not part of that boundary if it is not singular (all triangles at it, near and
-        far ones, cancel), and is nearer to x than (reach - 1)/2 times its length L. Proof: a far
-        node that has a triangle at this edge has a radius R >= L/2 and is farther than reach R, and
-        so the edge is farther than (reach - 1) R. Hence all triangles at a nearer edge are near,
-        and cancel there.
+        The edge is not part of the boundary if it is not singular, and is nearer to x than (reach -
+        1)/2 times its length L. Proof: a far node that has a triangle at this edge has a radius R
+        >= L/2 and is farther than reach R, and so the edge is farther than (reach - 1) R. Hence all
+        triangles at a nearer edge are near, and cancel there.
 
-        If the far triangles are summed by the polynomial of an octree cell that contains x,
-        `reach` is `TRIANGLE_RATIO`. The polynomial holds in a ball around the cell, and a triangle
-        is far if it is farther from the ball's center than k > 1 radii of the ball plus a multiple
-        of its size (`dipole_expansion`). As x is in the ball, the same proof holds. Far nodes are
-        even farther.
+        If x is in an FMM cell, far triangles are summed by the cell's polynomial, and `reach` is
+        `TRIANGLE_RATIO`. The polynomial holds in a ball around the cell, and a triangle is far if
+        it is farther from the ball's center than k > 1 radii of the ball plus `reach` times the
+        triangle's size (`dipole_expansion`). As x is in the ball, the triangle is farther from x
+        than `reach` times its size, and the same proof holds. Far nodes are even farther.
         """
         square, inverse = self.edge.edge.squared_distance, self.edge.edge.inverse_square_length
+        # square * inverse is (distance/L)^2.
         is_closed = ~self.is_singular & (square * inverse < dr.square(0.5 * (reach - 1)))
         return (inverse > 0) & ~is_closed
 
 
 def edges_of(row: list[Real], x: Vec3, frame: RayFrame | VerticalRayFrame) -> Iterator[NearEdge]:
-    """Yield the three edges of the triangle in the record `row`, relative to x and to rays of the
-    frame. The record of an empty slot gives edges of length 0."""
+    """Yield the three edges of a triangle, each relative to points x. The record of an empty slot
+    of a leaf gives edges of length 0.
+
+    row: the triangle's record.
+    frame: the rays from x whose crossings with triangles are counted; the solid angles of edges
+        refer to their direction.
+    """
     ends = corners_of(row, cast("Any", type(x)))
     for k, (i, j, sign) in enumerate(_EDGES):
+        # Empty slots have the triangle number -1.
         inverse = dr.select(row[NUMBER_COLUMN] >= 0, row[INVERSE_SQUARES_COLUMN + k], 0)
         edge = LiftedEdge.between(ends[i], ends[j], sign * row[PARITY_COLUMN], inverse, frame, x)
         yield NearEdge(edge, row[SINGULAR + k] > 0)
@@ -119,12 +132,14 @@ _PER_SPHERE = 1 / (4 * math.pi)
 
 @dataclass(frozen=True)
 class TreeWinding:
-    """The winding number w of a mesh on a backend, in units in which the mesh has a size of about
-    one.
+    """The winding number w of a mesh on a backend, evaluated by a tree over its triangles, in units
+    in which the mesh has a size of about one. The accuracy scale of a sample is a factor: the
+    larger it is, the more accurate the sample.
 
-    clusters: the sum by a tree over the triangles.
+    clusters: the tree, which sums far clusters of triangles by their moments and visits near
+        triangles.
     rounding: a bound of the rounding of w that the final operations cause.
-    cells: FMM cells for samples with gradients at accuracy scales up to 1; None for no cells.
+    cells: FMM cells for values and gradients; None for no cells.
     """
 
     clusters: Treecode
@@ -135,11 +150,12 @@ class TreeWinding:
     def of(
         cls, backend: Backend, mesh: WindingMesh, accuracy: float, order: int,
     ) -> TreeWinding:  # fmt: skip
-        """Upload the data of a mesh, without cells.
+        """Upload a mesh to a backend, without FMM cells.
 
         accuracy: the moments of a node are used beyond this many times its radius.
-        order: the order of the multipoles.
+        order: the order of the multipoles: 0, 1 or 2.
         """
+        # The flags are the columns that begin at `SINGULAR`.
         records = np.concatenate([mesh.records, mesh.singular_flags], axis=1)
         slots = records_in_slots(mesh.tree, records)
         rounding = final_rounding(backend)
@@ -148,8 +164,11 @@ class TreeWinding:
         return cls(clusters, rounding)
 
     def build_cells(self, mesh: WindingMesh, half: float, most_bytes: int) -> DipoleCells | None:
-        """Build cells of the cube [-half, half]^3, of at most `most_bytes` bytes (`dipole_cells`);
-        None if they would need more."""
+        """Build FMM cells in the cube [-half, half]^3 in unit coordinates (`dipole_cells`). None if
+        they would need more than `most_bytes` bytes.
+
+        mesh: the mesh from which this object was made.
+        """
         sources, triangles = (
             mesh.tree.values_in_slots(triangle_sources(mesh.corners)),
             self.clusters.tree,
@@ -161,23 +180,27 @@ class TreeWinding:
 
     @property
     def has_detail(self) -> bool:
-        """Whether samples at small accuracy scales cost less. It is true for a tree."""
+        """Whether samples at small accuracy scales take less time. It is true for a tree."""
         return True
 
     @property
     def backend(self) -> Backend:
+        """The backend on which the tree lies."""
         return self.clusters.backend
 
     @property
     def coarsest_detail(self) -> float:
-        """The accuracy scale of coarse samples (`Field.coarsest_accuracy`)."""
+        """The smallest accuracy scale that makes a difference: at smaller scales samples are the
+        same (`Field.coarsest_accuracy`). With FMM cells it is 1, up to which samples come from the
+        cells."""
         return self.clusters.coarsest_accuracy if self.cells is None else 1.0
 
     def values(self, x: Vec3, derivatives: int, closer: Real) -> PointValues:
         """The winding number w and its derivatives up to order `derivatives` at points x (3, n),
-        with error bounds. closer: the accuracy scale, at least 1.
+        with error bounds. Near triangles add their crossings with the rays from x along z, and
+        their open edges.
 
-        Near triangles add their crossings with the rays from x along z, and their open edges.
+        closer: the accuracy scale; larger is more accurate. Values below 1 count as 1.
         """
         unit, detail = (
             coordinate_rounding(x),
@@ -185,7 +208,7 @@ class TreeWinding:
         )
 
         def is_ahead(row: list[Real], t: Real) -> Mask:
-            """The mask of the lanes on which a crossing at the ray parameter t is ahead of x."""
+            """Mask of the lanes on which a crossing at the ray parameter t is ahead of x."""
             del row
             return t > 0
 
@@ -202,27 +225,29 @@ class TreeWinding:
         derivatives: int,
         active_lanes: Mask = True,
     ) -> SourceSums:
-        """Sums whose value is 4 pi w: far clusters, the crossings of near triangles that are ahead
-        of x on rays of the frame, and the open edges of near triangles (`NearEdge.is_open`).
+        """Sums whose value is 4 pi w: the moments of far clusters, the crossings of near triangles
+        that are ahead of x on rays, and the open edges of near triangles (`NearEdge.is_open`).
 
-        x: points of the rays.
-        detail: the accuracy scale.
+        frame: the rays, with points x on them.
+        detail: the accuracy scale; larger is more accurate.
         unit: the rounding of a coordinate.
-        is_ahead: a function; is_ahead(row, t) tells whether a crossing at t with the triangle of
-            the record `row` is ahead.
-        active_lanes: the mask of the active lanes.
+        is_ahead: a function (row, t): whether a crossing at the ray parameter t with the triangle
+            of the record `row` counts as ahead of x.
+        derivatives: 0 for the value, 1 with the gradient, 2 with the Hessian.
+        active_lanes: the mask of the lanes on which sums are wanted.
         """
+        # Angles of edges are added as the argument of a product of complex factors.
         start = LiftedProduct.identity(self.backend.Float).parts()
 
         def adder(reach: Real) -> AddPrimitive:
-            """Make a function that adds a near triangle to sums. reach: nodes are far beyond this
-            many times their radius."""
+            """Make the function that adds a near triangle to sums, where nodes are far beyond
+            `reach` times their radius."""
 
             def add(
                 row: list[Real], active: Mask, sums: SourceSums, state: tuple[Any, ...]
             ) -> tuple[SourceSums, tuple[Any, ...]]:
                 """Add the triangle in the record `row` to the sums, on active lanes. state: the
-                parts of the product of the factors of edges (`LiftedProduct`)."""
+                parts of the product of the edges' factors so far (`LiftedProduct`)."""
                 t, sign = signed_crossing(row, frame)
                 # A crossing is a full turn of the product, which counts them without rounding.
                 re, im, turns = state
@@ -241,25 +266,29 @@ class TreeWinding:
         self, x: Vec3, detail: Real, adder: Callable[[Real], AddPrimitive], state: tuple[Any, ...],
         active_lanes: Mask, derivatives: int = 1,
     ) -> tuple[SourceSums, tuple[Any, ...]]:  # fmt: skip
-        """The sums at points x over far clusters, to which near triangles are added; and the
-        caller's own state. They come from the FMM cells if there are cells, no second derivatives
-        are requested, and the accuracy scale `detail` is at most 1; otherwise from the tree.
+        """Sums at points x over far clusters, to which the caller's function adds near triangles.
+        They come from the FMM cells if there are cells, no second derivatives are requested, and
+        the accuracy scale `detail` is at most 1; otherwise from the tree.
 
         adder: a function that makes the function that adds a near triangle. Its argument is the
-            number of radii beyond which nodes are far (`reach` of `NearEdge.is_open`).
+            number of radii beyond which nodes are far.
         state: a further state of the caller, which that function updates.
-        active_lanes: the mask of the active lanes.
+        active_lanes: the mask of the lanes on which sums are wanted.
+        derivatives: 0 for the value, 1 with the gradient, 2 with the Hessian.
+
+        Returns the sums and the caller's last state.
         """
         if self.cells is None or derivatives == 2:
             add = adder(self.clusters.acceptance_ratio(detail))
             return self.clusters.sums(x, detail, add, state, active_lanes, derivatives=derivatives)
+        # On lanes whose sums come from the tree after all, the accuracy scale is at least 1.
         acceptance = self.clusters.acceptance_ratio(fmax(detail, self.backend.Float(1)))
         adders = adder(self.backend.Float(TRIANGLE_RATIO)), adder(acceptance)
         return self.cells.sums_with_tree(self.clusters, x, detail, adders, state, active_lanes)
 
     def crossings_ahead(self, frame: RayFrame, t: Real, active: Mask) -> Real:
-        """Always 0. The crossings ahead on a ray need not be counted separately, because every sum
-        over the tree contains them and gives w with its integer."""
+        """Always 0. The crossings of rays with triangles need not be counted before sampling,
+        because every sum over the tree contains them and gives w with its integer."""
         del frame, t, active
         return self.backend.Float(0)
 
@@ -267,62 +296,66 @@ class TreeWinding:
         self, frame: RayFrame, x: Vec3, behind: JumpCrossing, turns: Real, detail: Real,
         active: Mask = True,
     ) -> Sample:  # fmt: skip
-        """The sample of w at points x of a ray interval between two crossings of triangles, on
-        active
-        lanes: value, gradient, errors and promises (proved bounds near x).
+        """A sample of w at points x of a ray interval between two crossings of triangles, on active
+        lanes: value, gradient, errors, and promises (proved bounds of w near x and along the ray).
 
-        frame: the frame of the rays.
+        frame: the rays.
         behind: the crossing at which the interval starts.
         turns: not used here.
-        detail: the accuracy scale.
+        detail: the accuracy scale; larger is more accurate.
 
         Near triangles add their crossings ahead of x along the ray, and their open edges
         (`NearEdge.is_open`). Crossings that the tracer has passed up to the start of the interval
         count as behind x, all others as ahead. So it does not matter on which side of a triangle
         rounding puts x.
 
-        Promises. For far dipoles see `SourceSums.sample`. The near triangles' field is that of
-        their open edges, and f is harmonic up to the nearest of them; `LiftedEdge.bounds` has their
-        terms of the remainder.
+        The proved bounds near x come from two parts. For far clusters see `SourceSums.sample`. The
+        near triangles' field is that of their open edges, and it is harmonic up to the nearest of
+        them; `LiftedEdge.bounds` has their terms of the remainder.
         """
         del turns
+        # `unit` is the rounding of a coordinate.
         index, unit = (
             self.backend.UInt32,
             fmax(coordinate_rounding(frame.o), coordinate_rounding(x)),
         )
 
         def is_ahead(row: list[Real], t: Real) -> Mask:
-            """Whether the crossing at t with a record's triangle is after the start of the
-            interval."""
+            """Whether the crossing at t with the triangle of the record `row` is after the start of
+            the interval. Crossings at the same t are in the order of the triangles' numbers."""
             number = index(fmax(row[NUMBER_COLUMN], self.backend.Float(0)))
             return ~((t < behind.t) | ((t == behind.t) & (number <= behind.facet)))
 
         sums = self._sums(frame, x, detail, unit, is_ahead, 1, active)
         line = RayLine(x, frame.d, 8 * unit)
-        promises = lipschitz_along(
+        bounds_along = lipschitz_along(
             line, sums.gradient, sums.singularity_distance, self._rates(line, active)
         )
-        return sums.sample(_PER_SPHERE, unit, self.rounding, along=promises)
+        return sums.sample(_PER_SPHERE, unit, self.rounding, along=bounds_along)
 
     def _rates(self, line: RayLine, active_lanes: Mask) -> Rates:
         """Make a function that computes, for each of several lengths T, a bound of the derivative
-        of 4 pi w along a line, at points within T of x = line.x (as `trail_sums.line_rates` does
-        for curves). active_lanes: the mask of the lanes that may be active."""
+        of 4 pi w along a line, at its points within T of x = line.x. It does for meshes what
+        `trail_sums.line_rates` does for curves.
+
+        active_lanes: the mask of the lanes that may be active.
+        """
 
         def rates(lengths: tuple[Real, ...], active: Mask) -> tuple[Real, ...]:
-            """For each length, a bound of the derivative along the line within that length of x;
-            infinite on lanes that are not active."""
+            """For each length, a bound of the derivative of 4 pi w along the line within that
+            length of x; infinite on lanes that are not active."""
             active = active & active_lanes
 
             def adder(reach: Real) -> AddPrimitive:
-                """Make a function that adds the open edges of a near triangle to the bounds. reach:
-                nodes are far beyond this many times their radius."""
+                """Make the function that adds the open edges of a near triangle to the bounds,
+                where nodes are far beyond `reach` times their radius."""
 
                 def add(
                     row: list[Real], active: Mask, sums: SourceSums, old: tuple[Any, ...]
                 ) -> tuple[SourceSums, tuple[Any, ...]]:
                     """Add the open edges of the triangle in the record `row` to the bounds `old`,
-                    on active lanes. The sums stay as they are."""
+                    one for each length, on active lanes. The sums over far clusters stay as they
+                    are."""
                     for near in edges_of(row, line.x, VerticalRayFrame(line.x)):
                         is_open = active & near.is_open(reach)
                         new = add_edge_rates(line, near.edge.edge, lengths, old)
@@ -332,6 +365,7 @@ class TreeWinding:
                 return add
 
             start = tuple(self.backend.Float(0) for _ in lengths)
+            # Accuracy scale 0: the coarsest sums are enough for bounds.
             far, near = self._near_sums(line.x, self.backend.Float(0), adder, start, active)
             return far.add_line_rates(line.v, line.slack, lengths, near, active)
 

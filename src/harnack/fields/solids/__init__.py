@@ -1,1 +1,2 @@
-"""Solids: where a function is negative, and how they are put together."""
+"""Solids: sets of points where a function f is at most 0, and the operations that combine and move
+them."""

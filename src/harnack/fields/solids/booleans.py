@@ -1,4 +1,9 @@
-"""Combinations of solids: unions, intersections, complements, offsets, and blends."""
+"""Combinations of solids: unions, intersections, complements, offsets, and blends. A solid is the
+set of points where its function f is at most 0; the solids that are combined are called operands
+(or parts), with the functions f_i. The union has the function min f_i, the intersection max f_i,
+the complement -f. A sample of f at a point is its value and gradient there, with bounds of their
+errors, and with promises (proved bounds of f near the point). A ray sample adds enclosures: proved
+bounds of the change of f along the ray, in front of the point and behind it."""
 
 from __future__ import annotations
 
@@ -55,8 +60,10 @@ def intersection(*solids: Solid) -> Solid:
 
 
 def _flatten_operands(solids: tuple[Solid, ...], *, is_union: bool) -> tuple[Solid, ...]:
-    """The operands of a union (or intersection). An operand that is itself a union (or
-    intersection) is replaced by its own operands.
+    """The operands of a union (or intersection). An argument that is itself a union (or
+    intersection) is replaced by its own operands, so that combinations are not nested.
+
+    is_union: whether a union is made; otherwise an intersection.
 
     Raises:
         ValueError: no solids.
@@ -77,11 +84,13 @@ def _flatten_operands(solids: tuple[Solid, ...], *, is_union: bool) -> tuple[Sol
 
 @dataclass(frozen=True, eq=False)
 class BooleanSolid(Solid):
-    """The union of solids, with the function min f_i, or their intersection, with the function max
-    f_i.
+    """The union of solids, whose function is the minimum of their functions f_i; or their
+    intersection, whose function is the maximum of the f_i. The solids are called operands. At a
+    point, the extreme operand is the one whose value is the minimum (or maximum). A union is
+    computed as an intersection of negated functions: min f_i = -max(-f_i).
 
-    parts: the solids.
-    is_union: whether it is their union; else it is their intersection.
+    parts: the operands.
+    is_union: True for the union, False for the intersection.
 
     If the f_i are distances, the minimum is the exact distance outside and only a bound inside, and
     the maximum is only a bound. Hart 1996, equation 16, calls the union exact inside too. Unit
@@ -93,8 +102,8 @@ class BooleanSolid(Solid):
     is_union: bool
 
     def __post_init__(self) -> None:
-        """Set the attributes that follow from the operands: the domain, and the settings for the
-        tracer."""
+        """Set the attributes that follow from the operands: the domain, the settings for the
+        tracer, and the Lipschitz constant."""
         domains = list(dict.fromkeys(part.domain for part in self.parts if part.domain is not None))
         domain = None
         if domains:
@@ -105,12 +114,14 @@ class BooleanSolid(Solid):
         )
         coarsest = min((part.coarsest_accuracy for part in self.parts), default=1.0)
         object.__setattr__(self, "coarsest_accuracy", coarsest)
-        # An operand that proves nothing looking back would refuse all longer steps.
+        # The smallest factor: a step longer than the proved one is accepted only if every operand
+        # proves the rest looking back, so one operand without such proofs refuses all of them.
         object.__setattr__(
             self, "over_relaxation", min(part.over_relaxation for part in self.parts)
         )
         object.__setattr__(self, "min_wavelength", min_wavelength(self.parts))
         constants = [part.lipschitz for part in self.parts]
+        # The minimum or maximum of functions has the largest of their constants.
         all_known = all(part is not None for part in constants)
         object.__setattr__(self, "lipschitz", max(constants) if all_known else None)
 
@@ -121,15 +132,17 @@ class BooleanSolid(Solid):
         """A volume that is proved to contain all points where f <= level or, if `above`, all points
         where f >= level; None if no such volume is known.
 
-        The volumes of the operands (the solids that are combined) are put together. If the points
-        lie in each of these volumes, they lie in the intersection of the volumes. If they lie in at
-        least one of the volumes, they lie in a box around all volumes. Which case it is depends on
-        `is_union` and `above`.
+        It is put together from the volumes of the operands. A point with max f_i <= level (or min
+        f_i >= level) lies in the volumes of all operands, so in their intersection. A point with
+        min f_i <= level (or max f_i >= level) lies in at least one of the volumes, so in a box
+        around all of them.
         """
         extents = [part.sublevel_extent(level, above=above) for part in self.parts]
         bounded = [part for part in extents if part is not None]
+        # The first case: min and >=, or max and <=. An operand without a volume limits nothing.
         if self.is_union == above:
             return VolumeIntersection(bounded) if len(bounded) > 1 else next(iter(bounded), None)
+        # The second case: an operand without a volume may have such points anywhere.
         if len(bounded) < len(extents):
             return None
         return _box_around_volumes(bounded)
@@ -146,7 +159,7 @@ class BooleanSolid(Solid):
 
     def for_ray_count(self, count: int) -> Field:
         def make(parts: list[Any]) -> Solid:
-            """The combination of other operands."""
+            """The same combination of other operands."""
             return BooleanSolid(tuple(parts), self.is_union)
 
         return self._for_rays(self.parts, count, make)
@@ -168,7 +181,8 @@ class BooleanSolid(Solid):
         return self._combine_samples(samples, max_norm(p))[0]
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
-        """The rows of the Hessian of the operand that is extreme at p."""
+        """The rows of the Hessian at p: that of the operand whose value is the smallest (for a
+        union) or the largest (for an intersection)."""
         extreme: Any = None
         rows: Any = None
         for part in self.parts:
@@ -176,16 +190,17 @@ class BooleanSolid(Solid):
             if rows is None:
                 extreme, rows = value, part_rows
                 continue
+            # On the lanes where this operand is more extreme than those before, take its Hessian.
             is_chosen = (value < extreme) if self.is_union else (value > extreme)
             rows = tuple(dr.select(is_chosen, a, b) for a, b in zip(part_rows, rows, strict=True))
             extreme = dr.select(is_chosen, value, extreme)
         return rows
 
     def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
-        """Two bounds at p: of the error of the gradient, as a length, and of the error of the
-        Hessian. Each is the largest error of the operands whose value may be the smallest (for a
-        union) or the largest (for an intersection). Both are infinite where rounding leaves open
-        which operand that is, since derivatives jump there."""
+        """Two error bounds at p: of the gradient, as a length, and of the Hessian. If rounding
+        leaves no doubt which operand has the smallest value (for a union) or the largest (for an
+        intersection), they are the bounds of that operand. Otherwise both are infinite, since
+        derivatives jump from one operand to the other."""
         size = max_norm(p)
         sign = -1.0 if self.is_union else 1.0
         total_error = value_error_bound(sample, safe_norm(sample.gradient), size)
@@ -203,13 +218,19 @@ class BooleanSolid(Solid):
         return dr.select(is_single, max_first, dr.inf), dr.select(is_single, max_second, dr.inf)
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
-        """The ray sample of the combination, from the ray samples of all operands. Its enclosures
-        are `MaximumEnclosure`s."""
+        """The sample of the combination at the point of a ray with parameter t, with enclosures
+        (proved bounds of the change of f along the ray) in front of the point and behind it. They
+        are `MaximumEnclosure`s, made from the enclosures of all operands.
+
+        path: the ray.
+        ahead, back: the lengths in front of and behind the point up to which enclosures are useful.
+        """
         ray_samples = [operand.sample_ray(path, t, ahead, back) for operand in self.parts]
         size = max_norm(path.origin) + t
         sample, deficits, extreme = self._combine_samples(
             [operand.sample for operand in ray_samples], size
         )
+        # The slope is that of the extreme operand.
         slope, slope_error = ray_samples[-1].slope, ray_samples[-1].slope_error_bound
         for ray_sample in ray_samples[:-1]:
             is_chosen = ray_sample.sample.value == extreme
@@ -223,18 +244,18 @@ class BooleanSolid(Solid):
     def _combine_enclosures(
         self, operands: list[tuple[Enclosure, ...]], deficits: list[tuple[Real, Real]]
     ) -> tuple[Enclosure, ...]:
-        """The enclosures of the combination's function along the ray, from those of its operands;
-        () if an operand has none.
+        """The enclosures of the combination's function along a ray, from those of its operands; ()
+        if an operand has none.
 
-        operands: the enclosures of each operand. For a union they are those of the negated
-            operands.
-        deficits: for each operand, bounds (lower, upper) of how much its value is below the
-            greatest value.
+        operands: the enclosures of each operand's function f_i.
+        deficits: for each operand, bounds (lower, upper) of the difference between the greatest
+            value of all operands and its own value. For a union they are about the values of -f_i.
         """
         if not all(operands):
             return ()
         if self.is_union:
             operands = [tuple(NegatedEnclosure(kind) for kind in kinds) for kinds in operands]
+        # For a union: min f_i = -max(-f_i).
         greatest = MaximumEnclosure(
             tuple(
                 MaximumOperand(*bounds, kinds)
@@ -246,14 +267,16 @@ class BooleanSolid(Solid):
     def _combine_samples(
         self, samples: list[Sample], size: Real
     ) -> tuple[Sample, list[tuple[Real, Real]], Real]:
-        """The sample of the combination from those of the operands.
+        """Combine the samples of all operands at one point to the sample of the union or
+        intersection.
 
-        samples: the samples of the operands, at one point.
+        samples: the samples of the operands.
         size: a bound of the absolute values of the point's coordinates.
 
-        Returns the sample; for each operand, bounds (lower, upper) of how much its value is below
-        the greatest value; and the greatest value. For a union the bounds are about the negated
-        operands, and the last result is the least value of an operand.
+        Returns three results: the sample; for each operand, bounds (lower, upper) of its deficit,
+        which is the difference between the greatest value of all operands and its own value; and
+        the extreme value itself as the operand computed it. For a union, all of this is done for
+        the functions -f_i, and the third result is the least value of an operand.
 
         Proof of the errors. Let v_i be the values of the operands f_i, e_i bounds of their errors
         (all rounding included, `value_error_bound`), and v = v_k the greatest value. Then max f_i
@@ -262,8 +285,8 @@ class BooleanSolid(Solid):
         with a smaller error may exclude most of that range. Then the value is set to the middle of
         the remaining range. Otherwise a ray would hit, by the rounding of one operand, a surface
         that lies inside of another operand. The tracer subtracts the error of the combination from
-        the differences between f and the levels. If the error of an operand is larger, the excess
-        is subtracted from the bound of how much the operand is below.
+        the differences between f and the levels. If the error of an operand is larger, the bounds
+        of its deficit are widened by the excess.
         """
         sign = -1.0 if self.is_union else 1.0
         values = [sign * operand.value for operand in samples]
@@ -272,6 +295,7 @@ class BooleanSolid(Solid):
             greatest = fmax(operand, greatest)
         last = samples[-1]
         value, gradient, slope_error = last.value, last.gradient, last.gradient_error
+        # Adding 0 times a number of the backend turns Python numbers into numbers of that kind.
         value, slope_error = 0 * greatest + value, 0 * greatest + slope_error
         for sample, operand_value in zip(samples[:-1], values[:-1], strict=True):
             is_greatest = operand_value >= greatest
@@ -281,16 +305,20 @@ class BooleanSolid(Solid):
         errors = [
             value_error_bound(operand, safe_norm(operand.gradient), size) for operand in samples
         ]
+        # The error of the greatest value, and the part of it that more accurate samples would
+        # reduce.
         error, truncation = 0 * greatest, 0 * greatest
         for sample, operand_value, operand_error in zip(samples, values, errors, strict=True):
             deficit = greatest - operand_value
             error = fmax(fmax(operand_error - deficit, sample.value_error - deficit), error)
             truncation = fmax(sample.truncation_error - deficit, truncation)
+        # The largest v_j - e_j; and the shift of the value to the middle of the remaining range.
         lower_bound = values[0] - errors[0]
         for operand_value, operand_error in zip(values[1:], errors[1:], strict=True):
             lower_bound = fmax(operand_value - operand_error, lower_bound)
         shift = 0.5 * (lower_bound - (greatest - error))
         shift = dr.select(shift > _MIN_SHIFT * error, shift, 0)
+        # Note the unshifted value: it tells the extreme operand.
         extreme, value = value, value + sign * shift
         greatest, error = greatest + shift, error - shift
         # `Sample.value_error` leaves out the rounding that follows from value and gradient.
@@ -315,8 +343,10 @@ class BooleanSolid(Solid):
 
     def _common_lipschitz(self, samples: list[Sample]) -> tuple[Lipschitz, ...]:
         """A Lipschitz constant of the combination near the point, as a promise: the largest of the
-        operands' constants, on the smallest of their balls; () if an operand promises no
-        constant."""
+        operands' constants, on the smallest of their balls; () if an operand has no constant there.
+
+        samples: the samples of the operands.
+        """
         constant: Any = 0.0
         radius: Any = math.inf
         for sample in samples:
@@ -337,7 +367,8 @@ def min_wavelength(parts: Iterable[Solid]) -> float | None:
 
 
 def lipschitz_of(sample: Sample) -> Lipschitz | None:
-    """A Lipschitz promise of a sample, or one that follows from another of its promises; None if
+    """A Lipschitz constant of f near the point of a sample, as a promise: one that the sample
+    states, or one that follows from another of its promises (proved bounds near the point); None if
     there is none."""
     implied = [promise.implied_lipschitz(sample.value) for promise in sample.all_promises]
     stated = (promise for promise in sample.all_promises if isinstance(promise, Lipschitz))
@@ -345,8 +376,8 @@ def lipschitz_of(sample: Sample) -> Lipschitz | None:
 
 
 def _box_around_volumes(volumes: list[Volume]) -> Volume | None:
-    """A box that contains several volumes. A single volume is returned as it is; None if the
-    volumes have no bounds."""
+    """A box that contains several volumes. A single bounded volume is returned as it is. None if a
+    volume is unbounded."""
     corners = [volume.bounds() for volume in volumes]
     lower = np.min([volume for volume, _ in corners], axis=0)
     upper = np.max([volume for _, volume in corners], axis=0)
@@ -359,9 +390,10 @@ def _box_around_volumes(volumes: list[Volume]) -> Volume | None:
 
 @dataclass(frozen=True, eq=False)
 class Complement(SolidOfField):
-    """The complement of a solid: all points that are not inside it. Its function is -f.
+    """The complement of a solid: all points that are not inside it. Its function is -f, where f is
+    the function of the solid.
 
-    field: the solid with the function f.
+    field: the solid.
     """
 
     field: Solid
@@ -393,7 +425,8 @@ class Complement(SolidOfField):
 
 
 def negated_look(look: RaySample) -> RaySample:
-    """The ray sample of -f from that of f."""
+    """The ray sample of the function -f, from that of f at the same point of the ray.
+    (`min_gradient_norm` is left out.)"""
     return RaySample(
         negated_sample(look.sample),
         tuple(NegatedEnclosure(enclosure) for enclosure in look.forward),
@@ -405,7 +438,8 @@ def negated_look(look: RaySample) -> RaySample:
 
 
 def negated_sample(sample: Sample) -> Sample:
-    """The sample of -f from that of f."""
+    """The sample of the function -f, from that of f at the same point. A promise f >= a becomes -f
+    <= -a."""
     return sample.map_promises(
         lambda promise: promise.negated(),
         value=-sample.value,
@@ -416,12 +450,14 @@ def negated_sample(sample: Sample) -> Sample:
 
 @dataclass(frozen=True, eq=False)
 class OffsetSolid(SolidOfField):
-    """An offset of a solid: the points where f <= distance.
+    """An offset of a solid: the points where f <= distance, where f is the function of the solid.
+    So the function of the offset is f - distance.
 
-    field: the solid with the function f.
+    field: the solid.
     distance: the level of f that becomes the surface. Where f is a distance, the solid grows by it.
 
-    Proof. The function f - distance has the enclosures of f, and its Lipschitz constant.
+    Proof. The function f - distance changes as f does. So it has the enclosures of f along a ray,
+    and its Lipschitz constant.
     """
 
     field: Solid
@@ -446,9 +482,8 @@ class OffsetSolid(SolidOfField):
         return self._shifted(self.field.evaluate(p))
 
     def _shifted(self, sample: Sample) -> Sample:
-        """The sample of f - distance at the same point, from the sample of f. Here f is the
-        function of the solid that is offset. The bound of the error includes the rounding of the
-        difference."""
+        """The sample of f - distance, from the sample of f at the same point. The bound of the
+        error includes the rounding of the difference."""
         size = dr.abs(sample.value) + abs(self.distance)
         return sample.map_promises(
             lambda promise: promise.shifted(-self.distance),
@@ -460,19 +495,20 @@ class OffsetSolid(SolidOfField):
         return self.field.hessian(p)
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
-        look = self.field.sample_ray(path, t, ahead, back)
-        return replace(look, sample=self._shifted(look.sample))
+        ray_sample = self.field.sample_ray(path, t, ahead, back)
+        return replace(ray_sample, sample=self._shifted(ray_sample.sample))
 
 
 @dataclass(frozen=True, eq=False)
 class BlendedSolid(FormulaSolid):
-    """The union or intersection of two solids with a fillet (`arithmetic.norms.blend_union` has the
-    function and its proofs).
+    """The union or intersection of two solids with a fillet where their surfaces meet.
+    `arithmetic.norms.blend_union` has the function, the blend of the functions of both solids, and
+    its proofs.
 
     parts: the two solids.
     radius: how far the fillet extends along the surfaces, if the functions are distances.
     power: the exponent p of the superellipse that the fillet is a part of.
-    is_union: whether it is their union; else it is their intersection.
+    is_union: True for the union, False for the intersection.
 
     Its Lipschitz constant is 2^(1/p) times the larger of the solids' constants. The fillet of a
     union lies where both functions are at most the radius. So it lies within the union of the
@@ -487,7 +523,12 @@ class BlendedSolid(FormulaSolid):
     is_union: bool
 
     def __post_init__(self) -> None:
-        """Check the arguments, and set the attributes that follow from the operands."""
+        """Check the arguments, and set the attributes that follow from the two solids.
+
+        Raises:
+            ValueError: radius or power out of range.
+            TypeError: a part that is not a solid, or has no formula.
+        """
         for name, least, value in (("radius", 0.0, self.radius), ("power", 1.0, self.power)):
             is_valid = isinstance(value, numbers.Real) and least <= float(value) < math.inf
             if not is_valid or value == 0:
@@ -509,9 +550,11 @@ class BlendedSolid(FormulaSolid):
         """A volume that is proved to contain all points where f <= level or, if `above`, all points
         where f >= level; None if no such volume is known.
 
-        A fillet adds points to a union below a level, and takes points from an intersection. So the
-        volume is that of the combination without a fillet; if the fillet adds points, for a level
-        shifted by `_min_operand_bound`.
+        It is a volume of the same combination without a fillet. A fillet makes the function of a
+        union smaller, so it adds points with f <= level: for these, the level is raised by
+        `_min_operand_bound`. A fillet makes the function of an intersection larger, so the same
+        holds for points with f >= level, with opposite signs. In the other two cases the level
+        stays.
         """
         sharp = union(*self.parts) if self.is_union else self.parts[0] & self.parts[1]
         if self.is_union:
@@ -527,12 +570,12 @@ class BlendedSolid(FormulaSolid):
         )
 
     def _min_operand_bound(self, level: float) -> float:
-        """A bound of the smaller of the two functions at all points where their blended union is at
-        most `level`.
+        """A bound of the smaller of the two solids' functions at all points where their blended
+        union is at most `level`.
 
         Proof. The blend grows with both functions. So it is at least the blend of the smaller value
         m with itself. With r the radius and p the power, that is r - 2^(1/p) (r - m) for m < r, and
-        m for larger m.
+        m for larger m. Solving r - 2^(1/p) (r - m) <= level for m gives the bound.
         """
         if level >= self.radius:
             return level
@@ -544,6 +587,8 @@ class BlendedSolid(FormulaSolid):
         return blend(a, b, self.radius, self.power)
 
     def prepare(self, backend: Backend) -> Solid:
+        """The same blend with its operands prepared, and its radius as a kernel parameter of the
+        backend."""
         prepared = copy.copy(self)
         parts = tuple(part.prepare(backend) for part in self.parts)
         object.__setattr__(prepared, "parts", parts)

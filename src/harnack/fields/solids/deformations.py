@@ -1,4 +1,8 @@
-"""Twisted and tapered solids: images of solids under maps that do not keep lines straight."""
+"""Twisted and tapered solids. A deformation is a one-to-one map of space that does not keep lines
+straight. The preimage of a point p is the point that the map takes to p. The function f of the
+image of a solid, at p, is the solid's formula at the preimage of p; so the solid must have a
+formula. A Lipschitz constant of the inverse map bounds how far apart the preimages of two points
+are, relative to the distance of the points."""
 
 from __future__ import annotations
 
@@ -29,13 +33,14 @@ from harnack.fields.solids.solid import AXES, SpaceMap, axis_index
 
 
 class Deformation(SpaceMap):
-    """A map of space that does not keep lines straight. It applies only to solids with a formula.
+    """A map of space that does not keep lines straight, such as a twist about an axis. It can be
+    applied to solids with a formula. The preimage of a point is the point that the map takes to it.
 
     axis: "x", "y" or "z", the coordinate on which the map depends.
     """
 
     def apply(self, solid: Solid) -> Solid:
-        """The image of a solid.
+        """The image of a solid under the map.
 
         Raises:
             TypeError: the solid has no formula.
@@ -45,7 +50,8 @@ class Deformation(SpaceMap):
 
     @property
     def min_scale(self) -> float:
-        """The smallest factor by which the map multiplies lengths, and so wavelengths.
+        """The smallest factor by which the map multiplies lengths, and so the wavelengths of a
+        solid's function.
 
         The default is 1, for maps whose factor has no positive lower bound: a twist compresses
         waves more the farther they are from its axis.
@@ -54,32 +60,35 @@ class Deformation(SpaceMap):
 
     @abc.abstractmethod
     def preimage(self, x: Any, y: Any, z: Any) -> tuple[Any, Any, Any]:
-        """The point that is mapped to (x, y, z)."""
+        """The point that the map takes to (x, y, z). Coordinates may be numbers of any
+        arithmetic."""
 
     @abc.abstractmethod
     def volume(self, volume: Volume | None) -> Volume | None:
-        """A volume that contains the image of `volume` under the map; None if no such volume is
-        known."""
+        """A volume that contains the image of `volume` under the map; None if `volume` is None or
+        unbounded."""
 
     @abc.abstractmethod
     def preimage_lipschitz(self, p: Vec3) -> tuple[Real, Real]:
-        """A Lipschitz constant of `preimage` on a ball about p, and the radius of that ball."""
+        """A Lipschitz constant of the inverse map `preimage` on a ball about p, and the radius of
+        that ball."""
 
     @abc.abstractmethod
     def prepare(self, backend: Backend) -> Deformation:
-        """The same map with its numbers as kernel parameters of the backend."""
+        """The same map with its numbers as kernel parameters of the backend (numbers that a
+        compiled kernel reads when it runs)."""
 
 
 @dataclass(frozen=True, eq=False)
 class DeformedSolid(FormulaSolid):
-    """The image of a solid under a deformation. f at a point p is the solid's formula at the
-    preimage of p.
+    """The image of a solid, the inner solid, under a deformation. f at a point p is the inner
+    solid's formula at the preimage of p, the point that the deformation takes to p.
 
-    inner: the solid.
+    inner: the inner solid.
     map: the deformation.
 
-    Steps need no Lipschitz constant of the map. The ranges of the preimage's coordinates along the
-    ray, and of their derivatives, are passed on to the formula.
+    Steps along a ray need no Lipschitz constant of the map. The ranges of the preimage's
+    coordinates along the ray, and of their derivatives, are passed on to the formula.
     """
 
     inner: Solid
@@ -98,12 +107,13 @@ class DeformedSolid(FormulaSolid):
 
     @property
     def may_jump(self) -> bool:
-        """Whether the inner solid's formula may jump; the map is continuous."""
+        """Whether f may jump: whether the inner solid's formula may, as the map is continuous."""
         return tally_of(self.inner.formula).may_jump
 
     def promises(self, p: Vec3) -> tuple[Promise, ...]:
-        """A Lipschitz promise: the Lipschitz constant of the inner solid times that of the inverse
-        map on a ball about p; () if the inner solid has no constant."""
+        """A Lipschitz constant of f on a ball about p, as a promise (a proved bound near p): the
+        constant of the inner solid times that of the inverse map; () if the inner solid has no
+        constant."""
         constant = self.inner.lipschitz
         if constant is None:
             return ()
@@ -126,8 +136,8 @@ class DeformedSolid(FormulaSolid):
 
 @dataclass(frozen=True)
 class Twist(Deformation):
-    """Rotates cross sections about an axis by `rate` radians for each unit of length along it (Hart
-    1996, equation 50).
+    """The map that rotates cross sections about an axis by `rate` radians for each unit of length
+    along it (Hart 1996, equation 50).
 
     rate: in radians per unit of length.
     axis: "x", "y" or "z".
@@ -160,8 +170,13 @@ class Twist(Deformation):
         )
 
     def preimage_lipschitz(self, p: Vec3) -> tuple[Real, Real]:
+        """A Lipschitz constant of the inverse map on a ball about p, and the radius of that ball.
+        The class docstring has the proof, with the symbols m and a (here `rate`). Without a twist
+        the constant is 1 everywhere."""
+        # 0 * p.x + number is a Dr.Jit array, with the number in each lane.
         rate = dr.abs(0 * p.x + self.rate)
         axis_distance = _distance_from_axis(p, self.axis)
+        # Any radius is valid; this one keeps m within a factor of about 5/4, plus 1/4.
         radius = 0.25 * axis_distance + 0.25 / rate
         m = (axis_distance + radius) * rate
         constant = 0.5 * (m + dr.sqrt(m * m + 4)) * (1 + 1e-5)
@@ -174,8 +189,8 @@ class Twist(Deformation):
 
 @dataclass(frozen=True)
 class Taper(Deformation):
-    """Scales cross sections about an axis by a factor r that depends on the position along the
-    axis. It is linear between two positions and constant beyond them.
+    """The map that scales cross sections about an axis by a factor r that depends on the position
+    along the axis. r is linear between two positions and constant beyond them.
 
     start, end: (position along the axis, factor r there); start lies before end, and factors are
         positive.
@@ -194,7 +209,12 @@ class Taper(Deformation):
     axis: str = "z"
 
     def __post_init__(self) -> None:
-        """Check the arguments."""
+        """Check the arguments.
+
+        Raises:
+            ValueError: start or end is not a pair of finite numbers, start does not lie before end,
+                or a factor is not positive.
+        """
         axis_index(self.axis)
         try:
             ends = (*self.start, *self.end)
@@ -219,13 +239,18 @@ class Taper(Deformation):
         return min(1.0, self.start[1], self.end[1])
 
     def preimage(self, x: Any, y: Any, z: Any) -> tuple[Any, Any, Any]:
+        """The point that the taper takes to (x, y, z): its coordinates across the axis are divided
+        by the factor r."""
         u, v, w = _axis_last((x, y, z), self.axis)
         (a, r), (b, s) = self.start, self.end
+        # The position between start (0) and end (1); then 1/r there.
         fraction = minimum(maximum((w - a) * (1.0 / (b - a)), 0.0), 1.0)
         inverse = 1.0 / (fraction * (s - r) + r)
         return _axis_in_place((u * inverse, v * inverse, w), self.axis)
 
     def volume(self, volume: Volume | None) -> Volume | None:
+        """A box that contains the image of `volume`: the box around a cylinder about the axis,
+        whose radius is multiplied by the larger factor. None if `volume` is None or unbounded."""
         cylinder = _cylinder_around(volume, self.axis)
         if cylinder is None:
             return None
@@ -234,9 +259,12 @@ class Taper(Deformation):
         )
 
     def preimage_lipschitz(self, p: Vec3) -> tuple[Real, Real]:
+        """A Lipschitz constant of the inverse map on a ball about p, and the radius of that ball.
+        The class docstring has the proof, with the symbols k, m and S (here `total`)."""
         (a, r), (b, s) = ((0 * p.x + u, 0 * p.x + v) for u, v in (self.start, self.end))
         axis_distance = _distance_from_axis(p, self.axis)
         radius = 0.25 * axis_distance + 0.25 * (b - a)
+        # The largest k and m on the ball.
         k = 1 / fmin(r, s)
         m = (axis_distance + radius) * dr.abs(s - r) / (b - a) * k * k
         total = k * k + m * m + 1
@@ -261,8 +289,8 @@ def _axis_last(p: tuple[Any, Any, Any], axis: str) -> tuple[Any, Any, Any]:
 
 
 def _axis_in_place(p: tuple[Any, Any, Any], axis: str) -> tuple[Any, Any, Any]:
-    """The coordinates in the order x, y, z, from coordinates in the order of `_axis_last`, in which
-    the coordinate along `axis` is the last."""
+    """The inverse of `_axis_last`: coordinates whose last is the one along `axis`, put into the
+    order x, y, z."""
     k = AXES[axis]
     x, y, z = (p[(i - k - 1) % 3] for i in range(3))
     return x, y, z
@@ -270,13 +298,14 @@ def _axis_in_place(p: tuple[Any, Any, Any], axis: str) -> tuple[Any, Any, Any]:
 
 def _cylinder_around(volume: Volume | None, axis: str) -> tuple[float, tuple[float, float]] | None:
     """A cylinder about a coordinate axis that contains a volume: its radius, and the ends (low,
-    high) of its range along the axis. None for no volume or a volume without bounds."""
+    high) of its range along the axis. None if there is no volume, or it is unbounded."""
     if volume is None:
         return None
     lower, upper = volume.bounds()
     if not (np.isfinite(lower).all() and np.isfinite(upper).all()):
         return None
     k = AXES[axis]
+    # The cylinder around the box of the volume; for a ball, a smaller one.
     max_abs = np.maximum(np.abs(lower), np.abs(upper))
     radius = float(np.hypot(max_abs[(k + 1) % 3], max_abs[(k + 2) % 3])) * (1 + 1e-12)
     if isinstance(volume, Ball):

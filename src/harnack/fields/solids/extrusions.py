@@ -1,4 +1,9 @@
-"""Solids from outlines in the plane: `Extrusion` along the z axis, `SolidOfRevolution` about it."""
+"""Solids made from outlines in the plane: `Extrusion` along the z axis, and `SolidOfRevolution`
+about it. An outline is a set of closed polygonal loops that bound a region. The function f of a
+solid is the signed distance from its surface, negative inside. It is made from the signed distance
+d of a point of the plane from the outline. A sample gives value and gradient at a point, with
+bounds of their errors and with a Lipschitz constant. An enclosure is a proved bound of the change
+of f along a ray."""
 
 from __future__ import annotations
 
@@ -35,18 +40,21 @@ if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
     from harnack.geometry import Volume
 
-# The next ray sample is bounded up to this multiple of the last step: evaluations are expensive, so
-# that long proofs pay (`RaySample.reach_growth`).
+# The next ray sample is bounded up to this multiple of the last step (`RaySample.reach_growth`).
+# Evaluations take long, so that long steps save time.
 _REACH_GROWTH = 4.0
 # A lower bound of |gradient| of a signed distance, which is 1 wherever the gradient exists.
 _MIN_GRADIENT = 0.99
-# If coordinates of jets have an error of more than this many roundings, they stand for a range.
+# If coordinates have an error of more than this many roundings, they stand for a range of points.
 _MAX_POINT_ROUNDINGS = 256.0
 
 
 @dataclass(frozen=True, eq=False)
 class Extrusion(Solid):
     """An extruded region of the plane z = 0: the points above the region, with 0 <= z <= height.
+    The region is bounded by an outline. The solid may be twisted about the z axis and tapered; then
+    f at p is the function of the straight solid at the preimage of p, which is the point that twist
+    and taper move to p.
 
     loops: the outline of the region, an array (n, 2) of the vertices of a closed loop, or several
         such arrays. A point is inside if an odd number of loops surrounds it (the even-odd rule).
@@ -60,15 +68,16 @@ class Extrusion(Solid):
 
     Without twist and taper, f is the signed distance. It combines the distance d from the outline
     in the plane, which is exact over all edges, and the distance from the two ends, as distances at
-    right angles (`orthogonal_intersection`). So its Lipschitz constant is 1. Along a path more is
+    right angles (`orthogonal_intersection`). So its Lipschitz constant is 1. Along a ray more is
     proved: see `ExtrusionEnclosure`.
 
     With twist or taper, f at p is this function at the preimage of p, which has the same z. Along a
-    path f changes no faster than the preimage moves; ranges bound its speed. Proof of the promise
-    in all directions. Let c be the Lipschitz constant of the inverse of the taper on a ball about p
-    of radius R, and b that of the inverse of the twist on a ball of radius S about the point that
-    the first returns (proofs: `Taper`, `Twist`). Then both maps together have the constant b c
-    within min(R, S/c). So has f, because the signed distance has the constant 1.
+    ray f changes no faster than the preimage moves; ranges of the preimage's derivative bound its
+    speed. Proof of the Lipschitz constant in all directions. Let c be the Lipschitz constant of the
+    inverse of the taper on a ball about p of radius R, and b that of the inverse of the twist on a
+    ball of radius S about the point that the first returns (proofs: `Taper`, `Twist`). Then both
+    maps together have the constant b c within min(R, S/c). So has f, because the signed distance
+    has the constant 1.
 
     Raises:
         ValueError: loops that enclose no area; a height or a taper that is not positive.
@@ -80,7 +89,11 @@ class Extrusion(Solid):
     taper: float = 1.0
 
     def __post_init__(self) -> None:
-        """Check the arguments, and make the maps `Twist` and `Taper`."""
+        """Check the arguments, and make the maps `Twist` and `Taper` if they are needed.
+
+        Raises:
+            ValueError: loops that enclose no area; a height or a taper that is not positive.
+        """
         set_frozen(self, "loops", make_outline(self.loops))
         height = as_positive(self.height, "the height of an extruded outline")
         twist = as_finite(self.twist, "the twist of an extruded outline, in degrees,")
@@ -90,11 +103,12 @@ class Extrusion(Solid):
         set_frozen(self, "_turning", Twist(math.radians(twist) / height) if twist else None)
         profile = (0.0, 1.0), (height, taper)
         set_frozen(self, "_tapering", Taper(*profile) if taper != 1.0 else None)
+        # Twist and taper have no Lipschitz constant in all of space.
         set_frozen(self, "lipschitz", 1.0 if self.is_straight else None)
 
     @property
     def is_straight(self) -> bool:
-        """Whether it has neither twist nor taper."""
+        """Whether the solid has neither twist nor taper."""
         return self.twist == 0.0 and self.taper == 1.0
 
     def map_operands(self, change: Callable[[Solid], Solid]) -> Solid:
@@ -105,16 +119,19 @@ class Extrusion(Solid):
 
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
         """A box that contains all points where f <= level: a box around the outline, grown by the
-        level. For a twisted or tapered solid it contains the images of that box at all heights.
-        None if `above`."""
+        level on all sides. For a twisted or tapered solid it contains the images of that box at all
+        heights. None if `above` (a volume for all points where f >= level), as these points are
+        unbounded."""
         if above:
             return None
         points = np.concatenate(self.loops)
         lower, upper = points.min(axis=0) - level, points.max(axis=0) + level
         if not self.is_straight:
+            # The box of all scaled copies, which contains the axis. (A scale may be below 1.)
             max_scale = max(1.0, self.taper)
             lower, upper = max_scale * np.minimum(lower, 0.0), max_scale * np.maximum(upper, 0.0)
         if self.twist:
+            # Turned by any angle, the outline stays in a disc about the axis.
             radius = float(np.linalg.norm(points, axis=1).max()) + max(level, 0.0)
             upper = np.full(2, radius * max(1.0, self.taper))
             lower = -upper
@@ -137,17 +154,20 @@ class Extrusion(Solid):
         return prepared
 
     def evaluate(self, p: Vec3) -> Sample:
-        """The sample at p. Without twist and taper it follows from that of the outline in the
-        plane. Otherwise the outline is sampled at the preimage of p. Ranges of the preimage and of
-        its derivatives then give the gradient by the chain rule, and the errors."""
+        """The sample of f at p. Without twist and taper it follows from the signed distance of (x,
+        y) from the outline. Otherwise the outline is sampled at the preimage of p (the point that
+        twist and taper move to p). Proved ranges of the preimage and of its derivatives then give
+        the gradient by the chain rule, and the errors."""
         solid = _prepared_for(self, p)
         if self.is_straight:
             planar = solid._outline.sample(p.x, p.y)
             return solid._sample_of_outline(p, planar, cast("Any", type(p))(*planar.gradient, 0))
+        # Jets (ranges of value and derivatives) of the preimage's coordinates.
         x, y, _ = solid._preimage(*Jet.at_point(p))
         zero = 0 * p.x
         u, v = (zero + component.value.midpoint for component in (x, y))
         planar = solid._outline.sample(u, v)
+        # A bound of the error of the preimage's position; then gradients as ranges.
         spread = zero + x.value.radius + y.value.radius
         gradient_ranges = [
             Interval.point(planar.gradient[0]) * a + Interval.point(planar.gradient[1]) * b
@@ -167,12 +187,11 @@ class Extrusion(Solid):
     def _sample_of_outline(
         self, p: Vec3, side: OutlineSample, gradient: Vec3, promise: Lipschitz | None = None
     ) -> Sample:
-        """The sample of the solid at p, from that of the outline in the plane and the distance from
-        the ends.
+        """The sample of the solid at p, from the distances from the outline and from the two ends.
 
-        side: the sample of the distance from the outline.
-        gradient: the gradient of that distance as a function in space.
-        promise: a Lipschitz constant of f; None for the constant 1 everywhere.
+        side: the sample of the signed distance from the outline, in the plane.
+        gradient: (3,) the gradient of that distance as a function of p in space.
+        promise: a Lipschitz constant of f near p; None for the constant 1 everywhere.
         """
         epsilon = 2 * float(dr.epsilon(type(p.x)))
         half = cast("Any", self)._half
@@ -190,25 +209,36 @@ class Extrusion(Solid):
         return Sample(value, gradient, promises, error, gradient_error)
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
-        """The ray sample. Without twist and taper its enclosure (the proof of bounds of f along the
-        ray) is an `ExtrusionEnclosure`. Otherwise its enclosures follow from a Lipschitz constant
-        along the ray, the speed of the preimage. It has no enclosure looking back. If the caller
-        asks for other kinds of enclosures, those of the promises are used."""
+        """The sample at the point of a ray with parameter t, with enclosures (proved bounds of the
+        change of f along the ray) in front of the point, up to the length `ahead`.
+
+        Without twist and taper the enclosure is an `ExtrusionEnclosure`, and there is none behind
+        the point. Otherwise the enclosures follow from a Lipschitz constant along the ray, the
+        largest speed of the preimage; there is none behind the point either. If the caller asks for
+        other kinds of enclosures, they follow from the sample at the point.
+
+        path: the ray.
+        ahead, back: the lengths in front of and behind the point; `back` is not used.
+        """
         del back
         p, d = path.point(t), path.direction
         if not self.is_straight:
             sample = self.evaluate(p)
             min_norm = self._min_gradient_norm(sample)
+            # A constant of about 1 proves a step of about |f| to the surface: twice that is enough.
             path_constant = _prepared_for(self, p)._path_lipschitz(
                 p, d, fmin(ahead, 2 * dr.abs(sample.value))
             )
             ray_sample = path.enclose(replace(sample, ray_promises=(path_constant,)))
             # The speed has no bound looking back.
             return replace(ray_sample, backward=(), min_gradient_norm=min_norm)
+        # This kind is in the sharpest choice of enclosures; otherwise others were asked for.
         if PiecewiseTaylorEnclosure not in path.proofs.kinds:
             return path.enclose(self.evaluate(p))
         solid = _prepared_for(self, p)
         outline: OutlineEdges = solid._outline
+        # Positions on the ray at which the distance from the outline is bounded. The ray's
+        # direction in the plane is (d.x, d.y), which is no longer than 1.
         knots = outline.knots(p.x, p.y, ahead)
         planar = outline.sample(p.x, p.y, (d.x, d.y), knots)
         sample = solid._sample_of_outline(p, planar, cast("Any", type(p))(*planar.gradient, 0))
@@ -224,7 +254,8 @@ class Extrusion(Solid):
         )
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
-        """f at coordinates that are jets or Dr.Jit numbers."""
+        """f at coordinates that are Dr.Jit numbers, or jets (ranges of numbers and of their
+        derivatives)."""
         if not is_jet(x, type(self).__name__):
             return self.differentiable_value(_vector(x, y, z))
         solid = _prepared_for(self, x.piece_length)
@@ -234,17 +265,18 @@ class Extrusion(Solid):
         )
 
     def _preimage(self, x: Any, y: Any, z: Any) -> tuple[Any, Any, Any]:
-        """The preimage of (x, y, z): the point that taper and twist map to it. Coordinates may be
-        numbers of any arithmetic."""
+        """The preimage of (x, y, z): the point that twist and taper move to (x, y, z). Coordinates
+        may be numbers of any arithmetic."""
         for deform in (cast("Any", self)._tapering, cast("Any", self)._turning):
             if deform is not None:
                 x, y, z = deform.preimage(x, y, z)
         return x, y, z
 
     def _path_lipschitz(self, p: Vec3, direction: Vec3, length: Real) -> Lipschitz:
-        """A Lipschitz constant of f along the path from p, up to the length `length`. It is the
-        largest speed of the preimage of the path's point, as f has the Lipschitz constant 1 in the
-        preimage."""
+        """A Lipschitz constant of f along the ray from p, up to the length `length`. It is the
+        largest speed at which the preimage moves as p moves along the ray, because f has the
+        Lipschitz constant 1 as a function of the preimage. If no bound is found, the constant holds
+        on the length 0."""
         local = self._preimage(*Jet.along_ray(p, direction, 0.0, length))
         speeds = [0 * p.x + jet.first_derivatives[0].max_abs for jet in local]
         speed = dr.norm(cast("Any", type(p))(*speeds)) * (1 + 1e-5)
@@ -252,28 +284,30 @@ class Extrusion(Solid):
         return Lipschitz(dr.select(is_known, speed, dr.inf), dr.select(is_known, length, 0))
 
     def _min_gradient_norm(self, sample: Sample) -> Real:
-        """A lower bound of |grad f|, from the Lipschitz constant c that a sample promises.
+        """A lower bound of |grad f|, from the Lipschitz constant c in a sample of f.
 
-        Proof. f at p is the signed distance of an outline's extrusion, whose gradient is at least
-        `_MIN_GRADIENT` long, at the preimage of p. So |grad f| is at least `_MIN_GRADIENT` times
-        the smallest singular value of the derivative of the inverse map, and that is at least the
-        product of the smallest singular values for the twist and for the taper. For the twist, the
-        singular values are s, 1 and 1/s with s >= 1, so the smallest is 1/s. For the taper, they
-        are k and those of a 2 x 2 matrix of determinant k. Let q be the larger of these two; then q
-        >= k and q >= 1, so the smallest is at least k/q. As c is at least s q, and k at least
-        1/max(1, taper), k/(s q) is at least 1/(max(1, taper) c).
+        Proof. f at p is the signed distance from a straight extrusion, taken at the preimage of p.
+        The gradient of the signed distance is at least `_MIN_GRADIENT` long. So |grad f| is at
+        least `_MIN_GRADIENT` times the smallest singular value of the derivative of the inverse
+        map. That is at least the product of the smallest singular values for the twist and for the
+        taper. For the twist, the singular values are s, 1 and 1/s with s >= 1, so the smallest is
+        1/s. For the taper, they are k and the two of a 2 x 2 matrix of determinant k. Let q be the
+        larger of these two; then q >= k and q >= 1, so the smallest is at least k/q. As c is at
+        least s q, and k at least 1/max(1, taper), k/(s q) is at least 1/(max(1, taper) c).
         """
         (promise,) = sample.promises
         return _MIN_GRADIENT / (max(1.0, self.taper) * cast("Lipschitz", promise).constant)
 
     def _preimage_lipschitz(self, p: Vec3) -> tuple[Real, Real]:
         """A Lipschitz constant of the inverse map (`_preimage`) on a ball about p, and the radius
-        of that ball."""
+        of that ball. The class docstring has the proof."""
         taper, twist = cast("Any", self)._tapering, cast("Any", self)._turning
         constant, radius = 0 * p.x + 1, 0 * p.x + dr.inf
         if taper is not None:
             constant, radius = taper.preimage_lipschitz(p)
             p = cast("Any", type(p))(*taper.preimage(p.x, p.y, p.z))
+        # The proof in the class docstring: constants are multiplied, and the inner ball, taken back
+        # by the first map, is smaller by its constant.
         if twist is not None:
             inner_constant, inner_radius = twist.preimage_lipschitz(p)
             constant, radius = (
@@ -284,8 +318,10 @@ class Extrusion(Solid):
 
 
 def _prepared_for(solid: Any, like: Any) -> Any:
-    """The solid, prepared for the backend of `like`, a number or a point. A solid that is prepared
-    is returned as it is."""
+    """The solid, prepared for a backend. A solid that is prepared already is returned as it is.
+
+    like: a number or a point of that backend.
+    """
     return solid if hasattr(solid, "_outline") else solid.prepare(backend_of(like))
 
 
@@ -295,10 +331,12 @@ def _vector(x: Real, y: Real, z: Real) -> Vec3:
 
 
 def _corner(d: Real, w: Real) -> tuple[Real, Real, Real]:
-    """The signed distance from two faces at right angles (`orthogonal_intersection`), and its
-    derivatives by d and by w.
+    """The signed distance from the edge at which two faces meet at right angles
+    (`orthogonal_intersection`), and its derivatives with respect to d and to w.
 
-    d, w: the signed distances from each of the faces.
+    d, w: the signed distances from the planes of the two faces, negative inside.
+
+    Outside of both faces the distance is |(d, w)|, otherwise the larger of d and w.
     """
     is_outside = (d > 0) & (w > 0)
     length = dr.sqrt(dr.fma(d, d, w * w))
@@ -311,18 +349,21 @@ def _corner(d: Real, w: Real) -> tuple[Real, Real, Real]:
 
 @dataclass(frozen=True)
 class ExtrusionEnclosure(Enclosure):
-    """An enclosure of the signed distance f from an extruded outline along a path.
+    """A proved bound of the change of f along a ray, where f is the signed distance from a straight
+    extrusion. d is the signed distance from the outline in the plane, and w = |height| - half the
+    signed distance from the two ends, where `height` is z above the middle of the solid. The gaps
+    are the differences between f at the start and the next level below and above.
 
     value, error: f at the start, and a bound of its error.
-    side: the enclosure of the distance d from the outline in the plane.
-    height: z above the middle of the solid.
-    half: half of the solid's height. So w = |height| - half is the distance from the ends.
-    rate: the derivative of z along the path.
+    side: the enclosure of d.
+    height: z above the middle of the solid, at the start.
+    half: half of the solid's height.
+    rate: the derivative of z along the ray.
 
     Proof. max(d, w) <= f, with equality where f <= 0. So f stays above a level as long as d does or
     w does, and it stays below a level <= 0 as long as both do. The errors of d and w are at most
-    `error`. Besides, f changes by no more than the length of the path. Along a line w is |height|
-    less a constant. If w falls, it reaches the value lower by g at the length g/|rate|, unless the
+    `error`. Besides, f changes by no more than the length of the ray. Along a line w is |height|
+    minus a constant. If w falls, it reaches the value lower by g at the length g/|rate|, unless the
     height comes to 0 before. If it rises, it never reaches that value. It reaches the value higher
     by g at the length g/|rate| if it rises, and at (2 |height| + g)/|rate| if it falls first.
     """
@@ -335,10 +376,12 @@ class ExtrusionEnclosure(Enclosure):
     rate: Real
 
     def free_length(self, gaps: LevelGaps) -> Real:
-        """The length of the path on which f is proved to meet neither the level above nor the level
-        below.
+        """The length of the ray on which f is proved to meet neither the level above nor the level
+        below: the smaller of the two lengths that are proved for the levels one by one.
 
-        In the code the deficits are by how much w and d are less than f at the start, error
+        gaps: the differences between f at the start and its next levels.
+
+        The deficits in the code are bounds of how much w and d are less than f at the start, error
         included.
         """
         inf = type(gaps.below)(dr.inf)
@@ -347,12 +390,16 @@ class ExtrusionEnclosure(Enclosure):
             self.value - end_distance + self.error,
             self.value - self.side.value + self.error,
         )
+        # The level below: the longest of the lengths proved by the Lipschitz constant 1, by w, and
+        # by d.
         down = fmax(gaps.below, self._fall(gaps.below - end_deficit))
         side_gap = gaps.below - side_deficit
         down = fmax(
             dr.select(side_gap > 0, self.side.free_length(LevelGaps(side_gap, inf)), 0), down
         )
+        # The level above: if it is <= 0, both d and w must stay below it.
         is_inside = self.value + gaps.above + self.error <= 0  # also for unrounded numbers
+        # The deficits contain the error with the sign that is safe for the level below.
         error = 2 * self.error
         up = fmin(
             self._rise(gaps.above + end_deficit - error),
@@ -363,13 +410,16 @@ class ExtrusionEnclosure(Enclosure):
         return dr.select(is_valid, fmin(down, up) * (1 - 1e-6), 0)
 
     def _fall(self, gap: Real) -> Real:
-        """A length of the path on which w falls by less than `gap`."""
+        """A length of the ray on which w falls by less than `gap`; infinite if it never falls so
+        far."""
+        # w rises, or the height comes to 0 before.
         is_unreached = (self.height * self.rate >= 0) | (gap > dr.abs(self.height))
         length = dr.select(is_unreached, dr.inf, gap / dr.abs(self.rate))
         return dr.select((gap > 0) & (length >= 0), length, 0)
 
     def _rise(self, gap: Real) -> Real:
-        """A length of the path on which w rises by less than `gap`."""
+        """A length of the ray on which w rises by less than `gap`; infinite if it is constant."""
+        # w falls until the height is 0, and rises from there on.
         is_falling = self.height * self.rate < 0
         path = gap + dr.select(is_falling, 2 * dr.abs(self.height), 0)
         length = dr.select(self.rate == 0, dr.inf, path / dr.abs(self.rate))
@@ -377,22 +427,26 @@ class ExtrusionEnclosure(Enclosure):
 
 
 def outline_distance_jet(nearest: Callable[[Real, Real], OutlineSample], x: Jet, y: Jet) -> Jet:
-    """The jet of a signed distance d in the plane.
+    """The jet (proved ranges of value and derivatives) of a signed distance d in the plane, from
+    the jets of the coordinates (x, y).
 
     nearest: a function that returns the sample of d at a point (u, v).
-    x, y: jets of the coordinates.
+    x, y: the jets of the coordinates, at a point or on a piece of a line.
 
     Proof. d has the Lipschitz constant 1. So its derivative by any variable is at most the length
     of the derivative of (x, y) by that variable, and its value at the start is known up to the
     error of the coordinates there. On a piece d may have kinks, so that second derivatives have no
     bound. At a point, the gradient and the second derivatives are those of the distance from the
     nearest edge or vertex. If coordinates are ranges that stand for a ball, and not numbers with
-    their rounding, another edge may be nearest, as on a piece.
+    their rounding, another edge may be nearest, as on a piece; then the bounds of the piece are
+    used.
     """
+    # The jets at the start of the piece; at a point, the jets themselves.
     starts = [jet_u if jet_u.jet_at_start is None else jet_u.jet_at_start for jet_u in (x, y)]
     zero = 0 * x.piece_length
     u, v = (zero + jet_u.value.midpoint for jet_u in starts)
     nearest_sample = nearest(u, v)
+    # A bound of the error of the coordinates at the start.
     input_error = zero + starts[0].value.radius + starts[1].value.radius
     size = dr.abs(u) + dr.abs(v) + dr.abs(nearest_sample.value)
     is_ball = input_error > _MAX_POINT_ROUNDINGS * float(dr.epsilon(size)) * size
@@ -411,12 +465,17 @@ def outline_distance_jet(nearest: Callable[[Real, Real], OutlineSample], x: Jet,
 
     def or_range_on_ball(jet_u: Interval, limit: Interval) -> Interval:
         """An interval: `jet_u` where the coordinates are those of a point, and `limit` where they
-        are ranges that stand for a ball."""
+        are ranges that stand for a ball.
+
+        jet_u: an interval that holds at a point.
+        limit: an interval that holds on a ball.
+        """
         lower, upper = (zero + jet_u.lower, limit.lower), (zero + jet_u.upper, limit.upper)
         return Interval(*(dr.select(is_ball, b, a) for a, b in (lower, upper)))
 
     all_numbers = Interval(zero - dr.inf, zero + dr.inf)
     errors = Interval(zero - nearest_sample.gradient_error, zero + nearest_sample.gradient_error)
+    # The gradient of d with its error, as intervals; then its product with derivatives of (u, v).
     gx, gy = (Interval.point(jet_u) + errors for jet_u in nearest_sample.gradient)
     count = range(len(x.first_derivatives))
     u, v = starts
@@ -428,6 +487,8 @@ def outline_distance_jet(nearest: Callable[[Real, Real], OutlineSample], x: Jet,
         )
         for i in count
     )
+    # How fast (u, v) moves across the gradient. The second derivative of d is `curvature` in that
+    # direction, and 0 along the gradient.
     across = [gx * v.first_derivatives[i] - gy * u.first_derivatives[i] for i in count]
     curvature = Interval.point(zero + nearest_sample.second_derivative).widened(
         1e-5 + nearest_sample.gradient_error
@@ -452,20 +513,22 @@ def outline_distance_jet(nearest: Callable[[Real, Real], OutlineSample], x: Jet,
 
 @dataclass(frozen=True, eq=False)
 class SolidOfRevolution(Solid):
-    """The solid of revolution, about the z axis, of an outline in the half-plane (r, z), r >= 0.
+    """The solid of revolution, about the z axis, of an outline in the half-plane (r, z), where r is
+    the distance from the axis. f is the signed distance from its surface, which is the signed
+    distance of the point (r, z) from the outline.
 
     loops: the outline, an array (n, 2) of the vertices (r, z) of a closed loop, or several such
-        arrays (even-odd rule). Edges on the axis are inside of the solid, and no part of its
-        surface.
+        arrays (a point is inside if an odd number of loops surrounds it). Edges on the axis are
+        inside of the solid, and no part of its surface.
 
-    f is the signed distance, with the Lipschitz constant 1. Proof. The nearest point of a surface
-    of revolution lies in the half-plane of p, so f is the signed distance of (r, z) from the
-    outline. Along a path, `OutlineEdges.sample` bounds the distance on the tangent line of (r, z).
-    The point (r, z) departs from that line in r alone. r(s) is convex along the path, and lies
-    above its tangent by e(s) = (c/r)^2 s^2/(r(s) + r + r' s) >= 0, where c/r is the component of
-    the direction across the half-plane. As the distance has the constant 1, it is less by at most
-    e(s). A concave bound less a convex function is still concave, and `TangentEnclosure` needs no
-    more than that.
+    f has the Lipschitz constant 1. Proof. The nearest point of a surface of revolution lies in the
+    half-plane of p, so f is the signed distance of (r, z) from the outline. Along a ray,
+    `OutlineEdges.sample` bounds the distance on the line that is tangent to the curve (r(s), z(s))
+    at its start. The curve departs from that line in r alone. r(s) is convex along the ray, and
+    lies above its tangent by e(s) = (c/r)^2 s^2/(r(s) + r + r' s) >= 0, where c/r is the component
+    of the direction across the half-plane. As the distance has the constant 1, it is less by at
+    most e(s). A concave bound minus a convex function is still concave, and `TangentEnclosure`
+    needs no more than that.
 
     Raises:
         ValueError: loops that enclose no area, or with points of r < 0.
@@ -476,7 +539,11 @@ class SolidOfRevolution(Solid):
     lipschitz = 1.0
 
     def __post_init__(self) -> None:
-        """Check the loops."""
+        """Check the loops.
+
+        Raises:
+            ValueError: loops that enclose no area, or with points of r < 0.
+        """
         loops = make_outline(self.loops)
         min_radius = min(float(loop[:, 0].min()) for loop in loops)
         if min_radius < 0:
@@ -492,6 +559,9 @@ class SolidOfRevolution(Solid):
         return {"edges": sum(map(len, self.loops))}
 
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+        """A box that contains all points where f <= level: the box of the solid, grown by the level
+        on each side. None if `above` (a volume for all points where f >= level), as these points
+        are unbounded."""
         if above:
             return None
         points = np.concatenate(self.loops)
@@ -511,11 +581,11 @@ class SolidOfRevolution(Solid):
         return self._sample(p, r, outward, _prepared_for(self, p)._outline.sample(r, p.z))
 
     def _sample(self, p: Vec3, r: Real, outward: tuple[Real, Real], side: OutlineSample) -> Sample:
-        """The sample at p, from that of the outline in the half-plane.
+        """The sample of f at p, from the sample of the outline's signed distance at (r, z).
 
         r: the distance of p from the axis.
         outward: x and y of the unit vector from the axis to p.
-        side: the sample of the signed distance from the outline at (r, z).
+        side: the sample of the outline's distance.
         """
         epsilon = 2 * float(dr.epsilon(type(p.x)))
         radial, up = side.gradient
@@ -530,16 +600,26 @@ class SolidOfRevolution(Solid):
         )
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
-        """The ray sample. Its enclosure is that of the distance from the outline along the tangent
-        line of the path in the half-plane, whose lower bounds are reduced by `_tangent_gap`. It has
-        no enclosure looking back."""
+        """The sample at the point of a ray with parameter t, with an enclosure (a proved bound of
+        the change of f along the ray) in front of the point, up to the length `ahead`; there is
+        none behind it.
+
+        It is the enclosure of the distance from the outline along the tangent line of (r(s), z(s)),
+        whose lower bounds are reduced by `_tangent_gap`. If the caller asks for other kinds of
+        enclosures, they follow from the Lipschitz constant 1.
+
+        path: the ray.
+        ahead, back: the lengths in front of and behind the point; `back` is not used.
+        """
         del back
         p, d = path.point(t), path.direction
+        # This kind is in the sharpest choice of enclosures; otherwise others were asked for.
         if PiecewiseTaylorEnclosure not in path.proofs.kinds:
             return path.enclose(self.evaluate(p))
         outline: OutlineEdges = _prepared_for(self, p)._outline
         r, (unit_x, unit_y) = _from_axis(p)
         knots = outline.knots(r, p.z, ahead)
+        # The components of the ray's direction away from the axis and around it.
         rate, across = unit_x * d.x + unit_y * d.y, unit_x * d.y - unit_y * d.x
         side = outline.sample(r, p.z, (rate, d.z), knots)
         epsilon = 2 * float(dr.epsilon(type(r)))
@@ -547,6 +627,7 @@ class SolidOfRevolution(Solid):
             bound - _tangent_gap(r, rate, across, knot, epsilon)
             for bound, knot in zip(side.lower_bounds, knots, strict=True)
         )
+        # A bound that is NaN, as at an infinite knot, proves nothing.
         lower_bounds = tuple(dr.select(bound == bound, bound, -dr.inf) for bound in lower_bounds)
         rounding = 8 * epsilon * r
         side = OutlineSample(
@@ -567,21 +648,25 @@ class SolidOfRevolution(Solid):
 
 
 def _from_axis(p: Vec3) -> tuple[Real, tuple[Real, Real]]:
-    """The distance of p from the z axis, and the unit vector (x, y) that points away from the axis;
-    for p on the axis, any unit vector."""
+    """The distance of p from the z axis, and x and y of the unit vector that points from the axis
+    to p. For p on the axis the vector is (1, 0)."""
     r = dr.sqrt(dr.fma(p.x, p.x, p.y * p.y))
     is_off_axis = r > 0
     return r, (dr.select(is_off_axis, p.x / r, 1), dr.select(is_off_axis, p.y / r, 0))
 
 
 def _tangent_gap(r: Real, rate: Real, across: Real, s: Real, epsilon: float) -> Real:
-    """By how much r(s) is above its tangent line at s = 0, rounded upwards, where r(s)^2 = (r +
-    rate s)^2 + (across s)^2 is the squared distance from the axis.
+    """By how much r(s) is above its tangent line at s = 0, rounded upwards. r(s) is the distance
+    from the axis along a ray: r(s)^2 = (r + rate s)^2 + (across s)^2, and the tangent line is r +
+    rate s.
 
-    r: at s = 0.
-    rate, across: the components of the path's direction away from the axis and around it.
+    r: the distance at s = 0.
+    rate, across: the components of the ray's direction away from the axis and around it.
+    s: the length along the ray.
+    epsilon: the machine epsilon.
     """
     line, sideways = r + rate * s, across * s
     length = dr.sqrt(dr.fma(line, line, sideways * sideways))
+    # The first form has no cancellation, but needs a positive divisor.
     gap = dr.select(line > 0, sideways / (length + line) * sideways, length - line)
     return gap * (1 + 1e-5) + 16 * epsilon * (dr.abs(line) + dr.abs(sideways))

@@ -1,7 +1,9 @@
-"""Gradient noise and fractal noise as fields, and solids that are displaced by them.
-
-`NoiseConstants` holds the proved bounds of gradient noise on a lattice.
-"""
+"""Gradient noise and fractal noise as fields, and solids that are displaced by noise. Gradient
+noise is a random smooth function: space is cut into the cubic cells of a lattice; each lattice
+point has a pseudo-random unit vector; and in a cell the noise interpolates eight linear functions
+(ramps), one for each corner, whose gradients are these vectors. The interpolation weights come from
+a fade function. Fractal noise is a sum of such noises, the octaves, each with half the spacing of
+the one before. `NoiseConstants` holds the proved bounds of gradient noise."""
 
 from __future__ import annotations
 
@@ -29,18 +31,18 @@ if TYPE_CHECKING:
 
 Fade: TypeAlias = Literal["quintic", "cubic"]
 
-# The corners of a cell: 0 or 1 along each axis, the last axis fastest.
+# The corners of a cell of the lattice: 0 or 1 along each axis. The last axis changes fastest.
 CORNERS = tuple(itertools.product((0, 1), repeat=3))
 
 
 @dataclass(frozen=True)
 class NoiseConstants:
-    """Bounds of gradient noise on a lattice of spacing 1, for any unit vectors at the lattice
-    points.
+    """Bounds of gradient noise and of its derivatives on a lattice of spacing 1, for any unit
+    vectors at the lattice points.
 
-    max_abs: of |noise|.
-    max_gradient: of |grad noise|.
-    max_second_derivative: of all second derivatives along lines.
+    max_abs: a bound of |noise|.
+    max_gradient: a bound of |grad noise|.
+    max_second_derivative: a bound of the second derivative along any line.
 
     Proof. Let c run over the corners of a cell, with the weights w_c, the unit vectors g_c and r_c
     = x - c. Then noise is the sum of w_c g_c . r_c. So |noise| <= sum w_c |r_c| <= sqrt(sum w_c
@@ -74,8 +76,9 @@ CONSTANTS: dict[Fade, NoiseConstants] = {
 
 
 def fade(kind: Fade, t: Any) -> tuple[Any, Any, Any]:
-    """The weight of the far end of an edge at the position t from the near end, 0 <= t <= 1; and
-    its first two derivatives."""
+    """The interpolation weight of the far end of an edge at the position t from the near end, 0 <=
+    t <= 1; and its first two derivatives with respect to t. The weight rises from 0 to 1, with
+    slope 0 at both ends."""
     if kind == "cubic":
         return t * t * (3 - 2 * t), 6 * t * (1 - t), 6 - 12 * t
     rest = 1 - t
@@ -87,13 +90,15 @@ def fade(kind: Fade, t: Any) -> tuple[Any, Any, Any]:
 
 
 def cell_noise(kind: Fade, t: Any, vectors: Any) -> tuple[Any, list[Any], list[Any]]:
-    """Noise in a cell: its value, its gradient (3,), and its Hessian (6,), the upper triangle row
-    by row.
+    """Gradient noise in a cell: its value, its gradient (3,), and its Hessian (6,), the upper
+    triangle row by row.
 
-    t: (3,) the position in the cell, 0 to 1.
+    kind: the fade function that gives the interpolation weights.
+    t: (3,) the position in the cell, each coordinate from 0 to 1.
     vectors: (8,) unit vectors (3,) at the corners, in the order of `CORNERS`.
     """
     weights: list[tuple[tuple[Any, Any], ...]] = []
+    # For each axis the weights of the near and of the far end, and their first two derivatives.
     for fraction in t:
         s, ds, dds = fade(kind, fraction)
         weights.append(((1 - s, s), (-ds, ds), (-dds, dds)))
@@ -102,8 +107,8 @@ def cell_noise(kind: Fade, t: Any, vectors: Any) -> tuple[Any, list[Any], list[A
     hessian: list[Any] = [0.0] * 6
 
     def weight(corner: tuple[int, ...], orders: list[int]) -> Any:
-        """The weight of a corner, a product of three factors, one for each axis; or a derivative of
-        that product.
+        """The interpolation weight of a corner, a product of three factors, one for each axis; or a
+        derivative of that product.
 
         corner: 0 or 1 for each axis.
         orders: the order of the derivative along each axis, 0 to 2.
@@ -116,6 +121,7 @@ def cell_noise(kind: Fade, t: Any, vectors: Any) -> tuple[Any, list[Any], list[A
 
     # The ramp of a corner is the linear function vector . (t - corner).
     for corner, vector in zip(CORNERS, vectors, strict=True):
+        # The noise is the sum of weight times ramp; derivatives follow by the product rule.
         ramp = sum(vector[k] * (t[k] - corner[k]) for k in range(3))
         w = weight(corner, [0, 0, 0])
         value = value + w * ramp
@@ -131,11 +137,13 @@ def cell_noise(kind: Fade, t: Any, vectors: Any) -> tuple[Any, list[Any], list[A
 
 
 def lattice_vector(x: Any, y: Any, z: Any, seed: Any, like: Real) -> list[Any]:
-    """A pseudo-random unit vector (3,) for a lattice point.
+    """A pseudo-random unit vector (3,) for a lattice point, the same for equal numbers.
 
-    x, y, z, seed: Dr.Jit integers of 32 bits without sign.
-    like: a number of the type that the components are to have.
+    x, y, z: the integer coordinates of the lattice point, Dr.Jit UInt32.
+    seed: a Dr.Jit UInt32; another seed gives other vectors.
+    like: a number of the type that the components shall have.
     """
+    # A hash function: multiplications and shifts mix the bits.
     h = x * 0x8DA6B343 + y * 0xD8163841 + z * 0xCB1AB31F + seed * 0x9E3779B1
     for shift, factor in ((16, 0x7FEB352D), (15, 0x846CA68B)):
         h = (h ^ (h >> shift)) * factor
@@ -149,10 +157,10 @@ def lattice_vector(x: Any, y: Any, z: Any, seed: Any, like: Real) -> list[Any]:
 
 @dataclass(frozen=True)
 class FractalNoise(FormulaSolid):
-    """Fractal noise: f(p) is the sum of a_i noise(2^i k p), with a_i = amplitude 2^(-beta i), over
-    the octaves i = 0, 1, ...
+    """Fractal noise as a solid: f(p) is the sum of a_i noise(2^i k p) over the octaves i = 0, 1,
+    ..., where noise is gradient noise on a lattice of spacing 1, and a_i = amplitude 2^(-beta i).
 
-    octaves: their number.
+    octaves: the number of octaves.
     beta: how fast amplitudes fall: 0 for white noise, 1 for 1/f noise, 2 for Brownian motion.
     frequency: k, the number of lattice points per unit of length of the first octave.
     amplitude: of the first octave.
@@ -172,6 +180,11 @@ class FractalNoise(FormulaSolid):
     fade: Fade = "quintic"
 
     def __post_init__(self) -> None:
+        """Check the arguments, and turn them into numbers of the right type.
+
+        Raises:
+            ValueError, TypeError: an argument out of range or of another kind.
+        """
         object.__setattr__(self, "octaves", as_integer_in_range(self.octaves, "octaves", 1, 24))
         object.__setattr__(self, "seed", as_integer_in_range(self.seed, "the seed", 0, 2**32 - 1))
         if not is_one_of(self.fade, CONSTANTS):
@@ -182,8 +195,8 @@ class FractalNoise(FormulaSolid):
             object.__setattr__(self, name, value)
 
     def _sum(self, power: float) -> float:
-        """The sum of a_i (2^i k)^power over the octaves i, rounded up. Times a bound of the noise's
-        derivatives of order `power`, it bounds those of f."""
+        """The sum of a_i (2^i k)^power over the octaves i, rounded up. A bound of the derivatives
+        of order `power` of gradient noise, multiplied by this sum, bounds the derivatives of f."""
         terms = (2.0 ** (i * (power - self.beta)) for i in range(self.octaves))
         return self.amplitude * self.frequency**power * sum(terms) * (1.0 + 1e-5)
 
@@ -198,13 +211,16 @@ class FractalNoise(FormulaSolid):
 
     @property
     def max_second_derivative(self) -> float:
-        """A bound of all second derivatives."""
+        """A bound of the second derivative of f along any line."""
         return self._sum(2.0) * CONSTANTS[self.fade].max_second_derivative
 
     def prepare(self, backend: Backend) -> Field:
-        """The same noise with its numbers and bounds as kernel parameters."""
+        """The same noise with its numbers and bounds as kernel parameters of the backend (numbers
+        that a compiled kernel reads when it runs)."""
         prepared = with_device_numbers(self, backend)
         constants = (self._sum(1.0) * CONSTANTS[self.fade].max_gradient, self.max_second_derivative)
+        # `_constants`: bounds of first and second derivatives. `_falls`: the ratio of an octave's
+        # amplitude to the one before.
         numbers = {
             "_constants": tuple(dr.opaque(backend.Float, constant) for constant in constants),
             "_falls": dr.opaque(backend.Float, 2.0**-self.beta),
@@ -219,7 +235,7 @@ class FractalNoise(FormulaSolid):
         return Lipschitz(0 * p.x + first), TaylorRemainder(0 * p.x + second)
 
     def _data(self, like: Real) -> dict[str, Any]:
-        """The attributes of the noise as numbers of a backend.
+        """The attributes of the noise by name, with its numbers as kernel parameters of a backend.
 
         like: any number of that backend.
         """
@@ -228,7 +244,7 @@ class FractalNoise(FormulaSolid):
 
     @property
     def may_jump(self) -> bool:
-        """Noise is continuous."""
+        """Whether f may jump: False, as noise is continuous."""
         return False
 
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
@@ -236,7 +252,8 @@ class FractalNoise(FormulaSolid):
         return None
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
-        """f at coordinates that are jets or Dr.Jit numbers."""
+        """f at coordinates that are Dr.Jit numbers, or jets (ranges of numbers and of their
+        derivatives). Coordinates of a jet that are plain numbers are turned into constant jets."""
         jets = [axis for axis in (x, y, z) if is_jet(axis, type(self).__name__)]
         if jets:
             coordinates = [
@@ -246,8 +263,8 @@ class FractalNoise(FormulaSolid):
         return self._octaves([x, y, z])[0][0]
 
     def _octaves(self, q: list[Real], *, each: bool = False) -> list[tuple[Any, Any, Any]]:
-        """The octaves of the noise at points, each as a tuple (value, gradient (3,), Hessian (6,));
-        the Hessian is its upper triangle, row by row.
+        """The octaves of the noise at points q, each as a tuple (value, gradient (3,), Hessian
+        (6,)); the Hessian is its upper triangle, row by row.
 
         q: the coordinates x, y and z of the points.
         each: if True, the list has one tuple for each octave; else a single tuple, the sum of all
@@ -258,10 +275,12 @@ class FractalNoise(FormulaSolid):
         octaves: list[tuple[Any, list[Any], list[Any]]] = []
         for octave in range(self.octaves):
             position = [entry * scale for entry in q]
+            # The cell of the point is constant under derivatives; the position in it is not.
             floors = [dr.floor(dr.detach(entry)) for entry in position]
             cell_position = [a - b for a, b in zip(position, floors, strict=True)]
             integer = dr.int32_array_t(cast("Any", type(q[0])))
             unsigned = dr.uint32_array_t(cast("Any", type(q[0])))
+            # Negative indices wrap around to large ones.
             cell_index = [unsigned(integer(entry)) for entry in floors]
             seed = data["_seed"] + octave
             vectors: list[Any] = []
@@ -269,6 +288,7 @@ class FractalNoise(FormulaSolid):
                 i, j, k = (b + c for b, c in zip(cell_index, corner, strict=True))
                 vectors.append(lattice_vector(i, j, k, seed, q[0]))
             value, gradient, hessian = cell_noise(self.fade, cell_position, vectors)
+            # The position is multiplied by the scale, so derivatives are too.
             slope = amplitude * scale
             octaves.append(
                 (
@@ -290,12 +310,16 @@ class FractalNoise(FormulaSolid):
         return [total]
 
     def _ranges(self, coordinates: list[Jet]) -> Jet:
-        """The jet of f from jets of the coordinates: the sum of the jets of all octaves.
+        """The jet of f (proved ranges of its value and derivatives) from the jets of the
+        coordinates. It is the sum of the jets of all octaves.
 
-        coordinates: the jets, at a point or on a piece of a path.
+        coordinates: the three jets, at a point or on a piece of a line.
         """
+        # Any number of the backend, for the type and width of Dr.Jit arrays.
         like = coordinates[0].backend_number()
         like = like if coordinates[0].jet_at_start is None else coordinates[0].piece_length
+        # The jets at the start of the piece; at a point, the jets themselves. All octaves are
+        # sampled at the middle of their ranges.
         starts = [
             start if start.jet_at_start is None else start.jet_at_start for start in coordinates
         ]
@@ -347,18 +371,19 @@ class Noise(FractalNoise):
         seed: int = 0,
         fade: Fade = "quintic",
     ) -> None:
-        """Noise of one octave: it needs no exponent `beta`, by which amplitudes fall from octave to
-        octave."""
+        """Make fractal noise with one octave. Its exponent beta, by which amplitudes fall from
+        octave to octave, is then of no effect, and set to 0."""
+        # In this order: octaves, beta, frequency, amplitude, seed, fade.
         super().__init__(1, 0.0, frequency, amplitude, seed, fade)
 
 
 @dataclass(frozen=True)
 class DisplacedSolid(FormulaSolid):
-    """A displaced solid: the points where f + noise <= 0, with f the function of another solid
+    """A displaced solid: the points where f + noise <= 0, where f is the function of another solid
     (Hart 1996, appendix F).
 
-    solid: the solid with the function f. It must be a `Formula`, whose f is computed from the
-        coordinates by arithmetic.
+    solid: the other solid. It must be a `Formula`, whose f is computed from the coordinates by
+        arithmetic.
     noise: the noise that is added to f.
 
     The Lipschitz constant of f + noise is the sum of the constants of f and of the noise. The
@@ -369,6 +394,7 @@ class DisplacedSolid(FormulaSolid):
     noise: FractalNoise
 
     def __post_init__(self) -> None:
+        """Raise TypeError unless the solid has a formula and the noise is `FractalNoise`."""
         if not isinstance(cast("Any", self.solid), Formula):
             raise TypeError(
                 f"only shapes with a formula are displaced, not {type(self.solid).__name__}"
@@ -383,7 +409,7 @@ class DisplacedSolid(FormulaSolid):
 
     @property
     def may_jump(self) -> bool:
-        """Whether the solid's function may jump; noise is continuous."""
+        """Whether the solid's function may jump; the noise is continuous."""
         return self.solid.may_jump
 
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
@@ -398,14 +424,15 @@ class DisplacedSolid(FormulaSolid):
 
 @dataclass(frozen=True)
 class _Octave:
-    """An octave of fractal noise, sampled at a point, with bounds that hold around it.
+    """An octave of fractal noise at a point q, with bounds that hold around the point: the octave's
+    value, gradient and Hessian at q, and bounds of its derivatives everywhere. From these follow
+    its jets: proved ranges of value and derivatives for ranges of the coordinates.
 
-    center: the coordinates of the point.
-    value, gradient, hessian: those of the octave at the point; the Hessian (6,) is its upper
-        triangle, row by row.
+    center: the coordinates of q.
+    value, gradient, hessian: at q; the Hessian (6,) is its upper triangle, row by row.
     slope: a bound of the length of the gradient, everywhere.
-    bend: a bound of all second derivatives, everywhere.
-    error, slope_error: bounds of the rounding errors of value and gradient at the point.
+    bend: a bound of all second derivatives along lines, everywhere.
+    error, slope_error: bounds of the rounding errors of value and gradient.
     """
 
     center: list[Real]
@@ -418,15 +445,16 @@ class _Octave:
     slope_error: Real
 
     def jet(self, coordinates: list[Jet], starts: list[Jet], start_error: Real) -> Jet:
-        """The octave's jet, from jets of the coordinates.
+        """The octave's jet (proved ranges of value and derivatives), from the jets of the
+        coordinates.
 
-        coordinates: the jets, at a point or on a piece of a path.
-        starts: the jets where the piece starts, or `coordinates` themselves for a point. Their
-            values lie within `start_error` of the octave's point.
+        coordinates: the jets, at a point or on a piece of a line.
+        starts: the jets where the piece starts; for a point, `coordinates` themselves. Their values
+            lie within `start_error` of the octave's point q.
 
-        Proof. Within the distance m of the point, the gradient differs from that at the point by at
-        most bend m (mean value theorem). Derivatives along a path follow by the chain rule. The
-        value is that at the start plus the integral of the slope.
+        Proof. Within the distance m of q, the gradient differs from the gradient at q by at most
+        bend m (mean value theorem). Derivatives along a line follow by the chain rule. The value is
+        the value at the start plus the integral of the slope.
         """
         error = self.error + self.slope * start_error * (1 + 1e-5)
         value = Interval(self.value - error, self.value + error)
@@ -435,6 +463,7 @@ class _Octave:
             is_point = len(coordinates[0].first_derivatives) > 1
             return self._derivatives(coordinates, start_error, value, is_point=is_point)
         start = self._derivatives(starts, start_error, value, is_point=False)
+        # The distance m of q from the farthest point of the piece.
         offsets = [
             fmax(dr.abs(coordinate.value.upper - q), dr.abs(coordinate.value.lower - q))
             for coordinate, q in zip(coordinates, self.center, strict=True)
@@ -448,14 +477,17 @@ class _Octave:
     def _derivatives(
         self, jets: list[Jet], distance: Real, value: Interval, *, is_point: bool
     ) -> Jet:
-        """The octave's jet, from jets of the coordinates and from the range of its value.
+        """The octave's jet, with the given range of its value, and with ranges of its derivatives
+        by the chain rule.
 
         jets: the jets of the coordinates, whose values lie within `distance` of the octave's point.
         value: the range of the value.
-        is_point: whether second derivatives are those of the Hessian; else they are bounded by
+        is_point: whether second derivatives are computed from the Hessian; else they are bounded by
             `bend`.
         """
         change = self.bend * distance + self.slope_error
+        # The gradient within `distance` of the point, and never longer than `slope`. (-max(-a, -b)
+        # is min(a, b).)
         slopes = [
             Interval(fmax(g - change, -self.slope), -fmax(-g - change, -self.slope))
             for g in self.gradient
@@ -464,6 +496,7 @@ class _Octave:
         speeds: list[Real] = []
         for i in range(len(jets[0].first_derivatives)):
             rates = [jet.first_derivatives[i] for jet in jets]
+            # A bound of the length of the derivative of (x, y, z) by variable i.
             speed = _norm3([0 * self.value + r.max_abs for r in rates]) * (1 + 1e-5)
             rate = _interval_sum([g * r for g, r in zip(slopes, rates, strict=True)])
             limit = self.slope * speed
@@ -473,6 +506,7 @@ class _Octave:
         second: list[Interval] = []
         for k, (i, j) in enumerate(jets[0].hessian_indices()):
             bound = self.bend * speeds[i] * speeds[j]
+            # The part of a second derivative that comes from the octave's own second derivatives.
             quadratic = Interval(-bound, bound)
             if is_point:
                 quadratic = _hessian_form(
@@ -484,7 +518,7 @@ class _Octave:
 
 
 def _interval_sum(parts: list[Interval]) -> Interval:
-    """The sum of intervals."""
+    """The sum of intervals, at least one."""
     total = parts[0]
     for part in parts[1:]:
         total = total + part
@@ -492,10 +526,11 @@ def _interval_sum(parts: list[Interval]) -> Interval:
 
 
 def _hessian_form(hessian: list[Interval], jets: list[Jet], i: int, j: int) -> Interval:
-    """x_i^T H x_j, where x_i is the derivative of the coordinates by variable i.
+    """The number x_i^T H x_j as an interval, where x_i is the derivative of the coordinates (x, y,
+    z) by variable i.
 
-    hessian: the upper triangle (6,) of H, row by row.
-    jets: of the three coordinates.
+    hessian: the upper triangle (6,) of the matrix H, row by row, as intervals.
+    jets: the jets of the three coordinates, which hold these derivatives.
     """
     terms: list[Interval] = []
     for m, (a, b) in enumerate(itertools.combinations_with_replacement(range(3), 2)):

@@ -1,5 +1,9 @@
-"""Solids of arbitrary fields: the points whose values lie on one side of a level, or between two
-levels."""
+"""Solids that are made of a field with the function f: all points at which f is below a level,
+above a level, or between two levels. f may be angle-valued: then it is known up to multiples of its
+period, and differences of f are reduced to the nearest multiple. A sample of f at a point is its
+value and gradient there, with proved bounds of f near the point. An enclosure is a proved bound of
+the change of f along a ray, from which follows a length of ray on which f meets no level. The gaps
+are the differences between f and the next level below and above."""
 
 from __future__ import annotations
 
@@ -45,8 +49,8 @@ def solid(
         file. The solid of a mesh is a `MeshSolid`, whose f is the signed distance from the mesh.
     below, above: a level.
     between: (low, high), two levels.
-    around: (level, half_width): the points at which the value is at most half_width from the level.
-        Use this for an angle-valued field, for example to thicken a surface that spans a knot.
+    around: (level, half_width): the points at which f is at most half_width from the level. Use
+        this for an angle-valued field, for example to thicken a surface that spans a knot.
 
         hk.solid(hk.Gyroid(1.0), between=(-0.3, 0.3)) & hk.Torus(0.8, 0.3)
         hk.solid("part.stl") - hk.Cylinder(2.0, 50.0)
@@ -72,6 +76,7 @@ def solid(
             f"{type(field).__name__} jumps across sheets: values on both sides of a level may meet "
             "without any in between, so it bounds no solid"
         )
+    # A band has two numbers, a single level one.
     is_band = between is not None or around is not None
     numbers = _levels(bounds[0] if is_band else (bounds[0],), 2 if is_band else 1)
     if numbers is None:
@@ -82,12 +87,14 @@ def solid(
             f"{type(field).__name__} is angle-valued: no value is below another. Use "
             "around=(level, half_width) for the solid near a level"
         )
+    # f <= level is an offset of f <= 0; f >= level is the complement.
     sublevel = SublevelSolid(field)
     if below is not None:
         return OffsetSolid(sublevel, numbers[0])
     if above is not None:
         return Complement(OffsetSolid(sublevel, numbers[0]))
     lower, upper = numbers
+    # Here `around` is given: lower is its level, and upper its half width.
     if around is not None:
         if not upper > 0:
             raise ValueError(f"half_width must be positive, not {upper:g}")
@@ -100,7 +107,7 @@ def solid(
 
 
 def _levels(levels: Any, count: int) -> tuple[float, ...] | None:
-    """The levels as a tuple of `count` finite numbers; None if they are not numbers, not finite or
+    """The levels as a tuple of `count` finite numbers. None if they are not numbers, not finite, or
     not that many."""
     try:
         numbers = tuple(float(level) for level in levels)
@@ -111,7 +118,8 @@ def _levels(levels: Any, count: int) -> tuple[float, ...] | None:
 
 @dataclass(frozen=True, eq=False)
 class SublevelSolid(SolidOfField):
-    """The solid of the points where a field is at most 0.
+    """The solid of the points where a field's function f is at most 0. So the solid has the
+    function f itself.
 
     field: any field.
     """
@@ -124,11 +132,15 @@ class SublevelSolid(SolidOfField):
         object.__setattr__(self, "domain", domain)
 
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+        """A volume that is proved to contain all points where f <= level or, if `above`, all points
+        where f >= level. None if no such volume is known, as for a field that is defined in all of
+        space."""
         if self.field.is_global:
             return None
 
         def is_inside(value: float) -> bool:
-            """Whether a point at which f has this value is inside."""
+            """Whether a point at which f has this value is one of the points that the volume must
+            contain."""
             return value >= level if above else value <= level
 
         return bounded_side_extent(self.field, (level,), is_inside)
@@ -153,22 +165,21 @@ class SublevelSolid(SolidOfField):
 def bounded_side_extent(
     field: Field, levels: tuple[float, ...], is_inside: Callable[[float], bool]
 ) -> Volume | None:
-    """A volume that contains all points inside a solid, if one is proved. Else the field's domain,
-    outside of which f is not defined, or None.
+    """A volume that contains all points inside a solid made of the field f. If none is proved, the
+    field's domain, outside of which f is not defined; None if there is no domain.
 
-    field: the field with the values f.
+    field: the field f.
     levels: the values of f on the surface of the solid.
     is_inside: a function that takes a value of f, and returns whether points with this value are
-        inside.
+        inside the solid.
 
     Proof. The level sets lie in `Field.extent`, which is convex. If it has bounds, its complement
     is connected and meets no level. So a single point of the complement decides on which side of
-    the levels the whole complement lies.
+    the levels the whole complement lies. If it is outside the solid, the extent contains the solid.
     """
     extent = field.extent(levels)
-    if (
-        field.is_global and extent is field.domain
-    ):  # the domain only clips the picture and bounds no level set
+    if field.is_global and extent is field.domain:
+        # The domain only clips the picture, and bounds no level set.
         return None
     if extent is None or (field.domain is not None and not field.is_global):
         return field.domain
@@ -186,23 +197,30 @@ def _vector(x: Real, y: Real, z: Real) -> Vec3:
 
 
 def field_jet(field: Field, x: Jet, y: Jet, z: Jet) -> Jet:
-    """The jet of a field f whose second derivatives are bounded near a point.
+    """The jet of a field f (proved ranges of its value and derivatives), from the jets of the
+    coordinates. So a field without a formula can be used in formulas of solids. Its second
+    derivatives must be bounded near a point.
 
-    x, y, z: jets of the coordinates, at a point or on a piece of a path.
+    x, y, z: the jets of the coordinates, at a point or on a piece of a line.
 
     Proof. Let q be the point, or the start of the piece, and |f''| <= H within the distance r of q.
     Let all points of the piece be within m of q, rounding included. If m <= r, the gradient on the
     piece differs from that at q by at most H m, by the mean value theorem. Derivatives along the
-    path follow by the chain rule, and the value is that at the start plus the length times a
-    derivative. If m > r, derivatives are not bounded. Second derivatives at a point, if all six are
-    asked for, are those of the field's Hessian. Their error is the one that the field states
-    (without the effect of the rounding of coordinates), or else 2 H, as both are at most H.
+    line follow by the chain rule. The value is the value at the start plus the length times the
+    range of the derivative. If m > r, derivatives are not bounded. Second derivatives at a point,
+    if all six are asked for, are those of the field's Hessian. Their error is the one that the
+    field states (without the effect of the rounding of coordinates), or else 2 H, as both are at
+    most H.
 
     Raises:
-        TypeError: the field promises no bound of its second derivatives.
+        TypeError: the field has no proved bound of its second derivatives.
     """
+    # Jets at the start of the piece; at a point, the jets themselves.
     coordinates = (x, y, z)
     starts = [entry if entry.jet_at_start is None else entry.jet_at_start for entry in coordinates]
+    # q is the middle of the ranges of the coordinates, and `offset` bounds its distance from the
+    # start, which is known up to rounding. (0 times a number of the backend gives arrays, not
+    # Python numbers.)
     q = _vector(*(0 * x.piece_length + entry.value.midpoint for entry in starts))
     sample = field.evaluate(q)
     bound, radius = _second_derivative_bound(field, sample)
@@ -218,11 +236,15 @@ def field_jet(field: Field, x: Jet, y: Jet, z: Jet) -> Jet:
     def derivative_ranges(
         jets: list[Jet], distance: Real
     ) -> tuple[tuple[Interval, ...], tuple[Interval, ...]]:
-        """The ranges of the first and of the second derivatives of f by the variables of the jets.
+        """The ranges of the first and of the second derivatives of f with respect to the variables
+        of the jets, by the chain rule.
 
-        jets: the jets of the coordinates.
-        distance: a bound of the distance from q to the points of the box of these jets.
+        jets: the jets of the three coordinates.
+        distance: a bound of the distance from q to all points of the box of these jets (m in the
+            proof).
         """
+        # The bound H, infinite if the jets reach beyond its ball; and by how much the gradient on
+        # the box may differ from that of the sample at q.
         limit = dr.select(distance <= radius, bound, dr.inf)
         spread = limit * distance * (1 + 1e-5) + sample.gradient_error
         slopes = [Interval(entry - spread, entry + spread) for entry in sample.gradient]
@@ -232,6 +254,7 @@ def field_jet(field: Field, x: Jet, y: Jet, z: Jet) -> Jet:
             )
             for i in range(len(x.first_derivatives))
         )
+        # Bounds of the length of the derivative of (x, y, z) by each variable.
         speeds = [
             safe_norm(
                 type(q)(
@@ -244,6 +267,7 @@ def field_jet(field: Field, x: Jet, y: Jet, z: Jet) -> Jet:
         for k, (i, j) in enumerate(
             _variable_pairs(len(x.first_derivatives), len(x.second_derivatives))
         ):
+            # The part grad f . d^2 (x, y, z); the part of the Hessian of f follows.
             rate = _interval_sum(
                 g * entry.second_derivatives[k] for g, entry in zip(slopes, jets, strict=True)
             )
@@ -260,6 +284,7 @@ def field_jet(field: Field, x: Jet, y: Jet, z: Jet) -> Jet:
             second.append(rate + Interval(-margin, margin))
         return first, tuple(second)
 
+    # The error of the value includes the change of f within `offset` of q.
     slope = safe_norm(sample.gradient) + sample.gradient_error
     epsilon = 2 * float(dr.epsilon(type(q.x)))
     error = sample.value_error + 8 * epsilon * dr.abs(sample.value)
@@ -271,11 +296,13 @@ def field_jet(field: Field, x: Jet, y: Jet, z: Jet) -> Jet:
     start = Jet(value, first, second, piece_length=starts[0].piece_length)
     if x.jet_at_start is None:
         return start
+    # The distance from q to the farthest point of the whole piece.
     offsets = (
         fmax(dr.abs(entry.value.upper - m), dr.abs(entry.value.lower - m))
         for entry, m in zip(coordinates, q, strict=True)
     )
     first, second = derivative_ranges(list(coordinates), safe_norm(type(q)(*offsets)) * (1 + 1e-5))
+    # The lengths along the piece, from 0 to its end.
     span = Interval(0 * x.piece_length, 0 * value.lower + x.piece_length)
     return Jet(value + first[0] * span, first, second, start, x.piece_length)
 
@@ -290,18 +317,18 @@ def _interval_sum(terms: Iterable[Interval]) -> Interval:
 
 def _variable_pairs(n: int, count: int) -> list[tuple[int, int]]:
     """The first `count` pairs (i, j) with i <= j of n variables, in the order of the entries of
-    `Jet.second_derivatives`."""
+    `Jet.second_derivatives`: the upper triangle of a matrix, row by row."""
     return [(i, j) for i in range(n) for j in range(i, n)][:count]
 
 
-# The number of second derivatives by three coordinates. And the number of roundings: coordinates of
-# jets with an error of at most so many stand for a point, others for a range.
+# The number of second derivatives with respect to three coordinates. And a number of roundings:
+# coordinates with an error of at most so many roundings stand for a point, others for a range.
 _PAIR_COUNT, _MAX_POINT_ROUNDINGS = 6, 256.0
 
 
 def _hessian_rows(field: Field, q: Vec3) -> list[list[Interval]] | None:
-    """The rows of the Hessian of a field at a point q, with each entry as an interval; None for a
-    field without a Hessian."""
+    """The rows of the Hessian of a field at a point q, with each entry as an interval of a single
+    number; None for a field without a Hessian."""
     try:
         rows = field.hessian(q)
     except NotImplementedError:
@@ -311,10 +338,11 @@ def _hessian_rows(field: Field, q: Vec3) -> list[list[Interval]] | None:
 
 def _second_derivative_bound(field: Field, sample: Sample) -> tuple[Real, Real]:
     """A bound of all second derivatives of a field near the point of a sample, and the radius of
-    the ball on which it holds.
+    the ball on which it holds. It follows from one of the sample's promises (proved bounds of f
+    near the point).
 
     Raises:
-        TypeError: the sample promises no such bound.
+        TypeError: no promise implies such a bound.
     """
     for promise in sample.all_promises:
         bound = promise.implied_second_derivative_bound(sample.value)
@@ -329,13 +357,13 @@ def _second_derivative_bound(field: Field, sample: Sample) -> tuple[Real, Real]:
 
 @dataclass(frozen=True, eq=False)
 class BandSolid(SolidOfField):
-    """The solid of the points where a field f is at most half_width from a level. Its function is
-    |f - level| - half_width. For an angle-valued field, f - level stands for its distance from the
-    nearest multiple of the period.
+    """The solid of the points where a field's function f differs from a level by at most
+    half_width. The function of the solid is |f - level| - half_width. If f is angle-valued, f -
+    level is reduced by the nearest multiple of the period.
 
-    Proof. The function of the solid changes as f does, up to the sign. So it does not reach a value
-    v as long as f stays away from level + v + half_width and from level - v - half_width, and from
-    these plus multiples of the period (`FoldedEnclosure`).
+    Proof of steps. The function of the solid changes as f does, up to the sign. So it does not
+    reach a value v as long as f stays away from level + v + half_width and from level - v -
+    half_width, and from these plus multiples of the period (`FoldedEnclosure`).
     """
 
     field: Field
@@ -355,15 +383,16 @@ class BandSolid(SolidOfField):
 
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
         """A volume that is proved to contain all points where |f - level| - half_width is at most
-        the number `level`; these points lie between two levels of f. If no such volume is known, or
-        if `above`, it is the field's domain, outside of which f is not defined; None if there is
-        none."""
+        the number `level`. These points lie between two level sets of f. If no such volume is
+        known, or if `above`, it is the field's domain, outside of which f is not defined; None if
+        there is no domain."""
+        # The two values of f on the surface of these points.
         ends = tuple(self.level + sign * (self.half_width + level) for sign in (-1, 1))
         if above or (self.field.is_global and self.field.period is None):
             return self.domain
 
         def is_inside(value: float) -> bool:
-            """Whether a point at which f has this value is inside."""
+            """Whether a point at which f has this value is one of these points."""
             offset, period = value - self.level, self.field.period
             if period is not None:
                 offset -= period * round(offset / period)
@@ -380,12 +409,14 @@ class BandSolid(SolidOfField):
         return x, y, z
 
     def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
-        """Two bounds at p, of the errors of the gradient and of the Hessian: those of the field f.
-        They are infinite where rounding leaves open whether f is above or below the level (or, if f
-        has a period, which multiple of it is nearest), since derivatives jump there."""
+        """Two error bounds at p, of the gradient and of the Hessian: those of the field f. Both are
+        infinite where rounding leaves open whether f is above or below the level, since derivatives
+        jump there. For an angle-valued f they are also infinite where rounding leaves open which
+        multiple of the period is nearest."""
         inner_sample = self.field.evaluate(p)
         first_error, second_error = self.field.derivative_errors(p, inner_sample)
         error = value_error_bound(inner_sample, safe_norm(inner_sample.gradient), max_norm(p))
+        # The difference between f and the nearest value at which derivatives jump.
         kink_distance = dr.abs(self._level_difference(inner_sample.value))
         if self.field.period is not None:
             kink_distance = fmin(kink_distance, 0.5 * self.field.period - kink_distance)
@@ -393,8 +424,13 @@ class BandSolid(SolidOfField):
         return dr.select(is_clear, first_error, dr.inf), dr.select(is_clear, second_error, dr.inf)
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
-        """The ray sample of |f - level| - half_width, from that of f. Its enclosures are
-        `FoldedEnclosure`s."""
+        """The sample of |f - level| - half_width at the point of a ray with parameter t, with
+        enclosures (proved bounds of its change along the ray), from the ray sample of f. The
+        enclosures are `FoldedEnclosure`s.
+
+        path: the ray.
+        ahead, back: the lengths in front of and behind the point up to which enclosures are useful.
+        """
         ray_sample = self.field.sample_ray(path, t, ahead, back)
         sample, offset = self._sample_with_difference(ray_sample.sample)
 
@@ -404,6 +440,7 @@ class BandSolid(SolidOfField):
                 FoldedEnclosure(enclosure, offset, self.field.period) for enclosure in enclosures
             )
 
+        # The absolute value reverses the slope where f is below the level.
         slope = dr.mulsign(ray_sample.slope, offset)
         forward, backward = folded(ray_sample.forward), folded(ray_sample.backward)
         return RaySample(
@@ -416,8 +453,8 @@ class BandSolid(SolidOfField):
         return abs(self.field.formula(x, y, z) - self.level) - self.half_width
 
     def _level_difference(self, value: Real) -> Real:
-        """f - level; if the field has a period, minus the multiple of the period that brings the
-        difference closest to 0.
+        """f - level. If f is angle-valued, the multiple of its period that is nearest is
+        subtracted.
 
         value: f.
         """
@@ -425,14 +462,20 @@ class BandSolid(SolidOfField):
         return offset if period is None else offset - period * dr.round(offset / period)
 
     def _sample_with_difference(self, sample: Sample) -> tuple[Sample, Real]:
-        """The sample of |f - level| - half_width from that of f; and f - level, as
-        `_level_difference` gives it."""
+        """The sample of |f - level| - half_width, from the sample of f at the same point; and the
+        difference f - level of `_level_difference`.
+
+        The only promise of the new sample (a proved bound near the point) is a Lipschitz constant
+        of f, as others do not hold across the level.
+        """
         offset = self._level_difference(sample.value)
         negated = negated_sample(sample)
         is_below = offset < 0
         epsilon = 2 * float(dr.epsilon(type(offset)))
+        # The rounding of the two differences.
         rounding = 8 * epsilon * (dr.abs(sample.value) + abs(self.level) + self.half_width)
         lipschitz = lipschitz_of(sample)
+        # Where f is below the level, |f - level| has the opposite gradient.
         return replace(
             sample,
             value=dr.abs(offset) - self.half_width,
@@ -447,18 +490,20 @@ class BandSolid(SolidOfField):
 
 @dataclass(frozen=True)
 class FoldedEnclosure(Enclosure):
-    """An enclosure of |r| along a path from an enclosure of r.
+    """A proved bound of the change of |r| along a line, from an enclosure (such a bound) of a
+    function r. The gaps are the differences between |r| at the start and its next level below and
+    above. If there is a period, r is known up to multiples of it, and |r| stands for the distance
+    of r from the nearest multiple.
 
     inner: the enclosure of r.
-    offset: r at the start of the path.
-    period: if not None, r is known up to multiples of the period, and `offset` is within half a
-        period of 0. Then |r| stands for the distance of r from the nearest multiple.
+    offset: r at the start of the line, within half a period of 0.
+    period: the period of r; None if there is none.
 
-    Proof. |r| rises by g only where r reaches plus or minus |r| + g, or one of these two numbers
-    plus a multiple of the period. It falls by g only where r reaches plus or minus |r| - g, or one
-    of these two numbers plus a multiple of the period. The nearest of all these numbers above and
-    below r are the levels of r. If |r| - g < 0, or |r| + g is more than half a period, |r| never
-    takes this value.
+    Proof. |r| rises by g only where r reaches plus or minus (|r| + g), with |r| taken at the start,
+    or one of these two numbers plus a multiple of the period. It falls by g only where r reaches
+    plus or minus (|r| - g), or one of these two numbers plus a multiple of the period. The nearest
+    of all these numbers above and below r are the levels of r. If |r| - g < 0, or |r| + g is more
+    than half a period, |r| never takes this value.
     """
 
     inner: Enclosure
@@ -472,32 +517,33 @@ class FoldedEnclosure(Enclosure):
         return self.inner.is_free(self._gaps_of_offset(gaps), length)
 
     def _gaps_of_offset(self, gaps: LevelGaps) -> LevelGaps:
-        """The gaps of r: how far r must rise, and how far it must fall, for |r| to reach one of its
-        next levels.
+        """The gaps of r: how far r must rise, and how far it must fall, until |r| reaches one of
+        its next levels. A gap is infinite if that cannot happen.
 
-        r begins at `self.offset`. If there is a period P, then |r| <= P/2 at the start, and |r|
-        stands for the distance of r from the nearest multiple of P.
-
-        gaps: the differences between |r| and its next level below and above.
+        gaps: the differences between |r| at the start and its next level below and above.
 
         Let s = |r| at the start. The levels of |r| are B = s - gaps.below and A = s + gaps.above. B
-        is reached only if B >= 0, and A, if there is a period, only if A <= P/2. Let r >= 0. If r
-        rises, |r| can be A at r = A, and B at r = P - B, which is at the distance B from the
-        multiple P. If r falls, |r| can be B at r = B, and A at r = -A. If r < 0, the two directions
-        are exchanged.
+        is reached only if B >= 0. If r has a period P, then s <= P/2, |r| stands for the distance
+        of r from the nearest multiple of P, and A is reached only if A <= P/2. Let r >= 0 at the
+        start. If r rises, |r| can be A at r = A, and B at r = P - B, which is at the distance B
+        from the multiple P. If r falls, |r| can be B at r = B, and A at r = -A. If r < 0, the two
+        directions are exchanged.
         """
         size, inf = dr.abs(self.offset), type(self.offset)(dr.inf)
         has_below = gaps.below <= size * _ROUNDING_FACTOR
+        # Gaps for r >= 0: up to A, and down to -A, at the distance s + A.
         upwards, downwards = gaps.above, 2 * size + gaps.above
         if self.period is not None:
             has_above = size + gaps.above <= 0.5 * self.period * _ROUNDING_FACTOR
             upwards, downwards = (dr.select(has_above, gap, inf) for gap in (upwards, downwards))
+            # The distance from r = s up to P - B.
             wrapped = self.period - 2 * size + gaps.below
             upwards = dr.select(has_below, fmin(wrapped, upwards), upwards)
         downwards = dr.select(has_below, fmin(gaps.below, downwards), downwards)
         # NaN proves nothing.
         is_valid = (gaps.below >= 0) & (gaps.above >= 0) & (size >= 0)
         upwards, downwards = (dr.select(is_valid, gap, dr.nan) for gap in (upwards, downwards))
+        # If r < 0, exchange the two directions. The gap below comes first in `LevelGaps`.
         is_positive = self.offset >= 0
         return LevelGaps(
             dr.select(is_positive, downwards, upwards), dr.select(is_positive, upwards, downwards)

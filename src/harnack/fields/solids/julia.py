@@ -1,4 +1,8 @@
-"""Quaternion Julia sets, with a proved empty ball about each point outside."""
+"""Quaternion Julia sets as solids. The orbit of a quaternion q_0 is the sequence q_0, q_1 = q_0^2 +
+c, q_2 = q_1^2 + c, ... with a constant c; its members are called iterates. The filled Julia set
+consists of the points whose orbits stay bounded. It is drawn in a slice of the space of
+quaternions. The function f of the solid is positive outside; a Lipschitz constant of f on a ball
+about a point outside proves that the ball holds no point of the set."""
 
 from __future__ import annotations
 
@@ -22,27 +26,28 @@ if TYPE_CHECKING:
 
 Quaternion = tuple[float, float, float, float]
 
-# Radii of the balls on which a Lipschitz constant is promised, as fractions of the longest possible
+# Radii of the balls on which a Lipschitz constant is computed, as fractions of the longest possible
 # step.
 _RADIUS_FRACTIONS = (0.8, 0.6, 0.45, 0.3, 0.15)
-# An iterate whose absolute value is above this number has escaped: the logarithms of later iterates
-# are computed from it, and not these iterates themselves.
+# An iterate whose absolute value is above this number has escaped. Later iterates are not computed;
+# their logarithms follow from this one.
 _ESCAPED_NORM = {"single": 1e4, "double": 1e8}
 
 
 @dataclass(frozen=True)
 class Julia(Solid):
     """A filled quaternion Julia set: the points whose orbit q_0, q_1 = q_0^2 + c, q_2 = q_1^2 + c
-    ... stays small for a number of iterations.
+    ... stays small for N iterations. f = 2^-N max(log(|q_N|/B), -1), where B is the escape radius:
+    an orbit that has left the ball of radius B never returns. So f <= 0 on the set.
 
     c: the constant, four numbers; the real part comes first.
     iterations: N. More iterations show finer details, and the solid shrinks to the Julia set.
-    fourth_coordinate: that of the slice shown. The point (x, y, z) of space is the quaternion q_0 =
-        x + y i + z j + fourth_coordinate k.
+    fourth_coordinate: the position of the slice that is shown. The point (x, y, z) of space is the
+        quaternion q_0 = x + y i + z j + fourth_coordinate k.
 
-    f = 2^-N max(log(|q_N|/B), -1), with the escape radius B = (1 + sqrt(1 + 4 |c|))/2. If |q| > B,
-    then |q^2 + c| >= |q|^2 - |c| > |q|: an orbit that leaves the ball of radius B never returns. So
-    no orbit of the filled Julia set leaves it, and f <= 0 on the set, for any N.
+    B = (1 + sqrt(1 + 4 |c|))/2. If |q| > B, then |q^2 + c| >= |q|^2 - |c| > |q|: an orbit that
+    leaves the ball of radius B never returns. So no orbit of the filled Julia set leaves it, and f
+    <= 0 on the set, for any N.
 
     Proof of the Lipschitz constants. Consider all orbits that begin in a ball of radius r about a
     point, and let q_n be that of the point itself. The n-th iterates of the ball are within e_n of
@@ -74,7 +79,12 @@ class Julia(Solid):
     fourth_coordinate: float = 0.0
 
     def __post_init__(self) -> None:
-        """Check the arguments."""
+        """Check the arguments.
+
+        Raises:
+            ValueError: c is not four finite numbers of a length of at most 10, or another argument
+                is out of range.
+        """
         try:
             numbers = tuple(self.c)
         except TypeError:
@@ -93,14 +103,15 @@ class Julia(Solid):
 
     @property
     def escape_radius(self) -> float:
-        """B: an orbit that has left the ball of this radius never returns."""
+        """The escape radius B: an orbit that has left the ball of this radius never returns."""
         return 0.5 + math.sqrt(0.25 + math.hypot(*self.c))
 
     def map_operands(self, change: Callable[[Solid], Solid]) -> Solid:
         return change(self)
 
     def prepare(self, backend: Backend) -> Julia:
-        """The same set with its numbers as kernel parameters of the backend."""
+        """The same set with its numbers as kernel parameters of the backend (numbers that a
+        compiled kernel reads when it runs): c, the fourth coordinate, |c| and B."""
         prepared = copy.copy(self)
         size = math.hypot(*self.c)
         for name, value in (
@@ -125,15 +136,16 @@ class Julia(Solid):
         b, scaled = self.escape_radius, 2.0**self.iterations * level
         if above or scaled > 600.0:
             return None
+        # The largest possible t; then the largest |q_0|.
         excess = math.expm1(max(scaled, 0.0)) / (2.0 * b) ** self.iterations
         reach = b * (1.0 + excess)
         square = reach * reach - self.fourth_coordinate * self.fourth_coordinate
         return ball_around((0.0, 0.0, 0.0), math.sqrt(max(square, 0.0)))
 
     def evaluate(self, p: Vec3) -> Sample:
-        """The sample at p. A first orbit gives f and its gradient, and so the longest step that
-        could be proved. A second orbit gives Lipschitz constants on balls whose radii are fractions
-        of it."""
+        """The sample of f at p. A first orbit gives f and its gradient, and so the longest step
+        that could be proved. A second computation gives Lipschitz constants on balls about p, whose
+        radii are fractions of that step. Where none is proved, the radius is 0."""
         if not hasattr(self, "_c"):
             from harnack.backend import backend_of
 
@@ -155,18 +167,18 @@ class Julia(Solid):
         return Sample(value, gradient, tuple(promises), error)
 
     def _parameter(self, name: str) -> Any:
-        """The attribute `name`, which is a number of the backend."""
+        """The attribute with this name, a number of the backend (of the prepared solid)."""
         return getattr(self, name)
 
     def _orbit(self, p: Vec3, radii: tuple[Real, ...]) -> tuple[Any, ...]:
-        """f at p, its gradient, a bound of the error of f, and for each radius a bound of |grad f|
-        on the ball of that radius about p.
+        """Compute the orbit of p. Returns four results: f at p; its gradient; a bound of the error
+        of f; and for each radius a bound of |grad f| on the ball of that radius about p.
 
         radii: the first must be 0, so that the error of f is that of rounding alone.
 
-        In the notation of `Julia`, `size` is |c|, b is B, and for each radius `change` holds e_n,
-        `slopes` d_n, `min_q` m_n and `rates` g_n. `rounded` is the bound of the rounding of one
-        iteration.
+        In the notation of the class docstring `Julia`, `size` is |c|, b is B, and for each radius
+        `change` holds e_n, `slopes` d_n, `min_q` m_n and `rates` g_n. `jac` is the Jacobian of q_n
+        with respect to x, y and z. `rounded` is the bound of the rounding of one iteration.
         """
         c, size, b = self._parameter("_c"), self._parameter("_size"), self._parameter("_b")
         real = cast("Any", type(p.x))
@@ -183,7 +195,7 @@ class Julia(Solid):
         rates = [1 / m for m in min_q]
 
         def iterate(n: Any, *state: Any) -> tuple[Any, ...]:
-            """The state after one more iteration.
+            """The state of the loop after one more iteration.
 
             The state consists of the number n of iterations; the four components of q_n; the 12
             entries of its Jacobian with respect to x, y and z, row by row; and `change`, `slopes`,
@@ -193,6 +205,8 @@ class Julia(Solid):
             change, slopes, min_q, rates = _split_in_four(state[16:])
             next_jac: list[Any] = [None] * 12
             for k in range(3):
+                # Column k of the Jacobian: a is the real part of the derivative of q_n, v the other
+                # three. The derivative of q^2 follows from the formula of `next_q`.
                 a, *v = (jac[3 * i + k] for i in range(4))
                 next_jac[k] = 2 * (q[0] * a - (q[1] * v[0] + q[2] * v[1] + q[3] * v[2]))
                 for i in range(3):
@@ -208,6 +222,7 @@ class Julia(Solid):
                 2 * (norm + e) * d * (1 + 8 * epsilon) for e, d in zip(change, slopes, strict=True)
             ]
             next_norm = dr.sqrt(_squared_norm(next_q)) * (1 - 4 * epsilon)
+            # The bounds m_n and g_n: the better of the two bounds of each.
             next_min_q: list[Real] = []
             next_rates: list[Real] = []
             for e, d, m, rate in zip(next_change, next_slopes, min_q, rates, strict=True):
@@ -219,7 +234,7 @@ class Julia(Solid):
             return n + 1, *next_q, *next_jac, *next_change, *next_slopes, *next_min_q, *next_rates
 
         def is_active(n: Any, *state: Any) -> Any:
-            """Whether iterations are left and the orbit has not escaped."""
+            """Whether iterations are left, and the orbit has not escaped."""
             return (n < self.iterations) & (_squared_norm(state[:4]) <= escape * escape)
 
         index = dr.uint32_array_t(real)
@@ -229,12 +244,15 @@ class Julia(Solid):
         change, slopes, min_q, rates = _split_in_four(state[16:])
         square = _squared_norm(q)
         norm = dr.sqrt(square)
+        # 2^-n, where n is the number of iterations that were done.
         factor = dr.exp2(-real(n)) * (1 + 4 * epsilon)
         is_complete = n >= self.iterations
         last = 2.0**-self.iterations
         offset = last * dr.log(b)
+        # Where log(|q_N|/B) < -1, f is constant.
         is_floor = norm <= b * math.exp(-1.0)
         value = dr.select(is_floor, -last, factor * dr.log(norm) - offset)
+        # The gradient of log|q| is q/|q|^2, times the Jacobian.
         scale = dr.select(is_floor, 0, factor / square)
         gradient = type(p)(
             *(scale * sum(q[i] * jac[3 * i + k] for i in range(4)) for k in range(3))
@@ -242,30 +260,33 @@ class Julia(Solid):
         cut = b * (math.exp(-1.0) * (1 - 1e-6))  # f is constant where |q_N| is smaller
         constants: list[Real] = []
         for e, d, m, rate in zip(change, slopes, min_q, rates, strict=True):
+            # If all N iterations were done, g_N or d_N exp(1)/B; if the orbit escaped, the bound of
+            # the early end.
             at_end = fmin(rate, d / fmax(norm * (1 - 4 * epsilon) - e, cut))
             escaped = dr.select(m >= 2 * b, rate * dr.exp(4 * size / (m * m)), dr.inf)
             constants.append(factor * dr.select(is_complete, at_end, escaped) * (1 + 8 * epsilon))
         # The error of logarithms is a few roundings of their size, or of 1.
         rounding = 16 * epsilon * (factor * (dr.abs(dr.log(norm)) + 1) + dr.abs(offset))
+        # The error of leaving out later iterates, and below the effect of the error of q_n.
         rounding += dr.select(is_complete, 0, factor * 2 * size / square)
         error = factor * change[0] / fmax(norm - change[0], cut)
         return value, gradient, error + rounding, constants
 
 
 def _split_in_four(state: Any) -> tuple[Any, Any, Any, Any]:
-    """A sequence cut into four parts of the same length."""
+    """A sequence, cut into four parts of the same length."""
     k = len(state) // 4
     return state[:k], state[k : 2 * k], state[2 * k : 3 * k], state[3 * k :]
 
 
 def _kernel_parameters(backend: Backend, value: Any) -> Any:
-    """A number, or nested tuples of numbers, as kernel parameters of a backend."""
+    """A number, or nested tuples of numbers, as kernel parameters of a backend (numbers that a
+    compiled kernel reads when it runs)."""
     if isinstance(value, tuple):
         return tuple(_kernel_parameters(backend, part) for part in cast("tuple[Any, ...]", value))
     return dr.opaque(backend.Float, float(value))
 
 
 def _squared_norm(q: Any) -> Any:
-    """The squared absolute value of a quaternion, or squared length of a vector of four
-    components."""
+    """The squared absolute value of a quaternion, given by its four components."""
     return q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]

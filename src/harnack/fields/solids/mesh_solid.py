@@ -1,14 +1,14 @@
-"""Solids bounded by closed triangle meshes: `MeshSolid`, whose function is the signed distance from
-the mesh.
-
-`ClosedSurface.of` returns the faces of a mesh that bound the solid, and refuses a mesh that bounds
+"""Solids bounded by closed triangle meshes: `MeshSolid`, whose function f is the signed distance
+from the mesh, negative inside. Its size is found from the nearest triangle, and its sign from the
+winding number: how often the mesh winds around a point, which is counted by the crossings of a ray
+with the mesh. Points are used in unit coordinates, in which the mesh has a size of about 1.
+`ClosedSurface.of` finds the faces of a mesh that bound the solid, and refuses a mesh that bounds
 none.
 
-Whether a point is inside is decided by the crossings of a ray with the mesh. The usual way would be
-the normals of edges and vertices, weighted by angles. But near triangles as thin as rounding these
-normals decide nothing. The ray decides there too, because the two triangles at an edge compare the
-edge with the ray by the same bits. It takes a thirtieth of the time of the search for the nearest
-triangle.
+Why a ray decides whether a point is inside. The usual way would be the normals of edges and
+vertices, weighted by angles. But near triangles as thin as rounding these normals decide nothing.
+The ray decides there too, because the two triangles at an edge compare the edge with the ray by the
+same bits. It takes a thirtieth of the time of the search for the nearest triangle.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ _MIN_GRADIENT = 0.99
 # The rounding error of a distance, in machine epsilons of coordinates and of the mesh's size, as
 # `tree.closest_triangles.distance_lower_bound` proves.
 _DISTANCE_ROUNDINGS = 16.0
-# If coordinates of jets have an error of more than this many roundings, they stand for a range.
+# If coordinates have an error of more than this many roundings, they stand for a range of points.
 _MAX_POINT_ROUNDINGS = 256.0
 # The normal of the nearest triangle decides whether a point is inside only where the distance is
 # larger than this multiple of its error.
@@ -81,8 +81,8 @@ _CLEAR_MULTIPLE = 8.0
 def solid_of_mesh(source: Any) -> MeshSolid:
     """The solid that a mesh bounds, as a `MeshSolid`.
 
-    source: anything with `vertices` and `faces`, a pair (vertices, faces), or the path of a surface
-        file.
+    source: anything with the attributes `vertices` and `faces`, a pair (vertices, faces), or the
+        path of a surface file.
 
     Raises:
         MeshError: the mesh bounds no solid; the message states the reason and a remedy.
@@ -108,8 +108,8 @@ def solid_of_mesh(source: Any) -> MeshSolid:
 
 
 def looks_like_mesh(candidate: Any) -> bool:
-    """Whether an argument is meant as a mesh: it has the attributes of a mesh, is a pair, or is the
-    name of a surface file."""
+    """Whether an argument is meant as a mesh: it has the attributes `vertices` and `faces`, is a
+    pair, or is the name of a surface file."""
     if isinstance(candidate, str | os.PathLike):
         return Path(cast("Any", candidate)).suffix.lower() in GEOMETRY_SUFFIXES
     if hasattr(candidate, "vertices") and hasattr(candidate, "faces"):
@@ -119,7 +119,8 @@ def looks_like_mesh(candidate: Any) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class MeshSolid(Solid):
-    """The inside of a closed triangle mesh. f is the signed distance from its surface.
+    """The inside of a closed triangle mesh. Its function f is the signed distance from the surface
+    of the mesh, negative inside. So f has the Lipschitz constant 1.
 
     vertices: (n, 3). Vertices at the same position count as one vertex. At open edges, vertices
         that differ by rounding count as one too (`geometry.welding`).
@@ -130,23 +131,23 @@ class MeshSolid(Solid):
     than 1/2 times, which is the union where its parts overlap or touch. f is the distance from the
     boundary of that union.
 
-    |f| is the distance from the nearest triangle, which is found in a tree; so its Lipschitz
-    constant is 1. Its error is at most 16 epsilons of the size of the mesh and of the distance from
-    its center (`tree.closest_triangles.ClosestPointOnTriangle`).
+    |f| is the distance from the nearest triangle, which is found in a tree. Its error is at most 16
+    epsilons of the size of the mesh and of the distance from its center
+    (`tree.closest_triangles.ClosestPointOnTriangle`).
 
-    Proof of the sign. The sign is that of the winding number less 1/2. The winding number is the
+    Proof of the sign. The sign is that of 1/2 minus the winding number. The winding number is the
     sum of the signs of the crossings of the mesh with a ray along z
     (`tree.triangle_tree.signed_crossing`). It is right wherever the distance is more than its error
     e, also for rays through edges and vertices and for triangles without area. Each triangle that
-    counts as crossed has a point within rounding of the ray; the depth of this point is compared
-    with 0. Let C be a cylinder of that radius around the line of the ray. The ball of radius e
-    about the point x has no point of the surface. So the part of a triangle in C, which is convex,
-    lies ahead of x or behind x as a whole, and its depth decides which. An edge that meets C ahead
-    of x belongs to two triangles ahead. For both, the same bits decide on which side of the edge
-    the ray passes, so that they cancel. All other edges are passed at a distance greater than
-    rounding. So the sum is that of a ray in general position. Normals of edges and vertices,
-    weighted by angles (Baerentzen and Aanaes 2005), would need no ray, but have no reliable
-    direction near triangles as thin as rounding.
+    counts as crossed has a point within rounding of the ray; the depth of this point along the ray
+    is compared with 0. Let C be a cylinder of that radius around the line of the ray. The ball of
+    radius e about the point x has no point of the surface. So the part of a triangle in C, which is
+    convex, lies in front of x or behind x as a whole, and its depth decides which. An edge that
+    meets C in front of x belongs to two triangles in front. For both, the same bits decide on which
+    side of the edge the ray passes, so that they cancel. All other edges are passed at a distance
+    greater than rounding. So the sum is that of a ray in general position. Normals of edges and
+    vertices, weighted by angles (Baerentzen and Aanaes 2005), would need no ray, but have no
+    reliable direction near triangles as thin as rounding.
 
     If the nearest point lies inside a triangle, the triangle's normal decides the same without a
     ray. Proof. The ball about x through that point is free of the surface, so that x is on the side
@@ -188,9 +189,13 @@ class MeshSolid(Solid):
         }
 
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
-        """The box of the mesh, grown by the level on each side. Proof for a negative level. The
-        ball of radius -level about a point where f < level is inside the solid, and so in the
-        box."""
+        """A box that contains all points where f <= level: the box of the mesh, grown by the level
+        on each side. None if `above` (a volume for all points where f >= level), as these points
+        are unbounded.
+
+        Proof for a negative level. The ball of radius -level about a point where f <= level is
+        inside the solid, and so in the box.
+        """
         if above:
             return None
         surface = self.surface
@@ -206,27 +211,34 @@ class MeshSolid(Solid):
         return prepared
 
     def evaluate(self, p: Vec3) -> Sample:
-        """The sample of the signed distance at p. Within `share_samples`, a sample at the same
-        Dr.Jit points is taken from the cache."""
+        """The sample of f at p: value, gradient, error bounds and the Lipschitz constant 1. Within
+        the context `share_samples`, a sample at the same Dr.Jit points is taken from the cache."""
         data, cache = _data_on_backend(self, p), _SAMPLE_CACHE.get()
         if cache is None or dr.flag(dr.JitFlag.SymbolicScope):
             return data.sample(p)
+        # Dr.Jit numbers its arrays: equal indices are the same arrays.
         key = id(data), p.x.index, p.y.index, p.z.index
         if key not in cache:
             cache[key] = p, data.sample(p)  # with p, so that its indices name nothing else
         return cache[key][1]
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
-        """The ray sample, with the enclosures that the Lipschitz constant 1 proves, and with a
-        lower bound of |grad f|."""
+        """The sample at the point of a ray with parameter t, with enclosures (proved bounds of the
+        change of f along the ray) in front of the point and behind it, which follow from the
+        Lipschitz constant 1; and with a lower bound of |grad f|.
+
+        path: the ray.
+        ahead, back: lengths for which enclosures are wanted; not used, as these hold on all
+            lengths.
+        """
         del ahead, back
-        look = path.enclose(self.evaluate(path.point(t)))
+        ray_sample = path.enclose(self.evaluate(path.point(t)))
         return RaySample(
-            look.sample,
-            look.forward,
-            look.backward,
-            look.slope,
-            look.reach_growth,
+            ray_sample.sample,
+            ray_sample.forward,
+            ray_sample.backward,
+            ray_sample.slope,
+            ray_sample.reach_growth,
             min_gradient_norm=_MIN_GRADIENT,
         )
 
@@ -257,7 +269,10 @@ def share_samples() -> Generator[None]:
 
 
 def _data_on_backend(solid: Any, like: Any) -> _MeshData:
-    """The data of a solid on the backend of `like`, a number or a point."""
+    """The data of a solid on a backend; they are uploaded if the solid is not prepared.
+
+    like: a number or a point of the backend.
+    """
     if not hasattr(solid, "_on_device"):
         solid = solid.prepare(backend_of(like))
     return solid._on_device
@@ -265,7 +280,8 @@ def _data_on_backend(solid: Any, like: Any) -> _MeshData:
 
 @dataclass(frozen=True)
 class _MeshData(UnitFrame):
-    """The triangles of a mesh on a backend, in unit coordinates.
+    """The triangles of a mesh on a backend, in unit coordinates: x = (p - center) / size for a
+    point p of space. Two trees find closest points and the crossings of rays.
 
     rays: a tree of all faces, which form a closed mesh, with which the crossings of rays are found.
     near: a tree of the triangles that bound the solid, with which closest points are found.
@@ -281,8 +297,9 @@ class _MeshData(UnitFrame):
 
     @classmethod
     def upload(cls, backend: Backend, surface: ClosedSurface) -> _MeshData:
-        """The triangles of a surface on a backend."""
+        """Upload the triangles of a surface to a backend, and make the trees."""
         vertices, faces, weights = surface.vertices, surface.faces, surface.weights
+        # One tree serves both purposes, unless the boundary of the solid is not just the faces.
         near = rays = _triangle_tree(
             backend, vertices, faces, weights, slabs=surface.boundary_triangles is None
         )
@@ -304,17 +321,19 @@ class _MeshData(UnitFrame):
         return self._signed_sample(p, x, self._closest_triangle(x))
 
     def sample_with_feature(self, p: Vec3) -> tuple[Sample, Vec3, Mask, Mask]:
-        """The sample at p, and whether the closest point of the mesh lies inside a triangle, on an
-        edge or at a vertex.
+        """The sample of the signed distance at p, and what the closest point of the mesh is: a
+        point inside a triangle, a point on an edge, or a vertex.
 
-        Returns the sample; a unit vector along the edge that is nearest to the closest point; a
-        mask, whether the closest point is on that edge and no vertex; and a mask, whether it is a
-        vertex. Both masks are False where the closest point is inside a triangle.
+        Returns four results: the sample; a unit vector along the triangle's edge that is nearest to
+        the closest point; a mask, whether the closest point is on that edge and no vertex; and a
+        mask, whether it is a vertex. Both masks are False where the closest point is inside a
+        triangle.
         """
         vector = self.backend.Array3f
         x = self.to_unit(p)
         closest = self._closest_triangle(x)
         corners = self.corners.read_record(closest.triangle, closest.triangle != NO_TRIANGLE)
+        # The vectors from the closest point to the corners of its triangle.
         to_corners = [vector(*corners[k : k + 3]) - (x + closest.offset) for k in (0, 3, 6)]
         rounding = _DISTANCE_ROUNDINGS * self.backend.machine_epsilon * (1 + dr.max(dr.abs(x)))
         at_vertex, along, min_distance = (
@@ -325,6 +344,7 @@ class _MeshData(UnitFrame):
         for a, b in ((0, 1), (1, 2), (2, 0)):
             edge = to_corners[b] - to_corners[a]
             length = dr.norm(edge)
+            # The distance of the closest point from the edge's line.
             edge_distance = dr.norm(dr.cross(to_corners[a], edge)) / length
             along = dr.select(edge_distance < min_distance, edge / length, along)
             min_distance = fmin(edge_distance, min_distance)
@@ -336,24 +356,27 @@ class _MeshData(UnitFrame):
         """The triangle closest to x, a point in unit coordinates."""
         backend = self.backend
         upper_bound = initial_squared_distance(self.near, x)
+        # Begin the enumeration of triangles by distance: no triangle came before.
         before = backend.Float(-1), backend.UInt32(NO_TRIANGLE)
         return next_closest_triangle(self.near, x, before, upper_bound, backend.Bool(True))
 
     def _signed_sample(self, p: Vec3, x: Any, closest: ClosestTriangle) -> Sample:
-        """The sample of the signed distance at p.
+        """The sample of the signed distance at p, from the triangle that is closest to p.
 
         x: p in unit coordinates.
-        closest: the triangle closest to it.
+        closest: that triangle, with the vector from x to its closest point.
         """
         backend = self.backend
         real, vector, epsilon = backend.Float, backend.Array3f, backend.machine_epsilon
         distance = dr.sqrt(closest.squared_distance)
         error = _DISTANCE_ROUNDINGS * epsilon * (1 + dr.max(dr.abs(x)))
 
+        # `closest.normal` has twice the triangle's area as its length.
         double_area = dr.norm(closest.normal)
         has_area = double_area > 0
         normal = dr.select(has_area, closest.normal / double_area, vector(0, 0, 1))
         height = -dr.dot(closest.offset, normal)  # of x above the triangle's plane
+        # The normal decides if the distance is well above its error; otherwise a ray does.
         normal_decides = closest.is_inner & (distance > _CLEAR_MULTIPLE * error)
         normal_decides &= 2 * dr.abs(height) > distance
         inside = self._is_inside(x, ~normal_decides)
@@ -390,10 +413,11 @@ class _MeshData(UnitFrame):
 def _triangle_tree(
     backend: Backend, vertices: FloatArray, faces: IntArray, weights: Any, *, slabs: bool
 ) -> TriangleTree:
-    """A tree of triangles for closest points and ray crossings.
+    """A tree of triangles, for closest points and for crossings with rays.
 
-    weights: (m,) or a number: the crossings of a face count this many times.
-    slabs: whether nodes have slabs besides boxes, for closest points from far away.
+    vertices, faces: (n, 3), and (m, 3) indices of vertices.
+    weights: (m,) or a number: how many times the crossings of a face count.
+    slabs: whether the nodes of the tree have slabs besides boxes, for closest points from far away.
     """
     tree = build_balanced_tree(vertices[faces].mean(axis=1), leaf_size=_LEAF_SIZE)
     records = triangle_records(vertices, faces)
@@ -402,9 +426,11 @@ def _triangle_tree(
 
 
 def mesh_distance_jet(solid: MeshSolid, x: Jet, y: Jet, z: Jet) -> Jet:
-    """The jet of the signed distance d from a mesh.
+    """The jet (proved ranges of value and derivatives) of the signed distance d from a mesh, from
+    the jets of the coordinates.
 
-    x, y, z: jets of the coordinates, at a point or on a piece of a path.
+    solid: the solid of the mesh.
+    x, y, z: the jets of the coordinates, at a point or on a piece of a line.
 
     Proof. d has the Lipschitz constant 1. So its derivative by any variable is at most the length
     of the derivative of (x, y, z) by that variable, and its value at the start is known up to the
@@ -414,6 +440,7 @@ def mesh_distance_jet(solid: MeshSolid, x: Jet, y: Jet, z: Jet) -> Jet:
     both the gradient and the edge, and 0 along the edge.
     """
     coordinates = (x, y, z)
+    # The jets at the start of the piece; at a point, the jets themselves.
     starts = [coord if coord.jet_at_start is None else coord.jet_at_start for coord in coordinates]
     zero = 0 * x.piece_length
     q = backend_of(zero).Array3f(*(zero + coord.value.midpoint for coord in starts))
@@ -438,8 +465,11 @@ def mesh_distance_jet(solid: MeshSolid, x: Jet, y: Jet, z: Jet) -> Jet:
         ]
 
     errors = Interval(zero - sample.gradient_error, zero + sample.gradient_error)
+    # The components of the gradient with their error, as intervals.
     slopes = [Interval.point(coord) + errors for coord in sample.gradient]
     first: list[Interval] = []
+    # First derivatives: by the chain rule, and by the Lipschitz constant alone on a range of
+    # points.
     for i, limit in enumerate(speeds(starts)):
         rate = Interval(0.0, 0.0)
         for slope, coord in zip(slopes, starts, strict=True):
@@ -453,10 +483,9 @@ def mesh_distance_jet(solid: MeshSolid, x: Jet, y: Jet, z: Jet) -> Jet:
         first.append(Interval(lower, upper))
 
     def rate_along(direction: Vec3, jets: Any, i: int) -> Interval:
-        """The range of the component, along `direction`, of the derivative of (x, y, z) by variable
-        i.
+        """The range of the dot product of a vector with the derivative of (x, y, z) by variable i.
 
-        direction: (3,) a vector.
+        direction: (3,) the vector.
         jets: the jets of the coordinates.
         """
         total = Interval(0.0, 0.0)
@@ -465,6 +494,7 @@ def mesh_distance_jet(solid: MeshSolid, x: Jet, y: Jet, z: Jet) -> Jet:
         return total
 
     count = range(len(x.first_derivatives))
+    # Second derivatives: the curvature times the squared motion across the gradient (and the edge).
     gradient_rates = [rate_along(sample.gradient, starts, i) for i in count]
     edge_rates = [rate_along(edge, starts, i) for i in count]
     curvature = dr.select(on_edge | at_vertex, 1 / sample.value, 0)
@@ -484,6 +514,7 @@ def mesh_distance_jet(solid: MeshSolid, x: Jet, y: Jet, z: Jet) -> Jet:
     start = Jet(value, tuple(first), tuple(second), piece_length=starts[0].piece_length)
     if x.jet_at_start is None:
         return start
+    # On a piece, only the Lipschitz constant is used.
     ranges = tuple(Interval(-limit, limit) for limit in speeds(coordinates))
     piece_value = value + range_times_length(ranges[0], x.piece_length)
     unbounded = (Interval(zero - dr.inf, zero + dr.inf),) * len(x.second_derivatives)
@@ -504,18 +535,18 @@ _PROBE_POINTS = ((0.98, 0.01, 0.01), (0.01, 0.98, 0.01), (0.01, 0.01, 0.98))
 
 @dataclass(frozen=True)
 class ClosedSurface:
-    """The boundary of the solid that a mesh bounds, in unit coordinates.
-
-    A point u in unit coordinates stands for center + size * u; the coordinates are at most about 1.
+    """The boundary of the solid that a mesh bounds, in unit coordinates. A point u in unit
+    coordinates stands for the point center + size * u of space; the coordinates are at most about
+    1.
 
     vertices: (n, 3).
     faces: (m, 3), indices of vertices. They form a closed mesh, and no two are alike.
     weights: (m,) how many times each face is counted.
-    center: (3,), and size: the unit coordinates.
-    boundary_triangles: (k, 3, 3) corners of the triangles that bound the points of a winding number
-        above 1/2; None if these are just the faces.
+    center, size: (3,) and a length: they define the unit coordinates.
+    boundary_triangles: (k, 3, 3) the corners of the triangles that bound the points of a winding
+        number above 1/2; None if these are just the faces.
     box: the lowest and the highest corner (3,) of that boundary.
-    area: of that boundary in the mesh's own units; triangles that coincide count once.
+    area: the area of that boundary in the mesh's own units; triangles that coincide count once.
     """
 
     vertices: FloatArray
@@ -538,13 +569,14 @@ class ClosedSurface:
 
     @classmethod
     def of(cls, vertices: FloatArray, faces: IntArray) -> ClosedSurface:
-        """The closed surface of a mesh.
+        """Find the boundary of the solid that a mesh bounds.
 
-        vertices, faces: (n, 3) and (m, 3).
+        vertices, faces: (n, 3), and (m, 3) indices of vertices.
 
         Raises:
             MeshError: the mesh bounds no solid.
         """
+        # Faces whose reversed copies are also faces cancel each other; the rest is the net.
         welded = Welded.of(vertices, faces)
         net = welded.net
         if not len(net.faces):
@@ -554,14 +586,15 @@ class ClosedSurface:
         _check_closed(vertices, welded)
         used = vertices[np.unique(net.faces)]
         lower, upper = used.min(axis=0), used.max(axis=0)
+        # A power of two, so that scaling is exact.
         size = float(2.0 ** np.ceil(np.log2(0.5 * float((upper - lower).max()))))
         center = round_to_single(0.5 * (lower + upper))
         unit = (vertices - center) / size
 
         def place(corners: FloatArray) -> str:
-            """The center of triangles, as text in the mesh's own units, for messages.
+            """The center of a triangle as text, in the mesh's own units, for messages.
 
-            corners: of one triangle (3, 3), in unit coordinates.
+            corners: (3, 3) of the triangle, in unit coordinates.
             """
             return format_vector(center + size * corners.mean(axis=0))
 
@@ -574,18 +607,19 @@ class ClosedSurface:
 def _boundary_pieces(
     unit: FloatArray, faces: IntArray, weights: IntArray, place: Callable[[FloatArray], str]
 ) -> tuple[FloatArray | None, float]:
-    """The triangles between winding numbers below and above 1/2, and their area.
+    """Find the boundary of a solid: the triangles between points of a winding number below 1/2 and
+    points of a winding number above 1/2. Faces are first cut into pieces where they meet other
+    faces.
 
     unit: (n, 3) the vertices in unit coordinates.
     faces: (m, 3), indices of vertices.
     weights: (m,) how many times each face is counted.
     place: a function that returns the text for a place near a triangle, for messages.
 
-    Faces are cut into pieces where they meet other faces. The result is the corners (k, 3, 3) of
-    the pieces that bound the solid, or None if these are all faces, uncut. Pieces run
-    counter-clockwise as seen from outside. In the area, pieces that coincide count once. If several
-    faces coincide, and more of them are turned one way than the opposite way, each of these is a
-    piece of the boundary.
+    Returns two results: the corners (k, 3, 3) of the pieces that bound the solid, or None if these
+    are all faces, uncut; and their area. Pieces run counter-clockwise as seen from outside. In the
+    area, pieces that coincide count once. If several faces coincide, and more of them are turned
+    one way than the opposite way, each of these is a piece of the boundary.
 
     Triangles thinner than `_THIN_HEIGHT` have no reliable normal, and so no reliable winding
     numbers beside them. If the boundary is all faces, it includes such triangles. Else their
@@ -597,6 +631,7 @@ def _boundary_pieces(
     """
     faces = np.repeat(faces, weights, axis=0)
     rays = _triangle_tree(choose_backend("double"), unit, faces, np.ones(len(faces)), slabs=False)
+    # The faces of nonzero area. Only these can be cut.
     proper = np.delete(faces, zero_area_faces(unit, faces), axis=0)
     proper_tree = rays
     if len(proper) < len(faces):
@@ -605,6 +640,7 @@ def _boundary_pieces(
     edges = pieces - np.roll(pieces, 1, axis=1)
     longest = np.linalg.norm(edges, axis=2).max(axis=1)
     is_thick = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) > _THIN_HEIGHT * longest
+    # The winding numbers in front of and behind each piece.
     front, back = windings_of_sides(rays, pieces)
     lower, upper = np.minimum(front, back), np.maximum(front, back)
     if (wrong := is_thick & (lower < 0)).any():
@@ -618,10 +654,12 @@ def _boundary_pieces(
             "faces of that part (trimesh.repair.fix_normals(mesh, multibody=True) tries), or take "
             "harnack.WindingNumber, which asks for no sides"
         )
+    # A piece is wrong if the winding numbers beside it differ from point to point.
     wrong = np.zeros(len(pieces), np.bool_)
     for barycentric in _PROBE_POINTS:
         front_probe, back_probe = winding_numbers_of_sides(rays, pieces, barycentric)
         wrong |= (front_probe != lower) | (back_probe != upper)
+    # Keep the pieces between winding numbers below and above 1/2.
     is_kept, jump = (lower < 0.5) & (upper > 0.5), upper - lower
     if not _is_closed(pieces[is_kept], jump[is_kept], is_thick[is_kept]):
         wrong |= jump != 1  # where components are in contact, or faces are repeated
@@ -648,18 +686,19 @@ def _boundary_pieces(
 
 
 def _is_closed(pieces: FloatArray, jump: FloatArray, is_thick: BoolArray) -> bool:
-    """Whether triangles, some of which may coincide, bound a volume.
+    """Whether triangles, some of which may coincide, together bound a volume.
 
-    pieces: (k, 3, 3) corners.
-    jump: (k,) by how much the winding number changes across the position of each piece.
-    is_thick: (k,) whether the normal of each piece is reliable.
+    pieces: (k, 3, 3) their corners.
+    jump: (k,) by how much the winding number changes across each piece.
+    is_thick: (k,) whether the piece is thick enough to have a reliable normal.
 
     Proof. Over a closed surface the integral of the normal n is 0 by Gauss's theorem, and the
     integral of x_i n_j is the volume for i = j, else 0. A piece that is in contact with another and
-    should be left out violates this. At each position of pieces that coincide, the number of those
-    turned one way less the number of those turned the other way is the jump. So each piece counts
-    with 1/jump. Pieces that are not thick may count or not.
+    should be left out violates this. At each position of pieces that coincide, the number of pieces
+    turned one way minus the number turned the other way is the jump. So each piece counts with
+    1/jump. Pieces that are not thick may count or not, so their area is a tolerance.
     """
+    # The integral of n over each piece; `moment` is the sum of the integrals of x_i n_j.
     normal_integral = 0.5 * np.cross(pieces[:, 1] - pieces[:, 0], pieces[:, 2] - pieces[:, 0])
     piece_area = np.linalg.norm(normal_integral, axis=1)
     normal_integral = normal_integral / np.maximum(jump, 1)[:, None]
@@ -672,7 +711,9 @@ def _is_closed(pieces: FloatArray, jump: FloatArray, is_thick: BoolArray) -> boo
 
 
 def _check_closed(vertices: FloatArray, welded: Welded) -> None:
-    """Raise MeshError unless every edge occurs as often in one direction as in the other.
+    """Raise MeshError unless every edge occurs as often in one direction as in the other. The
+    message names an open edge, which belongs to one face only; or else an edge at which faces are
+    turned differently.
 
     vertices: (n, 3).
     welded: the faces, and the edges that occur more often in one direction.
@@ -682,9 +723,11 @@ def _check_closed(vertices: FloatArray, welded: Welded) -> None:
         return
     face_edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     pairs, count = np.unique(face_edges, axis=0, return_counts=True)
+    # Find each of these edges among all edges of faces, by the number that stands for its vertices.
     key = len(vertices)
     indices = np.searchsorted(pairs @ [key, 1], np.sort(edges, axis=1) @ [key, 1])
     is_open = (count[indices] == 1) & (edge_weights == 1)
+    # Open edges are reported first.
     bad_edges = edges[is_open] if is_open.any() else edges
     example = " and ".join(format_vector(vertex) for vertex in vertices[bad_edges[0]])
     if is_open.any():

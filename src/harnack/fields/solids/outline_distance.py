@@ -1,8 +1,11 @@
-"""The signed distance from an outline in the plane, and its bounds along a line of the plane.
+"""The signed distance d from an outline in the plane, and its bounds along a line of the plane. An
+outline is a set of closed polygonal loops that do not cross; d is negative inside. A lane of the
+computation has one query point (x, y), and possibly a line from this point, with positions on it,
+the knots, at which d is bounded.
 
-Edges are read in a loop. If there are many, consecutive edges form chains, and far chains are
-skipped by their boxes. So an outline of 1,000 edges costs about as much as an outline of 100
-(`OutlineEdges`).
+Edges are read in a loop, one after the other. If there are many, consecutive edges form chains, and
+far chains are skipped by their boxes. So an outline of 1,000 edges takes about as much time as an
+outline of 100 (`OutlineEdges`).
 """
 
 from __future__ import annotations
@@ -27,9 +30,9 @@ if TYPE_CHECKING:
 
 # The number of edges from which on they are read by chains.
 _MIN_EDGES_FOR_CHAINS = 48
-# Along a line the distance is bounded at knots. The inner knots are these fractions of the length
-# asked for or, if that is infinite, of this multiple of the largest coordinate and the outline's
-# size.
+# Along a line the distance is bounded at knots. The inner knots are these fractions of the
+# requested length. If that is infinite, they are fractions of this multiple of the sum of the
+# largest coordinate and the outline's size.
 _KNOT_FRACTIONS = (0.0625, 0.125, 0.25, 0.5)
 _ENDLESS_LENGTH = 8.0
 # The error of the vector between a point and an edge, in roundings of the terms of the vector.
@@ -38,7 +41,8 @@ _VECTOR_ROUNDINGS = 4.0
 
 @dataclass(frozen=True)
 class OutlineSample:
-    """A sample of the signed distance d at points of the plane.
+    """The signed distance d from an outline at points of the plane, with its derivatives and error
+    bounds, and with lower bounds of |d| along lines from the points.
 
     value: d, negative inside.
     gradient: (d_x, d_y), a unit vector.
@@ -46,8 +50,8 @@ class OutlineSample:
     gradient_error: a bound of the error of `gradient`, as a length.
     second_derivative: the second derivative of d across the gradient. It is 1/d if the nearest
         point of the outline is a vertex, else 0.
-    lower_bounds: for each knot of a line, a lower bound of |d| at the knot less |d| at the start;
-        rounding is included.
+    lower_bounds: for each knot (a position on the line), a lower bound of |d| at the knot minus |d|
+        at the start; rounding is included.
     """
 
     value: Real
@@ -60,7 +64,10 @@ class OutlineSample:
 
 @dataclass(frozen=True)
 class OutlineEdges:
-    """The edges of an outline on a backend.
+    """The edges of an outline on a backend, as a table of records that a loop reads. The signed
+    distance is computed from the nearest edge. Consecutive edges form chains; a far chain is
+    skipped by its box. A line starts at each query point; the knots are positions on it at which
+    the distance is bounded.
 
     edges: a record (ax, ay, bx, by, 1/length^2) for each edge from a to b, relative to `center`.
         The region lies to the left of its edges.
@@ -93,14 +100,16 @@ class OutlineEdges:
 
     @classmethod
     def upload(cls, backend: Backend, outline: Outline, *, axis: bool = False) -> OutlineEdges:
-        """The edges of an outline on a backend.
+        """The records of an outline's edges, on a backend.
 
+        outline: its loops, each an array (n, 2) of vertices.
         axis: whether edges on the line x = 0 are left out. No point with x < 0 may be sampled then.
         """
         points = np.concatenate(outline)
         center = 0.5 * (points.min(axis=0) + points.max(axis=0))
         start = points - center
         end = np.concatenate([np.roll(array, -1, axis=0) for array in outline]) - center
+        # For each edge the number of its loop, so that no chain joins two loops.
         loop = np.repeat(np.arange(len(outline)), [len(array) for array in outline])
         if axis:
             keep = (start[:, 0] != -center[0]) | (end[:, 0] != -center[0])
@@ -111,8 +120,10 @@ class OutlineEdges:
         # it.
         start, end = (array.astype(backend.dtype).astype(np.float64) for array in (start, end))
         square = ((end - start) ** 2).sum(axis=1)
+        # Rounding may have made an edge a point.
         keep = square > 0
         start, end, square, loop = (start[keep], end[keep], square[keep], loop[keep])
+        # The records.
         rows = np.column_stack([start, end, 1.0 / square])
         chains = None
         if len(rows) >= _MIN_EDGES_FOR_CHAINS:
@@ -122,8 +133,8 @@ class OutlineEdges:
         return cls(RecordTable.upload(backend, rows), chains, (x, y), size)
 
     def knots(self, x: Real, y: Real, ahead: Real) -> tuple[Real, ...]:
-        """The positions on the lines from points (x, y) at which the distance is bounded. They
-        increase; the last is the length `ahead` that is asked for, which may be infinite."""
+        """The knots: positions on lines from points (x, y) at which the distance is bounded. They
+        increase; the last is the requested length `ahead`, which may be infinite."""
         max_length = _ENDLESS_LENGTH * (
             fmax(dr.abs(x), dr.abs(y)) + self.size + dr.abs(self.center[0])
         )
@@ -137,8 +148,8 @@ class OutlineEdges:
         velocity: tuple[Real, Real] | None = None,
         knots: tuple[Real, ...] = (),
     ) -> OutlineSample:
-        """The sample of the signed distance at points (x, y), with lower bounds along lines from
-        them.
+        """The sample of the signed distance at points (x, y): value, gradient, error bounds, and
+        lower bounds at the knots of lines from these points.
 
         velocity: (x, y) the direction of the lines, of length 1 at most; None without lines.
         knots: increasing positions on the lines at which the distance is bounded.
@@ -154,6 +165,7 @@ class OutlineEdges:
             x, y, velocity, knots, _VECTOR_ROUNDINGS * epsilon * (size + self.size), epsilon
         )
         zero = 0 * x
+        # The state before any edge, in the order that `_OutlineQuery` describes.
         start = zero + dr.inf, zero, zero, zero, zero, zero, zero > 1, zero > 1
         state = (*start, *(zero + dr.inf for _ in knots))
         if self.chains is None:
@@ -174,6 +186,7 @@ class OutlineEdges:
             for n, away in ((normal_x, away_x), (normal_y, away_y))
         )
         slope_error = dr.select(on_edge, 8 * epsilon, fmin(2 * error / distance, 2))
+        # The bounds of the distance become bounds of its change from the start.
         lower = tuple(bound - distance - error for bound in bounds)
         curvature = dr.select(on_edge, 0, sign / distance)
         return OutlineSample(
@@ -183,26 +196,30 @@ class OutlineEdges:
     def _add_edges_by_chains(
         self, chains: RecordTable, query: _OutlineQuery, state: tuple[Any, ...]
     ) -> tuple[Any, ...]:
-        """The state of a loop over the edges (see `_OutlineQuery`), with all edges added. If a
-        chain is too far away to hold the nearest edge, its box is added in place of its edges.
+        """Loop over the chains: the state of the loop over edges (see `_OutlineQuery`) with all
+        edges added. A chain that is too far away to hold the nearest edge is added by its box, in
+        place of its edges.
 
         chains: the records of the chains.
         state: the state before any edge.
         """
+        # The distance within which some chain must have a point.
         (square,) = chains.for_each(query.chain_upper_bound, (query.x + dr.inf,), "outline chains")
         max_distance = dr.sqrt(square) * (1 + 1e-5) + query.error
         index = type(chains.iteration_count)(0)
 
         def visit_chain(i: Any, *state: Any) -> tuple[Any, ...]:
-            """The index of the next chain, and the state after the edges of chain i, or its box if
-            it is far away, were added."""
+            """The index of the next chain; and the state with chain i added, by its edges if it is
+            near, else by its box."""
             record = chains.read_record(i)
+            # A near chain has `count` edges to visit. A far one has 0, and its box is already in
+            # the state.
             count, state = query.with_chain(record, max_distance, state)
-            first, count = type(i)(record[6]), type(i)(count)
+            first_edge, count = type(i)(record[6]), type(i)(count)
 
             def each(j: Any, *edge_state: Any) -> tuple[Any, ...]:
-                """The state with edge j of the chain added."""
-                return j + 1, *query.with_edge(self.edges.read_record(first + j), edge_state)
+                """The next index, and the state with edge j of the chain added."""
+                return j + 1, *query.with_edge(self.edges.read_record(first_edge + j), edge_state)
 
             def has_more(j: Any, *_: Any) -> Mask:
                 return j < count
@@ -218,22 +235,23 @@ class OutlineEdges:
 
 @dataclass(frozen=True)
 class _OutlineQuery:
-    """Points of the plane at which the signed distance from an outline is wanted, and lines from
-    these points, on which it is to be bounded.
+    """Query points of the plane, one per lane, at which the signed distance from an outline is
+    wanted, and lines from these points along which it is bounded at given positions, the knots. A
+    loop visits the edges of the outline one by one; the methods update its state, a tuple, by an
+    edge or by a chain of edges. Edges and chains are read as records (`OutlineEdges`).
 
-    The methods update the state of a loop over the edges. It consists of these parts: the distance
-    from the nearest edge so far and its rounding error; x and y of the vector from the nearest
-    point of that edge to the query point; x and y of the edge's unit normal; whether the nearest
-    point lies inside the edge, so that it is no vertex; whether the ray towards +x has crossed an
-    odd number of edges; and a lower bound of the distance at each knot, a position on the line. The
-    distance from an edge lies above its tangent at the start of the line, so the bound is the
-    smallest of all tangents at the knot.
-
-    x, y: the points, relative to the outline's center.
+    x, y: the query points, relative to the outline's center.
     velocity: the direction of the lines, of length 1 at most; None without lines.
-    knots: increasing positions on the lines at which the distance is bounded.
+    knots: increasing positions on the lines.
     error: a bound of the rounding of distances from boxes.
     unit: the machine epsilon.
+
+    The state consists of these parts: the distance from the nearest edge so far, and its rounding
+    error; x and y of the vector from the nearest point of that edge to the query point; x and y of
+    the edge's unit normal; whether the nearest point lies inside the edge, so that it is no vertex;
+    whether the ray towards +x has crossed an odd number of edges; and for each knot a lower bound
+    of the distance there. The distance from an edge lies above its tangent at the start of the
+    line, so the bound is the smallest value at the knot of all these tangents.
     """
 
     x: Real
@@ -244,10 +262,15 @@ class _OutlineQuery:
     unit: float
 
     def with_edge(self, row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
-        """The state of the loop after the edge of the record `row` was added."""
+        """The state of the loop after one more edge was visited.
+
+        row: the record of the edge: (ax, ay, bx, by, 1/length^2).
+        state: the state before.
+        """
         nearest, error, away_x, away_y, normal_x, normal_y, on_edge, inside, *bounds = state
         from_x, from_y = self.x - row[0], self.y - row[1]
         edge_x, edge_y = row[2] - row[0], row[3] - row[1]
+        # The nearest point of the edge, as a fraction of the edge; and the vector from it.
         fraction = dr.fma(from_x, edge_x, from_y * edge_y) * row[4]
         t = clamp(fraction, 0, 1)
         to_x, to_y = dr.fma(edge_x, -t, from_x), dr.fma(edge_y, -t, from_y)
@@ -259,6 +282,8 @@ class _OutlineQuery:
         size = dr.abs(from_x) + dr.abs(from_y) + dr.abs(edge_x) + dr.abs(edge_y)
         rounding = _VECTOR_ROUNDINGS * self.unit * size
         bounds = self._with_tangent(bounds, to_x, to_y, distance, rounding)
+        # The ray towards +x crosses the edge if one end of the edge is above the ray, the other is
+        # not, and the edge is to the right of the point.
         crosses = (row[1] > self.y) != (row[3] > self.y)
         inside = inside ^ (crosses & ((cross_product > 0) == (row[3] > row[1])))
         is_nearer = distance < nearest
@@ -275,33 +300,49 @@ class _OutlineQuery:
         )
 
     def chain_upper_bound(self, row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
-        """The smaller of two squared distances: the state, and the square of a distance within
-        which the chain of the record `row` must have a point."""
+        """Update the state of a loop over chains, a tuple of one number: the square of a distance
+        within which some chain must have a point. The result is the smaller of the state and that
+        square for one more chain.
+
+        row: the record of the chain, which begins with its box.
+        """
         (min_square,) = state
         near_x, far_x = self._distances_from_ends(self.x, row[0], row[2])
         near_y, far_y = self._distances_from_ends(self.y, row[1], row[3])
+        # Each side of the box holds a point of the chain. For the nearer of the two vertical sides,
+        # the farthest point is at the distance |(near_x, far_y)|; likewise for the horizontal
+        # sides.
         square = fmin(near_x * near_x + far_y * far_y, far_x * far_x + near_y * near_y)
         return (fmin(square, min_square),)
 
     @staticmethod
     def _distances_from_ends(v: Real, lower: Real, upper: Real) -> tuple[Real, Real]:
-        """The distances of a coordinate from the nearer and from the farther end of the interval
-        [lower, upper]."""
+        """The distances of a coordinate v from the nearer and from the farther of the two numbers
+        `lower` and `upper`."""
         to_lower, to_upper = dr.abs(v - lower), dr.abs(v - upper)
         return fmin(to_lower, to_upper), fmax(to_lower, to_upper)
 
     def with_chain(
         self, row: list[Real], limit: Real, state: tuple[Any, ...]
     ) -> tuple[Real, tuple[Any, ...]]:
-        """The number of edges that must be read of the chain of the record `row`: all if its box is
-        within the distance `limit`, else 0; and the state. If the box is farther away, it is added
-        to the state in place of the edges."""
+        """Decide whether the edges of a chain must be visited. Returns the number of edges to
+        visit, and the state. If the box of the chain is within the distance `limit`, all its edges
+        must be visited, and the state stays. If it is farther away, the number is 0, and the box is
+        added to the state in place of the edges.
+
+        row: the record of the chain.
+        limit: a distance within which the nearest edge lies.
+        state: the state before (see the class).
+        """
         nearest, error, away_x, away_y, normal_x, normal_y, on_edge, inside, *bounds = state
         to_x, to_y = self.x - clamp(self.x, row[0], row[2]), self.y - clamp(self.y, row[1], row[3])
         distance = dr.sqrt(dr.fma(to_x, to_x, to_y * to_y))
         is_near = distance <= limit
+        # A far box bounds the distances from all its edges.
         bounds_with_box = self._with_tangent(bounds, to_x, to_y, distance, self.error)
         bounds = [dr.select(is_near, a, b) for a, b in zip(bounds, bounds_with_box, strict=True)]
+        # A far chain crosses the ray towards +x an odd number of times if its ends are above and
+        # below the ray and its box is to the right of the point.
         crosses = (row[4] > self.y) != (row[5] > self.y)
         inside = inside ^ (~is_near & crosses & (row[0] > self.x))
         count = dr.select(is_near, row[7], 0)
@@ -310,12 +351,12 @@ class _OutlineQuery:
     def _with_tangent(
         self, bounds: list[Real], x: Real, y: Real, distance: Real, error: Real
     ) -> list[Real]:
-        """The smallest tangents at the knots, with the tangent of the distance from another edge or
-        box included.
+        """The lower bounds at the knots after one more edge or box: the smaller of the bounds so
+        far and of the tangent of the distance from it at the start of the line.
 
-        bounds: the smallest tangents so far.
+        bounds: the bounds so far, one for each knot.
         x, y: the vector from the nearest point of the edge or box to the query point.
-        distance: its length.
+        distance: the length of that vector.
         error: a bound of the error of that vector.
         """
         if self.velocity is None:
@@ -326,22 +367,24 @@ class _OutlineQuery:
 
 
 def _chain_records(start: FloatArray, end: FloatArray, loop_index: IntArray) -> FloatArray:
-    """The records of chains of consecutive edges: for each its box as (lowest x, lowest y, highest
-    x, highest y), y of its first and of its last vertex, the index of its first edge, and the
-    number of its edges.
+    """The records of chains of consecutive edges (n, 8). For each chain: its box as (lowest x,
+    lowest y, highest x, highest y), y of its first and of its last vertex, the index of its first
+    edge, and the number of its edges.
 
     start, end: (n, 2) the ends of the edges.
-    loop_index: (n,) an index that changes where the next edge belongs to another chain.
+    loop_index: (n,) a number for each edge. Edges of different numbers belong to different chains.
 
-    A query reads all chains twice, and the edges of about three chains. The number of edges per
-    chain that costs least is about the square root of two thirds of the number of all edges.
+    A query reads all chains twice, and the edges of about three chains. So the number of edges per
+    chain that takes the least time is about the square root of two thirds of the number of all
+    edges.
     """
     length = max(8, round(math.sqrt(2 * len(start) / 3)))
     rows: list[Any] = []
+    # The index of the first edge of each run of edges with the same number, and the end.
     loop_starts = np.concatenate([[0], np.flatnonzero(np.diff(loop_index)) + 1, [len(loop_index)]])
-    for first, last in itertools.pairwise(loop_starts.tolist()):
-        for k in range(first, last, length):
-            stop = min(k + length, last)
+    for loop_start, loop_end in itertools.pairwise(loop_starts.tolist()):
+        for k in range(loop_start, loop_end, length):
+            stop = min(k + length, loop_end)
             ends = np.concatenate([start[k:stop], end[k:stop]])
             rows.append(
                 [*ends.min(axis=0), *ends.max(axis=0), start[k, 1], end[stop - 1, 1], k, stop - k]
@@ -351,15 +394,16 @@ def _chain_records(start: FloatArray, end: FloatArray, loop_index: IntArray) -> 
 
 @dataclass(frozen=True)
 class SignedDistanceEnclosure(Enclosure):
-    """An enclosure of a signed distance d along a path, from an enclosure of |d|. The Lipschitz
-    constant of d is 1.
+    """A proved bound of the change of a signed distance d along a line, from such a bound of |d|. d
+    has the Lipschitz constant 1. The gaps are the differences between d at the start and the next
+    level below and above.
 
-    value: d at the start of the path.
+    value: d at the start of the line.
     size: the enclosure of |d|.
 
     Proof. As long as |d| > 0, d keeps its sign. If d > 0, it falls as |d| does, down to 0, and
     rises as |d| does. If d < 0, it falls where |d| rises, and rises where |d| falls. And d changes
-    by no more than the length of the path.
+    by no more than the length of the line.
     """
 
     value: Real
@@ -369,21 +413,31 @@ class SignedDistanceEnclosure(Enclosure):
     def around(
         cls, nearest: OutlineSample, slope: Real, knots: tuple[Real, ...]
     ) -> SignedDistanceEnclosure:
-        """The enclosure from a sample of d.
+        """The enclosure from a sample of d at the start of the line.
 
-        slope: the derivative of d along the path.
-        knots: the positions on the path of the sample's lower bounds.
+        nearest: the sample, with lower bounds at the knots.
+        slope: the derivative of d along the line at its start.
+        knots: the positions on the line of the sample's lower bounds.
         """
         distance = dr.abs(nearest.value)
+        # The slope of |d|, at most 1.
         max_slope = fmin(dr.mulsign(slope, nearest.value) + nearest.gradient_error, 1.0)
         return cls(
             nearest.value, TangentEnclosure(distance, max_slope, knots, nearest.lower_bounds)
         )
 
     def free_length(self, gaps: LevelGaps) -> Real:
+        """The length of the line on which d is proved to meet neither the level below nor the level
+        above.
+
+        gaps: the differences between d at the start and these levels.
+        """
         is_positive = self.value > 0
+        # In terms of |d|: the gap toward 0, and the gap away from 0. If d passes 0, |d| tells
+        # nothing more, so the first gap is at most |d|.
         nearer = dr.select(is_positive, gaps.below, gaps.above)
         farther = dr.select(is_positive, gaps.above, gaps.below)
         length = self.size.free_length(LevelGaps(fmin(nearer, dr.abs(self.value)), farther))
+        # NaN proves nothing. The Lipschitz constant 1 proves the smaller gap.
         is_valid = (gaps.below >= 0) & (gaps.above >= 0)
         return dr.select(is_valid, fmax(length, fmin(gaps.below, gaps.above) * (1 - 1e-6)), 0)

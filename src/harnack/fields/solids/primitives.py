@@ -1,10 +1,8 @@
-"""Primitive solids: plane, sphere, ellipsoid, cylinder, cone, capsule, torus, box, superquadrics.
-
-The function f of each is its signed distance or a bound of it (Hart 1996, appendix A). f is
-negative inside. Except for superquadrics its Lipschitz constant is 1, so that it is no larger than
-the distance outside. Superquadrics have a larger constant. Shapes lie at the origin with their axis
-along z; they can be moved and rotated.
-"""
+"""Primitive solids: plane, sphere, ellipsoid, cylinder, cone, capsule, torus, box, superquadrics. A
+solid is the set of points where its function f is at most 0. The f of each shape is its signed
+distance, negative inside, or a bound of it (Hart 1996, appendix A). The Lipschitz constant of f is
+1, so that f is no larger than the distance outside; superquadrics have a larger constant. Shapes
+lie at the origin with their axis along z; they can be moved and rotated."""
 
 from __future__ import annotations
 
@@ -26,13 +24,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Plane(FormulaSolid):
-    """The half-space n . x <= distance, where n is the unit vector along `normal`.
+    """The half-space n . x <= distance, where n is the unit vector along `normal`. f is the signed
+    distance n . x - distance (Hart, equation 23).
 
     normal: (3,), of any length but 0.
-    distance: of the plane from the origin, along n.
+    distance: the distance of the plane from the origin, along n.
 
-    f is the signed distance n . x - distance (Hart, equation 23). Its gradient is n, so that its
-    Lipschitz constant is 1.
+    The gradient of f is n, so that the Lipschitz constant is 1.
     """
 
     is_convex = True
@@ -44,6 +42,7 @@ class Plane(FormulaSolid):
     distance: float = 0.0
 
     def __post_init__(self) -> None:
+        """Check the arguments, and make the normal a unit vector."""
         normal = as_triple(self.normal, "the normal of a plane")
         length = math.hypot(*normal)
         if length == 0.0:
@@ -62,11 +61,8 @@ class Plane(FormulaSolid):
 
 @dataclass(frozen=True)
 class Sphere(FormulaSolid):
-    """The ball |x - center| <= radius.
-
-    f is the signed distance |x - center| - radius (Hart, equation 24). By the triangle inequality
-    its Lipschitz constant is 1.
-    """
+    """The ball |x - center| <= radius. f is the signed distance |x - center| - radius (Hart,
+    equation 24). By the triangle inequality its Lipschitz constant is 1."""
 
     is_convex = True
 
@@ -90,10 +86,12 @@ class Sphere(FormulaSolid):
 
 
 def _box_of_radii(radii: tuple[float, float, float], level: float) -> Volume:
-    """A box that contains all points where f = m (g - 1) <= level, with m the smallest radius. g is
-    a norm: the set g <= 1 lies in the box whose half sides are the radii.
+    """A box that contains all points where f = m (g - 1) <= level. g is a norm whose unit ball g <=
+    1 lies in the box with the half sides `radii`, and m is the smallest of them.
 
-    radii: the half sides (3,) of that box.
+    radii: (3,) the half sides of that box.
+
+    f <= level means g <= 1 + level/m, so the box is scaled by this number.
     """
     a, b, c = radii
     size = 1.0 + level / min(radii)
@@ -102,14 +100,14 @@ def _box_of_radii(radii: tuple[float, float, float], level: float) -> Volume:
 
 @dataclass(frozen=True)
 class Ellipsoid(FormulaSolid):
-    """The points with |(x/a, y/b, z/c)| <= 1.
+    """The points with |(x/a, y/b, z/c)| <= 1. f = m (|(x/a, y/b, z/c)| - 1), where m is the
+    smallest of the radii a, b, c.
 
     radii: (a, b, c).
 
-    f = m (|(x/a, y/b, z/c)| - 1), with m the smallest radius. Proof of the Lipschitz constant 1.
-    The norm has the constant 1, and the stretched coordinates have 1/m, which is attained along the
-    shortest axis. So f is no larger than the distance outside. The distance itself has no closed
-    form.
+    Proof of the Lipschitz constant 1. The norm has the constant 1, and the stretched coordinates
+    have 1/m, which is attained along the shortest axis. So f is no larger than the distance
+    outside. The distance itself has no closed form.
     """
 
     is_convex = True
@@ -133,10 +131,11 @@ class Ellipsoid(FormulaSolid):
 @dataclass(frozen=True)
 class Cylinder(FormulaSolid):
     """The points within `radius` of the z axis and, unless `height` is None, with |z| <= height/2.
+    f is the signed distance.
 
-    Without ends f is the signed distance |(x, y)| - radius (Hart, equation 25). With ends, the
-    distances from the side and from the ends have gradients at right angles, so that
-    `orthogonal_intersection` of both is the signed distance. The Lipschitz constant is 1.
+    Without ends f is |(x, y)| - radius (Hart, equation 25). With ends, the distances from the side
+    and from the ends have gradients at right angles, so that `orthogonal_intersection` of both is
+    the signed distance. The Lipschitz constant is 1.
     """
 
     is_convex = True
@@ -152,6 +151,8 @@ class Cylinder(FormulaSolid):
             set_frozen(self, "height", as_positive(self.height, "the height of a cylinder"))
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
+        """f at (x, y, z). With ends, the distances from the side and from the ends are combined as
+        distances at right angles."""
         side = norm(x, y) - self.radius
         return (
             side
@@ -160,6 +161,9 @@ class Cylinder(FormulaSolid):
         )
 
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+        """A box that contains all points where f <= level: the box of the cylinder, grown by the
+        level on each side. None for a cylinder without ends, and if `above` (a volume for all
+        points where f >= level), as these points are unbounded."""
         if above:
             return None
         if self.height is None:
@@ -170,13 +174,15 @@ class Cylinder(FormulaSolid):
 
 @dataclass(frozen=True)
 class DoubleCone(FormulaSolid):
-    """The double cone around the z axis with its apex at the origin.
+    """The double cone around the z axis with its apex at the origin. f = |(x, y)| cos(angle) - |z|
+    sin(angle) (Hart, equation 26).
 
     angle: between the axis and the sides, in degrees, above 0 and below 90.
 
-    f = |(x, y)| cos(angle) - |z| sin(angle) (Hart, equation 26). Its gradient is a unit vector off
-    the axis and off the plane z = 0, so that its Lipschitz constant is 1. f is the signed distance
-    if the nearest point of the side's line is not past the apex, and smaller elsewhere.
+    The gradient of f is a unit vector off the axis and off the plane z = 0, so that the Lipschitz
+    constant is 1. Let L be the line of the cone's side in the half-plane of the point and the axis.
+    f is the signed distance where the nearest point of L is not past the apex, and smaller
+    elsewhere.
     """
 
     angle: float = 30.0
@@ -184,6 +190,7 @@ class DoubleCone(FormulaSolid):
     lipschitz = 1.0 + 1e-6  # sine and cosine are rounded
 
     def __post_init__(self) -> None:
+        """Raise ValueError unless the angle is between 0 and 90 degrees."""
         angle = as_finite(self.angle, "the angle of a cone")
         if not 0.0 < angle < 90.0:
             raise ValueError(
@@ -203,12 +210,10 @@ class DoubleCone(FormulaSolid):
 
 @dataclass(frozen=True)
 class Capsule(FormulaSolid):
-    """The points within `radius` of the segment from `start` to `end`.
-
-    f is the signed distance |q - max(0, min(1, t)) (end - start)| - radius, where q = x - start,
-    and t is the position of the nearest point of the line, as a fraction of the segment. As the
-    distance from a set, it has the Lipschitz constant 1.
-    """
+    """The points within `radius` of the segment from `start` to `end`. f is the signed distance |q
+    - max(0, min(1, t)) (end - start)| - radius, where q = x - start, and t is the position of the
+    nearest point of the segment's line, as a fraction of the segment. As the distance from a set
+    minus a constant, f has the Lipschitz constant 1."""
 
     is_convex = True
 
@@ -219,6 +224,11 @@ class Capsule(FormulaSolid):
     lipschitz = 1.0
 
     def __post_init__(self) -> None:
+        """Check the arguments.
+
+        Raises:
+            ValueError: start and end are the same point, or the radius is not positive.
+        """
         start = as_triple(self.start, "the start of a capsule")
         end = as_triple(self.end, "the end of a capsule")
         if start == end:
@@ -228,6 +238,8 @@ class Capsule(FormulaSolid):
         set_frozen(self, "radius", as_positive(self.radius, "the radius of a capsule"))
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
+        """f at (x, y, z): the distance from the segment minus the radius. t is the position of the
+        nearest point of the segment's line, as a fraction of the segment."""
         axis = [b - a for a, b in zip(self.start, self.end, strict=True)]
         from_start = [v - a for v, a in zip((x, y, z), self.start, strict=True)]
         square = axis[0] * axis[0] + axis[1] * axis[1] + axis[2] * axis[2]
@@ -239,6 +251,9 @@ class Capsule(FormulaSolid):
         return norm(across, beyond) - self.radius
 
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+        """A box that contains all points where f <= level: the box of the segment, grown by radius
+        and level on each side. None if `above` (a volume for all points where f >= level), as these
+        points are unbounded."""
         if above:
             return None
         r = self.radius + level
@@ -250,12 +265,10 @@ class Capsule(FormulaSolid):
 
 @dataclass(frozen=True)
 class Torus(FormulaSolid):
-    """The points within `minor` of the circle of radius `major` around the z axis.
-
-    f is the signed distance | (|(x, y)| - major, z) | - minor (Hart, equation 27). As the distance
-    from a set, it has the Lipschitz constant 1. If minor > major (a spindle torus), it is only a
-    bound of the distance inside.
-    """
+    """The points within `minor` of the circle of radius `major` around the z axis. f is the signed
+    distance | (|(x, y)| - major, z) | - minor (Hart, equation 27). As the distance from a set minus
+    a constant, f has the Lipschitz constant 1. If minor > major (a spindle torus), f is only a
+    bound of the distance inside."""
 
     major: float = 1.0
     minor: float = 0.25
@@ -278,13 +291,13 @@ class Torus(FormulaSolid):
 
 @dataclass(frozen=True)
 class Cuboid(FormulaSolid):
-    """The box |x| <= a/2, |y| <= b/2, |z| <= c/2.
+    """The box |x| <= a/2, |y| <= b/2, |z| <= c/2. f is the signed distance.
 
     sides: (a, b, c).
     radius: the radius with which the edges are rounded; 0 for sharp edges.
 
-    f is the signed distance. It is the signed distance from the box that is smaller by the radius
-    on each side (`orthogonal_intersection`), minus the radius.
+    f is computed as the signed distance from a box that is smaller by the radius on each side
+    (`orthogonal_intersection`), minus the radius.
     """
 
     is_convex = True
@@ -295,7 +308,11 @@ class Cuboid(FormulaSolid):
     lipschitz = 1.0
 
     def __post_init__(self) -> None:
-        """Check the arguments."""
+        """Check the arguments.
+
+        Raises:
+            ValueError: sides that are not positive, or a radius above half of the smallest side.
+        """
         sides = as_triple(self.sides, "the sides of a box", all_positive=True)
         set_frozen(self, "sides", sides)
         radius = as_finite(self.radius, "the radius of the edges of a box")
@@ -327,9 +344,9 @@ def lipschitz_of_norms(p: float, q: float) -> float:
     length is at most c = 2^max(0, 1/p - 1/2). So the square of the length of the whole gradient is
     at most c^2 u^(2q-2) + v^(2q-2). For q >= 2 both powers are at most u^q and v^q, whose sum is 1;
     so the square is at most c^2, as c >= 1. For q < 2, Hoelder's inequality with the exponents
-    q/(2q-2) and q/(2-q) gives (c^m + 1)^(2/m) with m = 2q/(2-q). All these bounds are attained.
-    The root is computed as c (1 + c^-m)^(1/m), as c^m overflows if q is just below 2. The result
-    has an error of a few roundings, for which callers have to increase it. (Hart's constant, 1996,
+    q/(2q-2) and q/(2-q) gives (c^m + 1)^(2/m) with m = 2q/(2-q). All these bounds are attained. The
+    root is computed as c (1 + c^-m)^(1/m), as c^m overflows if q is just below 2. The result has an
+    error of a few roundings, for which callers have to increase it. (Hart's constant, 1996,
     equation 31, is right only for p = q < 2, or p >= 2 and q >= 2.)
     """
     c = 2.0 ** max(0.0, 1.0 / p - 0.5)
@@ -340,9 +357,9 @@ def lipschitz_of_norms(p: float, q: float) -> float:
 
 
 def _checked_powers(powers: Any, name: str) -> tuple[float, float]:
-    """The two powers (p, q) as numbers.
+    """Check the powers of a superquadric, and return them as two numbers (p, q).
 
-    name: of the shape, for messages.
+    name: the name of the shape, for messages.
 
     Raises:
         ValueError: not two numbers, or a power below 1.
@@ -360,8 +377,8 @@ def _checked_powers(powers: Any, name: str) -> tuple[float, float]:
 
 
 class _Powered(FormulaSolid):
-    """A shape whose formula has powers. They are literals of its kernel, and not kernel parameters,
-    so that other powers compile another kernel."""
+    """A solid whose formula has powers p and q, the exponents of norms. In a kernel they are
+    literals, not parameters, so that other powers compile another kernel."""
 
     powers: tuple[float, float]
 
@@ -373,14 +390,14 @@ class _Powered(FormulaSolid):
 
 @dataclass(frozen=True)
 class Superellipsoid(_Powered):
-    """The points with | (|(x/a, y/b)|_p, z/c) |_q <= 1, where |.|_p is the p-norm.
+    """The points with | (|(x/a, y/b)|_p, z/c) |_q <= 1, where |.|_p is the p-norm. f = m (that norm
+    - 1), where m is the smallest of the radii (Hart, equations 28 to 30).
 
     powers: (p, q), each at least 1.
     radii: (a, b, c).
 
-    f = m (that norm - 1), with m the smallest radius (Hart, equations 28 to 30). For equal radii
-    its Lipschitz constant is that of the norm (`lipschitz_of_norms`); for other radii it is no
-    larger.
+    For equal radii the Lipschitz constant of f is that of the norm (`lipschitz_of_norms`); for
+    other radii it is no larger.
     """
 
     is_convex = True
@@ -407,7 +424,8 @@ class Superellipsoid(_Powered):
 
 @dataclass(frozen=True)
 class Supertorus(_Powered):
-    """The points with | (|(x, y)|_p - major, z) |_q <= minor, where |.|_p is the p-norm.
+    """The points with | (|(x, y)|_p - major, z) |_q <= minor, where |.|_p is the p-norm. f is that
+    norm minus `minor`.
 
     powers: (p, q), each at least 1.
     major: the radius of the central curve, in the p-norm.

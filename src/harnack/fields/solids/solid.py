@@ -1,9 +1,9 @@
-"""Solids: the points at which a function is not positive; and the operators that combine and move
-them.
-
-`Solid` is the base of all solids, `FormulaSolid` that of solids with a formula, and `SolidOfField`
-that of solids made of another field. `SpaceMap` is the base of maps of space.
-"""
+"""The base classes of solids. A solid is the set of points where its function f is not positive: f
+< 0 inside, f = 0 on the surface, f > 0 outside. Solids are combined by operators (union,
+intersection, difference), and moved and deformed by maps of space; the solids that are combined are
+called operands, or parts. `Solid` is the base of all solids, `FormulaSolid` that of solids whose f
+is a formula, and `SolidOfField` that of solids made of another field. `SpaceMap` is the base of
+maps of space."""
 
 from __future__ import annotations
 
@@ -36,8 +36,12 @@ Point = tuple[float, float, float]
 
 
 def box_around(half: tuple[float, float, float], center: Any = (0.0, 0.0, 0.0)) -> Volume:
-    """The box with the half sides `half` about a center, enlarged by `_EXTENT_MARGIN`. Negative
-    half sides count as 0."""
+    """The box around a center with the half sides `half`, enlarged by `_EXTENT_MARGIN` for
+    rounding. Negative half sides count as 0.
+
+    half: (3,) half of the side along each axis.
+    center: (3,).
+    """
     sizes = [
         max(h, 0.0) + _EXTENT_MARGIN * (abs(h) + abs(c)) for h, c in zip(half, center, strict=True)
     ]
@@ -47,13 +51,15 @@ def box_around(half: tuple[float, float, float], center: Any = (0.0, 0.0, 0.0)) 
 
 
 def ball_around(center: tuple[float, float, float], radius: float) -> Volume:
-    """The ball about a center, enlarged by `_EXTENT_MARGIN`. A negative radius counts as 0."""
+    """The ball around a center, enlarged by `_EXTENT_MARGIN` for rounding. A negative radius counts
+    as 0."""
     slack = _EXTENT_MARGIN * (abs(radius) + sum(abs(c) for c in center)) + 1e-30
     return Ball(center, max(radius, 0.0) + slack)
 
 
 def set_frozen(shape: Any, name: str, value: Any) -> None:
-    """Set an attribute of a shape that is a frozen dataclass."""
+    """Set an attribute of a solid although its class is a frozen dataclass, whose attributes cannot
+    be set in the usual way."""
     object.__setattr__(shape, name, value)
 
 
@@ -61,16 +67,16 @@ AXES = {"x": 0, "y": 1, "z": 2}
 
 
 class SpaceMap(abc.ABC):
-    """A one-to-one map of space."""
+    """A one-to-one map of space, such as a rotation or a twist, that can be applied to solids."""
 
     @abc.abstractmethod
     def apply(self, solid: Solid) -> Solid:
         """The image of a solid under the map. It is called only for solids that are not
-        combinations of other solids; a combination is mapped operand by operand."""
+        combinations of other solids, because a combination is mapped operand by operand."""
 
 
 def axis_index(axis: str) -> int:
-    """The index of an axis: 0, 1 or 2 for "x", "y" or "z".
+    """The index of a coordinate axis: 0, 1 or 2 for "x", "y" or "z".
 
     Raises:
         ValueError: another name.
@@ -93,14 +99,16 @@ def not_a_solid(other: Any) -> str:
 
 
 def _with_source(prepare: Callable[[Any, Backend], Field]) -> Callable[[Any, Backend], Field]:
-    """Wrap a method `prepare` so that the prepared solid keeps a reference to the original in its
-    attribute `_source`."""
+    """Decorator of the method `prepare` of a solid: the prepared solid, whose numbers lie on a
+    backend, keeps a reference to the original in its attribute `_source`. Python knows the
+    original's numbers, from which `Solid.extent` is computed."""
 
     @functools.wraps(prepare)
     def remembering(self: Any, backend: Backend) -> Field:
         """The prepared solid, with the original in its attribute `_source`."""
         prepared = prepare(self, backend)
         if prepared is not self:
+            # If `self` is already prepared, its own original is passed on.
             object.__setattr__(prepared, "_source", vars(self).get("_source", self))
         return prepared
 
@@ -108,11 +116,15 @@ def _with_source(prepare: Callable[[Any, Backend], Field]) -> Callable[[Any, Bac
 
 
 class Solid(Field):
-    """A solid: the points where f <= 0. Its boundary is the level 0.
+    """A solid: the points where its function f is at most 0. Its surface is the level set f = 0. A
+    solid is also a field, so samples of f give its value and gradient at a point, with proved
+    bounds of f near the point. A combination (union, intersection, difference) is made of other
+    solids, its operands.
 
     Solids are combined by operators: `a | b` (union), `a & b` (intersection), `a - b` (difference)
-    and `~a` (complement). They are moved and deformed by methods. Every step is proved from
-    enclosures of the operands, never from a distance, since f of a combination is not a distance.
+    and `~a` (complement). They are moved and deformed by methods. Steps of rays are proved from
+    enclosures of the operands (bounds of their change along the ray), never from a distance, since
+    f of a combination is not a distance.
 
     lipschitz: a proved bound of |grad f| everywhere; None if no such bound is known. Outside of the
         solid f/lipschitz is a lower bound of the distance (Hart 1996, definition 3).
@@ -124,28 +136,36 @@ class Solid(Field):
 
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
         """A volume that is proved to contain all points where f <= level or, if `above`, all points
-        where f >= level. None if no such volume is known."""
+        where f >= level. None if no such volume is known.
+
+        The default is the domain.
+        """
         del level, above
         return self.domain
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
+        """A volume that is proved to contain the level sets of f at these levels; None if none is
+        known. It is a volume that contains all points with f at most the highest level; if none is
+        known, one that contains all points with f at least the lowest level. A prepared solid asks
+        the original, whose numbers are known to Python."""
         original: Solid = vars(self).get("_source", self)
         return original.sublevel_extent(max(levels)) or original.sublevel_extent(
             min(levels), above=True
         )
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
-        """Wrap `prepare`: a prepared solid, whose numbers lie on a backend, keeps a reference to
-        the original."""
+        """Wrap the method `prepare` of a new subclass: a prepared solid keeps a reference to the
+        original."""
         super().__init_subclass__(**kwargs)
         if "prepare" in vars(cls):
             cls.prepare = _with_source(cls.prepare)  # type: ignore[method-assign]
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
-        """f at coordinates that are jets or Dr.Jit numbers.
+        """f at coordinates that are Dr.Jit numbers, or jets (ranges of numbers and of their
+        derivatives).
 
         Raises:
-            TypeError: f has no formula.
+            TypeError: f has no formula, as for this default.
         """
         del x, y, z
         raise TypeError(
@@ -155,8 +175,9 @@ class Solid(Field):
 
     @abc.abstractmethod
     def map_operands(self, change: Callable[[Solid], Solid]) -> Solid:
-        """The same combination of other operands (the solids that are combined): each operand is
-        replaced by change(operand). A solid that is not a combination is its own operand."""
+        """The same combination with each operand replaced by change(operand). (Operands are the
+        solids that are combined.) A solid that is not a combination is its own operand: the result
+        is change(self)."""
 
     # Combinations. Operands that are not solids are refused.
 
@@ -192,14 +213,15 @@ class Solid(Field):
         """The union with another solid, with a fillet where the surfaces meet; or, with
         intersect=True, the intersection with a rounded edge.
 
+        other: the other solid.
         radius: how far the fillet extends along both surfaces, where f is a distance.
         power: the exponent of the superellipse that the fillet is a part of: 2 for a circle, larger
             for a sharper corner (Hart 1996, appendix D.3, corrected).
 
         The fillet fills the space where both surfaces are near, whatever the angle between them.
-        Where faces are flush, as those of a plate and a rib of the same height, the blend bulges by
-        radius (1 - 2^(-1/power)), which is 0.29 radius for a circle. To avoid this, cut the bulge
-        off by a slab of the same height, here 10,
+        Where faces are flush, such as the faces of a plate and a rib of the same height, the blend
+        bulges by radius (1 - 2^(-1/power)), which is 0.29 radius for a circle. To avoid this, cut
+        the bulge off by a slab of the same height, here 10,
 
             plate.blended(rib, 2.0) & hk.Cuboid((60.0, 60.0, 10.0))
 
@@ -215,15 +237,15 @@ class Solid(Field):
 
     @no_derivatives
     def offset(self, distance: float) -> Solid:
-        """The points where f <= distance. Where f is a distance, the solid grows by this length, or
-        shrinks if it is negative."""
+        """The solid of the points where f <= distance. If f is a distance, the solid grows by this
+        length on all sides, or shrinks if it is negative."""
         from harnack.fields.solids.booleans import OffsetSolid
 
         return OffsetSolid(self, distance)
 
     @no_derivatives
     def shell(self, thickness: float) -> Solid:
-        """The hollow solid: the points where -thickness <= f <= 0. If f is a distance, as for a
+        """The hollow solid of the points where -thickness <= f <= 0. If f is a distance, as for a
         mesh, a sphere or an outline, this is a wall of that thickness inside of the surface.
 
         Raises:
@@ -245,8 +267,8 @@ class Solid(Field):
 
     @no_derivatives
     def rotated(self, degrees: float, axis: str | Sequence[float] = "z") -> Solid:
-        """The solid, rotated by an angle in degrees about an axis through the origin,
-        counter-clockwise as seen from the end of the axis.
+        """The solid, rotated about an axis through the origin by an angle in degrees,
+        counter-clockwise as seen from the positive end of the axis.
 
         axis: "x", "y", "z" or a vector (3,).
         """
@@ -256,20 +278,24 @@ class Solid(Field):
 
     @functools.cached_property
     def _ray_count_variants(self) -> TransientCache[tuple[int, ...], Solid]:
-        """The combinations made by `_for_rays` so far, by the identities (`id`) of their parts."""
+        """The combinations that `_for_rays` has made so far. The key of a combination is the tuple
+        of the identities (`id`) of its parts."""
         return TransientCache()
 
     def _for_rays(
         self, parts: Sequence[Field], count: int, make: Callable[[list[Field]], Solid]
     ) -> Field:
-        """The same combination of `parts`, each as it is for this number of rays
-        (`Field.for_ray_count`); this solid itself if no part changes. Combinations are cached, so
-        that nothing is prepared twice.
+        """The combination of the same kind as this solid, whose parts are prepared to be traced by
+        `count` rays: each part is replaced by part.for_ray_count(count) (`Field.for_ray_count`). If
+        no part changes, it is this solid itself. Combinations are cached, so that nothing is
+        prepared twice.
 
-        make: makes the combination from its parts.
+        parts: the parts of this solid.
+        make: a function that makes the combination from its parts.
         """
         variants = [part.for_ray_count(count) for part in parts]
-        key = tuple(map(id, variants))  # of objects that the solid keeps alive
+        # Fields are compared by identity: each part is an object that the solid keeps alive.
+        key = tuple(map(id, variants))
         if key == tuple(map(id, parts)):
             return self
         if key not in self._ray_count_variants:
@@ -282,8 +308,8 @@ class Solid(Field):
 
         factors: one factor, or one for each axis.
 
-        If all factors are equal, f is multiplied by them, so that a distance stays a distance.
-        Otherwise f is not multiplied.
+        If all factors are equal, f is multiplied by the factor too, so that a distance stays a
+        distance. Otherwise f is not multiplied.
         """
         from harnack.fields.solids.transforms import AffineMap
 
@@ -301,7 +327,8 @@ class Solid(Field):
 
     @no_derivatives
     def twisted(self, rate: float, axis: str = "z") -> Solid:
-        """The solid, twisted about an axis by `rate` degrees for each unit of length along it."""
+        """The solid, twisted about a coordinate axis: each cross section is rotated by `rate`
+        degrees for each unit of length along the axis."""
         from harnack.fields.solids.deformations import Twist
 
         return self._apply_map(Twist(math.radians(rate), axis))
@@ -310,7 +337,8 @@ class Solid(Field):
     def tapered(
         self, start: tuple[float, float], end: tuple[float, float], axis: str = "z"
     ) -> Solid:
-        """The solid, with its cross sections scaled along an axis.
+        """The solid, with its cross sections scaled by a factor that varies along a coordinate
+        axis.
 
         start, end: (position along the axis, scale there), for two positions. The scale is linear
             between them and constant beyond them. Scales are positive.
@@ -327,15 +355,16 @@ class Solid(Field):
 
 
 class SolidOfField(Solid):
-    """A solid whose function derives from that of another field.
+    """A solid whose function is made from the function of another field, the inner field, for
+    example by a change of sign. The solid takes over the inner field's settings for the tracer.
 
-    field: the other field. The solid takes over its settings for the tracer.
+    field: the inner field.
     """
 
     field: Any
 
     def _copy_settings(self, *names: str) -> None:
-        """Copy attributes of the inner field to this solid: its settings for the tracer, and the
+        """Copy attributes of the inner field to this solid: the settings for the tracer, and the
         further attributes with these names."""
         settings = (
             "has_variable_accuracy",
@@ -361,26 +390,28 @@ class SolidOfField(Solid):
         return self._with_inner(self.field.at_accuracy(detail))
 
     def _with_inner(self, inner: Field) -> Solid:
-        """The same solid, made of another field."""
+        """The same solid made of another inner field."""
         solid = copy.copy(self)
         object.__setattr__(solid, "field", inner)
         return solid
 
     def for_ray_count(self, count: int) -> Field:
         def make(parts: list[Field]) -> Solid:
-            """The same solid, made of the field parts[0]."""
+            """The same solid made of the inner field parts[0]."""
             return dataclasses.replace(cast("Any", self), field=parts[0])
 
         return self._for_rays([self.field], count, make)
 
     def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
-        """The bounds of the inner field, whose derivatives are the same up to their sign."""
+        """Two error bounds at p, of the gradient and of the Hessian: those of the inner field,
+        whose derivatives are the same up to their sign."""
         del sample
         return self.field.derivative_errors(p, self.field.evaluate(p))
 
 
 class FormulaSolid(Formula, Solid):
-    """A solid whose function is a formula of the coordinates."""
+    """A solid whose function f is a formula of the coordinates, its method `formula`. Value,
+    gradient and proofs follow from the formula."""
 
     def prepare(self, backend: Backend) -> Field:
         return super().prepare(backend)

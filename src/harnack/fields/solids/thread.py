@@ -1,5 +1,7 @@
-"""Screw threads: `Thread` is a profile wound along a helix, and `metric_thread` makes the metric
-threads of ISO."""
+"""Screw threads along the z axis as solids: `Thread` winds a profile along a helix, and
+`metric_thread` makes the metric threads of ISO. A profile is a polyline of points (z, r), where r
+is the distance from the axis; it is repeated along the axis with the pitch as its period. The
+function f of a thread is about the signed distance from its surface, negative inside."""
 
 from __future__ import annotations
 
@@ -42,8 +44,10 @@ _MAX_STARTS = 32
 
 @dataclass(frozen=True, eq=False)
 class Thread(Solid):
-    """An endless screw along the z axis. Its surface is made by a profile that moves along the axis
-    by `starts` pitches in each turn; the solid is all points nearer to the axis than the profile.
+    """An endless screw along the z axis. Its profile, a periodic polyline of points (z, r), moves
+    along the axis by `starts` pitches in each turn; the solid is all points nearer to the axis than
+    the profile. At a point p with the distance r from the axis, u is the position along the axis in
+    the coordinates of the profile, from which the turning has been subtracted.
 
     profile: (n, 2) points (z, r) of a polyline, at most 32. r is the distance from the axis and
         positive. z begins within half a pitch of 0 and rises by less than a pitch. From the last
@@ -72,8 +76,12 @@ class Thread(Solid):
     left_handed: bool = False
 
     def __post_init__(self) -> None:
-        """Check the arguments, and compute the numbers that the formula needs, with three periods
-        of the profile."""
+        """Check the arguments, and compute the numbers that the formula needs: three periods of the
+        profile, the lead, the smallest and largest radii, and the Lipschitz constant.
+
+        Raises:
+            ValueError, TypeError: arguments of another kind.
+        """
         set_frozen(self, "pitch", as_positive(self.pitch, "the pitch of a thread"))
         set_frozen(
             self,
@@ -106,12 +114,14 @@ class Thread(Solid):
         shifted = [(a + k * self.pitch, b) for k in (-1, 0, 1) for a, b in rows]
         shifted.append((rows[0][0] + 2 * self.pitch, rows[0][1]))
         set_frozen(self, "_points", tuple(shifted))
+        # The lead, divided by a full turn: u = z - _lead * angle.
         lead = self.starts * self.pitch * (-1 if self.left_handed else 1)
         set_frozen(self, "_lead", lead / (2 * math.pi))
         min_radius = min(b for _, b in rows)
         set_frozen(self, "_least", 0.5 * min_radius)
         max_radius = max(b for _, b in rows)
         set_frozen(self, "_most", max_radius)
+        # For the rounding error: a bound of the numbers in the computation of distances.
         set_frozen(self, "_size", max_radius + 2 * self.pitch * self.starts)
         slope = self.starts * self.pitch / (math.pi * min_radius)
         set_frozen(self, "lipschitz", math.hypot(1.0, slope) * (1 + 1e-6))
@@ -124,7 +134,8 @@ class Thread(Solid):
         return None
 
     def prepare(self, backend: Backend) -> Thread:
-        """The same thread with its numbers as kernel parameters."""
+        """The same thread with its numbers as kernel parameters of the backend (numbers that a
+        compiled kernel reads when it runs)."""
         prepared = with_device_numbers(self, backend)
         numbers: Any = cast("Any", self)
         points = tuple(
@@ -136,11 +147,13 @@ class Thread(Solid):
         return prepared
 
     def evaluate(self, p: Vec3) -> Sample:
-        """The sample at p: the signed distance of (r, u) from the profile, with u reduced to the
-        period from 0 to the pitch. Near the axis f is constant."""
+        """The sample at p: the signed distance of (r, u) from the profile, where u is reduced to
+        the period from 0 to the pitch. Near the axis (in the core) f is constant, and its gradient
+        0."""
         real, data = cast("Any", type(p.x)), cast("Any", self)
         epsilon = 2 * float(dr.epsilon(real))
         r = dr.sqrt(dr.fma(p.x, p.x, p.y * p.y))
+        # u, and then u in the period from 0 to the pitch.
         axial = p.z - dr.atan2(p.y, p.x) * data._lead
         axial = axial - dr.floor(axial / self.pitch) * self.pitch
         error = 8 * epsilon * (dr.abs(p.z) + r + data._size)
@@ -148,24 +161,28 @@ class Thread(Solid):
         sign = dr.select(is_outside, real(1), real(-1))
         distance, d_r, d_z, gradient_error = self._distance_with_gradient(r, axial, sign, error)
         value = sign * distance
+        # Where d < -m/2, in the docstring's symbols, f is -m/2.
         is_core = value <= -data._least
         value = dr.select(is_core, -data._least, value)
         d_r, d_z = (dr.select(is_core, 0, derivative) for derivative in (d_r, d_z))
+        # The unit vector away from the axis; 0 on the axis.
         divisor = dr.select(r > 0, r, 1)
         x, y = p.x / divisor, p.y / divisor
+        # The gradient in cylindrical coordinates, turned to x, y and z.
         tangential = -d_z * data._lead / divisor
         gradient = cast("Any", type(p))(d_r * x - tangential * y, d_r * y + tangential * x, d_z)
+        # A Dr.Jit array, with the number in each lane.
         constant = 0 * p.x + self.lipschitz
         gradient_error = dr.select(is_core, 0, gradient_error * constant + 16 * epsilon)
         return Sample(value, gradient, (Lipschitz(constant),), error, gradient_error)
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
-        """The sample of f at the ray parameter t, with enclosures: proved bounds of how f changes
-        along the ray, before and behind that point.
+        """The sample of f at the point of a ray with parameter t, with enclosures: proved bounds of
+        how f changes along the ray, in front of that point and behind it.
 
-        Both directions have the bounds that follow from the Lipschitz constant. The direction of
-        the ray also has an `OutsideCylinderEnclosure`: outside of the cylinder around the thread, f
-        is at least the distance from the cylinder.
+        Both directions have the bounds that follow from the Lipschitz constant. In front of the
+        point there is also an `OutsideCylinderEnclosure`: outside of the cylinder around the
+        thread, f is at least the distance from the cylinder.
 
         path: the ray.
         ahead, back: the lengths for which bounds are wanted; not used, as these hold everywhere.
@@ -173,6 +190,7 @@ class Thread(Solid):
         del ahead, back
         p, d = path.point(t), path.direction
         ray_sample = path.enclose(self.evaluate(p))
+        # This kind is in the sharpest choice of enclosures; otherwise others were asked for.
         if PiecewiseTaylorEnclosure not in path.proofs.kinds:
             return ray_sample
         numbers = cast("Any", self)
@@ -184,7 +202,7 @@ class Thread(Solid):
         return replace(ray_sample, forward=(*ray_sample.forward, cylinder))
 
     def _profile_radius(self, z: Real) -> Real:
-        """The r of the polyline at z, a coordinate from 0 to the pitch."""
+        """The r of the polyline at the position z along the axis, from 0 to the pitch."""
         height = 0 * z
         for (start_z, start_r), (end_z, end_r) in itertools.pairwise(self._corners()):
             r = start_r + (z - start_z) / (end_z - start_z) * (end_r - start_r)
@@ -192,22 +210,22 @@ class Thread(Solid):
         return height
 
     def _corners(self) -> tuple[tuple[Real, Real], ...]:
-        """The corners (z, r) of three periods of the profile, as tuples."""
+        """The corners (z, r) of three periods of the profile."""
         return cast("Any", self)._points
 
     def _distance_with_gradient(
         self, r: Real, z: Real, sign: Real, error: Real
     ) -> tuple[Real, Real, Real, Real]:
-        """The distance of the points (r, z) from the polyline, and the gradient of the signed
-        distance there.
+        """The distance of points (r, z) of the half-plane from the profile's polyline, and the
+        gradient of the signed distance there.
 
         sign: 1 for points outside, -1 inside.
-        error: a bound of the rounding of the distance. Points that are nearer count as points on
-            the polyline.
+        error: a bound of the rounding of the distance. Points that are nearer than this count as
+            points on the polyline.
 
-        Returns the distance; the derivatives of the signed distance by r and by z; and a bound of
-        the error of these derivatives. The gradient is the normal of the nearest edge, or the
-        direction away from the nearest vertex.
+        Returns the distance; the derivatives of the signed distance with respect to r and to z; and
+        a bound of the error of these derivatives. The gradient is the normal of the nearest edge,
+        or the direction away from the nearest vertex.
         """
         zero = 0 * r
         nearest, d_r, d_z, gradient_error = zero + dr.inf, zero, zero, zero
@@ -217,12 +235,16 @@ class Thread(Solid):
             inverse_length = dr.rsqrt(edge_z * edge_z + edge_r * edge_r)
             from_z, from_r = z - start_z, r - start_r
             fraction = (from_z * edge_z + from_r * edge_r) * inverse_length * inverse_length
+            # The nearest point of the edge, as a fraction of it; and the vector from there to the
+            # point.
             minus_t = -clamp(fraction, 0, 1)
             to_z, to_r = dr.fma(edge_z, minus_t, from_z), dr.fma(edge_r, minus_t, from_r)
             line_distance = dr.abs(from_r * edge_z - from_z * edge_r) * inverse_length
             is_inner = (fraction > 0) & (fraction < 1)
             distance = dr.select(is_inner, line_distance, dr.sqrt(to_z * to_z + to_r * to_r))
             is_nearer = distance < nearest
+            # If an inner point of the edge is nearest, or the distance is mere rounding, take the
+            # edge's normal.
             by_normal, scale = is_inner | (distance <= error), sign / distance
             for_r = dr.select(by_normal, edge_z * inverse_length, to_r * scale)
             for_z = dr.select(by_normal, -edge_r * inverse_length, to_z * scale)
@@ -235,12 +257,13 @@ class Thread(Solid):
 
 @dataclass(frozen=True)
 class OutsideCylinderEnclosure(Enclosure):
-    """An enclosure, along a path, of a function f that is, outside of an endless cylinder, at least
-    the distance from the cylinder.
+    """A proved bound of the change of f along a ray, for a function f that is, outside of an
+    endless cylinder about the z axis, at least the distance from the cylinder. The gaps are the
+    differences between f at the start and the next level below and above.
 
-    value, error: f at the start of the path, and a bound of its error.
-    r, radial_slope, square: the distance from the axis along the path is r(s) with r(s)^2 = r^2 + 2
-        radial_slope s + square s^2.
+    value, error: f at the start of the ray, and a bound of its error.
+    r, radial_slope, square: the distance r(s) from the axis at the length s along the ray is given
+        by r(s)^2 = r^2 + 2 radial_slope s + square s^2.
     radius: of the cylinder.
     constant: a Lipschitz constant of f.
 
@@ -260,8 +283,10 @@ class OutsideCylinderEnclosure(Enclosure):
     constant: Real
 
     def free_length(self, gaps: LevelGaps) -> Real:
-        """The length of the path on which f is proved to meet neither the level below nor the level
+        """The length of the ray on which f is proved to meet neither the level below nor the level
         above: the smaller of two lengths.
+
+        gaps: the differences between f at the start and these levels.
 
         The points at which f is at most the level below lie in the cylinder whose radius is larger
         by that level; the first length is the length up to this cylinder. The second length is the
@@ -269,11 +294,14 @@ class OutsideCylinderEnclosure(Enclosure):
         """
         level = self.value - gaps.below + self.error
         level_radius = self.radius + level
+        # With L the level below: r^2 - (R + L)^2, then the discriminant and the smaller root.
         excess = (self.r - level_radius) * (self.r + level_radius)
         squared, product = self.radial_slope * self.radial_slope, self.square * excess
         discriminant = squared - product + 1e-5 * (squared + dr.abs(product))
         root = excess / (dr.sqrt(fmax(discriminant, 0)) - self.radial_slope)
+        # A ray that moves away from the axis, or has no root, never reaches the cylinder.
         length = dr.select((self.radial_slope >= 0) | (discriminant < 0), dr.inf, root)
+        # Only for a level >= 0 and a start well outside of the cylinder.
         is_known = (
             (gaps.below <= self.value)
             & (excess > 1e-5 * level_radius * level_radius)
@@ -346,10 +374,12 @@ def metric_thread(
             f"its pitch, not {clearance:g}"
         )
     depth = 0.625 * math.sqrt(0.75) * pitch
+    # The clearance makes a bolt thinner, and the hole of a nut wider.
     sign = 1.0 if internal else -1.0
     crest, root = 0.5 * diameter + sign * clearance, 0.5 * diameter - depth + sign * clearance
     # Edges moved across themselves by c meet c tan(30 degrees) farther along, at both ends.
     shift = sign * clearance * math.tan(math.radians(30.0))
+    # The lengths along the axis of the flat crest, of a flank, and of the flat root.
     flat, flank, bottom = pitch / 8 + 2 * shift, 5 * pitch / 16, pitch / 4 - 2 * shift
     z = np.cumsum([-shift, flat, flank, bottom])
     thread = Thread(np.column_stack([z, [crest, crest, root, root]]), pitch, 1, left_handed)

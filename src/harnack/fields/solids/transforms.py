@@ -1,4 +1,8 @@
-"""Solids that are moved, rotated, scaled and sheared: affine maps of solids."""
+"""Affine maps of solids: solids that are moved, rotated, scaled or sheared. An affine map takes a
+point u to M u + b, with a matrix M (3, 3) and a vector b (3,). The preimage of a point p is the
+point M^-1 (p - b), which the map takes to p. A similarity is a map that multiplies all lengths by
+the same factor. The function f of the image of a solid, at p, is the function of the solid at the
+preimage of p, times a factor."""
 
 from __future__ import annotations
 
@@ -29,13 +33,14 @@ from harnack.fields.solids.solid import SpaceMap, axis_index
 
 @dataclass(frozen=True)
 class AffineMap(SpaceMap):
-    """The affine map u -> matrix u + translation_vector, in double precision.
+    """The affine map u -> matrix u + translation_vector, in double precision, which can be applied
+    to solids.
 
     matrix: (3, 3), row by row, not singular.
     translation_vector: (3,).
     value_factor: the factor by which the function of a solid is multiplied. For a similarity it is
-        the factor by which lengths grow; for other maps it is 1. For a composition of maps it is
-        the product of their factors.
+        the factor by which lengths grow, so that a distance stays a distance; for other maps it is
+        1. For a composition of maps it is the product of their factors.
     """
 
     matrix: tuple[tuple[float, ...], ...]
@@ -57,6 +62,7 @@ class AffineMap(SpaceMap):
             )
         if not (np.isfinite(m).all() and np.isfinite(b).all()):
             raise ValueError("matrix and offset must be finite")
+        # A map whose smallest singular value is relatively tiny counts as singular.
         sizes = np.linalg.svd(m, compute_uv=False)
         if not sizes[-1] > 1e-12 * sizes[0]:
             raise ValueError(
@@ -68,8 +74,12 @@ class AffineMap(SpaceMap):
 
     @classmethod
     def of_matrix(cls, matrix: npt.ArrayLike) -> AffineMap:
-        """A linear map from a matrix (3, 3), or an affine map from a matrix (3, 4), or (4, 4) whose
-        last row is (0, 0, 0, 1)."""
+        """The linear map with a matrix (3, 3); or the affine map with a matrix (3, 4), whose last
+        column is the translation, or (4, 4), whose last row must be (0, 0, 0, 1).
+
+        Raises:
+            ValueError: as `of_arrays`, or another last row.
+        """
         m = np.asarray(matrix, dtype=np.float64)
         if m.shape == (4, 4):
             if not np.array_equal(m[3], (0.0, 0.0, 0.0, 1.0)):
@@ -88,8 +98,8 @@ class AffineMap(SpaceMap):
 
     @classmethod
     def rotation(cls, degrees: float, axis: str | Sequence[float]) -> AffineMap:
-        """The rotation by an angle in degrees about an axis through the origin, counter-clockwise
-        as seen from the end of the axis, by Rodrigues' formula.
+        """The rotation about an axis through the origin by an angle in degrees, counter-clockwise
+        as seen from the positive end of the axis. The matrix is computed by Rodrigues' formula.
 
         axis: "x", "y", "z" or a vector (3,).
         """
@@ -104,6 +114,7 @@ class AffineMap(SpaceMap):
                     f'{axis!r}: write rotated(degrees, axis), such as rotated(30, "x")'
                 )
             unit = unit / length
+        # The matrix of the cross product with the axis, for Rodrigues' formula.
         angle = math.radians(float(degrees))
         k = np.cross(np.eye(3), unit)  # k v = unit x v
         turn = np.eye(3) + math.sin(angle) * k + (1 - math.cos(angle)) * (k @ k)
@@ -111,16 +122,17 @@ class AffineMap(SpaceMap):
 
     @classmethod
     def scaling(cls, factors: float | Sequence[float]) -> AffineMap:
-        """The scaling u -> factors u, by one factor or by one for each axis."""
+        """The scaling u -> factors u, by one positive factor, or by one for each axis."""
         sizes = np.asarray(factors, dtype=np.float64)
+        # Any other shape becomes NaN, which is refused below.
         sizes = np.broadcast_to(sizes if sizes.shape in ((), (3,)) else np.nan, (3,))
         if not (np.isfinite(sizes).all() and (sizes > 0).all()):
             raise ValueError(f"factors must be positive numbers, one or three, not {factors!r}")
         return cls.of_arrays(np.diag(sizes))
 
     def apply(self, solid: Solid) -> Solid:
-        """The image of a solid. If the solid is itself an image under an affine map, the two maps
-        are composed."""
+        """The image of a solid under this map. If the solid is itself the image of another under an
+        affine map, the two maps are composed to one."""
         if isinstance(solid, TransformedSolid):
             m, b = np.array(self.matrix), np.array(self.translation_vector)
             inner = solid.map
@@ -134,17 +146,19 @@ class AffineMap(SpaceMap):
 
     @property
     def inverse(self) -> FloatArray:
-        """The inverse matrix."""
+        """The inverse of the matrix."""
         return np.linalg.inv(np.array(self.matrix))
 
     @property
     def similarity(self) -> float | None:
-        """The factor by which the map multiplies all lengths; None if it is not a similarity."""
+        """The factor by which the map multiplies all lengths; None if it multiplies them by
+        different factors."""
         return _length_factor(np.array(self.matrix))
 
     def volume(self, volume: Volume | None) -> Volume | None:
-        """A volume that contains the image of `volume` under the map; None if `volume` is None or
-        has no bounds."""
+        """A volume that contains the image of `volume` under the map: a ball for a ball and a
+        similarity, else the convex hull of the image of its box. None if `volume` is None or
+        unbounded. It is enlarged a little for rounding."""
         if volume is None:
             return None
         m, b = np.array(self.matrix), np.array(self.translation_vector)
@@ -158,6 +172,7 @@ class AffineMap(SpaceMap):
         lower, upper = volume.bounds()
         if not (np.isfinite(lower).all() and np.isfinite(upper).all()):
             return None
+        # The image of a box is the convex hull of the images of its corners.
         corners = np.stack(np.meshgrid(*zip(lower, upper, strict=True)), axis=-1).reshape(-1, 3)
         image = corners @ m.T + b
         return ConvexHull.from_points(image).padded(1e-12 * float(np.abs(image).max()))
@@ -165,7 +180,8 @@ class AffineMap(SpaceMap):
 
 def _length_factor(m: FloatArray) -> float | None:
     """The factor by which the linear map with the matrix m (3, 3) multiplies all lengths; None if
-    it is not a similarity."""
+    it multiplies them by different factors. For a similarity m^T m is factor^2 times the identity
+    matrix."""
     factor = abs(float(np.linalg.det(m))) ** (1 / 3)
     deviation = np.abs(m.T @ m - factor**2 * np.eye(3)).max()
     return factor if deviation <= 1e-14 * factor**2 else None
@@ -173,12 +189,13 @@ def _length_factor(m: FloatArray) -> float | None:
 
 @dataclass(frozen=True, eq=False)
 class TransformedSolid(SolidOfField):
-    """The image of a solid under an affine map u -> M u + b. f is that of the solid at the
-    preimage, times the map's `value_factor`.
+    """The image of a solid, the inner solid, under an affine map u -> M u + b. f at p is the inner
+    solid's function at the preimage M^-1 (p - b), times the map's `value_factor`. Along a ray, the
+    inner solid is sampled along the straight line of the preimages.
 
-    Proof. The ray o + t d is the image of the straight path M^-1 (o - b) + t M^-1 d, along which
-    the solid is sampled. A length on the ray is |M^-1 d| times as large on that path
-    (`ScaledEnclosure`). The coordinates on the path are rounded by a few units in the last place of
+    Proof. The ray o + t d is the image of the straight line M^-1 (o - b) + t M^-1 d, along which
+    the inner solid is sampled. A length on the ray is |M^-1 d| times as large on that line
+    (`ScaledEnclosure`). The coordinates on the line are rounded by a few units in the last place of
     the sum of the absolute values of their terms; this enters the error of the value.
     """
 
@@ -186,8 +203,14 @@ class TransformedSolid(SolidOfField):
     map: AffineMap
 
     def __post_init__(self) -> None:
-        """Set the attributes that follow from those of the inner solid and from the map."""
+        """Set the attributes that follow from the inner solid and from the map: the domain, the
+        Lipschitz constant, and the settings for the tracer.
+
+        Raises:
+            ValueError: the domain of the inner solid has no bounds.
+        """
         self._copy_settings()
+        # The domain is mapped; a domain without bounds cannot be.
         domain = self.map.volume(self.field.domain)
         if self.field.domain is not None and domain is None:
             raise ValueError(
@@ -197,6 +220,8 @@ class TransformedSolid(SolidOfField):
         object.__setattr__(self, "domain", domain)
         numbers = _InverseMap.of(self.map)
         object.__setattr__(self, "_numbers", numbers)
+        # Preimages are at most `stretch` times as far apart as the points, so slopes grow by that
+        # factor.
         constant = self.field.lipschitz
         lipschitz = None if constant is None else constant * numbers.stretch * numbers.factor
         object.__setattr__(self, "lipschitz", lipschitz)
@@ -227,22 +252,26 @@ class TransformedSolid(SolidOfField):
         return self._image_sample(self.field.evaluate(local), self._term_bound(p, 0.0))
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
+        """The rows of the Hessian of f at p: M^-T H M^-1 times the value factor, where H is the
+        Hessian of the inner solid at the preimage of p."""
         numbers = self.numbers
         rows = self.field.hessian(type(p)(*numbers.local(p.x, p.y, p.z)))
-        columns = [numbers.pull_back(row) for row in rows]  # H M^-1
+        # Each row r of H becomes M^-T r; with the same for the columns, the result is M^-T H M^-1.
+        columns = [numbers.pull_back(row) for row in rows]
         product = [numbers.pull_back(type(p)(*(columns[j][k] for j in range(3)))) for k in range(3)]
         x, y, z = (vector * numbers.factor for vector in product)
         return x, y, z
 
     def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
-        """Two bounds at p, of the errors of the gradient and of the Hessian. For a solid with a
-        formula they follow from the ranges of the formula. For any other solid they are the bounds
-        of the inner solid at the preimage of p, scaled. These leave out the effect of the rounding
-        of the preimage, which is not known."""
+        """Two error bounds at p, of the gradient and of the Hessian. For an inner solid with a
+        formula they follow from the ranges of the formula. For any other inner solid they are its
+        own bounds at the preimage of p, scaled. These leave out the effect of the rounding of the
+        preimage, which is not known."""
         del sample
         numbers = self.numbers
         local = type(p)(*numbers.local(p.x, p.y, p.z))
         first, second = self.field.derivative_errors(local, self.field.evaluate(local))
+        # The gradient is multiplied by M^-T and the factor, the Hessian by M^-T twice.
         first = first * numbers.stretch * numbers.factor
         if not isinstance(self.field, FormulaSolid):
             return first, second * numbers.stretch * numbers.stretch * numbers.factor
@@ -253,49 +282,67 @@ class TransformedSolid(SolidOfField):
         return first + sum(rate.radius for rate in jet.first_derivatives), hessian_error(jet, p.x)
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
-        """The ray sample, from that of the inner solid on the path of the preimages, whose
-        direction is made a unit vector."""
+        """The sample at the point of a ray with parameter t, with enclosures (proved bounds of the
+        change of f along the ray) in front of the point and behind it. It is made from the ray
+        sample of the inner solid on the line of the preimages.
+
+        path: the ray.
+        ahead, back: the lengths in front of and behind the point up to which enclosures are useful.
+        """
         numbers, vector = self.numbers, cast("Any", type(path.origin))
         o, d = path.origin, path.direction
         direction = vector(*numbers.local_direction(d.x, d.y, d.z))
+        # The preimage moves this much for each unit of length on the ray; the inner ray has a unit
+        # direction, so lengths on it are multiplied by the speed.
         speed = safe_norm(direction)
         inner_ray = Ray(vector(*numbers.local(o.x, o.y, o.z)), direction / speed, path.proofs)
-        look = self.field.sample_ray(inner_ray, t * speed, ahead * speed, back * speed)
-        sample = self._image_sample(look.sample, self._term_bound(o, t))
+        ray_sample = self.field.sample_ray(inner_ray, t * speed, ahead * speed, back * speed)
+        sample = self._image_sample(ray_sample.sample, self._term_bound(o, t))
 
         def stretched(enclosures: tuple[Any, ...]) -> tuple[Any, ...]:
-            """The enclosures along the ray from those along the path of its preimages."""
+            """The enclosures along the ray from those along the line of the preimages."""
             return tuple(
                 ScaledEnclosure(enclosure, speed, numbers.factor) for enclosure in enclosures
             )
 
-        slope = look.slope * speed * numbers.factor
-        forward, backward = stretched(look.forward), stretched(look.backward)
-        error = None if look.slope_error is None else look.slope_error * speed * numbers.factor
-        return RaySample(sample, forward, backward, slope, look.reach_growth, error)
+        slope = ray_sample.slope * speed * numbers.factor
+        forward, backward = stretched(ray_sample.forward), stretched(ray_sample.backward)
+        error = (
+            None
+            if ray_sample.slope_error is None
+            else ray_sample.slope_error * speed * numbers.factor
+        )
+        return RaySample(sample, forward, backward, slope, ray_sample.reach_growth, error)
 
     def _term_bound(self, p: Vec3, t: Real) -> Real:
         """A bound of the absolute values of the terms in the sums that are the coordinates of the
-        preimage of p + t d."""
+        preimage of p + t d, for any unit direction d. The rounding error of the preimage is
+        proportional to it."""
         numbers = self.numbers
         return numbers.stretch * (max_norm(p) + numbers.offset_size + t) * math.sqrt(3)
 
     def _image_sample(self, sample: Sample, term_bound: Real) -> Sample:
-        """The sample of the image from that of the inner solid at the preimage.
+        """The sample of the image at a point, from the sample of the inner solid at the preimage of
+        the point.
 
-        term_bound: a bound of the terms of the preimage's coordinates (`_term_bound`).
+        term_bound: a bound of the terms in the preimage's coordinates (`_term_bound`), for the
+            rounding error.
         """
         numbers = self.numbers
         epsilon = 2 * float(dr.epsilon(type(sample.value)))
+        # The change of the inner function by the rounding of the preimage.
         rounding = 8 * epsilon * term_bound * safe_norm(sample.gradient)
         factor, stretch = numbers.factor, numbers.stretch
 
         def image_of_promise(promise: Promise) -> Promise:
-            """The promise of the image from a promise of the inner solid."""
+            """A proved bound of the image's function near the point, from such a bound of the inner
+            solid's function. If the map is no similarity, harmonic functions do not stay harmonic,
+            so such bounds are weakened first."""
             if self.map.similarity is None:
                 promise = promise.weakened_for_linear_maps(sample.value)
             return promise.scaled(factor).linearly_mapped(stretch)
 
+        # By the chain rule gradients are multiplied by M^-T.
         return sample.map_promises(
             image_of_promise,
             value=sample.value * factor,
@@ -310,12 +357,14 @@ class TransformedSolid(SolidOfField):
 
 @dataclass(frozen=True)
 class _InverseMap:
-    """The inverse of an affine map u -> M u + b, as kernels use it.
+    """The inverse of an affine map u -> M u + b, in the form that kernels use: it takes a point p
+    to its preimage M^-1 (p - b).
 
     rows: the rows of M^-1.
     translation_vector: b.
-    stretch: the largest singular value of M^-1, rounded up.
-    factor: the factor by which f is multiplied.
+    stretch: the largest singular value of M^-1, rounded up: a bound of how much the inverse map
+        stretches lengths.
+    factor: the factor by which the function f of a solid is multiplied.
     offset_size: the largest absolute value of a component of b.
     """
 
@@ -339,10 +388,12 @@ class _InverseMap:
         )
 
     def prepare(self, backend: Backend) -> _InverseMap:
-        """The same map with the entries of its matrix and its vector as kernel parameters. Entries
-        that are 0 or 1 stay Python numbers: then their terms or products are left out of the
-        kernel, which saves most of the work."""
+        """The same map with the entries of its matrix and its vector as kernel parameters of the
+        backend (numbers that a compiled kernel reads when it runs). Entries that are 0 or 1 stay
+        Python numbers: then their terms or products are left out of the kernel, which saves most of
+        the work."""
         prepared = with_device_numbers(self, backend)
+        # The three rows and, as a fourth, the translation.
         rows = tuple(
             tuple(a if a in (0.0, 1.0) else b for a, b in zip(old, new, strict=True))
             for old, new in zip(
@@ -363,19 +414,20 @@ class _InverseMap:
         return self.local_direction(a, b, c)
 
     def local_direction(self, x: Any, y: Any, z: Any) -> tuple[Any, Any, Any]:
-        """The preimage M^-1 d of a direction."""
+        """The preimage M^-1 d of a direction d = (x, y, z)."""
         u, v, w = (_weighted_sum(row, (x, y, z)) for row in self.rows)
         return u, v, w
 
     def pull_back(self, g: Vec3) -> Vec3:
-        """M^-T g: the gradient of f(M^-1 p), if g is the gradient of f."""
+        """The vector M^-T g. If g is the gradient of a function f, this is the gradient of f(M^-1
+        p) by p."""
         columns = (tuple(row[i] for row in self.rows) for i in range(3))
         return type(g)(*(_weighted_sum(column, (g.x, g.y, g.z)) for column in columns))
 
 
 def _weighted_sum(weights: tuple[Any, ...], terms: tuple[Any, ...]) -> Any:
     """The sum of the terms times their weights. Terms whose weight is the Python number 0 are left
-    out; None if all terms are left out."""
+    out, and factors that are the Python number 1. None if all terms are left out."""
     total: Any = None
     for weight, term in zip(weights, terms, strict=True):
         if _is_literal(weight, 0.0):
@@ -386,5 +438,6 @@ def _weighted_sum(weights: tuple[Any, ...], terms: tuple[Any, ...]) -> Any:
 
 
 def _is_literal(x: Any, number: float) -> bool:
-    """Whether x is a Python float that equals `number`; False for a kernel parameter."""
+    """Whether x is a Python float that equals `number`; False for a kernel parameter, whose value
+    is not known while a kernel is recorded."""
     return isinstance(x, float) and x == number

@@ -1,5 +1,9 @@
-"""Tubes: `Tube` around polylines and cubic Bezier curves, `TubeNetwork` around a large number of
-separate segments."""
+"""Tubes: the points within a radius of line segments. `Tube` is a single solid around polylines and
+cubic Bezier curves; its function f is the signed distance from its surface, which is the distance D
+from the nearest segment minus the radius. `TubeNetwork` is a surface of a large number of separate
+tubes, one for each segment. An enclosure is a proved bound of the change of a function along a ray.
+Bounds along a ray are computed at knots, which are increasing lengths along it; the last may be
+infinite. Segments are read by loops, as records of numbers."""
 
 from __future__ import annotations
 
@@ -54,16 +58,19 @@ _ENDLESS_LENGTH = 8.0
 
 @dataclass(frozen=True, eq=False)
 class Tube(Solid):
-    """A tube: the points within `radius` of a polyline.
+    """A tube: the points within `radius` of a polyline, or of several polylines. f is the signed
+    distance from its surface: the distance from the nearest segment of the polylines minus the
+    radius.
 
     points: (n, 3) the vertices of the polyline in order. Repeat the first to close it.
+    radius: of the tube.
     starts: indices of vertices at which another polyline starts, which is not joined to the one
         before: see `from_polylines`.
     flattening_error: if the polyline stands for a curve, a bound of the distance between the two,
         and so of the distance between the surfaces: see `bezier`.
 
-    f is the signed distance, with the Lipschitz constant 1 (Hart 1996, equations 32 to 35, for
-    cubic Bezier curves). Along a path a stronger bound is proved: see `TangentEnclosure`.
+    f has the Lipschitz constant 1 (Hart 1996, equations 32 to 35, for cubic Bezier curves). Along a
+    ray a stronger bound is proved: see `TangentEnclosure`.
     """
 
     points: FloatArray
@@ -74,7 +81,12 @@ class Tube(Solid):
     lipschitz = 1.0
 
     def __post_init__(self) -> None:
-        """Check the arguments, and leave out points that repeat the point before."""
+        """Check the arguments, and leave out points that repeat the point before.
+
+        Raises:
+            ValueError, TypeError: arguments of another kind, or a polyline of fewer than two
+                different points.
+        """
         array = as_real_array(self.points, "the points of a tube")
         check_vectors(array, "the points of a tube")
         points = np.array(array, dtype=np.float64)
@@ -86,6 +98,7 @@ class Tube(Solid):
         starts = [as_integer_in_range(start, "each start", 0, len(points)) for start in self.starts]
         if not 0 <= as_real(self.flattening_error, "flattening_error") < math.inf:
             raise ValueError(f"flattening_error must be a length, not {self.flattening_error!r}")
+        # Split at the starts of polylines, and leave out repeated points of each polyline.
         for part in np.split(points, starts):
             if len(part):
                 differs = np.any(part[1:] != part[:-1], axis=1)
@@ -94,6 +107,7 @@ class Tube(Solid):
                 raise ValueError("a tube needs two points or more that differ: use Sphere for one")
             parts.append(part)
         points = np.concatenate(parts)
+        # The indices at which polylines start, after points were left out.
         ends = np.cumsum([len(part) for part in parts])[:-1]
         object.__setattr__(self, "starts", tuple(int(end) for end in ends))
         points.setflags(write=False)
@@ -103,9 +117,10 @@ class Tube(Solid):
     @classmethod
     def from_polylines(cls, polylines: Iterable[npt.ArrayLike], radius: float) -> Tube:
         """One tube around several polylines: the points within `radius` of any of them. It has a
-        single distance function.
+        single function f.
 
-        polylines: arrays (n_i, 3).
+        polylines: arrays (n_i, 3) of vertices.
+        radius: of the tube.
 
         Raises:
             ValueError: no polylines, or an array that is not a polyline.
@@ -126,9 +141,10 @@ class Tube(Solid):
         cls, controls: npt.ArrayLike, radius: float, *, tolerance: float | None = None
     ) -> Tube:
         """The tube around a chain of cubic Bezier curves, each of which starts where the one before
-        ends.
+        ends. The curves are approximated by segments.
 
         controls: (3 n + 1, 3) control points of n curves; two curves meet at every third point.
+        radius: of the tube.
         tolerance: the largest distance allowed between the surface and the exact surface, in units
             of length; None for a thousandth of the radius. The number of segments grows like the
             inverse of its square root.
@@ -149,6 +165,7 @@ class Tube(Solid):
         check_finite(points, "control point {}", ValueError)
         radius = as_positive(radius, "the radius of a tube")
         allowed = 1e-3 * radius if tolerance is None else as_positive(tolerance, "the tolerance")
+        # The first point of each curve is the last of the one before.
         pieces = [points[:1]]
         max_error = 0.0
         for start in range(0, len(points) - 1, 3):
@@ -163,9 +180,9 @@ class Tube(Solid):
         left_handed: bool = False, tolerance: float | None = None,
     ) -> Tube:  # fmt: skip
         """A coil of round wire about the z axis. The middle of the wire is a helix from (radius, 0,
-        0) to z = pitch turns; the ends of the wire are round.
+        0) to z = pitch turns, which is approximated by segments. The ends of the wire are round.
 
-        radius: of the helix.
+        radius: the radius of the helix.
         pitch: how far the helix rises along the axis in each turn.
         turns: the number of turns.
         wire: the radius of the wire.
@@ -173,8 +190,8 @@ class Tube(Solid):
         tolerance: the largest distance allowed between the surface and the exact surface, in units
             of length; None for a thousandth of the wire's radius.
 
-        Proof. The helix c is parametrized by the angle, so that |c''| is the radius. A chord
-        between two angles that differ by h is within h^2/8 max |c''| of the helix.
+        Proof of the error. The helix c is parametrized by the angle, so that |c''| is the radius. A
+        chord between two angles that differ by h is within h^2/8 max |c''| of the helix.
 
         Raises:
             ValueError: numbers that are not positive, or more than a million segments.
@@ -183,6 +200,7 @@ class Tube(Solid):
         pitch, turns = as_positive(pitch, "the pitch of a helix"), as_positive(turns, "its turns")
         allowed = 1e-3 * wire if tolerance is None else as_positive(tolerance, "the tolerance")
         angle = 2 * math.pi * turns
+        # The number of segments for which radius h^2/8 is the allowed error.
         count = max(1.0, angle * math.sqrt(radius / (8.0 * allowed)))
         if not count <= _MOST_SEGMENTS:
             raise ValueError(f"{count:,.0f} segments: allow a larger tolerance")
@@ -200,6 +218,9 @@ class Tube(Solid):
         return {"segments": segments, "flattening_error": self.flattening_error}
 
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+        """A box that contains all points where f <= level: the box of the points, grown by radius
+        and level on each side. None if `above` (a volume for all points where f >= level), as these
+        points are unbounded."""
         if above:
             return None
         lower, upper = self.points.min(axis=0), self.points.max(axis=0)
@@ -209,10 +230,11 @@ class Tube(Solid):
 
     @cached_prepare
     def prepare(self, backend: Backend) -> Tube:
-        """The same tube with its segments as records of the backend. If there are many, they are
+        """The same tube with its segments as records on the backend. If there are many, they are
         grouped, and each group has a ball around it."""
         prepared = copy.copy(self)
         is_segment = np.ones(len(self.points) - 1, dtype=np.bool_)
+        # The last vertex of a polyline is not joined to the first of the next.
         is_segment[[vertex - 1 for vertex in self.starts]] = False
         start, segment = self.points[:-1][is_segment], np.diff(self.points, axis=0)[is_segment]
         rows = np.column_stack([start, segment, 1.0 / np.sum(segment * segment, axis=1)])
@@ -231,20 +253,28 @@ class Tube(Solid):
         return self._sample_with_bounds(p, None, ())[0]
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
-        """The ray sample, whose enclosure is a `TangentEnclosure`. It has no enclosure looking
-        back. If the caller asks for other kinds of enclosures, those of the Lipschitz constant are
-        used."""
+        """The sample at the point of a ray with parameter t, with an enclosure (a proved bound of
+        the change of f along the ray) in front of the point, up to the length `ahead`; there is
+        none behind it. It is a `TangentEnclosure`. If the caller asks for other kinds of
+        enclosures, they follow from the Lipschitz constant 1.
+
+        path: the ray.
+        ahead, back: the lengths in front of and behind the point; `back` is not used.
+        """
         del back
         p = path.point(t)
+        # This kind is in the sharpest choice of enclosures; otherwise others were asked for.
         if PiecewiseTaylorEnclosure not in path.proofs.kinds:
             return path.enclose(self.evaluate(p))
         if not hasattr(self, "_records"):
             return self.prepare(backend_of(p)).sample_ray(path, t, ahead, ahead)
+        # If `ahead` is infinite, the inner knots are fractions of another length.
         endless_length = _ENDLESS_LENGTH * (max_norm(p) + self._parameter("_size"))
         length = dr.select(dr.isfinite(ahead), ahead, endless_length)
         knots = (*(fraction * length for fraction in _KNOT_FRACTIONS), ahead)
         sample, distance, bounds = self._sample_with_bounds(p, path.direction, knots)
         slope = dr.dot(sample.gradient, path.direction)
+        # A distance grows no faster than the length.
         max_slope = fmin(slope + sample.gradient_error, 1.0)
         return RaySample(
             sample, (TangentEnclosure(distance, max_slope, knots, bounds),), (), slope, 4.0
@@ -253,10 +283,10 @@ class Tube(Solid):
     def _sample_with_bounds(
         self, p: Vec3, direction: Vec3 | None, knots: tuple[Real, ...]
     ) -> tuple[Sample, Real, tuple[Real, ...]]:
-        """The sample at p; the distance D of p from the polyline; and, for each knot, a lower bound
-        of the distance at p + knot direction minus D.
+        """The sample of f at p; the distance D of p from the nearest segment; and, for each knot, a
+        lower bound of the change of the distance from p to the point p + knot direction.
 
-        direction: the unit vectors of lines from p; None if there are no knots.
+        direction: the unit directions of lines from p; None if there are no knots.
         knots: increasing lengths along these lines; the last may be infinite.
         """
         if not hasattr(self, "_records"):
@@ -266,11 +296,14 @@ class Tube(Solid):
         records: RecordTable = cast("Any", self)._records
 
         def add_segment(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
-            """The state of the loop over segments after the segment of the record `row` was added.
+            """The state of the loop over segments after one more segment.
 
-            The state consists of the distance from the nearest segment, the three components of the
-            vector from its nearest point to p, the largest rounding error of such a vector, and for
-            each knot the smallest value there of the tangents of the distances from the segments.
+            row: the record of the segment: its start (3), the vector to its end (3), and 1 /
+                length^2.
+            state: the state before: the distance from the nearest segment so far, the three
+                components of the vector from its nearest point to p, the largest rounding error of
+                such a vector, and for each knot the smallest value there of the tangents of the
+                distances from all segments so far.
             """
             nearest, x, y, z, max_rounding, *bounds = state
             from_start, segment = p - vector(*row[:3]), vector(*row[3:6])
@@ -280,6 +313,7 @@ class Tube(Solid):
             # The error of the vector is a few roundings of its terms.
             rounding = 8 * epsilon * (dr.norm(from_start) + dr.norm(segment))
             if direction is not None:
+                # The slope of the distance along the line, lowered by its rounding error.
                 slope = dr.dot(away, direction) / distance - rounding / distance * 2
                 bounds = min_with_tangent(
                     bounds, knots, distance - rounding, slope, 4 * epsilon * distance, epsilon
@@ -293,6 +327,7 @@ class Tube(Solid):
             )
 
         zero = 0 * p.x
+        # The state before any segment.
         start = (zero + dr.inf, zero, zero, zero, zero, *(zero + dr.inf for _ in knots))
         groups: RecordTable | None = cast("Any", self)._groups
         if groups is None:
@@ -301,27 +336,32 @@ class Tube(Solid):
             final = _add_segments_by_groups(
                 p, direction, knots, records, groups, add_segment, start
             )
+        # The distance, the largest rounding error, and the vector from the nearest point to p.
         distance, error = final[0], final[4]
         away = vector(*final[1:4])
         gradient = dr.select(distance > 0, away / distance, vector(0))
         value = distance - self._parameter("_radius")
         error = error + 4 * epsilon * (distance + self._parameter("_radius"))
+        # The error of a unit vector is that of the vector over its length, and at most 2.
         gradient_error = dr.select(distance > 0, fmin(4 * error / distance, 2), 2)
         sample = Sample(value, gradient, (Lipschitz(zero + 1),), error, gradient_error)
         return sample, distance, tuple(bound - distance - error for bound in final[5:])
 
     def _parameter(self, name: str) -> Any:
-        """The attribute `name`, which is a number of the backend once the tube is prepared."""
+        """The attribute with this name, which is a number of the backend once the tube is
+        prepared."""
         return getattr(self, name)
 
 
 def _group_segments(records: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The records of segments in groups of `_GROUP_SIZE` consecutive segments; and for each group a
-    record of the center and the radius of a ball that contains its segments. The last group is
-    filled up with copies of the last segment.
+    """Put the records of segments into groups of `_GROUP_SIZE` consecutive segments. The last group
+    is filled up with copies of the last segment.
 
-    records: (n, 7), the start of each segment, the vector from its start to its end, and 1 /
+    records: (n, 7): for each segment its start, the vector from its start to its end, and 1 /
         length^2.
+
+    Returns the records of all groups; and for each group a record of the center and the radius of a
+    ball that contains its segments.
     """
     copy_count = -len(records) % _GROUP_SIZE
     records = np.concatenate([records, np.repeat(records[-1:], copy_count, axis=0)])
@@ -341,13 +381,14 @@ def _add_segments_by_groups(
     add_segment: Callable[[list[Real], tuple[Any, ...]], tuple[Any, ...]],
     start: tuple[Any, ...],
 ) -> tuple[Any, ...]:
-    """The state of the loop over segments of `Tube._sample_with_bounds`, with all segments added.
-    If a group is too far away to hold the nearest segment, the distance from its ball takes the
-    place of the distances from its segments.
+    """Loop over groups of segments, and return the state of the loop over segments of
+    `Tube._sample_with_bounds` with all segments added. A group that is too far away to hold the
+    nearest segment is not visited: the distance from its ball takes the place of the distances from
+    its segments.
 
     p: the points.
-    direction: the unit vectors of lines from p; None if there are no knots.
-    knots: increasing lengths along these lines.
+    direction: the unit directions of lines from p; None if there are no knots.
+    knots: increasing lengths along these lines, at which the distance is bounded.
     records: the records of the segments.
     groups: records (center, radius) of the groups' balls.
     add_segment: a function that takes a record and a state, and returns the state with that segment
@@ -364,16 +405,20 @@ def _add_segments_by_groups(
     epsilon = 2 * float(dr.epsilon(real))
 
     def add_ball_end(ball: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
-        """The smaller of two distances: the state, and the largest distance from p of a point of
-        the ball."""
+        """Update the state of a loop over balls, a tuple of one number: the smallest |p - c| + r so
+        far.
+
+        ball: the record (center c, radius r) of one more ball.
+        """
         return (fmin(dr.norm(p - vector(*ball[:3])) + ball[3], state[0]),)
 
+    # The nearest segment is within `max_distance`.
     (min_end,) = groups.for_each(add_ball_end, (real(dr.inf),), "tube groups")
     max_distance = min_end * (1 + 16 * epsilon) + 16 * epsilon * dr.norm(p)
 
     def visit_group(i: Any, *state: Any) -> tuple[Any, ...]:
-        """The state with the segments of group i added, or with the tangent of its ball if the
-        group is far."""
+        """The next index, and the state with group i added: by its segments if the group is near,
+        else by the tangent of the distance from its ball."""
         ball = groups.read_record(i)
         from_center = p - vector(*ball[:3])
         distance = dr.norm(from_center)
@@ -383,17 +428,20 @@ def _add_segments_by_groups(
             rounding = 8 * epsilon * (dr.norm(p) + distance + ball[3])
             slope = dr.dot(from_center, direction) / distance - 2 * rounding / distance
             start = dr.select(is_near, dr.inf, distance - ball[3] - rounding)
+            # From index 5 on the state holds the bounds at the knots. If the group is near, the
+            # tangent is infinite and changes nothing.
             updated[5:] = min_with_tangent(
                 updated[5:], knots, start, slope, 4 * epsilon * distance, epsilon
             )
 
         def visit_segment(j: Any, *segment_state: Any) -> tuple[Any, ...]:
-            """The state with segment j of the group added."""
+            """The next index, and the state with segment j of the group added."""
             return j + 1, *add_segment(records.read_record(i * _GROUP_SIZE + j), segment_state)
 
         def has_more_segments(j: Any, *_: Any) -> Any:
             return j < segment_count
 
+        # A far group has no segments to visit.
         segment_count = dr.select(is_near, type(i)(_GROUP_SIZE), type(i)(0))
         visited = dr.while_loop(
             (type(i)(0), *updated), has_more_segments, visit_segment, label="tube"
@@ -415,12 +463,14 @@ def min_with_tangent(
     rounding: Real,
     unit: float,
 ) -> list[Real]:
-    """At each knot, the smaller of the bound in `lows` and of the value of a tangent there.
+    """For each knot (a length along a line), the smaller of the bound in `lows` and of the value of
+    a tangent there. The tangent is the line start + slope * knot.
 
     lows: a bound for each knot.
-    knots: positions; the last may be infinite.
+    knots: the lengths; the last may be infinite.
     start: the tangent's value at 0, with an error of up to `rounding`.
-    slope: of the tangent, at least -1. NaN, which arises on the segment itself, counts as -1.
+    slope: of the tangent, at least -1 (the slope of a distance). NaN, which arises on the segment
+        itself, counts as -1.
     unit: the machine epsilon.
 
     The slope is lowered by four roundings, for the rounding of its product with a knot. It is never
@@ -435,11 +485,13 @@ def min_with_tangent(
 
 @dataclass(frozen=True)
 class TangentEnclosure(Enclosure):
-    """An enclosure of the distance F(s) from a set of segments along a path.
+    """A proved bound of the change of F(s), the distance from a set of segments at the length s
+    along a line. The gaps are the differences between F(0) and the next level below and above. The
+    knots are lengths s at which F is bounded from below.
 
     distance: F(0), the distance from the nearest segment.
-    slope: an upper bound of the rate at which the distance from that segment grows at s = 0.
-    knots: increasing lengths s.
+    slope: an upper bound of the derivative at s = 0 of the distance from that segment.
+    knots: increasing lengths s; the last may be infinite.
     lower_bounds: for each knot s, a lower bound of F(s) - F(0), which comes from the tangents of
         the distances from all segments.
 
@@ -462,9 +514,13 @@ class TangentEnclosure(Enclosure):
     lower_bounds: tuple[Real, ...]
 
     def free_length(self, gaps: LevelGaps) -> Real:
-        """The length of the path on which F is proved to meet neither level: the smaller of the
-        length up to which F does not rise to the level above, and the length up to which its lower
-        bound does not fall to the level below."""
+        """The length of the line on which F is proved to meet neither level: the smaller of two
+        lengths. Up to the first, F does not rise to the level above. Up to the second, its lower
+        bound does not fall to the level below.
+
+        gaps: the differences between F(0) and these levels.
+        """
+        # D m, and g^2 + 2 D g; the root of the quadratic equation in the form without cancellation.
         half_slope = self.distance * self.slope
         product = gaps.above * (gaps.above + 2 * self.distance)
         root = dr.sqrt(fmax(dr.fma(half_slope, half_slope, product), 0))
@@ -475,6 +531,7 @@ class TangentEnclosure(Enclosure):
         is_free = gaps.below >= 0  # and not NaN
         for knot, next_bound in zip(self.knots, self.lower_bounds, strict=True):
             is_clear = next_bound >= -gaps.below
+            # Where the chord from the knot before (`start`, `bound`) falls by the gap below.
             part = fmax((gaps.below + bound) / (bound - next_bound) * (knot - start), 0)
             length = dr.select(is_clear, knot, fmin(start + part, knot))
             length_down = dr.select(is_free, length, length_down)
@@ -484,7 +541,7 @@ class TangentEnclosure(Enclosure):
         return dr.select(is_valid, fmin(length_down, length_up) * (1 - 1e-6), 0)
 
 
-# The boxes of tubes are enlarged on each side by this fraction of their longest side.
+# The box of a tube is enlarged on each side by this fraction of the box's longest side.
 _BOX_MARGIN = 1e-5
 # The radius of the ball on which second derivatives are bounded, as a fraction of the distance to
 # the segment.
@@ -492,17 +549,18 @@ _TAYLOR_RADIUS = 0.5
 
 
 class TubeNetwork(PatchField["_TubeBuffers"]):
-    """The surfaces at distance `radius` from a set of segments, such as edges of meshes, wires or
-    struts.
+    """The surfaces at distance `radius` from each of a set of segments, such as edges of meshes,
+    wires or struts. Each segment is a patch: its tube is a level set of a function of its own, in a
+    box of its own.
 
     points: (n, 3).
     segments: (m, 2) indices of points, counted from 0.
     radius: a number, or (m,), one for each segment.
 
-    Each segment is a patch, a tube with rounded ends (`harnack.fields.capabilities`). A ray
-    evaluates only the patches whose boxes it enters, so that thousands of segments cost little more
-    than one. `Hits.primitive_index` is the index of the segment. A level is added to the radius of
-    all tubes. For a single polyline, and for combinations with other solids, use `Tube`.
+    Tubes have round ends (`harnack.fields.capabilities` explains patches). A ray evaluates only the
+    patches whose boxes it enters, so that thousands of segments take little more time than one.
+    `Hits.primitive_index` is the index of the segment. A level is added to the radius of all tubes.
+    For a single polyline, and for combinations with other solids, use `Tube`.
 
     Raises:
         ValueError: arrays of other shapes, numbers that are not finite, an index out of range, a
@@ -512,6 +570,7 @@ class TubeNetwork(PatchField["_TubeBuffers"]):
     default_level: float = 0.0
 
     def __init__(self, points: Any, segments: Any, radius: Any) -> None:
+        """Check the arguments, and store them as NumPy arrays."""
         super().__init__()
         array = as_real_array(points, "the points of tubes")
         check_vectors(array, "the points of tubes")
@@ -522,9 +581,9 @@ class TubeNetwork(PatchField["_TubeBuffers"]):
         self.radius: FloatArray = _checked_radius(radius, len(self.segments))
 
     def boxes(self, levels: tuple[float, ...] | None = None) -> tuple[FloatArray, FloatArray]:
-        """Lower and upper corners (m, 3) of boxes, each of which contains a tube.
+        """Lower and upper corners, two arrays (m, 3), of boxes. Each box contains one tube.
 
-        levels: the largest is added to the radii; None for the levels of the field.
+        levels: the largest of them is added to the radii; None for the levels of the field.
         """
         level = max(self.levels if levels is None else levels)
         ends = self.points[self.segments]
@@ -534,8 +593,8 @@ class TubeNetwork(PatchField["_TubeBuffers"]):
         return lower - slack, upper + slack
 
     def evaluate(self, p: Vec3) -> NoReturn:
-        """Not defined, as each segment has a function of its own, and there is none for all
-        segments together.
+        """Refuse to evaluate the field: each segment has a function of its own, and there is none
+        for all segments together.
 
         Raises:
             TypeError: always.
@@ -547,6 +606,8 @@ class TubeNetwork(PatchField["_TubeBuffers"]):
         )
 
     def _upload(self, backend: Backend) -> _TubeBuffers:
+        """Upload the boxes of all tubes, and the records of their segments, to a backend. Positions
+        are relative to the center of the boxes, so that they are rounded less."""
         boxes = PatchBoxes.upload(backend, *self.boxes())
         center = np.array(boxes.center, dtype=np.float64).reshape(3)
         start, end = ((self.points[ends] - center) for ends in self.segments.T)
@@ -560,6 +621,7 @@ class TubeNetwork(PatchField["_TubeBuffers"]):
         return _Segment(data.boxes, data.segments.read_record(index))
 
     def validate_levels(self, levels: tuple[float, ...]) -> None:
+        """Raise ValueError for a level that leaves nothing of the thinnest tube."""
         min_radius = float(self.radius.min())
         for level in levels:
             if not level > -min_radius:
@@ -573,11 +635,11 @@ class TubeNetwork(PatchField["_TubeBuffers"]):
 
 @dataclass(frozen=True)
 class _TubeBuffers:
-    """The data of separate tubes on a backend.
+    """The data of a network of tubes on a backend.
 
     boxes: a box for each tube.
-    segments: records of the start of a segment, the radius of its tube, the vector from start to
-        end, and 1 / length^2. Positions are relative to the center of the boxes.
+    segments: for each segment a record of its start, the radius of its tube, the vector from its
+        start to its end, and 1 / length^2. Positions are relative to the center of the boxes.
     """
 
     boxes: PatchBoxes
@@ -585,30 +647,31 @@ class _TubeBuffers:
 
 
 class _Segment(Field):
-    """The field of one tube: the distance D from its segment, less its radius r. The segment may
-    differ from lane to lane.
+    """The field of one tube of a network: the distance D from its segment minus its radius r. Each
+    lane may have another segment.
 
-    boxes: the boxes of all tubes, for their center.
-    row: the record of the segment: its start, the radius of its tube, the vector from start to end,
-        and 1 / length^2.
+    boxes: the boxes of all tubes, of which only the center is used.
+    row: the record of the segment: its start, the radius of its tube, the vector from its start to
+        its end, and 1 / length^2. Each entry is a Dr.Jit array.
 
-    D is convex, as the distance from a convex set, and its Lipschitz constant is 1. Its second
-    derivative along any line is at most 1/D (Hart 1996). For the distance from a point or from a
-    line it is 1/D across the gradient, and the distance from a segment is everywhere one of these
-    two distances. So on a ball of radius s < D about the point it is at most 1/(D - s). Here s =
-    D/2, so that the bound is 1/s.
+    D is convex, as the distance from a convex set, and its Lipschitz constant is 1. Proof of the
+    bound of second derivatives. Along any line they are at most 1/D (Hart 1996): for the distance
+    from a point or from a line the second derivative is 1/D across the gradient, and the distance
+    from a segment is everywhere one of these two distances. So on a ball of radius s < D about p it
+    is at most 1/(D - s). Here s = D/2, so that the bound is 1/s.
     """
 
     def __init__(self, boxes: PatchBoxes, row: list[Real]) -> None:
         self._boxes, self._row = boxes, row
 
     def evaluate(self, p: Vec3) -> Sample:
-        """The sample at p, with the Lipschitz constant 1 and a bound of second derivatives on a
-        ball."""
+        """The sample at p: value and gradient of D - r, with two proved bounds near p: the
+        Lipschitz constant 1, and a bound of second derivatives on a ball."""
         backend, row = self._boxes.backend, self._row
         vector, epsilon = backend.Array3f, 2 * backend.machine_epsilon
         from_start = vector(p) - self._boxes.center - vector(*row[:3])
         segment = vector(*row[4:7])
+        # The nearest point of the segment, as a fraction of it; and the vector from there to p.
         fraction = clamp(dr.dot(from_start, segment) * row[7], 0, 1)
         away = dr.fma(segment, vector(-fraction), from_start)
         distance = dr.norm(away)
@@ -628,7 +691,7 @@ class _Segment(Field):
 
 
 def _checked_segments(segments: Any, points: FloatArray) -> IntArray:
-    """The segments as an array (m, 2) of indices of points.
+    """Check the segments, and return them as an array (m, 2) of indices of points.
 
     points: (n, 3).
 
@@ -644,6 +707,7 @@ def _checked_segments(segments: Any, points: FloatArray) -> IntArray:
     if len(array) >= MAX_BOXES:
         raise ValueError(f"{len(array):,} segments are too many: at most {MAX_BOXES:,}")
     pairs = np.array(array, dtype=np.int64)
+    # Each index must be that of a point.
     if (bad := np.flatnonzero(((pairs < 0) | (pairs >= len(points))).any(axis=1))).size:
         raise ValueError(
             f"segment {bad[0]} joins points {pairs[bad[0], 0]} and {pairs[bad[0], 1]}: there are "
@@ -657,7 +721,8 @@ def _checked_segments(segments: Any, points: FloatArray) -> IntArray:
 
 
 def _checked_radius(radius: Any, count: int) -> FloatArray:
-    """The radii (count,) of the segments, from one number or an array of that shape.
+    """Check the radius, a number or an array (count,), and return the radii (count,) of all
+    segments.
 
     Raises:
         ValueError: a wrong shape, or a radius that is not positive.
