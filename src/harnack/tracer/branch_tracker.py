@@ -71,8 +71,8 @@ class BranchReading(LevelReading):
 
 @dataclass(frozen=True)
 class BranchTracker:
-    """A `LevelRule` for samples that give f only modulo 1. It finds the branch, the integer that has
-    to be added. f is the winding number of a mesh, and jumps by integers at facets (triangles).
+    """A `LevelRule` for samples that give f only modulo 1. It finds the branch, the integer that
+    has to be added. f is the winding number of a mesh, and jumps by integers at facets (triangles).
 
     levels: the true levels, at which rays hit. The periodic levels are all numbers that differ from
         a true level by an integer.
@@ -92,17 +92,17 @@ class BranchTracker:
         A ray that starts inside of `known` needs f at its start. If that is not cheap, its first
         sample is made with the branch.
         """
-        start, real = state.proved_to, type(state.proved_to)
+        start, backend = state.proved_to, backend_of(state.proved_to)
         entry, _ = known.clip(path.origin, path.direction, *ends)
         starts_outside = (entry > ends[0]) & (start <= entry)
         starts_inside = state.active & ~starts_outside
-        rounding = backend_of(start).machine_epsilon * (max_norm(path.origin) + start)
+        rounding = backend.machine_epsilon * (max_norm(path.origin) + start)
         value = field.value_if_cheap(path.point(start), rounding, starts_inside)
         has_branch = starts_outside | dr.isfinite(value)
         # Accuracy scale 0 is the coarsest, which may lack the branch.
-        accuracy = dr.select(has_branch, 0, real(field.coarsest_accuracy))
+        accuracy = dr.select(has_branch, 0, backend.Float(field.coarsest_accuracy))
         value = dr.select(dr.isfinite(value), value, 0)
-        return replace(state, accuracy_scale=accuracy, value=real(value))
+        return replace(state, accuracy_scale=accuracy, value=backend.Float(value))
 
     def accuracy_of(self, field: Field, scale: Real) -> Real:
         """The accuracy scale that the march asks for."""
