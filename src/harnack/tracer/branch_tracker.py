@@ -16,12 +16,18 @@ from typing import TYPE_CHECKING
 
 import drjit as dr
 
-from harnack.backend.elementary import fmax
+from harnack.backend import backend_of
+from harnack.backend.elementary import fmax, max_norm, safe_norm
 from harnack.enclosures import LevelGaps, Levels, any_is_free
+from harnack.fields.samples import value_error_bound
+from harnack.tracer.level_rule import LevelReading, read_plainly
 
 if TYPE_CHECKING:
     from harnack.backend import Mask, Real
-    from harnack.fields.samples import RaySample, Sample
+    from harnack.fields.field import Field
+    from harnack.fields.samples import Ray, RaySample, Sample
+    from harnack.geometry import Volume
+    from harnack.tracer.march import MarchState
 
 # A periodic level that is no true level is passed with known branch if it is nearer than this, in
 # value.
@@ -31,15 +37,93 @@ _MAX_CHANGE, _MAX_ERROR = 0.25, 0.125
 
 
 @dataclass(frozen=True)
+class BranchReading(LevelReading):
+    """A `LevelReading` of samples that may have been given without their branch.
+
+    passes_branch_level: mask of rays at which `gaps` holds the differences to true levels. On other
+        rays it holds those to periodic levels.
+    needs_branch: mask of rays whose point has to be sampled again, with the branch.
+    """
+
+    passes_branch_level: Mask
+    needs_branch: Mask
+
+    def gaps_after_jump(self, behind: LevelGaps) -> LevelGaps:
+        """The differences `gaps` for f behind a jump. The jump is an integer, so differences to
+        periodic levels stay as they are. Those to true levels are replaced by `behind`."""
+        down = dr.select(self.passes_branch_level, behind.below, self.gaps.below)
+        return replace(
+            self.gaps,
+            below=down,
+            above=dr.select(self.passes_branch_level, behind.above, self.gaps.above),
+        )
+
+    def must_repeat(self, too_coarse: Mask, accepted: Mask) -> Mask:
+        """Mask of the points that have to be sampled again: also those that need the branch. A
+        point that is not accepted is left anyway."""
+        return too_coarse | (self.needs_branch & accepted)
+
+    def next_accuracy(self, accuracy: Real, coarser: Real) -> Real:
+        """The accuracy scale of the next sample. A ray that passes a periodic level needs the
+        branch, which samples of accuracy scale 1 and above have, at the next point, too."""
+        return dr.select(self.passes_branch_level, fmax(accuracy, 1), coarser)
+
+
+@dataclass(frozen=True)
 class BranchTracker:
-    """Finds the branch of samples that give f only modulo 1: the integer that has to be added. f is
-    the winding number of a mesh, and it jumps by integers at facets (triangles).
+    """A `LevelRule` for samples that give f only modulo 1. It finds the branch, the integer that
+    has to be added. f is the winding number of a mesh, and jumps by integers at facets (triangles).
 
     levels: the true levels, at which rays hit. The periodic levels are all numbers that differ from
         a true level by an integer.
     """
 
     levels: Levels
+
+    def begin(
+        self, field: Field, known: Volume, path: Ray, ends: tuple[Real, Real], state: MarchState
+    ) -> MarchState:
+        """The state of rays at their start, with f there and the accuracy scale of the first
+        sample.
+
+        known: a volume outside of which the branch is that of f = 0.
+        ends: t_min and t_max of the rays `path`. They are marched from `state.proved_to` on.
+
+        A ray that starts inside of `known` needs f at its start. If that is not cheap, its first
+        sample is made with the branch.
+        """
+        start, backend = state.proved_to, backend_of(state.proved_to)
+        entry, _ = known.clip(path.origin, path.direction, *ends)
+        starts_outside = (entry > ends[0]) & (start <= entry)
+        starts_inside = state.active & ~starts_outside
+        rounding = backend.machine_epsilon * (max_norm(path.origin) + start)
+        value = field.value_if_cheap(path.point(start), rounding, starts_inside)
+        has_branch = starts_outside | dr.isfinite(value)
+        # Accuracy scale 0 is the coarsest, which may lack the branch.
+        accuracy = dr.select(has_branch, 0, backend.Float(field.coarsest_accuracy))
+        value = dr.select(dr.isfinite(value), value, 0)
+        return replace(state, accuracy_scale=accuracy, value=backend.Float(value))
+
+    def accuracy_of(self, field: Field, scale: Real) -> Real:
+        """The accuracy scale that the march asks for."""
+        del field
+        return scale
+
+    def read(self, ray_sample: RaySample, before: Real, step: Real, size: Real) -> LevelReading:
+        """Compare samples with the levels, after adding the branch to those that lack it. For the
+        parameters see `LevelRule.read`; before: also behind a facet, if the last accepted point
+        lies on one (`resolve`)."""
+        is_modulo = ray_sample.sample.branch_unknown
+        if is_modulo is None:
+            return read_plainly(self.levels, ray_sample, size)
+        gradient_norm = safe_norm(ray_sample.sample.gradient)
+        error = value_error_bound(ray_sample.sample, gradient_norm, size)
+        ray_sample, is_sure = self.resolve(ray_sample, before, step, error)
+        plain = read_plainly(self.levels, ray_sample, size)
+        gaps, passes, needs = self.gaps(ray_sample.sample, is_modulo, is_sure, plain.total_error)
+        return BranchReading(
+            ray_sample, gradient_norm, gaps, plain.nearest_gap, plain.total_error, passes, needs
+        )
 
     @property
     def _periodic_levels(self) -> Levels:

@@ -30,7 +30,6 @@ from harnack.backend.elementary import clamp, fmax, fmin, max_norm, safe_norm
 from harnack.backend.loops import loop_while_active
 from harnack.enclosures import any_is_free, longest_free_length
 from harnack.fields.capabilities import NO_FACET, JumpCrossing
-from harnack.fields.samples import value_error_bound
 from harnack.tracer.level_contact import (
     CONTACT_AIM,
     CONTACT_TOLERANCE,
@@ -49,7 +48,7 @@ if TYPE_CHECKING:
     from harnack.enclosures import LevelGaps, Levels
     from harnack.fields.field import Field
     from harnack.fields.samples import Ray, RaySample
-    from harnack.tracer.branch_tracker import BranchTracker
+    from harnack.tracer.level_rule import LevelReading, LevelRule
     from harnack.tree.empty_space import EmptySpaceGrid
 
 # A coarse sample is repeated with higher accuracy where a level is nearer in value than the first
@@ -181,8 +180,7 @@ class _TrialSample:
         side of the level it lies.
     excess: by how much |f - level| may exceed `value_tolerance`, because of rounding.
     is_smooth: whether values and slopes at two points predict f.
-    passes_branch_level, needs_branch: for functions whose samples may lack an unknown integer, the
-        two masks that `BranchTracker.gaps` returns; else None.
+    reading: the comparison of the sample with the levels.
     steep: bounds of f that come from ranges of its values, for functions whose slope has no bound;
         else None.
     extra_evaluations: the number of evaluations of f besides that at the trial point.
@@ -202,8 +200,7 @@ class _TrialSample:
     accepts_unknown_side: Mask
     excess: Real
     is_smooth: bool
-    passes_branch_level: Mask | None = None
-    needs_branch: Mask | None = None
+    reading: LevelReading
     steep: SteepPlace | None = None
     extra_evaluations: Any = 0
 
@@ -212,24 +209,6 @@ class _TrialSample:
         """f at the trial points."""
         return self.on_ray.sample.value
 
-    def gaps_after_jump(self, behind: LevelGaps) -> LevelGaps:
-        """Return the differences between f behind a jump and the next levels, for a function whose
-        samples may lack an unknown integer.
-
-        behind: the differences between f behind the jump and the next true levels.
-
-        Mostly `gaps` holds differences to periodic levels (all numbers that differ from a level by
-        an integer). The jump is an integer, so these stay as they are. On lanes of
-        `passes_branch_level` it holds differences to true levels, which change at the jump; there
-        `behind` replaces them.
-        """
-        down = dr.select(self.passes_branch_level, behind.below, self.gaps.below)
-        return replace(
-            self.gaps,
-            below=down,
-            above=dr.select(self.passes_branch_level, behind.above, self.gaps.above),
-        )
-
 
 @dataclass(frozen=True)
 class March:
@@ -237,7 +216,8 @@ class March:
     a level. A trial point of a ray is accepted if the ray is proved to meet no level before it. A
     trial step is the length from the last accepted point to the next trial point.
 
-    levels: the values of f that rays look for.
+    rule: the levels, which are the values of f that rays look for, and how samples are compared
+        with them.
     tolerance: how near to a level f must be at a hit.
     max_steps: the number of evaluations of f after which a ray ends as out of steps.
     over_relaxation: trial steps are at most this many times as long as proved steps.
@@ -251,12 +231,10 @@ class March:
     ray_end: the ray parameter at which rays end if `occupied` is given.
     only_component: if true, levels may lie outside of the marked cells, but do not belong to the
         surface.
-    branch_tracker: finds the missing integer of samples that give f only modulo 1; None if there
-        are no such samples.
     """
 
     backend: Backend
-    levels: Levels
+    rule: LevelRule
     tolerance: PreparedHitTolerance
     max_steps: Any
     over_relaxation: float
@@ -265,7 +243,11 @@ class March:
     occupied: EmptySpaceGrid | None = None
     ray_end: Real = 0.0
     only_component: bool = False
-    branch_tracker: BranchTracker | None = None
+
+    @property
+    def levels(self) -> Levels:
+        """The values of f that rays look for."""
+        return self.rule.levels
 
     def advance(
         self,
@@ -374,9 +356,7 @@ class March:
             jump = test_jump(
                 ahead, accepted & trial.at_end, trial.value, trial.total_error, self.levels
             )
-            gaps_ahead = (
-                jump.gaps if trial.passes_branch_level is None else trial.gaps_after_jump(jump.gaps)
-            )
+            gaps_ahead = trial.reading.gaps_after_jump(jump.gaps)
         # Trial steps aim at other levels than those that proofs use only if the ray counts
         # crossings.
         aim_gaps, contact, value = gaps_ahead, now.contact, trial.value
@@ -448,30 +428,18 @@ class March:
         t = now.proved_to + now.trial_step
         if ahead is not None or now.contact is not None:  # the end exactly
             t = dr.select(now.trial_step >= end - now.proved_to, end, t)
-        # Choose the accuracy. If samples may lack their branch (an unknown integer) and no tracker
-        # adds it, an accuracy scale of at least 1 makes them have it.
-        scaled, tracker, is_modulo = field, self.branch_tracker, None
+        scaled = field
         if now.accuracy_scale is not None and field.has_variable_accuracy:
-            needs_branch = field.has_unknown_branch and tracker is None
-            scaled = field.at_accuracy(
-                fmax(now.accuracy_scale, 1) if needs_branch else now.accuracy_scale
-            )
+            scaled = field.at_accuracy(self.rule.accuracy_of(field, now.accuracy_scale))
         unproved, size = now.trial_step - now.proved_step, max_norm(path.origin) + t
         ray_sample = scaled.sample_ray(
             path, t, fmin(now.enclosure_reach, end - t), fmax(unproved, real(0))
         )
-        passes_level, is_unsure, is_sure = None, None, None
-        gradient_norm = safe_norm(ray_sample.sample.gradient)
-        if tracker is not None and ray_sample.sample.branch_unknown is not None:
-            is_modulo = ray_sample.sample.branch_unknown
-            error = value_error_bound(ray_sample.sample, gradient_norm, size)
-            ray_sample, is_sure = tracker.resolve(ray_sample, now.value, now.trial_step, error)
-        sample = ray_sample.sample
         # How far f is from the levels, and how well it is known.
-        gaps = self.levels.gaps(sample.value)
-        gap, total_error = gaps.nearest, value_error_bound(sample, gradient_norm, size)
-        if tracker is not None and is_modulo is not None and is_sure is not None:
-            gaps, passes_level, is_unsure = tracker.gaps(sample, is_modulo, is_sure, total_error)
+        reading = self.rule.read(ray_sample, now.value, now.trial_step, size)
+        ray_sample, gradient_norm = reading.ray_sample, reading.gradient_norm
+        sample, gaps, gap = ray_sample.sample, reading.gaps, reading.nearest_gap
+        total_error = reading.total_error
         if self.cone_radius is not None:
             gaps = gaps.reduced_by(self.cone_radius * t * gradient_norm)
             gap = gaps.nearest
@@ -524,8 +492,7 @@ class March:
             accepts_unknown_side=is_near,
             excess=fmax(gap + total_error - within, real(0)),
             is_smooth=ahead is None and not field.has_variable_accuracy,
-            passes_branch_level=passes_level,
-            needs_branch=is_unsure,
+            reading=reading,
             steep=steep,
             extra_evaluations=evaluations,
         )
@@ -648,12 +615,8 @@ class March:
             accuracy, smallest_gap, trial.total_error, truncation, trial.value_tolerance
         )
         coarser = _next_accuracy(accuracy, trial.gaps.nearest, truncation, coarsest)
-        if trial.passes_branch_level is not None and trial.needs_branch is not None:
-            # Only accepted points need this: others are left for a shorter step.
-            too_coarse |= trial.needs_branch & accepted  # others go back in any case
-            coarser = dr.select(
-                trial.passes_branch_level, fmax(accuracy, 1), coarser
-            )  # the next knows it too
+        too_coarse = trial.reading.must_repeat(too_coarse, accepted)
+        coarser = trial.reading.next_accuracy(accuracy, coarser)
         accepted &= ~too_coarse & is_known
         scale = dr.select(too_coarse, finer, dr.select(accepted, coarser, now.accuracy_scale))
         return accepted, scale, too_coarse

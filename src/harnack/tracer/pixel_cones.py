@@ -26,6 +26,7 @@ from harnack.backend.elementary import fmax, fmin, safe_norm
 from harnack.backend.loops import loop_while_active
 from harnack.fields.samples import Ray
 from harnack.tracer.level_contact import PreparedHitTolerance, RayStatus
+from harnack.tracer.level_rule import PlainLevels
 from harnack.tracer.march import March, MarchState
 
 if TYPE_CHECKING:
@@ -115,7 +116,8 @@ class PixelCones:
         )
         # The march ends a small margin outside of the cover: the tolerance grows with the cone.
         tolerance = PreparedHitTolerance(real(0), margin * self.radius, real(0))
-        march_options = prepared.levels, tolerance, prepared.max_steps, prepared.over_relaxation
+        rule = PlainLevels(prepared.levels)
+        march_options = rule, tolerance, prepared.max_steps, prepared.over_relaxation
         march = March(backend, *march_options, cone_radius=self.radius)
         now = march.advance(prepared.field, path, real(end), state)
         is_hit = now.status == int(RayStatus.HIT)

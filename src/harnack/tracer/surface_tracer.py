@@ -29,6 +29,7 @@ from harnack.tracer.level_contact import (
     RayStatus,
     refine_crossing,
 )
+from harnack.tracer.level_rule import PlainLevels
 from harnack.tracer.march import March, MarchState
 from harnack.tracer.patch_tracer import PatchTracer
 
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
     from harnack.enclosures import EnclosureKinds, Levels
     from harnack.fields.field import Field, Sample
     from harnack.geometry import Volume
+    from harnack.tracer.level_rule import LevelRule
     from harnack.tree.empty_space import EmptySpaceGrid
 
 __all__ = ["RayTracer", "SmoothTracer", "TracerFactory", "trace_queued"]
@@ -453,24 +455,13 @@ class SurfaceTracer:
             out_of_steps = backend.UInt32(int(RayStatus.OUT_OF_STEPS))
             status = dr.select(in_uncertain_cell, out_of_steps, state.status)
             state = replace(state, active=state.active & ~in_uncertain_cell, status=status)
-        tracker = None
+        rule: LevelRule = PlainLevels(self.levels)
         if self.known_branch_volume is not None and not crosses:
-            # Outside of the volume the branch is that of f = 0. A ray that starts inside needs f at
-            # its start: if that is not cheap, its first sample is made with the branch.
-            tracker = BranchTracker(self.levels)
-            entry, _ = self.known_branch_volume.clip(path.origin, path.direction, t_min, t_max)
-            starts_outside = (entry > t_min) & (start <= entry)
-            starts_inside = state.active & ~starts_outside
-            rounding = backend.machine_epsilon * (max_norm(path.origin) + start)
-            value = self.field.value_if_cheap(path.point(start), rounding, starts_inside)
-            has_branch = starts_outside | dr.isfinite(value)
-            # Accuracy scale 0 is the coarsest, which may lack the branch.
-            accuracy = dr.select(has_branch, 0, real(self.field.coarsest_accuracy))
-            value = dr.select(dr.isfinite(value), value, 0)
-            state = replace(state, accuracy_scale=accuracy, value=real(value))
+            rule = tracker = BranchTracker(self.levels)
+            state = tracker.begin(self.field, self.known_branch_volume, path, (t_min, t_max), state)
         march = March(
             backend,
-            self.levels,
+            rule,
             self.tolerance,
             self.max_steps,
             self.over_relaxation,
@@ -478,7 +469,6 @@ class SurfaceTracer:
             occupied=occupied,
             ray_end=end,
             only_component=self.only_component,
-            branch_tracker=tracker,
         )
         return march, path, real(start), real(end), state
 
