@@ -45,16 +45,16 @@ parts: $(STAMP)
 
 # One worker a core; tests/conftest.py divides Dr.Jit's threads among them. Tests of a file share kernels.
 test: $(STAMP)
-	$(BIN)/python -m pytest -q -n auto --dist loadfile
+	$(BIN)/python -m pytest -q -n auto --dist loadfile --no-loadscope-reorder
 
 test-slow: $(STAMP)
-	$(BIN)/python -m pytest -q -n auto --dist loadfile -m slow
+	$(BIN)/python -m pytest -q -n auto --dist loadfile --no-loadscope-reorder -m slow
 
 # Exact versions, so that pip takes a file for processors alone where one is offered.
 test-frameworks: $(STAMP)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check $(FRAMEWORKS)
 	$(BIN)/python -c "import torch"
-	$(BIN)/python -m pytest -q -m "slow or not slow" tests/backend/test_frameworks.py
+	$(BIN)/python -m pytest -q -n auto -m "slow or not slow" tests/backend/test_frameworks.py
 
 # Chromium draws pages and views, with a GPU that is computed on the CPU; pictures go to out/browser.
 test-browser: $(STAMP)

@@ -25,6 +25,10 @@ settings.register_profile(
 settings.load_profile("harnack")
 
 
+# The folders whose files take longest.
+_LONG_FILES = "tests/project/", "tests/meshing/"
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Of a test marked `few(k)`, the quick suite runs k of its parameters, spread over all of them;
@@ -39,6 +43,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         for number, item in enumerate(each):
             if number not in quick:
                 item.add_marker(pytest.mark.slow)
+    # Files that take long first, so that no worker is left alone with one at the end.
+    items.sort(key=lambda item: not item.nodeid.startswith(_LONG_FILES))
 
 
 def _share_cores() -> None:
