@@ -248,7 +248,7 @@ def _volume(part: hk.solids.Solid, half: tuple[float, float, float], step: float
         (hk.solid(hk.fields.SchwarzP(1.0), between=(-0.3, 0.3)) & hk.Cylinder(0.6, 12.0),
          (0.6, 0.6, 6.0), 1),
         (_WALLS.scaled(0.1) & hk.Cylinder(0.3, 6.0), (0.3, 0.3, 3.0), 1),
-        pytest.param(_WALLS & hk.Cylinder(5.0, 20.0), (5.0, 5.0, 10.0), None, marks=pytest.mark.slow),
+        (_WALLS & hk.Cylinder(5.0, 20.0), (5.0, 5.0, 10.0), None),
     ],
     ids=["Schwarz P", "gyroid", "gyroid of 20 mm"],
 )  # fmt: skip
