@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
     from harnack.enclosures import LevelGaps, Levels
     from harnack.fields.field import Field
-    from harnack.fields.samples import Ray, RaySample
+    from harnack.fields.samples import Ray, RaySample, Sample
     from harnack.tracer.level_rule import LevelReading, LevelRule
     from harnack.tree.empty_space import EmptySpaceGrid
 
@@ -211,6 +211,29 @@ class _TrialSample:
 
 
 @dataclass(frozen=True)
+class _Arrival:
+    """How rays that were accepted at their trial points go on.
+
+    is_hit: whether the ray ends at the point, as it reaches or crosses a level there.
+    gaps: the differences between f and the next levels that the step from the point may not pass.
+    aim_gaps: the differences at which the next trial step aims. They differ from `gaps` only for
+        rays that count crossings.
+    contact: the contact with a level behind the point (`Hysteresis`); None if rays end where they
+        reach a level.
+    value: f behind the point, and behind a facet there at which f jumps.
+    jump: the comparison of f on both sides of that facet with the levels; None for functions
+        without jumps.
+    """
+
+    is_hit: Mask
+    gaps: LevelGaps
+    aim_gaps: LevelGaps
+    contact: Contact | None
+    value: Real
+    jump: JumpTest | None
+
+
+@dataclass(frozen=True)
 class March:
     """The fixed parameters of the march, which steps along rays to the first point at which f takes
     a level. A trial point of a ray is accepted if the ray is proved to meet no level before it. A
@@ -231,6 +254,24 @@ class March:
     ray_end: the ray parameter at which rays end if `occupied` is given.
     only_component: if true, levels may lie outside of the marked cells, but do not belong to the
         surface.
+
+    With `hysteresis`, the ray does not end where it reaches a level. It goes on towards levels
+    that the hysteresis has moved, and ends as a hit when it has crossed a level. The caller may
+    make it active again, to go on to the next level.
+
+    With `cone_radius`, a whole cone must stay clear of the levels. The differences between f
+    and the levels shrink by |grad f| times the radius of the cone, which grows with t. A tenth
+    of a difference is reserved for this growth: no step is longer than the length on which the
+    cone grows by that much, unless the level is never met and f moves away from it faster than
+    the cone grows.
+
+    With `occupied`, the part of the ray beyond a proved step is skipped, too, as far as it lies
+    in cells that contain no level (`EmptySpaceGrid.empty_run` has the proof).
+
+    With `only_component`, levels outside of the marked cells belong to other components of the
+    surface. Proved steps end in marked cells, and a trial step that would end elsewhere is
+    replaced by the proved step. So no hit lies outside of the marked cells, and levels that are
+    passed there do not count.
     """
 
     backend: Backend
@@ -287,25 +328,8 @@ class March:
         Rounding. A surface could be missed between the enclosure that reaches ahead from a point
         and the enclosure that reaches back from the next point. So for both enclosures the
         differences between f and the levels are reduced by the rounding of value and position
-        (`value_error_bound`).
-
-        With `hysteresis`, the ray does not end where it reaches a level. It goes on towards levels
-        that the hysteresis has moved, and ends as a hit when it has crossed a level. The caller may
-        make it active again, to go on to the next level.
-
-        With `cone_radius`, a whole cone must stay clear of the levels. The differences between f
-        and the levels shrink by |grad f| times the radius of the cone, which grows with t. A tenth
-        of a difference is reserved for this growth: no step is longer than the length on which the
-        cone grows by that much, unless the level is never met and f moves away from it faster than
-        the cone grows.
-
-        With `occupied`, the part of the ray beyond a proved step is skipped, too, as far as it lies
-        in cells that contain no level (`EmptySpaceGrid.empty_run` has the proof).
-
-        With `only_component`, levels outside of the marked cells belong to other components of the
-        surface. Proved steps end in marked cells, and a trial step that would end elsewhere is
-        replaced by the proved step. So no hit lies outside of the marked cells, and levels that are
-        passed there do not count.
+        (`value_error_bound`). The docstring of the class says what changes with `hysteresis`,
+        `cone_radius`, `occupied` and `only_component`.
         """
 
         def one_trial(now: MarchState) -> MarchState:
@@ -334,49 +358,14 @@ class March:
         if self.hysteresis is not None and now.contact is not None:
             trial = self._apply_hysteresis(trial, self.hysteresis, now.contact)
         accepted, accuracy, too_coarse = self._accept(field, trial, now, ahead)
-        # A trial point at the proved step needs no proof, so it is the next one if this one is
-        # rejected.
-        fallback = now.proved_step
-        if self.hysteresis is not None and now.contact is not None:
-            # In contact, a step that leads to a point with a much smaller band is rejected, and so
-            # is one to a point without an error bound. Then even the proved step is too long: it is
-            # shortened.
-            tolerance = dr.fma(trial.t, self.tolerance.per_length, self.tolerance.distance)
-            band_reaches = self.hysteresis.may_reach(
-                now.contact, trial.band, now.trial_step, tolerance
-            )
-            band_reaches &= ~now.contact.is_touching | dr.isfinite(trial.total_error)
-            shorter = fmin(now.proved_step, _RETRY_FRACTION * now.trial_step)
-            fallback = dr.select(band_reaches | too_coarse, now.proved_step, shorter)
-            accepted &= band_reaches
-
-        # Is the trial point a hit, a facet, or a crossing?
-        is_hit, gaps_ahead, jump = accepted & trial.is_near, trial.gaps, None
-        if ahead is not None:
-            jump = test_jump(
-                ahead, accepted & trial.at_end, trial.value, trial.total_error, self.levels
-            )
-            gaps_ahead = trial.reading.gaps_after_jump(jump.gaps)
-        # Trial steps aim at other levels than those that proofs use only if the ray counts
-        # crossings.
-        aim_gaps, contact, value = gaps_ahead, now.contact, trial.value
-        if self.hysteresis is not None and now.contact is not None:
-            contact, is_hit, jump, value = self._update_contact(
-                trial, self.hysteresis, now.contact, path, now, accepted, ahead, jump
-            )
-            contact_arguments = contact, value, self.levels.gaps(value), trial.band
-            gaps_ahead, aim_gaps = (
-                self.hysteresis.gaps(*contact_arguments),
-                self.hysteresis.gaps(*contact_arguments, CONTACT_AIM),
-            )
-        elif jump is not None and ahead is not None:
-            # A ray that passes the facet goes on with the value behind it.
-            value = value + dr.select(jump.at_crossing & ~jump.is_hit, ahead.jump, 0)
+        accepted, fallback = self._shorten_in_contact(trial, now, accepted, too_coarse)
+        arrival = self._arrive(trial, path, now, accepted, ahead)
+        jump, is_hit = arrival.jump, arrival.is_hit
 
         # The step from the trial point.
-        proved = self._proved_step(trial, gaps_ahead, contact)
+        proved = self._proved_step(trial, arrival.gaps, arrival.contact)
         next_step = self._next_trial_step(
-            proved, trial.on_ray, aim_gaps, now, path, trial.is_smooth
+            proved, trial.on_ray, arrival.aim_gaps, now, path, trial.is_smooth
         )
         extended_step = proved
         if self.occupied is not None:
@@ -385,9 +374,9 @@ class March:
             )
         # With cells, the step goes on over empty ones; the next enclosures depend on the proof of f
         # alone.
-        reach = self._next_reach(now, trial, end, proved, contact, is_hit)
+        reach = self._next_reach(now, trial, end, proved, arrival.contact, is_hit)
         proved_step = dr.select(accepted, extended_step, fallback)
-        is_free = self._is_free(now, trial, end, accepted, proved_step, contact)
+        is_free = self._is_free(now, trial, end, accepted, proved_step, arrival.contact)
         if jump is not None:
             # An interval that ends at a facet must be sampled there, whatever its steps prove.
             is_free = dr.select(jump.has_crossing, jump.at_crossing, is_free)
@@ -403,15 +392,66 @@ class March:
             trial_step=fmin(step, end - proved_to),
             proved_step=proved_step,
             enclosure_reach=dr.select(accepted, reach, now.enclosure_reach),
-            value=dr.select(accepted, value, now.value),
+            value=dr.select(accepted, arrival.value, now.value),
             gradient=gradient,
             tolerance_excess=dr.select(accepted, trial.excess, now.tolerance_excess),
             evaluations=evaluations,
             accuracy_scale=accuracy,
             status=status,
             active=now.active & ~(is_hit | is_free | (evaluations >= self.max_steps)),
-            contact=contact,
+            contact=arrival.contact,
         )
+
+    def _shorten_in_contact(
+        self, trial: _TrialSample, now: MarchState, accepted: Mask, too_coarse: Mask
+    ) -> tuple[Mask, Real]:
+        """Return the mask of accepted trial points, and the length of the next trial step for those
+        that are rejected.
+
+        A trial point at the proved step needs no proof, so it is the next one if this one is
+        rejected. On a ray in contact with a level, a step that leads to a point with a much smaller
+        band is rejected, and so is one to a point without an error bound. Then even the proved step
+        is too long, and is shortened.
+        """
+        if self.hysteresis is None or now.contact is None:
+            return accepted, now.proved_step
+        tolerance = dr.fma(trial.t, self.tolerance.per_length, self.tolerance.distance)
+        band_reaches = self.hysteresis.may_reach(now.contact, trial.band, now.trial_step, tolerance)
+        band_reaches &= ~now.contact.is_touching | dr.isfinite(trial.total_error)
+        shorter = fmin(now.proved_step, _RETRY_FRACTION * now.trial_step)
+        fallback = dr.select(band_reaches | too_coarse, now.proved_step, shorter)
+        return accepted & band_reaches, fallback
+
+    def _arrive(
+        self,
+        trial: _TrialSample,
+        path: Ray,
+        now: MarchState,
+        accepted: Mask,
+        ahead: JumpCrossing | None,
+    ) -> _Arrival:
+        """Find out whether accepted trial points are hits, facets or crossings of a level, and from
+        which values the ray goes on behind them. The parameters are those of `next_trial`;
+        accepted: mask of the accepted points."""
+        is_hit, gaps, jump = accepted & trial.is_near, trial.gaps, None
+        if ahead is not None:
+            jump = test_jump(
+                ahead, accepted & trial.at_end, trial.value, trial.total_error, self.levels
+            )
+            gaps = trial.reading.gaps_after_jump(jump.gaps)
+        if self.hysteresis is not None and now.contact is not None:
+            contact, is_hit, jump, value = self._update_contact(
+                trial, self.hysteresis, now.contact, path, now, accepted, ahead, jump
+            )
+            contact_arguments = contact, value, self.levels.gaps(value), trial.band
+            gaps = self.hysteresis.gaps(*contact_arguments)
+            aim_gaps = self.hysteresis.gaps(*contact_arguments, CONTACT_AIM)
+            return _Arrival(is_hit, gaps, aim_gaps, contact, value, jump)
+        value = trial.value
+        if jump is not None and ahead is not None:
+            # A ray that passes the facet goes on with the value behind it.
+            value = value + dr.select(jump.at_crossing & ~jump.is_hit, ahead.jump, 0)
+        return _Arrival(is_hit, gaps, gaps, now.contact, value, jump)
 
     def _sample_trial(
         self, field: Field, path: Ray, end: Real, now: MarchState, ahead: JumpCrossing | None
@@ -437,34 +477,19 @@ class March:
         )
         # How far f is from the levels, and how well it is known.
         reading = self.rule.read(ray_sample, now.value, now.trial_step, size)
-        ray_sample, gradient_norm = reading.ray_sample, reading.gradient_norm
-        sample, gaps, gap = ray_sample.sample, reading.gaps, reading.nearest_gap
-        total_error = reading.total_error
+        ray_sample, sample = reading.ray_sample, reading.ray_sample.sample
+        gaps, gap, total_error = reading.gaps, reading.nearest_gap, reading.total_error
         if self.cone_radius is not None:
-            gaps = gaps.reduced_by(self.cone_radius * t * gradient_norm)
+            gaps = gaps.reduced_by(self.cone_radius * t * reading.gradient_norm)
             gap = gaps.nearest
         steep = None
         if field.is_steep:
             length = fmin(now.enclosure_reach, end - t)
             steep = SteepPlace.at(field, self.levels, path, t, length, sample)
             total_error = total_error if steep.error is None else steep.error
-        # A proved lower bound of |grad f|: the tolerance in value is the tolerance times this.
-        steepness = fmax(gradient_norm - sample.gradient_error, real(0))
-        if ray_sample.slope_error is not None:  # the gradient is at least as long as its projection
-            steepness = fmax(dr.abs(ray_sample.slope) - ray_sample.slope_error, steepness)
-        if ray_sample.min_gradient_norm is not None:
-            steepness = fmax(ray_sample.min_gradient_norm, steepness)
-        if steep is not None:  # the gradient is no number where only slopes along the path are
-            gradient_norm = fmax(gradient_norm, steepness)
-        within = self.tolerance.value_tolerance(steepness, t)
+        gradient_norm, steepness = _gradient_bounds(reading, is_steep=field.is_steep)
+        within = self._value_tolerance(field, path, t, sample, steepness)
         knows_gradient = (sample.gradient_error <= gradient_norm) | (steepness > 0)
-        if self.hysteresis is not None:
-            if field.is_steep:  # otherwise f would have to change by more than it does
-                reach = dr.fma(t, self.tolerance.per_length, self.tolerance.distance)
-                change = largest_change(field, path.point(t), sample.value, reach)
-                # No crossing needs a larger change of f than its values allow within the tolerance.
-                within = fmax(fmin(within, change), self.tolerance.value)
-            within = self.hysteresis.contact_tolerance(within)
         # Where not even the gradient is known, no hit is due to rounding.
         rounding = dr.select(knows_gradient, total_error - sample.truncation_error, 0)
         is_near = self._is_near(
@@ -496,6 +521,24 @@ class March:
             steep=steep,
             extra_evaluations=evaluations,
         )
+
+    def _value_tolerance(
+        self, field: Field, path: Ray, t: Real, sample: Sample, steepness: Real
+    ) -> Real:
+        """Return the largest |f - level| at a hit; for rays that look for crossings, in contact.
+
+        sample: the sample of f at the parameter t of the rays `path`.
+        steepness: a proved lower bound of |grad f| there.
+        """
+        within = self.tolerance.value_tolerance(steepness, t)
+        if self.hysteresis is None:
+            return within
+        if field.is_steep:
+            # No crossing needs a larger change of f than its values allow within the tolerance.
+            reach = dr.fma(t, self.tolerance.per_length, self.tolerance.distance)
+            change = largest_change(field, path.point(t), sample.value, reach)
+            within = fmax(fmin(within, change), self.tolerance.value)
+        return self.hysteresis.contact_tolerance(within)
 
     def _confirms_level(
         self,
@@ -906,6 +949,24 @@ class March:
             gap_behind = self.levels.gaps(value + ahead.jump).nearest
             gap = dr.select(at_end & (ahead.facet != NO_FACET), fmin(gap, gap_behind), gap)
         return gap
+
+
+def _gradient_bounds(reading: LevelReading, *, is_steep: bool) -> tuple[Real, Real]:
+    """Return |grad f| at the point of a sample, and a proved lower bound of it, by which the
+    tolerance in space becomes one in value.
+
+    is_steep: whether f may be so steep that samples hold no gradient, but only slopes along the
+        ray. Then the first result is at least as large as the second.
+    """
+    ray_sample, gradient_norm = reading.ray_sample, reading.gradient_norm
+    steepness = fmax(gradient_norm - ray_sample.sample.gradient_error, type(gradient_norm)(0))
+    if ray_sample.slope_error is not None:  # the gradient is at least as long as its projection
+        steepness = fmax(dr.abs(ray_sample.slope) - ray_sample.slope_error, steepness)
+    if ray_sample.min_gradient_norm is not None:
+        steepness = fmax(ray_sample.min_gradient_norm, steepness)
+    if is_steep:
+        gradient_norm = fmax(gradient_norm, steepness)
+    return gradient_norm, steepness
 
 
 def _refined_accuracy(
