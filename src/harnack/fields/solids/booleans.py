@@ -168,6 +168,8 @@ class BooleanSolid(Solid):
         """The same combination of other operands, which need not be solids."""
         combination = copy.copy(self)
         object.__setattr__(combination, "parts", tuple(parts))
+        coarsest = min((part.coarsest_accuracy for part in parts), default=1.0)
+        object.__setattr__(combination, "coarsest_accuracy", coarsest)
         return combination
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:

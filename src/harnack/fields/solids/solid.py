@@ -390,9 +390,10 @@ class SolidOfField(Solid):
         return self._with_inner(self.field.at_accuracy(detail))
 
     def _with_inner(self, inner: Field) -> Solid:
-        """The same solid made of another inner field."""
+        """The same solid made of another inner field, such as one that is prepared."""
         solid = copy.copy(self)
         object.__setattr__(solid, "field", inner)
+        object.__setattr__(solid, "coarsest_accuracy", inner.coarsest_accuracy)
         return solid
 
     def for_ray_count(self, count: int) -> Field:
