@@ -471,5 +471,5 @@ def test_what_no_kernel_can_be() -> None:
         hk.Blobs([[0, 0, 0]], 1.0, kernel=3)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="level 0"):
         hk.trace(scene(3), [[0, 0, 9.0]], [[0, 0, -1.0]], level=0.0)
-    with pytest.raises(BlobError, match="single precision"):
+    with pytest.raises(ValueError, match="single precision"):
         hk.trace(hk.Blobs([[0, 0, 0]], 1e-25), [[0, 0, 1.0]], [[0, 0, -1.0]])

@@ -882,7 +882,7 @@ def _bounds(solid: Solid, level: float, volume: Volume | None) -> tuple[FloatArr
     if not (np.isfinite(lower).all() and np.isfinite(upper).all()):
         raise MeshingError(
             f"{type(solid).__name__} does not say where it ends (a solid does not end at the "
-            "domain of the field it is made of): give a clip, such as a box"
+            "domain of the field it is made of): give a clip, such as a box (harnack.Box)"
         )
     if not (lower < upper).all():
         raise MeshingError("the solid is empty: it lies outside of the clip")
