@@ -145,6 +145,7 @@ def build_balanced_tree(points: FloatArray, *, leaf_size: int = 8, arity: int = 
     # One row for each node: the indices of its points, and their coordinates (3, nodes, points).
     point_ids = np.arange(len(points), dtype=np.int64)[None]
     positions = np.array(points.T, dtype=np.float64, order="C")[:, None]
+    # The number of splits from the root to a leaf.
     depth = max(0, math.ceil(math.log2(len(points) / leaf_size)))
     remaining = depth
     while remaining and point_ids.shape[1] > _POINTS_IN_CACHE:
@@ -190,7 +191,9 @@ def _split(point_ids: IntArray, positions: FloatArray) -> tuple[IntArray, FloatA
     # The empty slot is somewhere on the right: move it to the end of the row.
     empty_slot = (order[short_rows] == width - 1).argmax(axis=1)
     order[short_rows, empty_slot], order[short_rows, -1] = order[short_rows, -1], width - 1
-    if width % 2:  # m points of 2m on either side, the empty slot on the left
+    # A short row of odd width 2m + 1 has 2m points, and its left half has m + 1 slots. The last of
+    # these becomes the empty slot, so that both halves have m points.
+    if width % 2:
         order[short_rows, -1], order[short_rows, middle] = order[short_rows, middle], width - 1
     # From places in a row to places in the flattened array.
     order += np.arange(0, point_ids.size, width, dtype=np.int64)[:, None]

@@ -59,6 +59,7 @@ def triangle_records(vertices: FloatArray, faces: IntArray) -> FloatArray:
     """
     order = np.argsort(faces, axis=1, kind="stable")
     corners = vertices[np.take_along_axis(faces, order, axis=1)]
+    # Orders that keep the orientation of the face.
     is_even = np.isin(order @ np.array([9, 3, 1]), (5, 15, 19))  # 012, 120, 201 in base three
     edges = corners[:, [1, 2, 2]] - corners[:, [0, 1, 0]]
     square = (edges * edges).sum(axis=2)
@@ -115,10 +116,12 @@ def node_slabs(
     for the triangle nearest to a far point would visit the whole cap of the surface whose depth is
     less than the width of a box.
     """
+    # Empty slots have NaN corners, which `nanmin` and `nanmax` leave out.
     points = tree.values_in_slots(corners, np.nan).reshape(len(tree.leaf_slots), -1, 3)
     edges = corners - corners[:, :1]
     normals = tree.values_in_slots(np.cross(edges[:, 1], edges[:, 2])).sum(axis=1)
     levels: list[FloatArray] = []
+    # The last arity, 1, is that of no level: above the root nothing is summed.
     for box, arity in zip(boxes, (*tree.arities, 1), strict=True):
         n = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
         n[~(np.linalg.norm(n, axis=1) > 0.5)] = (0.0, 0.0, 1.0)
@@ -127,6 +130,7 @@ def node_slabs(
         height = (offset @ n[:, :, None])[..., 0]
         low, high = np.nanmin(height, axis=1), np.nanmax(height, axis=1)
         square = np.einsum("nij,nij->ni", offset, offset) - height * height
+        # Enlarged for the rounding of the difference of squares.
         radius = np.sqrt(np.maximum(np.nanmax(square, axis=1), 0)) * (1 + 1e-6) + 1e-7
         levels.append(np.column_stack([n, 0.5 * (low + high), 0.5 * (high - low), radius]))
         normals = normals.reshape(-1, arity, 3).sum(axis=1)
@@ -294,6 +298,7 @@ class TriangleTree:
         # The best crossing so far: t, number of the triangle, sign, and a normal of any length.
         start = (real(dr.inf), index(NO_TRIANGLE), real(0), vector(0))
         best, number, sign, normal = traverse(self.tree, visit, start, active)
+        # 1e-37 only keeps the normal finite (0) where there is no crossing.
         return best, number, sign, normal * dr.rsqrt(fmax(dr.squared_norm(normal), real(1e-37)))
 
     def signed_crossings_ahead(self, frame: RayFrame, t_min: Real, active: Mask = True) -> Real:
@@ -339,13 +344,15 @@ class TriangleTree:
             total, is_sure = state
             t, sign = signed_crossing(row, frame)
             normal = normal_of(row, self.tree.backend.Array3f)
-            # |normal| times the cosine, and times the error of t times the cosine.
+            # Is |t| larger than the error of t? Both sides are multiplied by |normal| and by the
+            # cosine, so that nothing is divided by a cosine near 0.
             steep, error = (
                 dr.abs(dr.dot(normal, frame.d)),
                 _UNCERTAIN_ROUNDINGS * unit * dr.norm(normal),
             )
             is_certain = (dr.abs(t) * steep > error) & (dr.abs(t - end) * steep > error)
             is_between = active & (t > 0) & (t < end)
+            # A triangle that the ray does not cross (sign 0) adds no doubt, whatever its t.
             return total + dr.select(is_between, sign, 0), is_sure & (
                 is_certain | (sign == 0) | ~active
             )
@@ -484,7 +491,7 @@ def _is_beside(row: list[Real], frame: RayFrame, reach: float) -> Mask:
     p, q, r = corners_of(row, type(frame.o))
     a, b, c = frame.transverse(p), frame.transverse(q), frame.transverse(r)
     is_near: Mask = False
-    zero = type(a[0])(0)
+    zero = type(a[0])(0)  # stands for the depths, which `_square` does not read
     for start, end in ((a, b), (b, c), (a, c)):
         twice_area, square = edge_function(start, end), _square((*start, zero), (*end, zero))
         # Where the ray, at (0, 0), is projected on the edge: 0 at its start, 1 at its end. Its
@@ -547,7 +554,8 @@ def _crossing_depth(
     w = clamp(select_longest(ab, bc, -ac) / (bc - ac + ab), zero, max_w)
     s = clamp(dr.fma(-w, apex_position, ray_position), zero, 1 - w)
     t = dr.fma(s, end[2] - start[2], dr.fma(w, apex[2] - start[2], start[2]))
-    # Edges that the ray passes through decide t; vertices come last and overrule them.
+    # Edges that the ray passes through decide t; vertices come last and overrule them, up to twice
+    # the distance. From here on, `share` is the position of the ray along an edge, from 0 to 1.
     close_square = close * close
     for (tail, head), area, square in zip(
         ((a, b), (b, c), (a, c)), (ab, bc, ac), squares, strict=True
