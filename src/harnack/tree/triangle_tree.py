@@ -257,8 +257,8 @@ class TriangleTree:
         Returns:
             t (inf if there is none); the number of the triangle (NO_TRIANGLE if there is none); the
             sign of the crossing; and the unit normal of the triangle by the right-hand rule. The
-            sign is 1 if the normal points along the ray, -1 if it points back, and 0 if there is no
-            crossing.
+            sign is 1 if the normal points along the ray, and -1 if it points back. It is 0 if there
+            is no crossing, or if only the border of the triangle is within `reach` of the ray.
         """
         real, index, vector = (
             self.tree.backend.Float,
@@ -547,7 +547,8 @@ def _crossing_depth(
     apex_position = dr.fma(apex[0] - start[0], e[0], (apex[1] - start[1]) * e[1]) * share
     zero = type(ab)(0)
     ray_position, apex_position = clamp(ray_position, zero, 1), clamp(apex_position, zero, 1)
-    # So that 0 <= s <= 1 - w for s = ray_position - w apex_position.
+    # So that 0 <= s <= 1 - w for s = ray_position - w apex_position. `fmin` ignores the NaN of a
+    # quotient 0/0.
     max_w = fmin(
         (1 - ray_position) / (1 - apex_position), fmin(ray_position / apex_position, type(ab)(1))
     )

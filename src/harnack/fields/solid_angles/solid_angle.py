@@ -84,10 +84,10 @@ _LEVEL_MARGIN = 1e-9 * _PERIOD
 _MAX_PAIRS = 3_000_000
 # The number of sides of the polygons by which circles are drawn where a boundary is drawn.
 _CIRCLE_SIDES = 256
-# Cells pay if the number of rays times the number of edges is at least `_MIN_WORK`, and there are
-# at least `_MIN_RAYS` rays and `_MIN_EDGES` edges. To trace these rays takes five times as long as
-# to build the cells of a knot. The cells of a tangle of a thousand edges take ten times as long to
-# build as those of a knot.
+# FMM cells save more time than they take to build if the number of rays times the number of edges
+# is at least `_MIN_WORK`, and there are at least `_MIN_RAYS` rays and `_MIN_EDGES` edges. To trace
+# these rays takes five times as long as to build the cells of a knot. The cells of a tangle of a
+# thousand edges take ten times as long to build as those of a knot.
 _MIN_WORK, _MIN_RAYS, _MIN_EDGES = 2.5e8, 1e6, 48
 # The largest number of planes of the extent of a curve in convex position with cells, by
 # experiment: with hundreds, clipping rays takes longer than the march.
@@ -514,6 +514,8 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         is_off_curve = (distance > 0) & (sums.distance > 2 * data.rounding)  # see `evaluate`
         # By this factor |dp|/D^4 can grow if the distance D is reduced by its rounding.
         growth = dr.select(is_off_curve, dr.square(dr.square(sums.distance / distance)), dr.inf)
+        # The sums s4 and s5 of `SourceSums` are at most 1/3 of the integral of |dp|/D^3, and 1/4 of
+        # it divided by the distance (`LiftedTrails.sum` has smaller bounds).
         gradient_error = SLOPE_ROUNDINGS / 3 * unit * sums.inverse_cubes * growth / data.size
         second_error = 0.25 * SECOND_ROUNDINGS * unit * sums.inverse_cubes / sums.distance * growth
         return gradient_error, second_error / (data.size * data.size)

@@ -285,6 +285,7 @@ class _AngleProduct:
     @classmethod
     def of(cls, bits: _FloatFormat, factor: Complex) -> _AngleProduct:
         """The product of the single complex factor `factor`. bits: the format of its numbers."""
+        # Its argument lies in [-pi, 0], with half = -1, or in [0, pi], with half = 0.
         return cls(*factor, bits.sign(factor[1]))
 
     def times(self, bits: _FloatFormat, factor: Complex) -> _AngleProduct:
@@ -326,6 +327,7 @@ class _AngleProduct:
         real = cast("Any", type(self.x))
         # atan2 may ignore the sign of a zero, so that a zero becomes a tiny number of its sign.
         y = dr.copysign(fmax(dr.abs(self.y), real(1e-30)), self.y)
+        # theta is atan2(y, x), in [-pi, pi], plus (half + 1)/2 full turns, rounded down.
         return dr.fma(dr.atan2(y, self.x), 0.5 / dr.pi, real((self.half + 1) >> 1))
 
 
