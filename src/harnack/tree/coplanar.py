@@ -184,7 +184,7 @@ def _next_in_plane(
 
     tree: a tree of all faces.
     corners, face: the corners and the number of the lane's face.
-    sizes: the heights of all faces above their longest edges; of two faces with equal heights the
+    sizes: the heights of all faces over their longest edges; of two faces with equal heights the
         later one counts as larger.
     """
     backend = tree.tree.backend

@@ -72,7 +72,7 @@ def split_intersecting_faces(
     pieces, owner = _cut_up(corners[~is_uncut], place_among_cut[cut], knives)
     edges = pieces - np.roll(pieces, 1, axis=1)
     longest = np.linalg.norm(edges, axis=2).max(axis=1)
-    # Twice the area of a piece is its thickness times its longest edge.
+    # Twice the area, against the is_thickness times the longest edge.
     is_thick = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) > _MIN_THICKNESS * longest
     owner = np.concatenate([np.flatnonzero(is_uncut), np.flatnonzero(~is_uncut)[owner[is_thick]]])
     return np.concatenate([corners[is_uncut], pieces[is_thick]]), owner
@@ -153,8 +153,6 @@ def _crossing_faces(
     # The faces at edge 0, then those at edge 1, and so on; edge_start is where each begins.
     faces_by_edge = np.argsort(edge, kind="stable") // 3
     edge_start = np.searchsorted(np.sort(edge), np.arange(len(edges) + 1))
-    # Edge crossed[i] crosses face crossing[i]. Each such crossing is repeated for all faces at the
-    # edge.
     crossed, crossing = _crossings_of_edges(tree, vertices, faces, edges)
     count = edge_start[crossed + 1] - edge_start[crossed]
     places = np.repeat(edge_start[crossed], count) + _ranks_in_groups(count)
@@ -366,8 +364,7 @@ def _cut_meets_triangle(pieces: FloatArray, heights: FloatArray, knives: FloatAr
         inward /= np.maximum(np.linalg.norm(inward, axis=1, keepdims=True), 1e-300)
         # Heights of the segment's ends above the knife's edge, positive inside, with a tolerance.
         at_start, at_end = (np.einsum("nk,nk->n", x - p, inward) + 1e-9 for x in (start, end))
-        # The height is linear along the segment: 0 at the fraction `root`. If it is constant and
-        # negative, nothing of the segment is left.
+        # The height is linear along the segment: 0 at the fraction `root`.
         rate = at_end - at_start
         root = -at_start / np.where(rate == 0, 1, rate)
         low = np.where(rate > 0, np.maximum(low, root), low)

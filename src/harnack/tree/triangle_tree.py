@@ -130,7 +130,6 @@ def node_slabs(
         height = (offset @ n[:, :, None])[..., 0]
         low, high = np.nanmin(height, axis=1), np.nanmax(height, axis=1)
         square = np.einsum("nij,nij->ni", offset, offset) - height * height
-        # Enlarged for the rounding of the difference of squares.
         radius = np.sqrt(np.maximum(np.nanmax(square, axis=1), 0)) * (1 + 1e-6) + 1e-7
         levels.append(np.column_stack([n, 0.5 * (low + high), 0.5 * (high - low), radius]))
         normals = normals.reshape(-1, arity, 3).sum(axis=1)
@@ -555,8 +554,7 @@ def _crossing_depth(
     w = clamp(select_longest(ab, bc, -ac) / (bc - ac + ab), zero, max_w)
     s = clamp(dr.fma(-w, apex_position, ray_position), zero, 1 - w)
     t = dr.fma(s, end[2] - start[2], dr.fma(w, apex[2] - start[2], start[2]))
-    # Edges that the ray passes through decide t; vertices come last and overrule them, up to twice
-    # the distance. From here on, `share` is the position of the ray along an edge, from 0 to 1.
+    # Edges that the ray passes through decide t; vertices come last and overrule them.
     close_square = close * close
     for (tail, head), area, square in zip(
         ((a, b), (b, c), (a, c)), (ab, bc, ac), squares, strict=True

@@ -85,8 +85,7 @@ class PlanarRegion:
         # Upper bounds of h and of h/d in the module's notation.
         height_bound = dr.abs(height) + slack
         ratio = height_bound / distance
-        # Near the curve the rounding of positions moves f by up to about 2 slack/distance. 1e-3 is
-        # far more than the other rounding of f.
+        # Near the curve the rounding of positions moves f by up to about 2 slack/distance.
         tolerance = 1e-3 + 16 * slack / distance + error
         # If D is outside, |f| is at most 2 pi h/d; if inside, at least 2 pi (1 - h/d). So an |f|
         # above the first number proves D inside, one below the second number proves D outside. If
@@ -95,7 +94,7 @@ class PlanarRegion:
         is_outside = dr.abs(f) < turn * fmin(1 - ratio, 0.5) - tolerance
         free_height = fmax(dr.abs(height) - slack, 0)
         # If neither is certain, the smaller ball, which does not meet the plane, is used if it is
-        # large enough. Without rounding its radius would be at least half the distance.
+        # large enough.
         is_beside = ~(is_inside | is_outside) & (free_height >= 0.4 * distance)
         zero = type(f)(0)
         radius = dr.select(is_beside, free_height, distance)

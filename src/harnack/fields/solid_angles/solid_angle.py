@@ -514,8 +514,6 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         is_off_curve = (distance > 0) & (sums.distance > 2 * data.rounding)  # see `evaluate`
         # By this factor |dp|/D^4 can grow if the distance D is reduced by its rounding.
         growth = dr.select(is_off_curve, dr.square(dr.square(sums.distance / distance)), dr.inf)
-        # The sums s4 and s5 of `SourceSums` are at most 1/3 of the integral of |dp|/D^3, and 1/4 of
-        # it divided by the distance (`LiftedTrails.sum` has smaller bounds).
         gradient_error = SLOPE_ROUNDINGS / 3 * unit * sums.inverse_cubes * growth / data.size
         second_error = 0.25 * SECOND_ROUNDINGS * unit * sums.inverse_cubes / sums.distance * growth
         return gradient_error, second_error / (data.size * data.size)
