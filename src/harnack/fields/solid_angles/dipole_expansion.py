@@ -224,6 +224,7 @@ class DipoleExpansions:
             error, slope_error, *norms = payload[len(_MOMENTS) :]
             r = c - tree.backend.Array3f(*head[:3])
             expansion = _ClusterExpansion.of(r, _pairs(moments), norms, radius)
+            # head[4] and head[5]: the radius and the area of the node.
             return expansion.of_cluster(error, slope_error, head[4], head[5], radius)
 
         return cls._accumulated(tree.backend, lists, term)
@@ -463,28 +464,28 @@ class PendingSources:
         exactly one far node, or is itself far, or is among the remaining sources.
         """
         backend, far_radius = tree.backend, factor * radius
-        # `far=far` binds the value of this pass of the loop.
-        far, pending = (
+        # `is_far=is_far` binds the value of this pass of the loop.
+        far_nodes, pending_nodes = (
             build_lists(
                 backend,
-                lambda store, far=far: _count_nodes(
-                    tree, self.nodes, c, far_radius, max_node_radius, store, far=far
+                lambda store, is_far=is_far: _count_nodes(
+                    tree, self.nodes, c, far_radius, max_node_radius, store, far=is_far
                 ),
             )
-            for far in (True, False)
+            for is_far in (True, False)
         )
         far_primitives, near_primitives = (
             build_lists(
                 backend,
-                lambda store, far=far: self.primitives_of(
-                    tree, c, far_radius, max_node_radius, store, far=far
+                lambda store, is_far=is_far: self.primitives_of(
+                    tree, c, far_radius, max_node_radius, store, far=is_far
                 ),
             )
-            for far in (True, False)
+            for is_far in (True, False)
         )
-        sums = DipoleExpansions.over_nodes(tree, far, c, radius)
+        sums = DipoleExpansions.over_nodes(tree, far_nodes, c, radius)
         sums = sums.plus(DipoleExpansions.over_primitives(tree, far_primitives, c, radius))
-        return sums, PendingSources(pending, near_primitives)
+        return sums, PendingSources(pending_nodes, near_primitives)
 
     def primitives_of(
         self,
@@ -525,6 +526,7 @@ class PendingSources:
         def is_chosen(row: list[Real], active: Mask) -> Mask:
             """Decide on which active lanes a primitive is counted: it is far, or with far=False
             near, and its slot is not empty (its area is positive). row: the primitive's record."""
+            # row[6]: the area. row[7]: for a triangle, `TRIANGLE_RATIO` times its radius.
             far_distance = far_radius if are_points else far_radius + row[7]
             is_far = dr.squared_norm(c - vector(*row[:3])) > dr.square(far_distance)
             return (is_far if far else ~is_far) & (row[6] > 0) & active

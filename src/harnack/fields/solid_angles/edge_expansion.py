@@ -286,7 +286,7 @@ def tail_bounds(q: Any) -> tuple[Any, Any]:
     By the addition theorem the squares of the orthonormal harmonics of degree j add up to
     (2j+1)/(4 pi); the squares of the two of order 1 or -1 alone add up to
     2 (2j+1)/(4 pi) (1-s^2) P_j'^2/(j (j+1)). So sqrt(1-s^2)|P_j'|/j <= sqrt((j+1)/(2j)), which
-    falls with j, and its value at j = p+1 (the local `factor`) bounds all terms.
+    falls with j, and its value at j = p+1 (`factor` in the code) bounds all terms.
 
     The sum over j > p of q^j is q^(p+1)/(1-q), and that of j q^j is
     q^(p+1) (p+1 - p q)/(1-q)^2. By Bernstein and Szego's inequality a harmonic polynomial of degree

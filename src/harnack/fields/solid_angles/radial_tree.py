@@ -300,6 +300,7 @@ def taylor_tree_moments(tree: BalancedTree, rows: FloatArray) -> list[TaylorMome
     """
     slots = records_in_slots(tree, rows)
     levels: list[TaylorMoments] = []
+    # Leaves have no children: the first arity, 0, is not used.
     for count, arity in zip(tree.counts, (0, *tree.arities), strict=True):
         # (count, dipoles below a node, ...): positions, moments, weights.
         position, moment, weights = np.split(
