@@ -108,6 +108,8 @@ class BalancedTree:
             # After a child's subtree comes its next sibling; after the last, what follows its
             # parent's subtree.
             after_child = np.where(position < arity - 1, child + 1, next_index[0][:, None])
+            # Behind the siblings come the descendants of the first one, then those of the second,
+            # and so on: below[level] of each.
             child_of_child = first_child[0][:, None] + arity + position * below[level]
             index.insert(0, child.reshape(-1))
             next_index.insert(0, after_child.reshape(-1))

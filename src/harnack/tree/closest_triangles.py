@@ -97,6 +97,7 @@ class BoxTree:
             far."""
             best, leave, number = state
             near, far = enter_and_leave(row)
+            # The number -1 of an empty slot is no index; such a slot is never chosen.
             t, n = fmax(near, start), index(fmax(row[_BOX_NUMBER_COLUMN], real(0)))
             is_after = (t > t_after) | ((t == t_after) & (n > n_after))
             is_before_best = (t < best) | ((t == best) & (n < number))
@@ -301,6 +302,7 @@ def next_closest_triangle(
         far."""
         best, number, offset, normal, is_inner = state
         point = ClosestPointOnTriangle.of(row, x)
+        # The number -1 of an empty slot is no index; such a slot is never chosen.
         square, n = point.squared_distance, index(fmax(row[NUMBER_COLUMN], real(0)))
         is_after = (square > square_after) | ((square == square_after) & (n > number_after))
         is_before_best = (square < best) | ((square == best) & (n < number))

@@ -430,6 +430,7 @@ class TrailValues:
                 _multiplied_by_record(bits, row, slacks, x, previous) for x, previous in pairs
             )
 
+        # Each point begins with the product 1, without half turns, and with the margin 1.
         entry = (real(1), real(0), bits.integer(0), real(1))
         products = self.records.for_each(add, tuple(entry for _ in points), "trails")
         return [_AngleProduct(*entry[:3]) for entry in products], [entry[3] for entry in products]
