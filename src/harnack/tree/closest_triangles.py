@@ -470,7 +470,7 @@ def squared_distance_to_segment(a: Vec3, e: Vec3, inverse: Real) -> Real:
 
 def jump_sum_within(triangles: TriangleTree, x: Vec3, distance: Real, active: Mask = True) -> Real:
     """The sum of |jump| over all triangles within `distance` of points x. The jump is the change of
-    the winding number across a triangle; its size is that of the number in the column
+    the winding number across a triangle. Except for its sign, it is the number in the column
     `PARITY_COLUMN` of the triangle's record."""
     real, vector = triangles.tree.backend.Float, triangles.tree.backend.Array3f
     x, distance = vector(x), real(distance)

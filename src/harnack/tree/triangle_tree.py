@@ -50,8 +50,8 @@ NO_TRIANGLE = 0xFFFFFFFF
 
 
 def triangle_records(vertices: FloatArray, faces: IntArray) -> FloatArray:
-    """The records (m, 14) of the triangles `faces` (m, 3): the rows of numbers from which a tree
-    and its rays know each triangle.
+    """The records (m, 14) of the triangles `faces` (m, 3): for each triangle the row of numbers by
+    which a tree describes it to kernels.
 
     A record has the corners (9 numbers), ordered by the indices of their vertices; +1, or -1 if
     that order reverses the face; the index of the face; and 1/length^2 of the edges between corners

@@ -502,14 +502,16 @@ class PendingSources:
         their indices to lists. `build_lists` calls this function twice, to count and to write.
 
         The search goes through two sets: the primitives in the list `primitives`; and the
-        primitives in leaves that are not far, in the subtrees of the nodes in the list `nodes`. A
-        node that is far or remains a node is not entered.
+        primitives in leaves that are not far, in the subtrees of the nodes in the list `nodes`. The
+        search does not enter a node that is far, nor an inner node whose radius is at most
+        `max_node_radius`, which stays in a list of nodes (`split_far`).
 
         tree: the tree of the primitives.
         c: (3, n) the centers of the balls.
         far_radius: a dipole is far if its distance from c is more than this, which is k times the
             radius of the balls. For a triangle `TRIANGLE_RATIO` times its radius is added.
-        max_node_radius: inner nodes up to this radius remain nodes.
+        max_node_radius: the largest radius of inner nodes that are not entered; negative to enter
+            all that are not far.
         store: a function that writes an entry; None to count only.
         far: whether far primitives are sought, and not near ones.
         count_limit: once a count exceeds this, the remaining primitives need not be counted.

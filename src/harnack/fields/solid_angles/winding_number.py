@@ -499,8 +499,8 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
 
     @property
     def has_unknown_branch(self) -> bool:
-        """Whether samples along rays may give w only up to an unknown integer. Samples from FMM
-        cells of edges do."""
+        """Whether samples along rays may give w only up to an unknown integer. It is true if the
+        field was prepared with FMM cells of edges: samples from these do."""
         return self._device is not None and self._device.cells is not None
 
     def cells_pay_from(self) -> float:
