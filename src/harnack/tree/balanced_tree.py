@@ -250,8 +250,8 @@ class PackedTree:
     node_heads: eight numbers for each node: six of the caller; the index of the node at which the
         walk goes on if it skips the node's subtree; and for a leaf its index among leaves, or for
         an inner node minus the index of its first child.
-    node_payloads: further numbers of the caller for each node, or None. They are stored separately
-        because a walk reads many heads in a row and few payloads.
+    node_payloads: further numbers of the caller for each node; None if there are none. They are
+        stored separately because a walk reads many heads in a row and few payloads.
     node_count: the number of nodes.
     primitives: the records of primitives, `leaf_size` for each leaf.
     """

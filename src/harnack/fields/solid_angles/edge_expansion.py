@@ -104,6 +104,8 @@ class EdgeExpansions:
         """
         coefficients, matrix = self.coefficients[is_split], shifts.reshape(-1, COEFFICIENTS)
         shifted = (coefficients @ matrix.T).reshape(-1, COEFFICIENTS)
+        # For each octant and each coefficient of the cell, by how much the coefficients of the
+        # octant can be larger. 2^-44 is 2^-46, times 2 as harmonics count twice, and twice that.
         column_sums = np.abs(shifts).sum(axis=1)
         rounding = 2.0**-44 * (np.abs(coefficients) @ column_sums.T).ravel()
         error, slope = (np.repeat(bound[is_split], 8) for bound in (self.error, self.slope))
