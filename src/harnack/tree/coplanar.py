@@ -123,7 +123,7 @@ def _candidates(corners: FloatArray, normals: FloatArray, heights: FloatArray) -
     nearer to 0.3 in magnitude than this difference.
     """
     excess = np.abs(normals) - 0.3
-    # The coordinate that decides the orientation.
+    # The first coordinate larger than 0.3 in magnitude decides the orientation.
     deciding = np.take_along_axis(normals, (excess > 0).argmax(axis=1)[:, None], axis=1)
     normals = np.where(deciding < 0, -normals, normals)
     plane = np.column_stack([normals, np.einsum("ni,ni->n", normals, corners[:, 0])]) / _PLANE_CELL
@@ -132,7 +132,8 @@ def _candidates(corners: FloatArray, normals: FloatArray, heights: FloatArray) -
     wall_distance = np.minimum(in_cell, 1 - in_cell).min(axis=1) * _PLANE_CELL
     tolerance = 4 * (_IN_PLANE + _NORMAL_ROUNDING) / np.where(heights > 0, heights, 1e-300)
     is_sure = (wall_distance > tolerance) & (np.abs(excess).min(axis=1) > tolerance)
-    # Cells with the same number count as one cell.
+    # Each cell of R^4 is hashed to one number. If two cells get the same number, they count as one
+    # cell, which only adds candidates.
     number = (cell.astype(np.int64).astype(np.uint64) * _HASH_FACTORS).sum(axis=1)
     _, group, count = np.unique(number, return_inverse=True, return_counts=True)
     return np.flatnonzero((count[group] > 1) | ~is_sure)
@@ -147,8 +148,8 @@ def overlapping_faces(
     tree: a tree of the same faces, with coordinates of at most about 1.
 
     The search begins at the smaller face of each pair: for each face it finds the overlapping faces
-    that are at least as large, and there are few of them. The size of a face is its height over its
-    longest edge.
+    that are at least as large, and there are few of them. The size of a face is its height above
+    its longest edge.
     """
     backend = tree.tree.backend
     corners = vertices[faces]

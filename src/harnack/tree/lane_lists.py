@@ -101,6 +101,7 @@ def build_lists(backend: Backend, walk: Callable[[WriteEntry | None], Any]) -> L
     start = np.concatenate([[0], np.cumsum(to_numpy(count).astype(np.int64))])
     if start[-1] >= 2**31:
         raise ValueError(_TOO_LONG)
+    # One entry at least, so that the array is never empty.
     first, entries = upload_integers(backend, start[:-1]), dr.zeros(index, max(1, int(start[-1])))
 
     def write_entry(position: Any, entry: Any, active: Mask) -> None:

@@ -147,6 +147,7 @@ def _crossing_faces(
     face with each face at the edge.
     """
     ends = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    # edge: for each side of each face, three sides a face, the index of its edge.
     edges, edge = np.unique(ends, axis=0, return_inverse=True)
     edge = edge.reshape(-1)
     # The faces at edge 0, then those at edge 1, and so on; edge_start is where each begins.
@@ -340,7 +341,7 @@ def _cut_meets_triangle(pieces: FloatArray, heights: FloatArray, knives: FloatAr
     heights: (k, 3) the signed distances of the corners of pieces from the planes.
 
     The segment is clipped by the three edges of the knife: low and high are the ends of what is
-    left, as fractions of the segment.
+    left, as fractions of the segment. The mask is true where something is left, low <= high.
     """
     a, b, c = np.moveaxis(knives, 1, 0)
     normal = np.cross(b - a, c - a)
@@ -353,7 +354,8 @@ def _cut_meets_triangle(pieces: FloatArray, heights: FloatArray, knives: FloatAr
         ends.append(pieces[:, i] + fraction[:, None] * (pieces[:, j] - pieces[:, i]))
     low, high = np.zeros(len(pieces)), np.ones(len(pieces))
     points = np.stack(ends, axis=1)
-    # The two ends: at most two of the three points differ.
+    # The two ends of the segment: of the three points at most two differ. The first that is not NaN
+    # is one end, and the point farthest from it is the other.
     start = np.where(np.isnan(points[:, 0]), points[:, 1], points[:, 0])
     distances = np.nan_to_num(np.linalg.norm(points - start[:, None], axis=2), nan=-1.0)
     end = points[np.arange(len(points)), distances.argmax(axis=1)]
@@ -362,6 +364,7 @@ def _cut_meets_triangle(pieces: FloatArray, heights: FloatArray, knives: FloatAr
         inward /= np.maximum(np.linalg.norm(inward, axis=1, keepdims=True), 1e-300)
         # Heights of the segment's ends above the knife's edge, positive inside, with a tolerance.
         at_start, at_end = (np.einsum("nk,nk->n", x - p, inward) + 1e-9 for x in (start, end))
+        # The height is linear along the segment: 0 at the fraction `root`.
         rate = at_end - at_start
         root = -at_start / np.where(rate == 0, 1, rate)
         low = np.where(rate > 0, np.maximum(low, root), low)

@@ -50,8 +50,8 @@ NO_TRIANGLE = 0xFFFFFFFF
 
 
 def triangle_records(vertices: FloatArray, faces: IntArray) -> FloatArray:
-    """The records (m, 14) of the triangles `faces` (m, 3): the rows of numbers from which a tree
-    and its rays know each triangle.
+    """The records (m, 14) of the triangles `faces` (m, 3): for each triangle the row of numbers by
+    which a tree describes it to kernels.
 
     A record has the corners (9 numbers), ordered by the indices of their vertices; +1, or -1 if
     that order reverses the face; the index of the face; and 1/length^2 of the edges between corners
@@ -59,6 +59,7 @@ def triangle_records(vertices: FloatArray, faces: IntArray) -> FloatArray:
     """
     order = np.argsort(faces, axis=1, kind="stable")
     corners = vertices[np.take_along_axis(faces, order, axis=1)]
+    # Orders that keep the orientation of the face.
     is_even = np.isin(order @ np.array([9, 3, 1]), (5, 15, 19))  # 012, 120, 201 in base three
     edges = corners[:, [1, 2, 2]] - corners[:, [0, 1, 0]]
     square = (edges * edges).sum(axis=2)
@@ -115,10 +116,12 @@ def node_slabs(
     for the triangle nearest to a far point would visit the whole cap of the surface whose depth is
     less than the width of a box.
     """
+    # Empty slots have NaN corners, which `nanmin` and `nanmax` leave out.
     points = tree.values_in_slots(corners, np.nan).reshape(len(tree.leaf_slots), -1, 3)
     edges = corners - corners[:, :1]
     normals = tree.values_in_slots(np.cross(edges[:, 1], edges[:, 2])).sum(axis=1)
     levels: list[FloatArray] = []
+    # The last arity, 1, is that of no level: above the root nothing is summed.
     for box, arity in zip(boxes, (*tree.arities, 1), strict=True):
         n = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
         n[~(np.linalg.norm(n, axis=1) > 0.5)] = (0.0, 0.0, 1.0)
@@ -253,8 +256,8 @@ class TriangleTree:
         Returns:
             t (inf if there is none); the number of the triangle (NO_TRIANGLE if there is none); the
             sign of the crossing; and the unit normal of the triangle by the right-hand rule. The
-            sign is 1 if the normal points along the ray, -1 if it points back, and 0 if there is no
-            crossing.
+            sign is 1 if the normal points along the ray, and -1 if it points back. It is 0 if there
+            is no crossing, or if only the border of the triangle is within `reach` of the ray.
         """
         real, index, vector = (
             self.tree.backend.Float,
@@ -294,6 +297,7 @@ class TriangleTree:
         # The best crossing so far: t, number of the triangle, sign, and a normal of any length.
         start = (real(dr.inf), index(NO_TRIANGLE), real(0), vector(0))
         best, number, sign, normal = traverse(self.tree, visit, start, active)
+        # 1e-37 only keeps the normal finite (0) where there is no crossing.
         return best, number, sign, normal * dr.rsqrt(fmax(dr.squared_norm(normal), real(1e-37)))
 
     def signed_crossings_ahead(self, frame: RayFrame, t_min: Real, active: Mask = True) -> Real:
@@ -339,13 +343,15 @@ class TriangleTree:
             total, is_sure = state
             t, sign = signed_crossing(row, frame)
             normal = normal_of(row, self.tree.backend.Array3f)
-            # |normal| times the cosine, and times the error of t times the cosine.
+            # Is |t| larger than the error of t? Both sides are multiplied by |normal| and by the
+            # cosine, so that nothing is divided by a cosine near 0.
             steep, error = (
                 dr.abs(dr.dot(normal, frame.d)),
                 _UNCERTAIN_ROUNDINGS * unit * dr.norm(normal),
             )
             is_certain = (dr.abs(t) * steep > error) & (dr.abs(t - end) * steep > error)
             is_between = active & (t > 0) & (t < end)
+            # A triangle that the ray does not cross (sign 0) adds no doubt, whatever its t.
             return total + dr.select(is_between, sign, 0), is_sure & (
                 is_certain | (sign == 0) | ~active
             )
@@ -484,7 +490,7 @@ def _is_beside(row: list[Real], frame: RayFrame, reach: float) -> Mask:
     p, q, r = corners_of(row, type(frame.o))
     a, b, c = frame.transverse(p), frame.transverse(q), frame.transverse(r)
     is_near: Mask = False
-    zero = type(a[0])(0)
+    zero = type(a[0])(0)  # stands for the depths, which `_square` does not read
     for start, end in ((a, b), (b, c), (a, c)):
         twice_area, square = edge_function(start, end), _square((*start, zero), (*end, zero))
         # Where the ray, at (0, 0), is projected on the edge: 0 at its start, 1 at its end. Its
@@ -540,7 +546,8 @@ def _crossing_depth(
     apex_position = dr.fma(apex[0] - start[0], e[0], (apex[1] - start[1]) * e[1]) * share
     zero = type(ab)(0)
     ray_position, apex_position = clamp(ray_position, zero, 1), clamp(apex_position, zero, 1)
-    # So that 0 <= s <= 1 - w for s = ray_position - w apex_position.
+    # So that 0 <= s <= 1 - w for s = ray_position - w apex_position. `fmin` ignores the NaN of a
+    # quotient 0/0.
     max_w = fmin(
         (1 - ray_position) / (1 - apex_position), fmin(ray_position / apex_position, type(ab)(1))
     )

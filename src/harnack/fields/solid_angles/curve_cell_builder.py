@@ -316,6 +316,8 @@ class _FarBounds:
             least_square, inverse_cubes, slope, tail, total = state
             edge = Edge.between(p, q, inverse, c)
             square, length = edge.squared_distance, dr.rsqrt(inverse)
+            # weight: the integral of |dp|/D^3 over the edge, which is the factor w of `Edge` times
+            # the length. The second one of `hessian_factors` is grad w.
             weight, inverse_distance = edge.biot_savart()[0] * length, dr.rsqrt(square)
             is_far, radius_ratio = square > far_from * far_from, ball_radius * inverse_distance
             # The first omitted term, of degree p + 1: proportional to (radius/D)^(p+1)/D per

@@ -237,6 +237,7 @@ def _dipole_adder(x: Vec3, unit: Real, derivatives: int) -> AddPrimitive:
         # second and third derivatives follow.
         fourth = row[6] * dr.square(upper * upper)
         is_nearest = has_area & (distance <= sums.singularity_distance)
+        # At a dipole itself, where `inverse` is infinite, its term is left out.
         added = sums.add_term(terms, active & (inverse < dr.inf))
         new_sums = dataclasses.replace(
             added,
@@ -610,7 +611,7 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
 
         unit: (n, 3) the points in unit coordinates.
         """
-        # As in `extent`, with 0.1 % in hand for rounding.
+        # As in `extent`, and larger by 0.1 % for rounding.
         margin = math.sqrt(float(self.areas.sum()) / self.default_level) / self._size
         return 1.001 * (float(np.abs(unit).max()) + margin)
 

@@ -181,8 +181,8 @@ class LiftedEdge:
         other two are the terms that the edge adds to `s4` and `s5` of `SourceSums`.
 
         Symbols. L = 2a is the edge's length, d its distance from the point x (reduced by its
-        rounding), e' = a/(d sqrt(d^2 + a^2)) the local `half_field`, and e = e'/d the local
-        `half_integral`.
+        rounding), e' = a/(d sqrt(d^2 + a^2)), and e = e'/d. In the code e' is `half_field`, and e
+        is `half_integral`.
 
         Rounding. The ends of the edge, x, and their differences together are off by half a unit.
         This changes the angle by at most that length times the edge's Biot and Savart field, which
@@ -199,7 +199,8 @@ class LiftedEdge:
         bounds 1/(1 - q), for q = t/rho up to its largest value b, by 1 + q/(1 - b), and adds up the
         two parts with the weights s4 and s5. So the terms e/2 and 3e/(8d) bound the edge's share.
         """
-        # factor_rounding is not multiplied by anything, steep_rounding by e'.
+        # factor_rounding is a bound by itself; steep_rounding is multiplied by e'. `dr.epsilon` is
+        # the unit roundoff, half the distance from 1 to the next number.
         distance = fmax(dr.sqrt(self.edge.squared_distance) - 2 * unit, 0)
         half_field, half_integral = edge_variation(
             distance * distance, self.edge.inverse_square_length
@@ -210,6 +211,7 @@ class LiftedEdge:
             * float(dr.epsilon(half_field))
             * dr.rsqrt(self.edge.inverse_square_length)
         )
+        # Two moves by half a unit, times a field of at most 2 e'.
         rounding = fmin(
             dr.fma(dr.fma(2.0, unit, steep_rounding), half_field, factor_rounding), 4 * dr.pi
         )

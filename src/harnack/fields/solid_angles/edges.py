@@ -328,7 +328,8 @@ class Edge:
         return c, h_factor * h + e_factor * e
 
     def _denominator(self, square: Real) -> Real:
-        """Compute D = |a||b| + a.b of the class, near the edge in the form that does not cancel.
+        """Compute D = |a||b| + a.b, the denominator of the field's factor w (see the class). Near
+        the edge, where a.b < 0, it is computed in the form that does not cancel.
 
         square: |c|^2 with c = a x e.
         """

@@ -139,6 +139,7 @@ def local_to_local_matrices(degree: int, offset: float) -> FloatArray:
         shifted = regular_harmonics(x, y, z, degree)
         for (j, k, part), column in index.items():
             for sign in (1, -1) if k else (1,):  # L_j,-k = (-1)^k conj L_jk counts too
+                # phase: L_j,(sign k) if this coefficient is 1 and all others are 0.
                 phase = 1j if part else 1.0
                 if sign < 0:
                     phase = (-1) ** k * np.conj(phase)

@@ -164,6 +164,7 @@ def planar_region(loops: Loops, circles: Sequence[Circle]) -> PlanarRegion | Non
     for polygon in loops:
         centered = (polygon - origin) / size
         edges = np.roll(centered, -1, axis=0) - centered
+        # No edge may have the length 0.
         if len(polygon) < 3 or not (edges * edges).sum(axis=1).all() or not is_simple(centered):
             return None
         points = centered @ axes.T
@@ -206,6 +207,7 @@ def _plane_of(
     origin: FloatArray = 0.5 * (lower + upper)
     if not 0.0 < size < np.inf:
         return None
+    # The points relative to a point of the plane; which point that is, is decided below.
     x: FloatArray = (points - origin) / size
     if circles:
         normal = np.array(circles[0].normal)

@@ -66,7 +66,7 @@ class FaceLoops:
         sign as a mark that the face's vertices are in convex position (on the boundary of their
         convex hull); and bounds of the rounding of a point in the face's unit coordinates, and of
         the rounding of its solid angle.
-    edges: the records of all edges, four to a record, each face in its own unit coordinates.
+    edges: the edges of all faces, four to a record, each face in its own unit coordinates.
     """
 
     heads: RecordTable
@@ -87,6 +87,7 @@ class FaceLoops:
         x = faces.vertices[faces.corners] - center[face]
         first_corner = np.flatnonzero(np.diff(face, prepend=-1))
         size = np.maximum.reduceat(np.linalg.norm(x, axis=1), first_corner)
+        # The largest coordinate of a face, in units of its size: by it positions are rounded.
         magnitude = np.maximum(np.abs(low), np.abs(high)).max(axis=1) / size
         x /= size[face][:, None]
         loops = tuple(np.split(x, faces.loop_starts[1:]))
@@ -115,8 +116,9 @@ class FaceLoops:
         to lane."""
         row = self.heads.read_record(index)
         backend = self.heads.backend
-        count = backend.UInt32
-        edges = self.edges.records_of(count(row[4]), count(dr.abs(row[5])))
+        integer = backend.UInt32
+        # The index of the first record, and the number of records without its sign.
+        edges = self.edges.records_of(integer(row[4]), integer(dr.abs(row[5])))
         return FaceSolidAngle(FaceData(backend, backend.Array3f(*row[:3]), row[3], edges, *row[5:]))
 
 

@@ -3,7 +3,8 @@ only on the distance: the *kernel* K(r). A *dipole* is an oriented point y with 
 *moment*; its weight is |m|. At the point x it adds -m.grad_y K(|y - x|). A *cluster* of far dipoles
 is added as a single source. f is the sum over all dipoles. psi_0 = K, psi_1, psi_2, ... are
 functions of the distance, with psi_(k+1) = -psi_k'/r. The numbers Q_2, Q_3, ... bound the
-derivatives of K: the m-th derivative along lines is at most m! Q_m/D^(m+1) at the distance D.
+derivatives of K: the m-th derivative along lines is at most m! Q_m/D^(m+1) at the distance D. D is
+r, or sqrt(r^2 + height^2) if the kernel has a height.
 
 A dipole m at y = x + z adds -m.grad_y K = m.z psi_1. A polynomial P(z) times psi_k has the gradient
 grad P psi_k - P psi_(k+1) z and, with the Hessian HP of P, the Hessian HP psi_k - (grad P z^T + z

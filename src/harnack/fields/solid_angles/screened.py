@@ -109,9 +109,9 @@ class YukawaKernel(RadialKernel):
         return KernelValues(dr.exp(-t) * inverse, thetas(t, last))
 
     def bounds(self, distance: Real, last: int) -> list[Real]:
-        """The numbers Q_2(t) to Q_last(t) of the class for t = kappa times `distance`, which bound
-        derivatives of the kernel at this distance and beyond: exp(-t) times a sum of powers of t.
-        """
+        """The numbers Q_2(t), ..., Q_last(t) for t = kappa times `distance`, which bound
+        derivatives of the kernel at this distance and beyond (see the class). Each is exp(-t) times
+        a sum of powers of t."""
         t = fmin(self.kappa * distance, MAX_LENGTHS)
         decay = dr.exp(-t)
         sum2 = dr.fma(t, dr.fma(t, 0.5, 1), 1)
@@ -204,7 +204,7 @@ def accepting_distance(radius: FloatArray, kappa: float, accuracy: float) -> Flo
         q4 = np.exp(-t) * (1 + t * (1 + t / 2 * (1 + t / 3 * (1 + t / 4))))
         is_accepted = accuracy * radius * q4**0.2 <= r
         low, high = np.where(is_accepted, low, r), np.where(is_accepted, r, high)
-    return high + 1e-5
+    return high + 1e-5  # not 0 for a cluster of radius 0
 
 
 def mean_at_dipoles(rows: FloatArray, kappa: float) -> float:
@@ -217,8 +217,8 @@ def mean_at_dipoles(rows: FloatArray, kappa: float) -> float:
     """
     n = len(rows)
     count = min(n, max(_MIN_LEVEL_POINTS, min(_MAX_LEVEL_POINTS, _MAX_LEVEL_PAIRS // n)))
+    # The dipoles at whose positions w is computed, evenly spaced in the order of the records.
     probes = np.unique(np.linspace(0, n - 1, count).astype(np.int64))
-    # Some positions, evenly spaced in the order of the records; and all coordinates and moments.
     x, y, z, *moment = np.ascontiguousarray(rows[:, :6].T)
     values: list[float] = []
     for i in probes:
@@ -239,6 +239,7 @@ MethodName = Literal["auto", "sum", "tree"]
 _MAX_SUMMED = 2000
 # The largest number of cells that are tested in one round for an extent.
 _MAX_CELLS = 4096
+# Levels smaller than this in magnitude are not told from 0.
 _SMALLEST_LEVEL = 1e-20
 # A point nearer to a dipole than `_ON_DIPOLE` roundings counts as on it. There w may be any number
 # up to `_ANY_LEVEL`.

@@ -225,7 +225,8 @@ _SIGN_ROUNDINGS = 16
 # precision.
 _MAX_COORDINATE = 1024.0
 
-# A point, and 1 or -1 for the direction of its ray along the z axis.
+# A point, and its ray_sign (`TrailValues.turns`): 1 or -1 for the direction of its ray along the z
+# axis.
 Point: TypeAlias = "tuple[Vec3, Real]"
 Complex: TypeAlias = "tuple[Real, Real]"
 # A vertex a = (u, v, z) relative to a point: (u t, v t, s t) with t = |a| + |z| and s as in
@@ -284,6 +285,7 @@ class _AngleProduct:
     @classmethod
     def of(cls, bits: _FloatFormat, factor: Complex) -> _AngleProduct:
         """The product of the single complex factor `factor`. bits: the format of its numbers."""
+        # Its argument lies in [-pi, 0], with half = -1, or in [0, pi], with half = 0.
         return cls(*factor, bits.sign(factor[1]))
 
     def times(self, bits: _FloatFormat, factor: Complex) -> _AngleProduct:
@@ -325,6 +327,7 @@ class _AngleProduct:
         real = cast("Any", type(self.x))
         # atan2 may ignore the sign of a zero, so that a zero becomes a tiny number of its sign.
         y = dr.copysign(fmax(dr.abs(self.y), real(1e-30)), self.y)
+        # theta is atan2(y, x), in [-pi, pi], plus (half + 1)/2 full turns, rounded down.
         return dr.fma(dr.atan2(y, self.x), 0.5 / dr.pi, real((self.half + 1) >> 1))
 
 
@@ -367,15 +370,19 @@ class TrailValues:
 
     def turns(self, x: Vec3, ray_sign: Real) -> tuple[Real, Mask]:
         """The sum of the solid angles Omega_e of the edges' triangles (`edge_lift`) at points x,
-        divided by 4 pi; and a mask (n,) of the points at which it must be computed again.
+        divided by 4 pi; and a mask (n,), true where the sum is uncertain, so that it must be
+        computed again by `edge_lift`.
 
         x: (3, n) the points, in units in which the mesh has a size of about one.
-        ray_sign: (n,) 1 for triangles whose apex is opposite to the direction d = z; -1 if x and
-            the edges are first mirrored in a plane z = const.
+        ray_sign: (n,) 1 or -1, for each point. With 1 all triangles have their apex at infinity in
+            the direction -z. With -1 the edges and x are mirrored in a plane z = const before the
+            sum is computed (`_relative_vertex` does it). The result is then minus the sum of the
+            given edges for an apex in the direction +z.
 
         Each lane of the kernel computes several points. The mask is true in three cases: rounding
-        could have changed the sign of an imaginary part; a product of factors nearly underflows
-        (near an edge or at a short edge); or a coordinate of x is larger than 1024.
+        could have changed the sign of the imaginary part of a factor F_e; a product of factors
+        nearly underflows (near an edge or at a short edge); or a coordinate of x is larger than
+        1024.
         """
         dr.eval(x, ray_sign)
         backend, n = self.records.backend, dr.width(x)
@@ -390,7 +397,9 @@ class TrailValues:
             for point_id in point_ids
         ]
         products, margins = self._over_records(points)
-        turns = [-product.turns() for product in products]  # of conjugate factors
+        # Omega_e is twice the argument of F_e. So the sum of all Omega_e over 4 pi is the argument
+        # of the product of all F_e in turns. The products have the conjugate factors, hence minus.
+        turns = [-product.turns() for product in products]
         dr.eval(*turns, *margins)
         all_turns, all_margins = dr.empty(real, n), dr.empty(real, n)
         for point_id, turn, margin in zip(point_ids, turns, margins, strict=True):
@@ -421,6 +430,7 @@ class TrailValues:
                 _multiplied_by_record(bits, row, slacks, x, previous) for x, previous in pairs
             )
 
+        # Each point begins with the product 1, without half turns, and with the margin 1.
         entry = (real(1), real(0), bits.integer(0), real(1))
         products = self.records.for_each(add, tuple(entry for _ in points), "trails")
         return [_AngleProduct(*entry[:3]) for entry in products], [entry[3] for entry in products]
@@ -468,7 +478,8 @@ def _multiplied_by_record(
 def _relative_vertex(bits: _FloatFormat, vertex: list[Real], point: Point) -> Seen:
     """A vertex relative to a point, in the form that the factors of edges need. For the vector a =
     (u, v, z) from the point to the vertex it is (u t, v t, s t), with t = |a| + |z| and s = |a| -
-    ray_sign z.
+    ray_sign z. For ray_sign = -1 this is the vertex mirrored in a plane z = const: z changes its
+    sign, u and v do not.
 
     bits: the format of the numbers.
     vertex: the coordinates of the vertex.
