@@ -201,8 +201,10 @@ def _clip_bisectors(
 ) -> list[tuple[Real, Real, Mask]]:
     """Find the edges of a cell on the lines `own_lines`. Returns for each of them: the interval
     (lower, upper) of positions along it that lie in the cell, that is in the unit disc and not
-    beyond another line (empty if lower >= upper); and whether some other neighbor lies to the left
-    of the line's neighbor.
+    beyond another line (empty if lower >= upper); and whether some neighbor lies to the left of the
+    line's own neighbor: the direction to it, projected to the tangent plane, is less than 180
+    degrees counter-clockwise of the direction to the line's own neighbor. If no neighbor does, all
+    lie on one side.
 
     indices: the index of each of `own_lines` among all lines.
     bisector: bisector(i, mask) returns line i, in lanes of the mask.

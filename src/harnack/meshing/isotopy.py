@@ -215,7 +215,10 @@ def _linear_gradients(
 
     function: f.
     corners, index: (m, 4, 3), (m, 4) the corners of the tetrahedra and the indices of these points.
-    faces: (j, 3) of the mesh.
+    faces: (j, 3) the triangles of the mesh. In them a corner of a tetrahedron has the same index as
+        in `index`; the mesh's other vertices have larger indices.
+
+    Where F is not 0, the result is grad F. Where it was changed, only the direction is right.
     """
     edges = corners[:, 1:] - corners[:, :1]
     size = np.linalg.norm(edges, axis=2).max(axis=1)
@@ -227,8 +230,10 @@ def _linear_gradients(
     rise = values[rows, 1:] - values[rows, :1]
     slope: FloatArray = np.linalg.solve(edges[rows], rise[..., None])[..., 0].astype(np.float64)
     owners, slopes = [rows], [slope]
+    # From here on, the tetrahedra whose four corners are on the level set.
     rows = np.flatnonzero(has_volume & on_level)
     point_count = int(index.max(initial=0)) + 1
+    # Only triangles of the mesh whose vertices are all corners of tetrahedra can be their faces.
     mesh_keys = _triple_keys(faces[(faces < point_count).all(axis=1)], point_count)
     faces_of_tetrahedron = np.array([np.delete(np.arange(4), k) for k in range(4)])
     in_mesh = np.stack(
@@ -238,7 +243,8 @@ def _linear_gradients(
         ],
         axis=1,
     )
-    # The side of the level set to which all of T is given: the sign of f at the center.
+    # `marching_tetrahedra` assigns the inside of such a tetrahedron to one side of the level set:
+    # to the side f > 0 if f is positive at the center.
     sign = np.sign(function.values(corners[rows].mean(axis=1)))
     has_two = in_mesh.sum(axis=1) == 2
     for k, face in enumerate(faces_of_tetrahedron):

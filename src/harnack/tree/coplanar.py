@@ -99,7 +99,7 @@ def _normals(corners: FloatArray) -> tuple[FloatArray, FloatArray]:
     their heights (m,) above their longest edges."""
     u, v = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     normal = np.cross(u, v)
-    area = np.sqrt(np.einsum("ni,ni->n", normal, normal))
+    area = np.sqrt(np.einsum("ni,ni->n", normal, normal))  # twice the triangle's area
     squares = [np.einsum("ni,ni->n", edge, edge) for edge in (u, v, u - v)]
     longest = np.sqrt(np.max(squares, axis=0))
     height = area / np.where(longest > 0, longest, 1)
@@ -112,7 +112,7 @@ def _candidates(corners: FloatArray, normals: FloatArray, heights: FloatArray) -
 
     corners: (m, 3, 3) the corners of all triangles.
     normals: (m, 3) their unit normals.
-    heights: (m,) their heights over their longest edges.
+    heights: (m,) for each triangle, its height above its longest edge.
 
     A plane is a point of R^4: its unit normal and its distance from the origin. The normal is
     turned so that its first coordinate that is larger than 0.3 in magnitude is positive. For two
@@ -183,7 +183,7 @@ def _next_in_plane(
 
     tree: a tree of all faces.
     corners, face: the corners and the number of the lane's face.
-    sizes: the heights of all faces over their longest edges; of two faces with equal heights the
+    sizes: the height of each face above its longest edge; of two faces with equal heights the
         later one counts as larger.
     """
     backend = tree.tree.backend

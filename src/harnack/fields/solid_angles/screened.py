@@ -102,8 +102,11 @@ class YukawaKernel(RadialKernel):
         self.kappa = dr.opaque(backend.Float, kappa)
 
     def at(self, distance: Real, inverse: Real, last: int) -> KernelValues:
-        """The values psi_0 to psi_last of the class at a distance, by the polynomials theta_k.
-        inverse: 1/distance."""
+        """The values psi_0, ..., psi_last of the class docstring at the given distance rho. They
+        are psi_k = exp(-kappa rho) theta_k(kappa rho)/rho^(2k+1), with polynomials theta_k.
+
+        inverse: 1/distance.
+        """
         # Farther away exponentials are not computed, as they would underflow.
         t = fmin(self.kappa * distance, MAX_LENGTHS)
         return KernelValues(dr.exp(-t) * inverse, thetas(t, last))
