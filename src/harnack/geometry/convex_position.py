@@ -328,7 +328,8 @@ def _hull_normals(x: FloatArray) -> tuple[FloatArray, bool]:
     outward normals (m, 3) of half-spaces whose intersection, with suitable offsets, is the hull;
     and whether the points are flat or on a line. For flat points the normals are those of the sides
     of the slab, and of the edges of the outline; for points on a line, those of a rod (a box)."""
-    # The axes along which the points vary most, less and least.
+    # The axes along which the points vary most, less and least. For fewer than three points the
+    # missing axes are added (`full_matrices`).
     axes: FloatArray = np.linalg.svd(x - x.mean(axis=0), full_matrices=len(x) < 3)[2]
     coordinates: FloatArray = np.einsum("ij,kj->ik", x, axes)
     thickness: FloatArray = np.ptp(coordinates, axis=0)

@@ -307,6 +307,7 @@ def _proved_by_stars(
         if not is_short.any():
             break
         np.add.at(normal, vertex[is_short], units[is_short])
+    # n . grad F > 0, by more than rounding.
     is_proved = np.ones(len(vertices), np.bool_)
     is_proved[vertex[(normal[vertex] * units).sum(axis=1) <= 1e-9]] = False
     has_slope = np.bincount(slopes.owner, minlength=len(index)) > 0

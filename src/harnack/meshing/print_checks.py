@@ -424,6 +424,7 @@ def _size_problems(size: tuple[float, float, float], bed: list[float] | None) ->
         if longest < _SMALLEST:
             message += f"; in meters {longest * 1000:.4g}, in inches {longest * _INCH:.4g} mm long"
         problems.append(PrintProblem("unit", 1, no_locations, message, is_error=False))
+    # Small for millimeters, but possible.
     elif longest < 10 * _SMALLEST:
         message = f"it is {text} mm; if that is meant in inches, scale it by 25.4"
         problems.append(PrintProblem("unit", 1, no_locations, message, is_error=False))

@@ -168,6 +168,7 @@ def mesh_from_signs(
         layers = 2 if closed else 0
         lattice = BccLattice.covering_box(*box, spacing, layers=layers)
         try:
+            # Not the whole tolerance, as distances are only estimated there.
             mesh = extract_from_signs(function, lattice, 0.8 * tolerance, report, closed=closed)
         except EmptySurfaceError as error:
             empty_mesh = TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64))
@@ -576,8 +577,8 @@ class _CreaseRefinement:
         # Two angles for each split edge: between the normals at its ends; and the larger one
         # between the normal at the new vertex and that at an end.
         angle_of_ends, angle_to_end = (
-            np.arccos(np.clip(one, -1, 1))
-            for one in (
+            np.arccos(np.clip(cosine, -1, 1))
+            for cosine in (
                 row_dots(normals[ends[:, 0]], normals[ends[:, 1]]),
                 np.minimum(*(row_dots(normals[ends[:, k]], normal) for k in (0, 1))),
             )
@@ -587,14 +588,14 @@ class _CreaseRefinement:
         )
         is_bent = np.concatenate([bent, is_on_crease])
         new_vertices_of_face = vertex_of_edge[edges]
-        # Faces whose three new vertices all lie on creases.
-        corner = np.flatnonzero(
+        # Faces whose three new vertices all lie on creases; then those that get an inner vertex.
+        fan_rows = np.flatnonzero(
             (new_vertices_of_face >= 0).all(axis=1)
             & is_bent[np.maximum(new_vertices_of_face, 0)].all(axis=1)
         )
-        inner, inner_normal, corner = _crease_corners(function, x, normals, faces, corner)
+        inner, inner_normal, fan_rows = _crease_corners(function, x, normals, faces, fan_rows)
         return cls(
-            edges, vertex_of_edge, ends, fraction, faces[corner], corner,
+            edges, vertex_of_edge, ends, fraction, faces[fan_rows], fan_rows,
             np.concatenate([points, inner]), np.concatenate([normal, inner_normal]),
             np.concatenate([is_on_crease, np.ones(len(inner), np.bool_)]),
         )  # fmt: skip
@@ -710,8 +711,8 @@ def _crease_corners(
     offsets = np.einsum("kij,kij->ki", normal, corner - center[:, None])
     solve: Any = np.linalg.solve
     direction: FloatArray = solve(normal, offsets[:, :, None])[:, :, 0]
-    points, normal, is_found = _level_along(function, center, direction, _OFFSET * longest)
-    return points[is_found], normal[is_found], rows[is_found]
+    points, new_normals, is_found = _level_along(function, center, direction, _OFFSET * longest)
+    return points[is_found], new_normals[is_found], rows[is_found]
 
 
 def _undo_until_valid(

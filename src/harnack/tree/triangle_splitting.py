@@ -72,7 +72,7 @@ def split_intersecting_faces(
     pieces, owner = _cut_up(corners[~is_uncut], place_among_cut[cut], knives)
     edges = pieces - np.roll(pieces, 1, axis=1)
     longest = np.linalg.norm(edges, axis=2).max(axis=1)
-    # Twice the area, against the is_thickness times the longest edge.
+    # The thickness is the height above the longest edge: twice the area divided by that edge.
     is_thick = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) > _MIN_THICKNESS * longest
     owner = np.concatenate([np.flatnonzero(is_uncut), np.flatnonzero(~is_uncut)[owner[is_thick]]])
     return np.concatenate([corners[is_uncut], pieces[is_thick]]), owner
@@ -152,10 +152,11 @@ def _crossing_faces(
     # The faces at edge 0, then those at edge 1, and so on; edge_start is where each begins.
     faces_by_edge = np.argsort(edge, kind="stable") // 3
     edge_start = np.searchsorted(np.sort(edge), np.arange(len(edges) + 1))
-    crossed, crossing = _crossings_of_edges(tree, vertices, faces, edges)
-    count = edge_start[crossed + 1] - edge_start[crossed]
-    places = np.repeat(edge_start[crossed], count) + _ranks_in_groups(count)
-    passing, passed = faces_by_edge[places], np.repeat(crossing, count)
+    crossing_edge, crossed_face = _crossings_of_edges(tree, vertices, faces, edges)
+    # For each crossing, all faces at the edge, each paired with the crossed face.
+    count = edge_start[crossing_edge + 1] - edge_start[crossing_edge]
+    places = np.repeat(edge_start[crossing_edge], count) + _ranks_in_groups(count)
+    passing, passed = faces_by_edge[places], np.repeat(crossed_face, count)
     pairs = np.concatenate([np.column_stack([passing, passed]), np.column_stack([passed, passing])])
     pairs = np.unique(pairs[pairs[:, 0] != pairs[:, 1]], axis=0)
     return pairs[:, 0], pairs[:, 1]
@@ -367,5 +368,6 @@ def _cut_meets_triangle(pieces: FloatArray, heights: FloatArray, knives: FloatAr
         root = -at_start / np.where(rate == 0, 1, rate)
         low = np.where(rate > 0, np.maximum(low, root), low)
         high = np.where(rate < 0, np.minimum(high, root), high)
+        # A segment parallel to the knife's edge and outside of it: nothing is left.
         high = np.where((rate == 0) & (at_start < 0), -1.0, high)
     return low <= high

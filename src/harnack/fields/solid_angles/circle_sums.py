@@ -386,7 +386,8 @@ class CircleSet:
                 )
                 # A lower bound of |r - a| on the part of the line.
                 plane_distance = fmax(lowest - relative.a, relative.a - fmax(first, last))
-                # near and far: the distances d and P at all points of the line within `length`.
+                # near and far: lower bounds of the distances d and P at all points of the line
+                # within `length`. P is at least d.
                 near = fmax(relative.distance - length, plane_distance) - slack
                 far = fmax(relative.farthest - length, near + slack) - slack
                 bound = 2 * math.pi * relative.a / (near * far)

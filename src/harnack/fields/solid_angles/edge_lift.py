@@ -394,7 +394,7 @@ def _factor(a: tuple[Real, Real], b: tuple[Real, Real], sa: Real, sb: Real) -> t
     `tree.triangle_tree.signed_crossing` uses the same rule for crossings.
     """
     real, (au, av), (bu, bv) = cast("Any", type(sa)), a, b
-    # An end that lies on the ray is moved off it a little.
+    # An end that lies on the ray is moved off it, by far less than rounding.
     on_ray = (au == 0) & (av == 0), (bu == 0) & (bv == 0)
     ax, bx = dr.select(on_ray[0], real(-1e-18), au), dr.select(on_ray[1], real(-1e-18), bu)
     im = -edge_function((ax, av), (bx, bv))
@@ -450,13 +450,13 @@ class LiftedProduct:
         new_re = dr.fma(self.re, re, -(self.im * im))
         new_im = dr.fma(self.re, im, self.im * re)
         scale = dr.rcp(dr.abs(new_re) + dr.abs(new_im))
-        unit = type(new_re)(1)
+        one = type(new_re)(1)
         new_im = dr.select(new_im == 0, 0, new_im)  # no zero with a sign, which would be -pi
         # The sum can leave the interval only if one of the arguments is at least pi/2 in size;
         # testing for this keeps underflow from counting.
         may_wrap = (self.re <= 0) | (re <= 0)
-        turns_up = dr.select((self.im >= 0) & (im >= 0) & (new_im < 0) & may_wrap, unit, 0)
-        turns_down = dr.select((self.im < 0) & (im < 0) & (new_im >= 0) & may_wrap, unit, 0)
+        turns_up = dr.select((self.im >= 0) & (im >= 0) & (new_im < 0) & may_wrap, one, 0)
+        turns_down = dr.select((self.im < 0) & (im < 0) & (new_im >= 0) & may_wrap, one, 0)
         is_finite = dr.isfinite(scale)
         return LiftedProduct(
             dr.select(is_finite, new_re * scale, self.re),

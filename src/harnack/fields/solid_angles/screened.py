@@ -431,6 +431,7 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
         Q_4(t) <= (1 + t/4) Q_3(t), and a coordinate is off by `unit`: this adds to the error of
         second derivatives.
         """
+        # The error of the value is proportional to 1/rho^2; its derivatives to 2/rho^3 and 6/rho^4.
         inverse = dr.rcp(sums.singularity_distance)
         value_error = 2e-30 * float(self._rows[:, 6].sum()) * inverse * inverse
         fourth = 0.25 * data.kernel.kappa * sums.s4

@@ -105,6 +105,7 @@ def lipschitz_along(
     """
     slope, norm = dr.dot(gradient, line.v), dr.norm(gradient)
     max_slope = dr.select(distance < _NEAR_CURVE, _NEAR_SLOPE, _FAR_SLOPE) * norm
+    # Not 0, so that the power below is finite.
     shortest = 0.5 * fmax(distance, type(distance)(1e-30))
     # After `_LENGTHS` steps of this ratio the length would be 1, the size of the curve.
     ratio, lengths = dr.power(shortest, -1 / _LENGTHS), [shortest]
@@ -204,8 +205,8 @@ def add_edge_rates(
         s = clamp(s_nearest, -length, length)
         segment_distance = dr.norm(dr.fma(type(a)(s), n, area)) * per_length - slack
         rho = fmax(fmax(distance - length, line_distance), segment_distance)
-        square = rho * rho
-        term = c * dr.rcp(square) * dr.rsqrt(square + quarter)
+        rho_square = rho * rho
+        term = c * dr.rcp(rho_square) * dr.rsqrt(rho_square + quarter)
         # Infinite where the line may meet the edge.
         new_rates.append(rate + dr.select(rho > 0, term, dr.inf))
     return tuple(new_rates)
