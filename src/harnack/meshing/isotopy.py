@@ -383,8 +383,9 @@ def _proved_regular(
         gradient_length = np.linalg.norm(samples.gradient, axis=1)
         moved = (gradient_length + change) * radius
         product = (samples.gradient * projected).sum(axis=1)
-        # (b), with D = `change`; then (a), for f by its bound and for F by its values at the
-        # corners.
+        # (b): grad f . grad F exceeds `change` |grad F| at the center, where `change` bounds how
+        # much grad f changes in the ball. Then (a): f by its bound in the ball, and F by its values
+        # at the corners.
         is_regular = product > change * np.linalg.norm(projected, axis=1) * (1 + 1e-9)
         is_within_half_period = np.abs(samples.value) + moved < half_period
         linear = start[owner, None] + ((pieces - first[owner, None]) * slope[owner, None]).sum(2)

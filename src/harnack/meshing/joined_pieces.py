@@ -4,10 +4,6 @@ of the mesh are cut along each other into triangles, called "pieces". The windin
 sides of a piece tell whether it bounds the solid, and the pieces that do are joined. A "half edge"
 is an edge of a face with a direction.
 
-The solid is the set of points around which the mesh winds at least once. The faces of the mesh are
-cut along each other. The winding numbers on both sides of a piece tell whether it bounds the solid,
-and the pieces that do are joined.
-
 Where two faces meet, the vertices of pieces of one face differ by rounding from those of the other
 face, and a piece may have vertices in the middle of an edge of another piece. So vertices are
 merged first, and then edges are split at the vertices on them.

@@ -10,7 +10,6 @@ point is farther than d from the mesh. Then the sign of the function changes wit
 but near the point all space is on the same side of the mesh. So there is a part of the solid, or of
 the space around it, that the mesh does not have.
 
-
 Points of the level set are known: on the triangles of a mesh, where the winding number jumps across
 the level; beside the points of a cloud; and along rays out of blobs. About three thousand of them
 are used, spread evenly. They are a sample, and no proof.

@@ -108,6 +108,11 @@ class UnitCircle:
         r, z: the distance r >= 0 of the point from the axis, and its height z, as Dr.Jit numbers.
 
         On the circle's own plane z = 0 the sign of the zero decides the side.
+
+        The class docstring has the formulas. Here kc is the ratio of the distances from the nearest
+        and the farthest point of the circle; K and E are the complete elliptic integrals of that
+        complementary modulus; cel is Bulirsch's general complete integral; and the solid angle is
+        -W for z > 0 and W for z < 0. I3 and J are integrals from which the gradient follows.
         """
         real: Any = cast("Any", type(r))
         agm_rounds = _AGM_ROUNDS["double" if float(dr.epsilon(r)) < 1e-10 else "single"]

@@ -569,9 +569,11 @@ def truncation_bounds(
     Proof. Let R be the node's radius and q = R/r.
 
     1. Values. A dipole of area a at the offset d from the center gives a term of degree l of at
-       most a l |d|^(l-1)/r^(l+1): rho^l P_l is on the sphere of radius rho a trigonometric
-       polynomial of degree l along each great circle, so by Bernstein's and Szego's inequality its
-       gradient is at most l rho^(l-1).
+       most a l |d|^(l-1)/r^(l+1). It is a times a derivative, by d along a line, of |d|^l P_l(s)
+       over r^(l+1), with Legendre's polynomial P_l and the cosine s of the angle between d and the
+       vector to the point. On the sphere |d| = rho, rho^l P_l is a trigonometric polynomial of
+       degree l along each great circle, so by Bernstein's and Szego's inequality its gradient is at
+       most l rho^(l-1).
     2. Terms up to degree 5 are known exactly and bounded by `sup_norm`. For the terms l >= 6,
        |d|^(l-1) <= R^(l-5) |d|^4, and sum_{l>=6} l q^(l-5) = q (6 - 5q)/(1-q)^2.
     3. Gradients. The term of degree l is a harmonic function that is homogeneous of degree -(l+1)

@@ -162,8 +162,9 @@ def screened_promises(
         user's unit.
     epsilon: the machine epsilon of the backend.
 
-    Radii stay below 36 screening lengths. So exp(kappa r) times sums in which exponentials are at
-    least exp(-80) neither overflows nor grows.
+    kappa is one over the screening length. Radii r stay below 36 screening lengths. So the factor
+    exp(kappa r), times sums in which exponentials are at least exp(-80), neither overflows nor
+    grows.
     """
     sums, kappa = radial.sums, kernel.kappa
     nearest = fmax(sums.singularity_distance * (1 - SUM_MARGIN) - 8 * epsilon, 0)
@@ -177,7 +178,8 @@ def screened_promises(
         (1 + SUM_MARGIN) * r * dr.fma(r, radial.remainder(BALL_FRACTION, r, growth), slope)
     )
     max_change = fmin(radial.variation(r, growth), change_by_taylor)
-    # The products of f - S and f + S with the least cosine and with 1.
+    # The values on the ball in four dimensions are products of a number in [f - S, f + S] and a
+    # cosine in [min_cosine, 1]: they lie between the products of the ends of these intervals.
     min_cosine = dr.cos(fmin(kappa * r, math.pi))
     ends = (f - max_change, f + max_change)
     products = [end * min_cosine for end in ends]

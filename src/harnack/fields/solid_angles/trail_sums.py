@@ -182,7 +182,7 @@ def add_edge_rates(
     right angle. So the edge, seen along the line, runs from m to m + n, and the line is seen as the
     point 0: rho' is the distance of this segment from 0. Also c = v . (m x n). So c is small if m
     and n are, whatever the lengths of a and e: its error is at most 8 epsilon |m| |e| plus slack
-    |n|. Twice that is added.
+    |n|, where slack bounds the rounding of positions (`RayLine.slack`). Twice that is added.
     """
     a, e, inverse, slack = edge.a, edge.e, edge.inverse_square_length, line.slack
     epsilon = float(dr.epsilon(type(inverse)))
