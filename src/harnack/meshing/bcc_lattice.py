@@ -268,10 +268,10 @@ class BccLattice:
         else:
             center_below, center_above, *ring = (np.searchsorted(used, column) for column in keys)
         # A tetrahedron for each edge of the face: from corner k - 1 to corner k of the ring.
-        corners = [
+        corners_of_tetrahedra = [
             np.stack([center_below, center_above, ring[k - 1], ring[k]], axis=1) for k in range(4)
         ]
-        return _lattice_coordinates(used, shape), np.concatenate(corners)
+        return _lattice_coordinates(used, shape), np.concatenate(corners_of_tetrahedra)
 
 
 def distinct_rows(rows: IntArray) -> IntArray:

@@ -460,11 +460,14 @@ def _min_dihedral_triangulation(
         # The last diagonal is an edge of the polygon, with a face outside.
         if d == n - 1:
             sides.append(np.broadcast_to(beside[k, i], normals.shape))
-        turns = [-np.einsum("imk,imk->im", normals, side) for side in sides]
+        turns_at_sides = [-np.einsum("imk,imk->im", normals, side) for side in sides]
         # No neighbor, no angle.
-        turns = [np.where(side.any(axis=2), t, -1.0) for side, t in zip(sides, turns, strict=True)]
+        turns_at_sides = [
+            np.where(side.any(axis=2), t, -1.0)
+            for side, t in zip(sides, turns_at_sides, strict=True)
+        ]
         # For each m, the largest turn of the part that is divided at m, and twice its area.
-        worst = np.maximum.reduce([*turns, turn[i, m], turn[m, k]])
+        worst = np.maximum.reduce([*turns_at_sides, turn[i, m], turn[m, k]])
         size = area[i, m] + area[m, k] + np.sqrt((cross**2).sum(axis=2))
         smallest = worst.min(axis=1, keepdims=True)
         best = np.where(worst <= smallest + _EQUAL_COSINES, size, np.inf).argmin(axis=1)
@@ -723,8 +726,8 @@ def _loop_of_faces(new: IntArray, loops: list[IntArray], count: int) -> IntArray
     face_at[edges.edge_of_pair] = np.arange(3 * len(new)) % len(new)
     # The first edges of the loops, looked up among the edges of patches. Loops without a patch have
     # none.
-    firsts = edge_keys(np.array([loop[:2] for loop in loops]), count)
-    positions = np.minimum(np.searchsorted(keys, firsts), len(keys) - 1)
-    matched = np.flatnonzero(keys[positions] == firsts)
+    first_edge_keys = edge_keys(np.array([loop[:2] for loop in loops]), count)
+    positions = np.minimum(np.searchsorted(keys, first_edge_keys), len(keys) - 1)
+    matched = np.flatnonzero(keys[positions] == first_edge_keys)
     loop_at[part[face_at[positions[matched]]]] = matched
     return loop_at[part]

@@ -292,24 +292,24 @@ def _proved_by_stars(
     vertices = np.unique(index[rows])
     vertex_number = np.full(int(index.max(initial=0)) + 1, -1, np.int64)
     vertex_number[vertices] = np.arange(len(vertices))
-    # Pairs of a tetrahedron and a corner of it among `vertices`; then pairs of a gradient and such
-    # a corner of its tetrahedron.
-    tet, corner = np.nonzero(vertex_number[index] >= 0)
-    vertex_of_pair = vertex_number[index[tet, corner]]
-    entry, corner_of_entry = np.nonzero(vertex_number[index[slopes.owner]] >= 0)
-    vertex = vertex_number[index[slopes.owner[entry], corner_of_entry]]
+    # Pairs of a tetrahedron and the column, 0 to 3, of a corner of it among `vertices`; then pairs
+    # ("entries") of a gradient and such a column of its tetrahedron.
+    tet, column = np.nonzero(vertex_number[index] >= 0)
+    vertex_of_pair = vertex_number[index[tet, column]]
+    entry, column_of_entry = np.nonzero(vertex_number[index[slopes.owner]] >= 0)
+    vertex_of_entry = vertex_number[index[slopes.owner[entry], column_of_entry]]
     units = slopes.slope[entry]
     units = units / np.maximum(np.linalg.norm(units, axis=1), 1e-300)[:, None]
     normal = np.zeros((len(vertices), 3))
-    np.add.at(normal, vertex, units)
+    np.add.at(normal, vertex_of_entry, units)
     for _ in range(_MAX_PERCEPTRON_ROUNDS):
-        is_short = (normal[vertex] * units).sum(axis=1) <= 0
+        is_short = (normal[vertex_of_entry] * units).sum(axis=1) <= 0
         if not is_short.any():
             break
-        np.add.at(normal, vertex[is_short], units[is_short])
+        np.add.at(normal, vertex_of_entry[is_short], units[is_short])
     # n . grad F > 0, by more than rounding.
     is_proved = np.ones(len(vertices), np.bool_)
-    is_proved[vertex[(normal[vertex] * units).sum(axis=1) <= 1e-9]] = False
+    is_proved[vertex_of_entry[(normal[vertex_of_entry] * units).sum(axis=1) <= 1e-9]] = False
     has_slope = np.bincount(slopes.owner, minlength=len(index)) > 0
     # A tetrahedron without a gradient proves nothing at its corners.
     is_proved[vertex_of_pair[~has_slope[tet]]] = False

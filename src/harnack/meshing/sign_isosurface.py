@@ -564,11 +564,11 @@ class _CreaseRefinement:
         rows, to_line, fraction = rows[is_far], to_line[is_far], fraction[is_far]
         # Of these, the edges beside which the level set is found.
         foot, far_length = a[is_far] + fraction[:, None] * (b - a)[is_far], edge_length[is_far]
-        points, normal, is_found = _level_along(function, foot, to_line, _OFFSET * far_length)
-        rows, points, normal, fraction = (
+        points, new_normal, is_found = _level_along(function, foot, to_line, _OFFSET * far_length)
+        rows, points, new_normal, fraction = (
             rows[is_found],
             points[is_found],
-            normal[is_found],
+            new_normal[is_found],
             fraction[is_found],
         )
         ends = all_edges.vertices[rows]
@@ -580,7 +580,7 @@ class _CreaseRefinement:
             np.arccos(np.clip(cosine, -1, 1))
             for cosine in (
                 row_dots(normals[ends[:, 0]], normals[ends[:, 1]]),
-                np.minimum(*(row_dots(normals[ends[:, k]], normal) for k in (0, 1))),
+                np.minimum(*(row_dots(normals[ends[:, k]], new_normal) for k in (0, 1))),
             )
         )
         is_on_crease = (angle_of_ends > _MIN_CREASE_ANGLE) & (
@@ -593,11 +593,13 @@ class _CreaseRefinement:
             (new_vertices_of_face >= 0).all(axis=1)
             & is_bent[np.maximum(new_vertices_of_face, 0)].all(axis=1)
         )
-        inner, inner_normal, fan_rows = _crease_corners(function, x, normals, faces, fan_rows)
+        inner_points, inner_normal, fan_rows = _crease_corners(
+            function, x, normals, faces, fan_rows
+        )
         return cls(
             edges, vertex_of_edge, ends, fraction, faces[fan_rows], fan_rows,
-            np.concatenate([points, inner]), np.concatenate([normal, inner_normal]),
-            np.concatenate([is_on_crease, np.ones(len(inner), np.bool_)]),
+            np.concatenate([points, inner_points]), np.concatenate([new_normal, inner_normal]),
+            np.concatenate([is_on_crease, np.ones(len(inner_points), np.bool_)]),
         )  # fmt: skip
 
     def applied(self, x: FloatArray, faces: IntArray) -> tuple[FloatArray, IntArray]:
