@@ -260,7 +260,8 @@ class Polytope(Volume):
         backend = backend_of(p)
 
         def step(state: tuple[Real, Vec3], n: Vec3, h: Real) -> tuple[Real, Vec3]:
-            """Keep the larger of two signed distances, and its normal."""
+            """Keep the larger one of the signed distance so far and the signed distance from the
+            plane n.x = h, with the normal of its plane."""
             distance = dr.dot(n, p) - h
             is_larger = distance > state[0]
             return dr.select(is_larger, distance, state[0]), dr.select(is_larger, n, state[1])

@@ -135,9 +135,9 @@ class TangentVoronoi:
             return _line_in_disc(backend, q, 0.5 * dr.squared_norm(offset))
 
         def add_lines(j: Any, *state: Any) -> tuple[Any, ...]:
-            """Add the triangles at the lines j, j + 1, ... to the area and their angles to the sum
-            of angles; and note whether one of them has no neighbor to its left. The state is (area,
-            angle, is_one_sided)."""
+            """Add the triangles at the lines j, j + 1, ... to the area, and the angles of these
+            triangles to the sum of angles. Note whether there is a line whose neighbor has no other
+            neighbor to the left. The state is (area, angle, is_one_sided)."""
             numbers = [j + t for t in range(_LINES_PER_ITERATION)]
             own_lines = [bisector(number, number < line_count) for number in numbers]
             area, angle, is_one_sided = state
@@ -217,8 +217,9 @@ def _clip_bisectors(
         initial += [-half_chord, half_chord, half_chord > dr.inf]
 
     def clip_by_line(i: Any, *state: Any) -> tuple[Any, ...]:
-        """Clip the intervals of all own lines by line i; and note whether its neighbor is to the
-        left. The state has three entries for each own line: lower, upper, has_left."""
+        """Clip the intervals of all own lines by line i. Note for each own line whether the
+        neighbor of line i is to the left of the own line's neighbor. The state has three entries
+        for each own line: lower, upper, has_left."""
         other, clipped = bisector(i, i < line_count), list[Any]()
         for t, (index, own_line) in enumerate(zip(indices, own_lines, strict=True)):
             lower, upper, has_left = state[3 * t : 3 * t + 3]

@@ -103,8 +103,8 @@ def delaunay(points: FloatArray) -> Tetrahedra:
 
     qhull: Any = scipy.spatial
     middle, size = points.mean(axis=0), float(np.ptp(points, axis=0).max())
-    # The far points are the corners of a cube, rotated so that they lie in no plane with faces of a
-    # box.
+    # The far points are the corners of a large cube. It is rotated against the axes, since many of
+    # the points may lie on the faces of a box.
     rotation = np.array([[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]])
     far_corners = np.array(list(itertools.product((-1.0, 1.0), repeat=3))) @ rotation
     n = len(points)

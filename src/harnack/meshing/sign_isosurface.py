@@ -168,7 +168,8 @@ def mesh_from_signs(
         layers = 2 if closed else 0
         lattice = BccLattice.covering_box(*box, spacing, layers=layers)
         try:
-            # Not the whole tolerance, as distances are only estimated there.
+            # Edges are split from 0.8 of the tolerance on, by an estimate of distances. Then
+            # distances are measured.
             mesh = extract_from_signs(function, lattice, 0.8 * tolerance, report, closed=closed)
         except EmptySurfaceError as error:
             empty_mesh = TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64))

@@ -200,8 +200,8 @@ def _next_in_plane(
         return is_near, for_each_primitive(node, is_near & node.is_leaf, nearer, state)
 
     def nearer(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
-        """Take the face in the record `row` if it fits and has a lower number than the best so
-        far."""
+        """Take the face in the record `row` if it is one of those that are sought, and has a lower
+        number than the best so far."""
         number = index(fmax(row[NUMBER_COLUMN], real(0)))
         other_corners = corners_of(row, vector)
         other_size = dr.gather(real, sizes, number, active)
@@ -235,7 +235,8 @@ def _in_plane(ours: tuple[Vec3, ...], theirs: tuple[Vec3, ...]) -> Mask:
     """
 
     def lies_in(corners: tuple[Vec3, ...], plane: tuple[Vec3, ...]) -> Mask:
-        """Whether three corners lie in the plane of a triangle; False if that has no normal."""
+        """Whether three corners lie in the plane of the triangle with the corners `plane`; False if
+        this triangle has no area."""
         normal = _normal(plane)
         is_near = [dr.abs(dr.dot(normal, p - plane[0])) <= _IN_PLANE for p in corners]
         return is_near[0] & is_near[1] & is_near[2] & (dr.squared_norm(normal) > 0.5)

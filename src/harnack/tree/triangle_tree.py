@@ -128,7 +128,7 @@ def node_slabs(
         height = (offset @ n[:, :, None])[..., 0]
         low, high = np.nanmin(height, axis=1), np.nanmax(height, axis=1)
         square = np.einsum("nij,nij->ni", offset, offset) - height * height
-        # A little larger, against rounding to single precision.
+        # A little larger, against rounding.
         radius = np.sqrt(np.maximum(np.nanmax(square, axis=1), 0)) * (1 + 1e-6) + 1e-7
         levels.append(np.column_stack([n, 0.5 * (low + high), 0.5 * (high - low), radius]))
         normals = normals.reshape(-1, arity, 3).sum(axis=1)
@@ -381,7 +381,8 @@ class TriangleTree:
             return is_met, for_each_primitive(node, is_met & node.is_leaf, add, state)
 
         def add(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
-            """Add the sign of the crossing with a record's triangle, if it is ahead."""
+            """Add the sign of the ray's crossing with the triangle in the record `row`, if the
+            crossing is ahead of x."""
             t, sign = signed_crossing(row, VerticalRayFrame(x))
             return (state[0] + dr.select(active & (way * t > 0), sign, 0),)
 

@@ -315,7 +315,7 @@ class _FarBounds:
             inverse: 1/|q - p|^2.
             state: the smallest squared distance of a far edge; then, summed over the far edges,
                 the integral of |dp|/D^3, the gradient of this integral, and an estimate of the
-                truncation error; then, summed over all edges, the integral of |dp|/D^2.
+                truncation error; then, summed over all edges, a bound of the integral of |dp|/D^2.
 
             Returns the new state.
             """

@@ -399,7 +399,7 @@ def _are_empty(
     def add(p: Vec3, q: Vec3, inverse: Real, state: tuple[Any, ...]) -> tuple[Any, ...]:
         """Add the edge from p to q to the state: the product (zr, zi) of the factors whose
         arguments are half the angles of edges, the gradient, the distance of the nearest edge, and
-        the sums of both bounds.
+        the sums over edges in the two bounds S.
 
         inverse: 1/|q - p|^2.
         """

@@ -196,7 +196,8 @@ class RadialSums:
         radii. Each bounds the difference between f and its linear Taylor polynomial at x, by
         `remainder`.
 
-        growth: the function `RadialKernel.growth`.
+        growth: the function `RadialKernel.growth`: for a radius r, a bound of the factor by which
+            the numbers Q_m grow if distances shrink by r.
         least_distance: a lower bound of the distance to the nearest dipole.
         size: the length, in the user's unit, that is 1 in the coordinates of the sums. The results
             are in the user's unit.

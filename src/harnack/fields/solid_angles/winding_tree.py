@@ -347,8 +347,8 @@ class TreeWinding:
         """
 
         def rates(lengths: tuple[Real, ...], active: Mask) -> tuple[Real, ...]:
-            """For each length, a bound of the derivative of 4 pi w along the line within that
-            length of x; infinite on lanes that are not active."""
+            """For each length T, a bound of the derivative of 4 pi w along the line at its points
+            within T of x; infinite on lanes that are not active."""
             active = active & active_lanes
 
             def adder(reach: Real) -> AddPrimitive:
