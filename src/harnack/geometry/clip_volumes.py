@@ -208,8 +208,9 @@ class Polytope(Volume):
         slacks = self._slacks(table, o, d)
 
         def step(state: tuple[Real, Real], n: Vec3, h: Real) -> tuple[Real, Real]:
-            """Cut the interval [t0, t1] to the half-space n.x <= h. In the terms of the class,
-            `room` is N and `speed` is D, both with their bounds of rounding errors."""
+            """Cut the interval [t0, t1] to the half-space n.x <= h, which is the condition room - t
+            speed >= 0 with room = h - n.o and speed = n.d. Bounds of their rounding errors are
+            added to room and subtracted from speed, so that no point is lost."""
             t0, t1 = state
             room_slack, speed_slack = slacks(n, h)
             room = h - dr.dot(n, o) + room_slack

@@ -39,8 +39,9 @@ MIN_ANGLE = 1e-6  # so do edges that fold back at a smaller angle (radians)
 
 
 def is_convex_position(loops: tuple[FloatArray, ...]) -> bool:
-    """Whether it is proved that a curve is in convex position, so that the theorems of the module
-    apply to it.
+    """Whether it is proved that a curve is in convex position. Then the 2 pi level of its solid
+    angle lies in the hull of the curve, and a segment crosses that level at most once (theorems
+    that the module cites).
 
     loops: the validated loops (n, 3) of the curve.
 

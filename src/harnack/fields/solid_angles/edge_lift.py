@@ -186,9 +186,10 @@ class LiftedEdge:
 
         Rounding. The ends of the edge, x, and their differences together are off by half a unit.
         This changes the angle by at most that length times the edge's Biot and Savart field, which
-        is at most 2e'. The rounding of the number s of an end (see the module) acts as if the end
-        had moved by another half unit. Both edges at an end use the same bits of s, so that this
-        moves a single point of the boundary. The sums in the factor, and the product, add
+        is at most 2e'. The factor also contains, for each end, the number s: the distance of the
+        end from x, minus its component along the ray. Rounding of s acts as if the end had moved by
+        another half unit. Both edges at an end use the same bits of s, so that this moves a single
+        point of the boundary. The sums in the factor, and the product, add
         `FACTOR_ROUNDINGS` unit roundoffs, and `STEEP_ROUNDINGS` L e' unit roundoffs if the edge
         subtends more than a right angle. An angle is off by less than 4 pi in any case.
 
@@ -376,7 +377,8 @@ def edge_factor(a: Vec3, b: Vec3, la: Real, lb: Real) -> tuple[Real, Real]:
         and the coordinate along it.
     la, lb: |a| and |b|.
 
-    s_a is computed as |a'|^2/(|a| + a.d) where a.d > 0, so that nothing cancels.
+    The number s_a = |a| - a.d is computed as |a'|^2/(|a| + a.d) where a.d > 0, so that nothing
+    cancels. a' is a without its component along d.
     """
     return _factor((a.x, a.y), (b.x, b.y), _length_less_axial(a, la), _length_less_axial(b, lb))
 

@@ -333,7 +333,8 @@ class Edge:
         return c, h_factor * h + e_factor * e
 
     def _denominator(self, square: Real) -> Real:
-        """Compute D = |a||b| + a.b of the class, near the edge in the form that does not cancel.
+        """Compute D = |a||b| + a.b, a factor in the denominator of the edge's field. Near the edge,
+        where the sum cancels, it is computed as |c|^2/(|a||b| - a.b).
 
         square: |c|^2 with c = a x e.
         """

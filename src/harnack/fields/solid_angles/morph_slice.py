@@ -123,9 +123,10 @@ class SlicedKernel(RadialKernel):
         self._degree = _DEGREES[np.dtype(backend.dtype).itemsize]
 
     def at(self, distance: Real, inverse: Real, last: int) -> KernelValues:
-        """Compute the functions psi_0 to psi_last of the class at a distance D in four dimensions.
-        The integral i_n with the largest n comes from a polynomial, and all others from the
-        recurrence of the class, from larger to smaller n.
+        """Compute the functions psi_0, ..., psi_last at a distance D in four dimensions. psi_k is a
+        constant times i_(k+1)/D^(2k+1), with the integrals i_n of the class docstring. The integral
+        with the largest n comes from a polynomial, and all others from the recurrence i_n = (2n s^2
+        i_(n+1) + c)/(2n-1), where c = w/D and s = r/D.
 
         distance: D, which is not used.
         inverse: 1/D.

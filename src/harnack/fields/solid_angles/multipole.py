@@ -96,8 +96,8 @@ def dipole_moments(harmonics: Pairs, nx: Any, ny: Any, nz: Any) -> Pairs:
         points, these are the means of R_lm over the points.
     nx, ny, nz: n, the dipole's normal times its area.
 
-    By the derivatives of R_lm in the module's description,
-    M_lm = nz R_l-1,m - (x - iy) R_l-1,m+1 + (x + iy) R_l-1,m-1 with x = nx/2 and y = ny/2.
+    From d/dz R_lm = R_l-1,m, (d/dx + i d/dy) R_lm = -R_l-1,m+1 and (d/dx - i d/dy) R_lm = R_l-1,m-1
+    follows M_lm = nz R_l-1,m - (x - iy) R_l-1,m+1 + (x + iy) R_l-1,m-1 with x = nx/2 and y = ny/2.
     """
     # A harmonic is a + ib; a product such as (x - iy)(a + ib) is written out in its two parts.
     r, x, y = _with_negative_orders(harmonics), 0.5 * nx, 0.5 * ny

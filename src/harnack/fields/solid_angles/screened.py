@@ -112,9 +112,9 @@ class YukawaKernel(RadialKernel):
         return KernelValues(dr.exp(-t) * inverse, thetas(t, last))
 
     def bounds(self, distance: Real, last: int) -> list[Real]:
-        """The numbers Q_2(t) to Q_last(t) of the class for t = kappa times `distance`, which bound
-        derivatives of the kernel at this distance and beyond: exp(-t) times a sum of powers of t.
-        """
+        """The numbers Q_2(t), ..., Q_last(t) for t = kappa times `distance`, which bound
+        derivatives of the kernel at this distance and beyond. Q_m(t) is exp(-t) times the sum of
+        t^j/j! over j <= m."""
         t = fmin(self.kappa * distance, MAX_LENGTHS)
         decay = dr.exp(-t)
         sum2 = dr.fma(t, dr.fma(t, 0.5, 1), 1)

@@ -65,7 +65,8 @@ class SmoothedKernel(RadialKernel):
         self.height_square = dr.opaque(backend.Float, height * height)
 
     def at(self, distance: Real, inverse: Real, last: int) -> KernelValues:
-        """The values psi_0 to psi_last of the class at the distance D, by their closed form.
+        """The values psi_0, ..., psi_last at the distance D, by their closed form psi_k = (2k-1)!!
+        (1 + (2k+1) q/2)/D^(2k+1) with q = h^2/D^2.
 
         inverse: 1/D.
         """
@@ -79,8 +80,9 @@ class SmoothedKernel(RadialKernel):
         return KernelValues(inverse, thetas)
 
     def bounds(self, distance: Real, last: int) -> list[Real]:
-        """The numbers Q_2 to Q_last of the class, which bound derivatives of the kernel. They hold
-        at all distances D of at least 0.55 (`_BOUND_FRACTION`) times `distance`."""
+        """The numbers Q_2, ..., Q_last, which bound derivatives of the kernel: Q_m = 1 + q
+        (m+1)(m+2)/4 with q = h^2/D^2. They hold at all distances D of at least 0.55
+        (`_BOUND_FRACTION`) times `distance`."""
         # h/D at the least of these distances; its square is q.
         ratio = dr.sqrt(self.height_square) / (_BOUND_FRACTION * fmax(distance, 1e-30))
         q = fmin(ratio * ratio, 1)
