@@ -339,6 +339,7 @@ class CsgMesher:
             if not (lower < upper).all():
                 return TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64)), is_whole
         size = float((upper - lower).max())
+        # At least eight cells along the longest side.
         spacing = min(self.spacing, size / 8)
         if self.per_wave is not None and field.min_wavelength is not None:
             spacing = min(spacing, field.min_wavelength / self.per_wave)

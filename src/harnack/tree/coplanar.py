@@ -99,7 +99,7 @@ def _normals(corners: FloatArray) -> tuple[FloatArray, FloatArray]:
     their heights (m,) above their longest edges."""
     u, v = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     normal = np.cross(u, v)
-    area = np.sqrt(np.einsum("ni,ni->n", normal, normal))
+    area = np.sqrt(np.einsum("ni,ni->n", normal, normal))  # twice the triangle's area
     squares = [np.einsum("ni,ni->n", edge, edge) for edge in (u, v, u - v)]
     longest = np.sqrt(np.max(squares, axis=0))
     height = area / np.where(longest > 0, longest, 1)
@@ -112,10 +112,11 @@ def _candidates(corners: FloatArray, normals: FloatArray, heights: FloatArray) -
 
     corners: (m, 3, 3) the corners of all triangles.
     normals: (m, 3) their unit normals.
-    heights: (m,) their heights over their longest edges.
+    heights: (m,) for each triangle, its height above its longest edge.
 
     A plane is a point of R^4: its unit normal and its distance from the origin. The normal is
-    turned so that its first coordinate that is larger than 0.3 in magnitude is positive. For two
+    turned so that its first coordinate that is larger than 0.3 in magnitude is positive; a unit
+    vector always has one. For two
     triangles in one plane these points differ only by rounding and by the effect of moving corners
     by `_IN_PLANE`, divided by the smaller of the triangles' heights. R^4 is divided into cells. So
     a triangle that is alone in its cell shares its plane with another triangle only in two cases:
@@ -184,7 +185,7 @@ def _next_in_plane(
 
     tree: a tree of all faces.
     corners, face: the corners and the number of the lane's face.
-    sizes: the heights of all faces over their longest edges; of two faces with equal heights the
+    sizes: the height of each face above its longest edge; of two faces with equal heights the
         later one counts as larger.
     """
     backend = tree.tree.backend
@@ -200,8 +201,8 @@ def _next_in_plane(
         return is_near, for_each_primitive(node, is_near & node.is_leaf, nearer, state)
 
     def nearer(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
-        """Take the face in the record `row` if it fits and has a lower number than the best so
-        far."""
+        """Take the face in the record `row` if it is one of those that are sought, and has a lower
+        number than the best so far."""
         number = index(fmax(row[NUMBER_COLUMN], real(0)))
         other_corners = corners_of(row, vector)
         other_size = dr.gather(real, sizes, number, active)
@@ -235,7 +236,8 @@ def _in_plane(ours: tuple[Vec3, ...], theirs: tuple[Vec3, ...]) -> Mask:
     """
 
     def lies_in(corners: tuple[Vec3, ...], plane: tuple[Vec3, ...]) -> Mask:
-        """Whether three corners lie in the plane of a triangle; False if that has no normal."""
+        """Whether three corners lie in the plane of the triangle with the corners `plane`; False if
+        this triangle has no area."""
         normal = _normal(plane)
         is_near = [dr.abs(dr.dot(normal, p - plane[0])) <= _IN_PLANE for p in corners]
         return is_near[0] & is_near[1] & is_near[2] & (dr.squared_norm(normal) > 0.5)

@@ -297,7 +297,8 @@ class EmptySpaceGrid:
             ), free_cells > 0
 
         def body(s: Real, active: Mask) -> tuple[Real, Mask]:
-            """Extend s on active lanes; they stay active while cells are empty and s < length."""
+            """Extend s on active lanes. A lane stays active while the cell at p + s d is empty and
+            s is less than `length`."""
             further, empty = extend(s)
             return dr.select(active, further, s), active & empty & (further < length)
 
@@ -306,7 +307,8 @@ class EmptySpaceGrid:
         active = dr.full(self.backend.Bool, True, 1) & (start == start) & (length > 0)
 
         def running(s: Real, active: Mask) -> Mask:
-            """Whether a lane is still in empty cells and shorter than `length`."""
+            """Whether s is to be extended further: the path up to s ended in an empty cell, and s
+            is less than `length`."""
             del s
             return active
 

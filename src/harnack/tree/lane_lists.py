@@ -115,8 +115,9 @@ def build_lists(backend: Backend, walk: Callable[[WriteEntry | None], Any]) -> L
 def traverse_subtrees(
     tree: PackedTree, lists: LaneLists, visit: Visit, state: LoopValues
 ) -> LoopValues:
-    """Visit the subtrees below the listed nodes of a tree, depth first, and return the final state.
-    Each lane walks through the nodes of its own list, one subtree after the other.
+    """Visit the subtrees whose roots are the listed nodes of a tree, each from its root on, depth
+    first; and return the final state. Each lane goes through its own list, one subtree after the
+    other.
 
     lists: the indices of nodes, one list for each lane.
     visit: a function that takes a `VisitedNode` and the state. It returns a mask, whether to visit

@@ -118,8 +118,8 @@ class OctreeLookup:
             return node >= 0
 
         def step(node: Any, bit: Any) -> tuple[Any, Any]:
-            """Go to the child that contains the point: bit number `bit` of its coordinates chooses
-            it."""
+            """Go from a node to its child that contains x. Bit number `bit` of the integer
+            coordinates of x chooses the child."""
             octant = ((ix >> bit) & 1) * 4 + ((iy >> bit) & 1) * 2 + ((iz >> bit) & 1)
             return dr.gather(integer, self.encoded_nodes, index(node) + octant), bit - 1
 

@@ -123,6 +123,7 @@ def node_slabs(
     levels: list[FloatArray] = []
     # The last arity, 1, is that of no level: above the root nothing is summed.
     for box, arity in zip(boxes, (*tree.arities, 1), strict=True):
+        # The sum of the normals, scaled to length 1; it stays near 0 if the sum is 0 or tiny.
         n = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
         n[~(np.linalg.norm(n, axis=1) > 0.5)] = (0.0, 0.0, 1.0)
         # Offsets of all corners below each node from its center: h along n, and |r|^2 across.
@@ -130,6 +131,7 @@ def node_slabs(
         height = (offset @ n[:, :, None])[..., 0]
         low, high = np.nanmin(height, axis=1), np.nanmax(height, axis=1)
         square = np.einsum("nij,nij->ni", offset, offset) - height * height
+        # A little larger, against rounding.
         radius = np.sqrt(np.maximum(np.nanmax(square, axis=1), 0)) * (1 + 1e-6) + 1e-7
         levels.append(np.column_stack([n, 0.5 * (low + high), 0.5 * (high - low), radius]))
         normals = normals.reshape(-1, arity, 3).sum(axis=1)
@@ -385,7 +387,8 @@ class TriangleTree:
             return is_met, for_each_primitive(node, is_met & node.is_leaf, add, state)
 
         def add(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
-            """Add the sign of the crossing with a record's triangle, if it is ahead."""
+            """Add the sign of the ray's crossing with the triangle in the record `row`, if the
+            crossing is ahead of x."""
             t, sign = signed_crossing(row, VerticalRayFrame(x))
             return (state[0] + dr.select(active & (way * t > 0), sign, 0),)
 
@@ -541,9 +544,9 @@ def _crossing_depth(
     )
     e = end[0] - start[0], end[1] - start[1]
     # The positions of the ray and of the apex (s') along the longest edge.
-    share = dr.rcp(select_longest(*squares))
-    ray_position = -dr.fma(start[0], e[0], start[1] * e[1]) * share
-    apex_position = dr.fma(apex[0] - start[0], e[0], (apex[1] - start[1]) * e[1]) * share
+    inverse_square = dr.rcp(select_longest(*squares))
+    ray_position = -dr.fma(start[0], e[0], start[1] * e[1]) * inverse_square
+    apex_position = dr.fma(apex[0] - start[0], e[0], (apex[1] - start[1]) * e[1]) * inverse_square
     zero = type(ab)(0)
     ray_position, apex_position = clamp(ray_position, zero, 1), clamp(apex_position, zero, 1)
     # So that 0 <= s <= 1 - w for s = ray_position - w apex_position. `fmin` ignores the NaN of a
@@ -559,9 +562,9 @@ def _crossing_depth(
     for (tail, head), area, square in zip(
         ((a, b), (b, c), (a, c)), (ab, bc, ac), squares, strict=True
     ):
-        share = -dr.fma(tail[0], head[0] - tail[0], tail[1] * (head[1] - tail[1])) / square
-        edge_depth = dr.fma(clamp(share, zero, 1), head[2] - tail[2], tail[2])
-        is_on_edge = (area * area <= close_square * square) & (share > 0) & (share < 1)
+        position = -dr.fma(tail[0], head[0] - tail[0], tail[1] * (head[1] - tail[1])) / square
+        edge_depth = dr.fma(clamp(position, zero, 1), head[2] - tail[2], tail[2])
+        is_on_edge = (area * area <= close_square * square) & (position > 0) & (position < 1)
         t = dr.select(is_on_edge, edge_depth, t)
     for u, v, depth in corners:
         t = dr.select(dr.fma(u, u, v * v) <= 4 * close_square, depth, t)

@@ -430,9 +430,10 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
             )
 
         def gradients(x: FloatArray, n: FloatArray, areas: FloatArray, length: float) -> FloatArray:
-            """Compute the gradients (n, 3) of a smoothed dipole potential at its own points.
+            """Compute the gradients (k, 3) of a smoothed dipole potential at the dipoles
+            themselves.
 
-            x, n, areas: the points (n, 3), their normals (n, 3), and their areas (n,).
+            x, n, areas: the points (k, 3) of the dipoles, their normals (k, 3) and areas (k,).
             length: the smoothing length.
             """
             field = DipolePotential(x, n, areas, smoothing=length)

@@ -180,7 +180,9 @@ def evaluate_expansion(coefficients: Sequence[Any], y: Sequence[Any], degree: in
         total[0] = total[0] + weight * (real * re + (imag * im if k else 0.0))
         if j == degree:
             continue
-        # up, iup: real and imaginary part of L_j+1,k+1; down, idown: of L_j+1,k-1.
+        # up, iup: real and imaginary part of L_j+1,k+1; down, idown: of L_j+1,k-1; zr, zi: of
+        # L_j+1,k. From these, x, xi: of the difference up - down, for d/dx; v, vi: of the sum up +
+        # down, for d/dy. For k = 0 `up` alone is used, as L_j+1,-1 follows from it.
         up, down = a[j + 1, k + 1, 0], a.get((j + 1, k - 1, 0), 0.0)
         iup, idown = a[j + 1, k + 1, 1], a.get((j + 1, k - 1, 1), 0.0)
         zr, zi = a[j + 1, k, 0], a.get((j + 1, k, 1), 0.0)

@@ -123,10 +123,10 @@ class SlicedKernel(RadialKernel):
         self._degree = _DEGREES[np.dtype(backend.dtype).itemsize]
 
     def at(self, distance: Real, inverse: Real, last: int) -> KernelValues:
-        """Compute the values of the functions psi_0, ..., psi_last at a distance D in four
-        dimensions. They follow from the integrals i_1, ..., i_(last+1) of the class docstring. The
-        last of these comes from a polynomial, and the others from the recurrence, from larger to
-        smaller indices.
+        """Compute the functions psi_0, ..., psi_last at a distance D in four dimensions. psi_k is a
+        constant times i_(k+1)/D^(2k+1), with the integrals i_n of the class docstring. The integral
+        with the largest n comes from a polynomial, and all others from the recurrence i_n = (2n s^2
+        i_(n+1) + c)/(2n-1), where c = w/D and s = r/D.
 
         distance: D, which is not used.
         inverse: 1/D.

@@ -98,8 +98,8 @@ def dipole_moments(harmonics: Pairs, nx: Any, ny: Any, nz: Any) -> Pairs:
         points, these are the means of R_lm over the points.
     nx, ny, nz: n, the dipole's normal times its area.
 
-    By the derivatives of R_lm in the module's description,
-    M_lm = nz R_l-1,m - (x - iy) R_l-1,m+1 + (x + iy) R_l-1,m-1 with x = nx/2 and y = ny/2.
+    From d/dz R_lm = R_l-1,m, (d/dx + i d/dy) R_lm = -R_l-1,m+1 and (d/dx - i d/dy) R_lm = R_l-1,m-1
+    follows M_lm = nz R_l-1,m - (x - iy) R_l-1,m+1 + (x + iy) R_l-1,m-1 with x = nx/2 and y = ny/2.
     """
     # A harmonic is a + ib; a product such as (x - iy)(a + ib) is written out in its two parts.
     r, x, y = _with_negative_orders(harmonics), 0.5 * nx, 0.5 * ny
@@ -573,9 +573,11 @@ def truncation_bounds(
     Proof. Let R be the node's radius and q = R/r.
 
     1. Values. A dipole of area a at the offset d from the center gives a term of degree l of at
-       most a l |d|^(l-1)/r^(l+1): rho^l P_l is on the sphere of radius rho a trigonometric
-       polynomial of degree l along each great circle, so by Bernstein's and Szego's inequality its
-       gradient is at most l rho^(l-1).
+       most a l |d|^(l-1)/r^(l+1). It is a times a derivative, by d along a line, of |d|^l P_l(s)
+       over r^(l+1), with Legendre's polynomial P_l and the cosine s of the angle between d and the
+       vector to the point. On the sphere |d| = rho, rho^l P_l is a trigonometric polynomial of
+       degree l along each great circle, so by Bernstein's and Szego's inequality its gradient is at
+       most l rho^(l-1).
     2. Terms up to degree 5 are known exactly and bounded by `sup_norm`. For the terms l >= 6,
        |d|^(l-1) <= R^(l-5) |d|^4, and sum_{l>=6} l q^(l-5) = q (6 - 5q)/(1-q)^2.
     3. Gradients. The term of degree l is a harmonic function that is homogeneous of degree -(l+1)

@@ -102,6 +102,8 @@ class FaceLoops:
             )
         signed_counts = np.where(faces.in_convex_position, -counts, counts)
         edges = LoopEdges.upload(backend, loops, EDGES_PER_RECORD)
+        # A point has a few roundings of size 1 in unit coordinates, and was rounded once before, at
+        # its distance from the origin, which is about `magnitude`.
         heads = np.column_stack(
             [
                 center, size, np.cumsum(counts) - counts, signed_counts,
@@ -251,6 +253,7 @@ def face_boxes(faces: PolygonFaces, levels: tuple[float, ...]) -> tuple[FloatArr
     nearest = min(abs(math.remainder(level, PERIOD)) for level in levels)
     # Half the diagonal of each face's box.
     size = 0.5 * np.linalg.norm(high - low, axis=1)[:, None]
+    # If 2 pi is the least distance, all levels are 2 pi modulo 4 pi.
     is_in_hull = faces.in_convex_position & (nearest > 2 * math.pi * (1 - 1e-9))
     # The isoperimetric box: rho = L/sqrt(l (4 pi - l)) around the face.
     margin = 1.0001 * faces.face_perimeters()[:, None] / math.sqrt(nearest * (PERIOD - nearest))
@@ -398,7 +401,7 @@ def _are_empty(
     def add(p: Vec3, q: Vec3, inverse: Real, state: tuple[Any, ...]) -> tuple[Any, ...]:
         """Add the edge from p to q to the state: the product (zr, zi) of the factors whose
         arguments are half the angles of edges, the gradient, the distance of the nearest edge, and
-        the sums of both bounds.
+        the sums over edges in the two bounds S.
 
         inverse: 1/|q - p|^2.
         """

@@ -223,8 +223,10 @@ def cluster_source(
     bounds = kernel.bounds(nearest, 6)
     tail = KernelBounds.of(nearest, inverse_nearest, bounds)
     fourth, fifth, sixth = bounds[2:]
-    # The errors of the module, with |m_i| |d_i|^3 summed to the third moment c[23], and with
-    # 1/((1-q)^j r^(j+3)) written as 1/r^3 times 1/nearest^j.
+    # The errors of the module. Let r = D and q = R/r, with the radius R. A dipole m_i at the offset
+    # d_i from the center has an error of at most Q_4 |m_i| |d_i|^3 (4-3q)/((1-q)^2 r^5) of the
+    # value, and similar ones of the derivatives. The sum of |m_i| |d_i|^3 is the third moment
+    # c[23], and 1/((1-q)^j r^(j+3)) is 1/r^3 times 1/nearest^j, as nearest = (1-q) r.
     q = radius * inverse
     common = c[23] * inverse * inverse * inverse * inverse_nearest * inverse_nearest
     error = common * fourth * dr.fma(-3, q, 4)

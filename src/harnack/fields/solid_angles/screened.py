@@ -102,16 +102,19 @@ class YukawaKernel(RadialKernel):
         self.kappa = dr.opaque(backend.Float, kappa)
 
     def at(self, distance: Real, inverse: Real, last: int) -> KernelValues:
-        """The values psi_0 to psi_last of the class at a distance, by the polynomials theta_k.
-        inverse: 1/distance."""
+        """The values psi_0, ..., psi_last of the class docstring at the given distance rho. They
+        are psi_k = exp(-kappa rho) theta_k(kappa rho)/rho^(2k+1), with polynomials theta_k.
+
+        inverse: 1/distance.
+        """
         # Farther away exponentials are not computed, as they would underflow.
         t = fmin(self.kappa * distance, MAX_LENGTHS)
         return KernelValues(dr.exp(-t) * inverse, thetas(t, last))
 
     def bounds(self, distance: Real, last: int) -> list[Real]:
         """The numbers Q_2(t), ..., Q_last(t) for t = kappa times `distance`, which bound
-        derivatives of the kernel at this distance and beyond (see the class). Each is exp(-t) times
-        a sum of powers of t."""
+        derivatives of the kernel at this distance and beyond. Q_m(t) is exp(-t) times the sum of
+        t^j/j! over j <= m."""
         t = fmin(self.kappa * distance, MAX_LENGTHS)
         decay = dr.exp(-t)
         sum2 = dr.fma(t, dr.fma(t, 0.5, 1), 1)
@@ -159,8 +162,9 @@ def screened_promises(
         user's unit.
     epsilon: the machine epsilon of the backend.
 
-    Radii stay below 36 screening lengths. So exp(kappa r) times sums in which exponentials are at
-    least exp(-80) neither overflows nor grows.
+    kappa is one over the screening length. Radii r stay below 36 screening lengths. So the factor
+    exp(kappa r), times sums in which exponentials are at least exp(-80), neither overflows nor
+    grows.
     """
     sums, kappa = radial.sums, kernel.kappa
     nearest = fmax(sums.singularity_distance * (1 - SUM_MARGIN) - 8 * epsilon, 0)
@@ -174,7 +178,8 @@ def screened_promises(
         (1 + SUM_MARGIN) * r * dr.fma(r, radial.remainder(BALL_FRACTION, r, growth), slope)
     )
     max_change = fmin(radial.variation(r, growth), change_by_taylor)
-    # The products of f - S and f + S with the least cosine and with 1.
+    # The values on the ball in four dimensions are products of a number in [f - S, f + S] and a
+    # cosine in [min_cosine, 1]: they lie between the products of the ends of these intervals.
     min_cosine = dr.cos(fmin(kappa * r, math.pi))
     ends = (f - max_change, f + max_change)
     products = [end * min_cosine for end in ends]
@@ -429,6 +434,7 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
         Q_4(t) <= (1 + t/4) Q_3(t), and a coordinate is off by `unit`: this adds to the error of
         second derivatives.
         """
+        # The error of the value is proportional to 1/rho^2; its derivatives to 2/rho^3 and 6/rho^4.
         inverse = dr.rcp(sums.singularity_distance)
         value_error = 2e-30 * float(self._rows[:, 6].sum()) * inverse * inverse
         fourth = 0.25 * data.kernel.kappa * sums.s4

@@ -65,8 +65,8 @@ class SmoothedKernel(RadialKernel):
         self.height_square = dr.opaque(backend.Float, height * height)
 
     def at(self, distance: Real, inverse: Real, last: int) -> KernelValues:
-        """The values of the functions psi_0, ..., psi_last at a distance D, by their closed form
-        (see the class).
+        """The values psi_0, ..., psi_last at the distance D, by their closed form psi_k = (2k-1)!!
+        (1 + (2k+1) q/2)/D^(2k+1) with q = h^2/D^2.
 
         distance, inverse: D and 1/D. Only 1/D is used.
         """
@@ -80,9 +80,10 @@ class SmoothedKernel(RadialKernel):
         return KernelValues(inverse, thetas)
 
     def bounds(self, distance: Real, last: int) -> list[Real]:
-        """The numbers Q_2, ..., Q_last, which bound derivatives of the kernel (see the class). They
-        hold at all distances D of at least 0.55 (`_BOUND_FRACTION`) times `distance`."""
-        # h/D at the least of these distances; its square is q. 1e-30 prevents a division by zero.
+        """The numbers Q_2, ..., Q_last, which bound derivatives of the kernel: Q_m = 1 + q
+        (m+1)(m+2)/4 with q = h^2/D^2. They hold at all distances D of at least 0.55
+        (`_BOUND_FRACTION`) times `distance`."""
+        # h/D at the least of these distances; its square is q.
         ratio = dr.sqrt(self.height_square) / (_BOUND_FRACTION * fmax(distance, 1e-30))
         q = fmin(ratio * ratio, 1)
         return [dr.fma(0.25 * (m + 1) * (m + 2), q, 1) for m in range(2, last + 1)]

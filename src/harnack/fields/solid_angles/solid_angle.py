@@ -295,11 +295,13 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         records = (
             0 if edges is None else sum(-(-len(loop) // edges.edges_per_record) for loop in unit)
         )
+        # For circles alone: the last operations, as in `LoopEdges.rounding`.
         value_rounding = 16 * backend.machine_epsilon if edges is None else edges.rounding(records)
         cells = None
         if self.has_variable_accuracy and traced:
             low, high = self._box(center)
             cells = build_curve_cells(backend, unit, low, high, self.max_bytes())
+        # The number of roundings of a position: `_CurveData.rounding` lists them.
         return _CurveData(
             *frame_parameters(backend, center, self._size),
             edges,
@@ -511,9 +513,13 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         x = data.to_unit(p)
         sums, unit = data.sums(x), coordinate_rounding(x)
         distance = sums.distance - 4 * unit
-        is_off_curve = (distance > 0) & (sums.distance > 2 * data.rounding)  # see `evaluate`
+        # The second condition is that of `_sample`.
+        is_off_curve = (distance > 0) & (sums.distance > 2 * data.rounding)
         # By this factor |dp|/D^4 can grow if the distance D is reduced by its rounding.
         growth = dr.select(is_off_curve, dr.square(dr.square(sums.distance / distance)), dr.inf)
+        # With the integrals I3 and I4 of |dp|/D^3 and |dp|/D^4 the sums of `source_sums` are s4 =
+        # I3/4 and s5 = 3 I4/16 (`LiftedEdge.bounds`), and I4 <= I3/distance. The factors 1/3 and
+        # 1/4 in their places are a little larger.
         gradient_error = SLOPE_ROUNDINGS / 3 * unit * sums.inverse_cubes * growth / data.size
         second_error = 0.25 * SECOND_ROUNDINGS * unit * sums.inverse_cubes / sums.distance * growth
         return gradient_error, second_error / (data.size * data.size)

@@ -249,8 +249,8 @@ def _hessian(
     )  # fmt: skip
     # The first three entries, on the diagonal, contain s I.
     parts = [
-        (square * u2 + cube * u4 - left - right + w * a * b - (s if k < 3 else 0)) * u3
-        for k, (square, cube, (left, right), (a, b)) in enumerate(
+        (p2_entry * u2 + p3_entry * u4 - left - right + w * a * b - (s if k < 3 else 0)) * u3
+        for k, (p2_entry, p3_entry, (left, right), (a, b)) in enumerate(
             zip(p2_entries, p3_entries, crossed, pairs, strict=True)
         )
     ]

@@ -187,6 +187,7 @@ def winding_box(mesh: WindingMesh, levels: tuple[float, ...]) -> Box:
     slack = 1e-4 * float((high - low).max())  # for the rounding of the box
     # The numbers 1e-12 below only prevent a division by zero.
     min_level = min(abs(level) for level in levels)
+    # 1e-12 prevents divisions by 0: margins are huge for levels that have no bound.
     area_margin = math.sqrt(mesh.area / (4 * math.pi * max(min_level, 1e-12)))
     level_gap = min(abs(math.remainder(level, 1.0)) for level in levels) * 4 * math.pi  # l
     edge_margin = mesh.boundary_length / math.sqrt(
