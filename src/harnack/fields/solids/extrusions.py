@@ -240,7 +240,7 @@ class Extrusion(Solid):
             ray_sample = path.enclose(replace(sample, ray_promises=(path_constant,)))
             # The speed has no bound looking back.
             return replace(ray_sample, backward=(), min_gradient_norm=min_norm)
-        # The caller chooses the kinds of enclosures. The one below is used with the sharpest choice,
+        # The caller chooses kinds of enclosures. The one below is used with the sharpest choice,
         # which is the one that has `PiecewiseTaylorEnclosure`.
         if PiecewiseTaylorEnclosure not in path.proofs.kinds:
             return path.enclose(self.evaluate(p))
@@ -635,7 +635,7 @@ class SolidOfRevolution(Solid):
         """
         del back
         p, d = path.point(t), path.direction
-        # The caller chooses the kinds of enclosures. The one below is used with the sharpest choice,
+        # The caller chooses kinds of enclosures. The one below is used with the sharpest choice,
         # which is the one that has `PiecewiseTaylorEnclosure`.
         if PiecewiseTaylorEnclosure not in path.proofs.kinds:
             return path.enclose(self.evaluate(p))

@@ -194,7 +194,7 @@ class Thread(Solid):
         del ahead, back
         p, d = path.point(t), path.direction
         ray_sample = path.enclose(self.evaluate(p))
-        # The caller chooses the kinds of enclosures. The one below is used with the sharpest choice,
+        # The caller chooses kinds of enclosures. The one below is used with the sharpest choice,
         # which is the one that has `PiecewiseTaylorEnclosure`.
         if PiecewiseTaylorEnclosure not in path.proofs.kinds:
             return ray_sample
