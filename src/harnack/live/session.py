@@ -359,6 +359,7 @@ class Session:
         rays were traced that building cells takes less time than it saves. Cells hold local
         expansions of the field, which make each ray faster.
         """
+        # Arrays are compared by their bytes.
         loops = None if controls.curves is None else [loop.tobytes() for loop in controls.curves]
         key = controls.values, loops, controls.cut_volume, controls.settings
         state = self._painted

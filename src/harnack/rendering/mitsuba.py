@@ -296,6 +296,7 @@ def transmittance(mi: Any, carriers: Any, start: Any, si: Any, d: Any) -> Any:
         inside = is_inside(mi, carrier, start, d) & si.is_valid()
         # The spectrum of a reflectance of that color, at the ray's wavelengths.
         per_unit = mi.Spectrum(carrier.tint.eval(si, inside))
+        # `power` needs a positive base.
         remaining *= dr.select(inside, dr.power(dr.maximum(per_unit, 1e-6), si.t), 1)
     return remaining
 

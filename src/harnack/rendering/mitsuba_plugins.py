@@ -136,6 +136,7 @@ def equivalent_path_tracer(mi: Any, scene: Any) -> PathTracer | None:
         return _with_settings(mi, integrator)
     if not count or _sees_ours(integrator):
         return None
+    # Direct light is the light of paths of at most two edges.
     if class_name == _DIRECT:
         return PathTracer(mi, 2, hide_emitters=bool(integrator.hide_emitters))
     wrong = (

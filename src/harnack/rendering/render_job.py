@@ -49,8 +49,9 @@ class RenderJob:
     shorthand: options of surfaces and traces that were set by keywords, by name.
     variant: the Mitsuba variant.
 
-    The task is an `AovTask`, a `PathRenderTask` or a `ShadedTask`. The methods here that are named
-    like methods of a task call these, and return their results as plain arrays by name.
+    The task is an `AovTask`, a `PathRenderTask` or a `ShadedTask`. Each of the methods
+    `render_range`, `render_samples`, `render_gbuffer` and `refine_pixels` calls the method of the
+    task that has the same name, and returns its result as plain arrays by name.
     """
 
     surfaces: Any

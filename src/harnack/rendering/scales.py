@@ -1,7 +1,7 @@
 """Colors by name, and colors for numbers. A color map turns numbers in [0, 1] into colors. A color
-scale maps an interval of numbers to a color map, and has ticks, which are numbers with their texts.
-A color bar shows the scale beside a picture. Colors are in sRGB with channels in [0, 1] unless
-stated otherwise."""
+scale gives colors to the numbers of an interval by a color map. Its ticks are numbers of the
+interval with their texts. A color bar shows the scale beside a picture. Colors are in sRGB with
+channels in [0, 1] unless stated otherwise."""
 
 from __future__ import annotations
 

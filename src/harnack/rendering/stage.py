@@ -120,6 +120,7 @@ def _without_table(bsdf: Dictionary) -> Dictionary:
     """Return a BSDF dictionary with the same diffuse reflectance that Mitsuba loads faster. A rough
     coat is replaced by a smooth one, for which Mitsuba need not compute a table of transmittances.
     Other dictionaries are returned unchanged."""
+    # Only dictionaries with the entries of `_coated` are known well enough.
     if bsdf.keys() != _coated((0, 0, 0), 0).keys() or bsdf["type"] != "roughplastic":
         return bsdf
     return {**{key: bsdf[key] for key in bsdf if key != "alpha"}, "type": "plastic"}
