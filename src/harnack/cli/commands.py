@@ -87,8 +87,8 @@ def _view(arguments: Any) -> int:
 
 
 def _output(arguments: Any, path: Path, suffix: str, kind: str) -> str:
-    """The path of the file to write: the argument -o or, without it, the name of the source with
-    the extension `suffix`. path: of the source. kind: what is written, such as "picture", for
+    """Return the path of the file to write: the argument -o or, without it, the name of the source
+    with the extension `suffix`. path: of the source. kind: what is written, such as "picture", for
     messages."""
     if arguments.output == "":
         raise ValueError(f"-o is empty: name the {kind} to write, such as a{suffix}")
@@ -167,7 +167,8 @@ def _repaired(facts: dict[str, Any], old: int, new: int) -> str:
     """Describe a repair in one line: what was kept, changed and added, and why not more was kept.
 
     facts: the metadata that `harnack.repair` returns with a mesh.
-    old, new: the numbers of triangles before and after."""
+    old, new: the numbers of triangles before and after.
+    """
     parts = _counted(len(facts["parts"]), "part")
     if facts["dropped"]:
         parts += f", of which {facts['dropped']:,} dropped"
@@ -194,7 +195,7 @@ def _repaired(facts: dict[str, Any], old: int, new: int) -> str:
 
 
 def _counted(count: int, noun: str) -> str:
-    """A count and its noun, as text such as "1 hole" or "2 holes"."""
+    """Return a count and its noun, as text such as "1 hole" or "2 holes"."""
     return f"{count:,} {noun}" + ("" if count == 1 else "s")
 
 

@@ -20,7 +20,7 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def is_dask_array(value: Any) -> bool:
-    """Whether a value is a Dask array. This does not import Dask."""
+    """Return whether a value is a Dask array. This does not import Dask."""
     return type(value).__module__.startswith("dask.array") and hasattr(value, "dask")
 
 
@@ -30,7 +30,8 @@ def accepts_dask_arrays(*names: str) -> Callable[[Function], Function]:
     each of their blocks is the function's result for the same block of the arguments. All other
     arguments, such as a field, are sent to each worker once.
 
-    It must be the outermost decorator, since workers look the function up by its name."""
+    It must be the outermost decorator, since workers look the function up by its name.
+    """
 
     def decorate(function: Function) -> Function:
         """Return `function` with support for Dask arrays."""
@@ -159,16 +160,18 @@ def _align_blocks(
 
 
 def _arrays_of(result: Any) -> dict[str, np.ndarray[Any, Any]]:
-    """The arrays of a function's result by name: the attributes of a dataclass, or the array itself
-    under the name ""."""
+    """Return the arrays of a function's result by name: the attributes of a dataclass, or the array
+    itself under the name ""."""
     return dict(vars(result)) if is_dataclass(result) else {"": np.asarray(result)}
 
 
 def _run_block(packed: SerializedObject, blocks: dict[str, Any], start: int) -> dict[str, Any]:
     """Apply the function to one block of rows, on a worker. Returns the result's arrays by name.
 
-    packed: the serialized function. blocks: the block of each Dask array by the argument's name.
-    start: the first row of the block, for messages."""
+    packed: the serialized function.
+    blocks: the block of each Dask array by the argument's name.
+    start: the first row of the block, for messages.
+    """
     with exclusive_compute():
         try:
             return _arrays_of(packed.deserialize()(**blocks))

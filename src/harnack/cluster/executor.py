@@ -86,7 +86,7 @@ class CheckpointFolder:
         return cls(folder)
 
     def load(self, name: str) -> TaskResult | None:
-        """The stored result of the task with this name; None if the folder has none.
+        """Return the stored result of the task with this name; None if the folder has none.
 
         Raises:
             ValueError: the file is damaged.
@@ -103,7 +103,7 @@ class CheckpointFolder:
             ) from None
 
     def has(self, name: str) -> bool:
-        """Whether the folder has a result of the task with this name."""
+        """Return whether the folder has a result of the task with this name."""
         return self._file(name).exists()
 
     def save(self, name: str, arrays: TaskResult) -> None:
@@ -112,7 +112,7 @@ class CheckpointFolder:
             np.savez(partial, allow_pickle=False, **arrays)
 
     def _file(self, name: str) -> Path:
-        """The path of the file for the result of the task with this name."""
+        """Return the path of the file for the result of the task with this name."""
         return self.path / f"{name}.npz"
 
 
@@ -152,7 +152,8 @@ class Executor:
         step: the name of a method that returns arrays by name.
         parts: for each task, a tuple of the method's arguments.
 
-        Raises the errors of the method."""
+        Raises the errors of the method.
+        """
         if self.client is None and self.checkpoint is None:
             method: TaskFunction = getattr(job, step)
             for part in parts:
@@ -174,12 +175,12 @@ class Executor:
                     self.checkpoint.save(name, arrays)
 
     def _max_pending(self) -> int:
-        """The largest number of tasks that may be running or whose results wait to be yielded:
-        three for each thread of the workers, or one in this process."""
+        """Return the largest number of tasks that may be running or whose results wait to be
+        yielded: three for each thread of the workers, or one in this process."""
         return 1 if self.client is None else _PENDING_PER_THREAD * self._threads()
 
     def _threads(self) -> int:
-        """The number of threads of all workers of the client, at least 1."""
+        """Return the number of threads of all workers of the client, at least 1."""
         return max(1, sum(worker_threads(self.client).values()))
 
 
@@ -213,7 +214,8 @@ class _LocalTasks:
     `_DaskTasks`.
 
     do: the job's method that a task calls.
-    waiting: (name, arguments) of the tasks that were submitted and not run yet."""
+    waiting: (name, arguments) of the tasks that were submitted and not run yet.
+    """
 
     def __init__(self, packed: SerializedObject, step: str) -> None:
         """Prepare the tasks of the serialized job `packed`. step: the name of the job's method that
@@ -232,8 +234,8 @@ class _LocalTasks:
         return name, self.do(*part)
 
     def cancel(self) -> list[tuple[str, TaskResult]]:
-        """The (name, result) of the tasks that are finished but whose results were not fetched:
-        always none here."""
+        """Return the (name, result) of the tasks that are finished but whose results were not
+        fetched: always none here."""
         return []
 
 
@@ -244,7 +246,8 @@ class _DaskTasks:
     completed: Dask's iterator of finished futures.
     names: the name of the task of each future that was not fetched yet.
     checked_workers: addresses of the workers whose rounding was compared with that of this process.
-    packed: the future of the serialized job."""
+    packed: the future of the serialized job.
+    """
 
     def __init__(self, client: Any, packed: SerializedObject, step: str) -> None:
         """Send the serialized job `packed` to the cluster of `client`. step: the name of the job's
@@ -344,7 +347,8 @@ def _ordered_results(
     folder: the folder in which results are looked up and stored; None for no folder.
     runner: runs the tasks.
     max_pending: returns the largest number of tasks that may be running or whose results wait to be
-        yielded."""
+        yielded.
+    """
     results: dict[str, TaskResult] = {}
     pending: set[str] = set()
     uses_left, next_index = Counter(names), 0

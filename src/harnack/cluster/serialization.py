@@ -85,8 +85,8 @@ def import_optional(name: str, feature: str) -> Any:
 
 @functools.cache
 def package_versions() -> str:
-    """The versions, as one text, of this library and of the libraries on which the bits of its
-    results depend."""
+    """Return the versions, as one text, of this library and of the libraries on which the bits of
+    its results depend."""
     versions = (f"{name} {importlib.metadata.version(name)}" for name in _PACKAGES)
     return ", ".join((f"harnack {__version__}", *versions))
 
@@ -96,7 +96,7 @@ class TransientCache(dict[Key, Value]):
     the object."""
 
     def __reduce__(self) -> Any:
-        """How pickle rebuilds the cache: as an empty one."""
+        """Return how pickle rebuilds the cache: as an empty one."""
         return TransientCache, ()
 
 
@@ -111,7 +111,8 @@ class SerializedObject:
     file_digests: (path, hash of the contents) of each file that the object names.
     package_versions: the versions in the process that pickled the object; `deserialize` refuses
         others.
-    other_versions: (name, version) of the other installed packages that the object uses."""
+    other_versions: (name, version) of the other installed packages that the object uses.
+    """
 
     content_hash: str
     data: bytes
@@ -180,7 +181,7 @@ def _deserialize_cached(packed: SerializedObject) -> Any:
 
 
 def content_hash(thing: Any, label: str) -> str:
-    """A hash of 32 hexadecimal digits that depends on everything an object contains, on the
+    """Return a hash of 32 hexadecimal digits that depends on everything an object contains, on the
     contents of the files that it names, and on `package_versions`. label: what the object is, for
     messages.
 
@@ -197,12 +198,14 @@ def content_hash(thing: Any, label: str) -> str:
 def _hash_and_files(
     value: Any, label: str, identifiers: frozenset[str] = frozenset()
 ) -> tuple[str, Any]:
-    """The content hash of a value, and the pickler that wrote it. The pickler has noted the hashes
-    of the files (`files`) and the versions of the packages (`other_versions`) that the value uses.
+    """Return the content hash of a value, and the pickler that wrote it. The pickler has noted the
+    hashes of the files (`files`) and the versions of the packages (`other_versions`) that the value
+    uses.
 
     label: what the value is, for messages.
     identifiers: identifiers in users' code that are known already; they select the attributes of
-        users' modules that are written."""
+        users' modules that are written.
+    """
     # The fast way writes equal parts at each place, so it fails for an object that contains itself.
     # The other way writes a reference for a part that was written before.
     try:
@@ -252,9 +255,9 @@ def _pickle(
 
 
 def _by_value(definition: Any, reduce: Callable[[Any], Any]) -> Any:
-    """How pickle rebuilds a function, class or type variable: the result of cloudpickle's function
-    `reduce`. If the definition is in a user's module, the result describes its contents; otherwise
-    its name."""
+    """Return how pickle rebuilds a function, class or type variable: the result of cloudpickle's
+    function `reduce`. If the definition is in a user's module, the result describes its contents;
+    otherwise its name."""
     module = sys.modules.get(str(getattr(definition, "__module__", None)))
     if module is None or not is_sent_itself(module):
         return reduce(definition)
@@ -271,7 +274,8 @@ def _by_value(definition: Any, reduce: Callable[[Any], Any]) -> Any:
 
 
 def _file_digest(name: str) -> str | None:
-    """A hash of the contents of the file with this name, as text; None if there is no such file."""
+    """Return a hash of the contents of the file with this name, as text; None if there is no such
+    file."""
     try:
         if not Path(name).is_file():  # pipes never end
             return None
@@ -313,7 +317,8 @@ def _make_cacheless_pickler(base: Any) -> Callable[..., Any]:
     modules: for each user's module pickled so far, the module and the words known when it was
         pickled, which decided which of its attributes were written.
     spaces: the objects that stand for the global names of modules, by the id of the module's
-        dictionary."""
+        dictionary.
+    """
 
     class CachelessPickler(base):
         """A pickler that leaves out cached values and writes users' code by value. It writes into
@@ -329,7 +334,7 @@ def _make_cacheless_pickler(base: Any) -> Callable[..., Any]:
             self.spaces: dict[int, Namespace] = {}
 
         def reducer_override(self, obj: Any) -> Any:
-            """How an object is rebuilt: a function, its arguments and a state without cached
+            """Return how an object is rebuilt: a function, its arguments and a state without cached
             values, as `pickle.Pickler.reducer_override` returns it; NotImplemented to pickle the
             object as usual."""
             if isinstance(obj, ModuleType):
@@ -356,8 +361,8 @@ def _make_cacheless_pickler(base: Any) -> Callable[..., Any]:
             return constructor, arguments, state, *rest[:3]
 
         def of_module(self, module: ModuleType) -> Any:
-            """How a module is rebuilt: by its name; or, if it is a user's module, as a new module
-            with those of its attributes whose names are among the words."""
+            """Return how a module is rebuilt: by its name; or, if it is a user's module, as a new
+            module with those of its attributes whose names are among the words."""
             if not is_sent_itself(module):
                 return importlib.import_module, (module.__name__,)
             words = frozenset(self.words)
@@ -367,10 +372,11 @@ def _make_cacheless_pickler(base: Any) -> Callable[..., Any]:
             return itself, (self.space(vars(module)),), (attributes, left_out), None, None, fill
 
         def of_function(self, function: FunctionType, reduced: Any) -> Any:
-            """How a user's function is rebuilt, with its global names looked up in its rebuilt
-            module. Its identifiers and strings are added to the words.
+            """Return how a user's function is rebuilt, with its global names looked up in its
+            rebuilt module. Its identifiers and strings are added to the words.
 
-            reduced: how cloudpickle rebuilds it; returned unchanged if that is by name only."""
+            reduced: how cloudpickle rebuilds it; returned unchanged if that is by name only.
+            """
             if not isinstance(reduced, tuple):
                 return reduced
             refuse_imports_within(function)
@@ -379,11 +385,12 @@ def _make_cacheless_pickler(base: Any) -> Callable[..., Any]:
             return function_in, (self.space(function.__globals__), code, closure), *rest
 
         def space(self, names: dict[str, Any]) -> Namespace:
-            """The `Namespace` that stands for the global names of a module in the pickle. It is the
-            same object at each call for the same module, so that all functions of the module share
-            their global names after unpickling.
+            """Return the `Namespace` that stands for the global names of a module in the pickle. It
+            is the same object at each call for the same module, so that all functions of the module
+            share their global names after unpickling.
 
-            names: the dictionary of the module, `vars(module)`."""
+            names: the dictionary of the module, `vars(module)`.
+            """
             return self.spaces.setdefault(id(names), Namespace.of(names))
 
     return CachelessPickler
@@ -404,9 +411,9 @@ def _without_generated_id(reduced: Any) -> Any:
 
 
 def _refuse_user_names(obj: Any) -> Any:
-    """How to rebuild an object that pickle would describe only by its name in a user's module. A
-    cached function is rebuilt from its contents. The result is NotImplemented for all other
-    objects, which are pickled as usual.
+    """Return how to rebuild an object that pickle would describe only by its name in a user's
+    module. A cached function is rebuilt from its contents. The result is NotImplemented for all
+    other objects, which are pickled as usual.
 
     Raises:
         TypeError: the contents cannot be determined.
@@ -435,7 +442,8 @@ def _make_hashing_pickler(base: Any) -> Callable[..., Any]:
     files: the hash of each file by its path.
     other_versions: the versions of the installed packages that are used, by name.
     begun: the functions, classes and modules whose writing has begun: by the id of each, the object
-        itself and its number in the order in which they were begun."""
+        itself and its number in the order in which they were begun.
+    """
     base_pickler: Any = _make_cacheless_pickler(base)
 
     class HashingPickler(base_pickler):
@@ -455,7 +463,8 @@ def _make_hashing_pickler(base: Any) -> Callable[..., Any]:
 
             A function, class or module whose writing has begun is replaced by its number, as it may
             refer to itself. A set is replaced by the sorted hashes of its members, since its order
-            changes from run to run. The name of a file is replaced by a hash of the file."""
+            changes from run to run. The name of a file is replaced by a hash of the file.
+            """
             obj_type = cast("type[Any]", type(obj))
             if id(obj) in self.begun:  # classes, functions and modules may name themselves
                 return f"number {self.begun[id(obj)][1]}"
@@ -472,9 +481,9 @@ def _make_hashing_pickler(base: Any) -> Callable[..., Any]:
             return self.of_file(obj) if isinstance(obj, str | os.PathLike) else None
 
         def of_file(self, obj: Any) -> str | None:
-            """The text "file" and a hash of the contents, if the object is the name or path of an
-            existing file; None for a file of code and for any other string. The hash is noted in
-            `files`."""
+            """Return the text "file" and a hash of the contents, if the object is the name or path
+            of an existing file; None for a file of code and for any other string. The hash is noted
+            in `files`."""
             path = os.fsdecode(cast("str | os.PathLike[str]", obj))
             if path.endswith(_CODE_SUFFIXES) or (contents := _file_digest(path)) is None:
                 return None
@@ -537,8 +546,8 @@ _NAMESPACE_ATTRIBUTES = ("__globals__", "__kwdefaults__")
 
 
 def _with_encoded_keys(state: Any) -> Any:
-    """The state of an object, with the names of its attributes as bytes instead of strings. Strings
-    would be taken for names of files, and hashed as such if there is such a file."""
+    """Return the state of an object, with the names of its attributes as bytes instead of strings.
+    Strings would be taken for names of files, and hashed as such if there is such a file."""
     if isinstance(state, tuple):
         return tuple(map(_with_encoded_keys, cast("tuple[Any, ...]", state)))
     if not isinstance(state, dict):
@@ -555,8 +564,8 @@ def _with_encoded_keys(state: Any) -> Any:
 
 
 def _encoded(names: Any) -> Any:
-    """A string as bytes; a dictionary as a list of pairs, with its strings as bytes; any other
-    value unchanged."""
+    """Return a string as bytes; a dictionary as a list of pairs, with its strings as bytes; any
+    other value unchanged."""
     if isinstance(names, dict):
         mapping = cast("dict[Any, Any]", names)
         return [(_encoded(key), _encoded(value)) for key, value in mapping.items()]
@@ -570,15 +579,16 @@ _CODE_ATTRIBUTES = (
 
 
 def _is_generated_id(argument: Any) -> bool:
-    """Whether a value is an id that cloudpickle generated for a class: 32 hexadecimal digits."""
+    """Return whether a value is an id that cloudpickle generated for a class: 32 hexadecimal
+    digits."""
     return isinstance(argument, str) and _GENERATED_ID.fullmatch(argument) is not None
 
 
 @functools.lru_cache(maxsize=1024)
 def _transient_attributes(kind: type) -> dict[str, Any]:
-    """The attributes in which objects of the class `kind` cache computed values. The value of each
-    entry is what replaces the cached value in a pickle: the default of a private dataclass field,
-    or `_OMIT` to leave the attribute out."""
+    """Return the attributes in which objects of the class `kind` cache computed values. The value
+    of each entry is what replaces the cached value in a pickle: the default of a private dataclass
+    field, or `_OMIT` to leave the attribute out."""
     replacements: dict[str, Any] = {
         name: _OMIT
         for definition in kind.__mro__

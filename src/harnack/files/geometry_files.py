@@ -69,7 +69,7 @@ _LOOP_READERS: dict[str, Callable[[Path, bytes], FileGeometry]] = {
 
 
 def read_loops(path: str | os.PathLike[str], *, boundary: bool = False) -> list[FloatArray]:
-    """The closed curves in an .obj, .ply or .loops file, as arrays (n, 3).
+    """Return the closed curves in an .obj, .ply or .loops file, as arrays (n, 3).
 
     .obj: every `f` face is a loop, every `l` polyline that ends at its first vertex is a loop, and
     all other `l` polylines are joined end to end. .ply: every face is a loop, edges are joined; a
@@ -97,11 +97,12 @@ def read_loops(path: str | os.PathLike[str], *, boundary: bool = False) -> list[
 
 
 def closed_curves_of(contents: FileGeometry, *, boundary: bool = False) -> list[FloatArray]:
-    """The closed curves, arrays (n, 3), in the contents of an .obj or .ply file, by the rules of
-    `read_loops`.
+    """Return the closed curves, arrays (n, 3), in the contents of an .obj or .ply file, by the
+    rules of `read_loops`.
 
     contents: what was read from the file.
-    boundary: whether to return the boundary of the surface that the faces form, not the faces."""
+    boundary: whether to return the boundary of the surface that the faces form, not the faces.
+    """
     placed = _boundary_loops(contents) if boundary else _all_loops(contents)
     return [_validated(loop, place) for loop, place in placed]
 
@@ -116,9 +117,9 @@ def _validated(loop: FloatArray, place: FileLocation) -> FloatArray:
 
 
 def _all_loops(contents: FileGeometry) -> list[LocatedLoop]:
-    """The closed curves (n, 3) in the contents of a file, each with its place in the file. These
-    are its faces and its polylines, joined end to end. If a .ply file has neither, its vertices are
-    a single curve.
+    """Return the closed curves (n, 3) in the contents of a file, each with its place in the file.
+    These are its faces and its polylines, joined end to end. If a .ply file has neither, its
+    vertices are a single curve.
 
     Raises:
         FileFormatError: there are none, or polylines are open.
@@ -135,8 +136,9 @@ def _all_loops(contents: FileGeometry) -> list[LocatedLoop]:
 
 
 def _joined_polylines(contents: FileGeometry) -> list[LocatedLoop]:
-    """The closed curves (n, 3) that the polylines of a file form, each with its place in the file.
-    A polyline that is closed is a curve; the edges of all other polylines are joined to curves.
+    """Return the closed curves (n, 3) that the polylines of a file form, each with its place in the
+    file. A polyline that is closed is a curve; the edges of all other polylines are joined to
+    curves.
 
     Raises:
         FileFormatError: an edge of length zero, or edges that do not form closed curves.
@@ -164,8 +166,8 @@ def _joined_polylines(contents: FileGeometry) -> list[LocatedLoop]:
 
 
 def _open_message(error: OpenChainError, position: FloatArray) -> str:
-    """The message of an error about edges that cannot be joined to closed curves, because at the
-    vertex at `position` (3,) an edge ends, or more than two meet."""
+    """Return the message of an error about edges that cannot be joined to closed curves, because at
+    the vertex at `position` (3,) an edge ends, or more than two meet."""
     point = position.tolist()
     if error.count == 1:
         return (
@@ -179,8 +181,8 @@ def _open_message(error: OpenChainError, position: FloatArray) -> str:
 
 
 def _boundary_loops(contents: FileGeometry) -> list[LocatedLoop]:
-    """The closed curves (n, 3) that form the boundary of the surface of a file's faces, each with
-    its place in the file.
+    """Return the closed curves (n, 3) that form the boundary of the surface of a file's faces, each
+    with its place in the file.
 
     Raises:
         FileFormatError: there are no faces, or their surface is closed.
@@ -255,7 +257,8 @@ class LoadedPolygons:
     """Polygons from a file, not triangulated: vertices (n, 3), and for each face the indices (k,)
     of its corners.
 
-    summary: the contents of the file."""
+    summary: the contents of the file.
+    """
 
     vertices: FloatArray
     faces: list[IntArray]
@@ -377,7 +380,7 @@ def _interpret_faces(
 
 
 def _polygons(contents: FileGeometry) -> LoadedPolygons:
-    """The polygons of a file that have three corners or more, not triangulated."""
+    """Return the polygons of a file that have three corners or more, not triangulated."""
     sizes = contents.faces.sizes
     ends, indices = np.cumsum(sizes), np.flatnonzero(sizes >= 3)
     polygons = [contents.faces.corners[ends[k] - sizes[k] : ends[k]] for k in indices]
@@ -390,8 +393,8 @@ def _polygons(contents: FileGeometry) -> LoadedPolygons:
 
 
 def _looks_like_curves(contents: FileGeometry) -> bool:
-    """Whether the polygons of a file are probably meant as curves and not as the faces of a mesh:
-    some polygon has more than four corners, and no two polygons share an edge."""
+    """Return whether the polygons of a file are probably meant as curves and not as the faces of a
+    mesh: some polygon has more than four corners, and no two polygons share an edge."""
     faces = contents.faces
     if faces.sizes.max() <= 4:
         return False
@@ -447,8 +450,8 @@ def _mesh(contents: FileGeometry) -> LoadedMesh:
 
 
 def _mesh_to_cloud(mesh: LoadedMesh) -> LoadedCloud:
-    """A cloud of points that stands for the triangles of a mesh: their centers, with their normals
-    and areas."""
+    """Return a cloud of points that stands for the triangles of a mesh: their centers, with their
+    normals and areas."""
     corners = mesh.vertices[mesh.faces]
     area_normal = 0.5 * np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = np.linalg.norm(area_normal, axis=1)
@@ -457,7 +460,7 @@ def _mesh_to_cloud(mesh: LoadedMesh) -> LoadedCloud:
 
 
 def _mesh_to_boundary(path: Path, mesh: LoadedMesh) -> LoadedCurves:
-    """The boundary of a mesh's faces as closed curves. path: of the file, for errors.
+    """Return the boundary of a mesh's faces as closed curves. path: of the file, for errors.
 
     Raises:
         FileFormatError: the faces have no boundary, or it is not a valid curve.

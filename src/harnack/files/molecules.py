@@ -29,7 +29,8 @@ class Atoms:
     """Atoms of a molecule from a file: positions (n, 3) and van der Waals radii (n,) in angstrom,
     and the names of the elements (n,).
 
-    summary: the contents of the file, and which of its atoms were left out."""
+    summary: the contents of the file, and which of its atoms were left out.
+    """
 
     positions: FloatArray
     radii: FloatArray
@@ -122,8 +123,8 @@ def _text(data: bytes, *, is_cif: bool) -> str:
 
 
 def _drop_alternate_locations(model: Any) -> list[Any]:
-    """The atoms of a model of a molecule, without alternatives. Of several residues at the same
-    position only the first is kept; in a residue, of several atoms with the same name that are
+    """Return the atoms of a model of a molecule, without alternatives. Of several residues at the
+    same position only the first is kept; in a residue, of several atoms with the same name that are
     marked by different letters as alternatives, only the first. A line TER in the file ends a
     chain; the same residue number after it stands for another position."""
     # The first marked residue at each position (its name and its letter); and the first letter of
@@ -147,7 +148,7 @@ def _drop_alternate_locations(model: Any) -> list[Any]:
 
 
 def _count_atom_lines(text: str) -> int:
-    """The number of lines of a .pdb file that describe an atom."""
+    """Return the number of lines of a .pdb file that describe an atom."""
     return sum(line[:4].upper() in _ATOM_LINES for line in text.split("\n"))
 
 
@@ -186,11 +187,13 @@ def _check_coordinates(path: Path, text: str) -> None:
 
 
 def _summarize(elements: tuple[str, ...], left_out: dict[str, int], model_count: int) -> str:
-    """The summary of a molecule as a text: the number of atoms, the commonest elements, and how
-    many atoms were left out.
+    """Return the summary of a molecule as a text: the number of atoms, the commonest elements, and
+    how many atoms were left out.
 
-    elements: the name of each atom's element. left_out: the number of atoms that were left out, by
-        reason. model_count: the number of models in the file."""
+    elements: the name of each atom's element.
+    left_out: the number of atoms that were left out, by reason.
+    model_count: the number of models in the file.
+    """
     common = Counter(elements).most_common(_MAX_LISTED_ELEMENTS)
     names = ", ".join(f"{count:,} {name}" for name, count in common)
     summary = (

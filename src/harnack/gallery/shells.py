@@ -28,7 +28,7 @@ _PATCH_OPTIONS = TraceOptions(tolerance=1e-5)
 
 
 def _exoskeleton() -> list[Surface]:
-    """A wavy torus of some 150 nonplanar polygons, and tubes around their edges."""
+    """Return a wavy torus of some 150 nonplanar polygons, and tubes around their edges."""
     vertices, faces = example_meshes.torus_mesh(1.0, 0.45, 240, 108)
     angle = np.arctan2(vertices[:, 1], vertices[:, 0])
     # The center line of the torus goes up and down three times, and its tube is thicker and
@@ -42,7 +42,7 @@ def _exoskeleton() -> list[Surface]:
 
 
 def _patches() -> list[Surface]:
-    """A bumpy sphere of 5,200 nonplanar polygons with some eleven corners each."""
+    """Return a bumpy sphere of 5,200 nonplanar polygons with some eleven corners each."""
     vertices, faces = example_meshes.bumpy_sphere(6)
     mesh = PolygonMesh(*cluster_into_polygons(vertices, faces, 5200))
     return [Surface(mesh)]
@@ -90,7 +90,8 @@ class GridShell:
     holes: (x, y, radius) of each hole.
     angle: a in radians, twice the angle at which the shell leaves the ground.
     spacing: the distance of the beams along the outline and the holes, a length.
-    thickness: the radius of the beams, a length."""
+    thickness: the radius of the beams, a length.
+    """
 
     outline: FloatArray
     holes: tuple[tuple[float, float, float], ...]
@@ -99,8 +100,8 @@ class GridShell:
     thickness: float
 
     def field(self) -> SolidAngle:
-        """The solid angle of the outline and the holes, a function of space. The shell is its level
-        set at `level`."""
+        """Return the solid angle of the outline and the holes, a function of space. The shell is
+        its level set at `level`."""
         corners = np.column_stack([self.outline, np.zeros(len(self.outline))])
         return SolidAngle([corners, *(Circle(r, (x, y, 0), (0, 0, -1)) for x, y, r in self.holes)])
 
@@ -110,11 +111,12 @@ class GridShell:
         return -2 * math.pi + self.angle
 
     def beams(self, field: SolidAngle) -> list[FloatArray]:
-        """The center lines of all beams, each (k, 3): "ribs", lines of curvature from the outline
-        and the holes across the shell; lines of the other family, which cross them; and the outline
-        and the holes themselves.
+        """Return the center lines of all beams, each (k, 3): "ribs", lines of curvature from the
+        outline and the holes across the shell; lines of the other family, which cross them; and the
+        outline and the holes themselves.
 
-        field: the solid angle."""
+        field: the solid angle.
+        """
         above_ground = HalfSpace((0, 0, -1), 0.0)
         points, inward = self._boundary_points_and_normals()
         slope = 0.5 * self.angle
@@ -122,9 +124,9 @@ class GridShell:
         boundary_points = np.column_stack([points, np.zeros(len(points))])
 
         def lines(seeds: FloatArray) -> tuple[list[FloatArray], list[FloatArray]]:
-            """The lines of curvature through the points `seeds` (n, 3). Returns two lists with a
-            line for each seed: the lines along the largest curvature, and the lines along the
-            smallest."""
+            """Return the lines of curvature through the points `seeds` (n, 3). Returns two lists
+            with a line for each seed: the lines along the largest curvature, and the lines along
+            the smallest."""
             step = 0.25 * self.spacing
             maximum_lines, minimum_lines = (
                 curvature_lines(field, seeds, step=step, length=100 * step, family=family,
@@ -156,8 +158,9 @@ class GridShell:
         return [*ribs, *_drop_parallel_lines(crossing_lines, 0.55 * self.spacing), *self._edges()]
 
     def _boundary_points_and_normals(self) -> tuple[FloatArray, FloatArray]:
-        """Points (n, 2) on the outline and the holes, spaced by about `spacing`, and the unit
-        normals (n, 2) there that point into the region. Both are in the plane of the ground."""
+        """Return points (n, 2) on the outline and the holes, spaced by about `spacing`, and the
+        unit normals (n, 2) there that point into the region. Both are in the plane of the
+        ground."""
         points: list[FloatArray] = []
         inward: list[FloatArray] = []
         for a, b in zip(self.outline, np.roll(self.outline, -1, axis=0), strict=True):
@@ -177,7 +180,7 @@ class GridShell:
         return np.concatenate(points), np.concatenate(inward)
 
     def _edges(self) -> list[FloatArray]:
-        """The outline and the holes as closed lines (k, 3) on the ground."""
+        """Return the outline and the holes as closed lines (k, 3) on the ground."""
         closed = np.concatenate([self.outline, self.outline[:1]])
         edges = [np.column_stack([closed, np.zeros(len(closed))])]
         for x, y, r in self.holes:
@@ -187,8 +190,9 @@ class GridShell:
 
 
 def _relative_height(line: FloatArray, reach: float) -> float:
-    """The difference of the largest and smallest height of a line (k, 3), divided by the length
-    `reach`; -1 for a line without points. It is small for a line that runs along the boundary."""
+    """Return the difference of the largest and smallest height of a line (k, 3), divided by the
+    length `reach`; -1 for a line without points. It is small for a line that runs along the
+    boundary."""
     return float(line[:, 2].max() - line[:, 2].min()) / reach if len(line) else -1.0
 
 
@@ -205,9 +209,9 @@ def _crossing_cosine(line: FloatArray, other: FloatArray) -> float:
 
 
 def _drop_parallel_lines(lines: Sequence[FloatArray], gap: float) -> list[FloatArray]:
-    """The lines (k, 3), longest first, without each line that lies within the distance `gap` of
-    longer lines for more than 60 % of its points. Of each line every second point is returned, and
-    its last."""
+    """Return the lines (k, 3), longest first, without each line that lies within the distance `gap`
+    of longer lines for more than 60 % of its points. Of each line every second point is returned,
+    and its last."""
     kept: list[FloatArray] = []
     for line in sorted(lines, key=len, reverse=True):
         if len(line) < 3:
@@ -222,7 +226,7 @@ def _drop_parallel_lines(lines: Sequence[FloatArray], gap: float) -> list[FloatA
 
 
 def _grid_shell_surfaces(shell: GridShell) -> list[Surface]:
-    """A grid shell as two surfaces: the shell above the ground, and its beams as a solid."""
+    """Return a grid shell as two surfaces: the shell above the ground, and its beams as a solid."""
     field = shell.field()
     ground = HalfSpace((0, 0, -1), 0.0)
     beams = Tube.from_polylines(shell.beams(field), shell.thickness)
@@ -233,7 +237,7 @@ def _grid_shell_surfaces(shell: GridShell) -> list[Surface]:
 
 
 def _regular(sides: int) -> FloatArray:
-    """The corners (sides, 2) of a regular polygon in the unit circle."""
+    """Return the corners (sides, 2) of a regular polygon in the unit circle."""
     angle = 2 * math.pi * (np.arange(sides) + 0.5) / sides
     return np.column_stack([np.cos(angle), np.sin(angle)])
 
