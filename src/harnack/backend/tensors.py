@@ -60,6 +60,7 @@ def tensor_to_vectors(
     count = 3 * tensor.shape[0]
     # The numbers 0, 3, 6, ... of the rows are x coordinates, and so on.
     indices = (dr.arange(backend.UInt32, k, count, 3) for k in range(3 if count else 0))
+    # Without rows there is nothing to gather.
     components = [dr.gather(backend.Float, numbers, index) for index in indices]
     return backend.Array3f(*components) if components else dr.zeros(backend.Array3f, 0)
 
@@ -106,6 +107,7 @@ def accepts_tensors(method: Method) -> Method:
         """Call the method, with a tensor converted to vectors and the result converted back."""
         if not is_tensor(points):
             return method(self, points, **settings)
+        # A tensor without axes is refused by `tensor_to_vectors` below.
         *shape, _ = points.shape or (0,)
         # A single point is a table of one row.
         rows = cast("Any", type(points))(points.array, (1, 3)) if points.shape == (3,) else points

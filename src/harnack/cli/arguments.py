@@ -41,7 +41,8 @@ class _Parser(argparse.ArgumentParser):
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
-        # argparse takes -1 for a number and would take -1,0,0 and the axis -x for options.
+        # Arguments that match are no options. By itself, argparse takes -1 for a number, but would
+        # take -1,0,0 and the axis -x for options.
         self._negative_number_matcher = re.compile(r"-([\d.]|[xyz]$)")
 
     def error(self, message: str) -> NoReturn:

@@ -2,7 +2,7 @@
 library name keywords of Python, such as `max_steps=`; here they become options of the command line,
 such as --max-steps.
 
-Errors are printed on a single line, with options of the command line in place of Python's keywords.
+Errors are printed on a single line.
 """
 
 from __future__ import annotations

@@ -125,6 +125,7 @@ def load_content(
         return _of_scene(SCENES[arguments.source], arguments, given_options)
     if is_formula(arguments.source):
         _refuse_file_options(arguments)
+        # A formula has no camera of its own.
         camera = _camera(arguments, Camera())
         return formula_field(arguments, moved), {**camera, **given_options}, ()
     if path.suffix.lower() == ".json":
@@ -390,6 +391,7 @@ def _camera(arguments: Any, camera: Camera) -> dict[str, Any]:
         return {}
     if "position" in given_options:  # in place of where the camera stands by its angles
         camera = replace(camera, azimuth=None, elevation=None, distance=None)
+    # Angles and distance say where the camera stands, in place of a position.
     elif {"azimuth", "elevation", "distance"} & set(given_options):
         camera = replace(camera, position=None)
     return {"camera": replace(camera, **given_options)}

@@ -100,6 +100,7 @@ def _map_blocks(call: Callable[..., Any], names: tuple[str, ...], arguments: dic
         (serialized.content_hash, [(name, array.name) for name, array in dask_args.items()]),
         purpose,
     )
+    # traverse=False: Dask need not look for Dask arrays in it.
     sent_call = delayed(serialized, name=f"harnack-{serialized.content_hash}", traverse=False)
     run_block = delayed(_run_block, pure=False)
     block_lists = [array.to_delayed().reshape(-1).tolist() for array in dask_args.values()]
@@ -108,6 +109,7 @@ def _map_blocks(call: Callable[..., Any], names: tuple[str, ...], arguments: dic
     # One delayed call for each block; it returns the result's arrays by name.
     for block_index, blocks in enumerate(zip(*block_lists, strict=True)):
         block_of_argument = dict(zip(dask_args, blocks, strict=True))
+        # The third argument is the index of the first row of the block.
         output = run_block(
             sent_call,
             block_of_argument,
@@ -138,6 +140,7 @@ def _align_blocks(
     first_name, reference = next(iter(dask_args.items()))
     if reference.ndim == 0:
         raise ValueError(f"{first_name} must have shape (n, 3) or (n,), not ()")
+    # Unknown lengths are NaN in Dask.
     if any(np.isnan(array) for array in reference.chunks[0]):
         raise ValueError(
             f"{first_name}: the lengths of its blocks are not known; call its method "
@@ -155,6 +158,7 @@ def _align_blocks(
             raise ValueError(f"{name} must have shape (n, 3) or (n,), not {array.shape}")
         if array.shape[0] != count:
             raise ValueError(f"{name} has {array.shape[0]} entries, and {first_name} has {count}")
+    # -1: columns are not divided.
     chunks = reference.chunks[0]
     return {name: array.rechunk((chunks, -1)[: array.ndim]) for name, array in aligned.items()}
 

@@ -7,11 +7,6 @@ Each task is named by a hash of its contents, including files and users' code bu
 can be used again after a crash, with other workers, or for a film with more frames: finished tasks
 are not repeated, and results of other jobs are left alone.
 
-Each task is named by a hash of its contents, including files and users' code but not cached values
-(`serialization`, `users_code`). The name alone identifies a stored result. So a checkpoint folder
-can be used again after a crash, with other workers, or for a film with more frames: finished tasks
-are not repeated, and results of other jobs are left alone.
-
 All jobs take the same path. A picture is always computed band by band, in this process or on Dask's
 workers (`shading`, `RenderExecutor`), so that the result is the same bit for bit. Steps that need
 the whole picture (hidden sky, outlines) run in the process that assembles it. A job is sent as a
@@ -86,7 +81,8 @@ class CheckpointFolder:
         return cls(folder)
 
     def load(self, name: str) -> TaskResult | None:
-        """Return the stored result of the task with this name; None if the folder has none.
+        """Read and return the stored result of the task with this name; None if the folder has
+        none.
 
         Raises:
             ValueError: the file is damaged.
@@ -131,8 +127,8 @@ class Executor:
 
     def split_range(self, count: int, max_size: int) -> list[tuple[int, int]]:
         """Split range(count) into intervals (start, stop) of at most `max_size` numbers each; each
-        interval is to be a task. They are made shorter if there would be fewer tasks than `chunks`
-        or, if `chunks` is None and there is a client, fewer than six for each thread of its
+        interval is to be a task. With `chunks`, they are made shorter until there are about so many
+        tasks. Without it but with a client, until there are about six for each thread of its
         workers."""
         size = max(1, min(max_size, count))
         if self.chunks is not None:
@@ -235,7 +231,7 @@ class _LocalTasks:
 
     def cancel(self) -> list[tuple[str, TaskResult]]:
         """Return the (name, result) of the tasks that are finished but whose results were not
-        fetched: always none here."""
+        fetched: always none here, since a task is run only when its result is fetched."""
         return []
 
 
@@ -254,6 +250,7 @@ class _DaskTasks:
         method that a task calls."""
         distributed = import_optional("distributed", "client")
         self.client, self.step = client, step
+        # Classes of errors of Dask, by which lost workers and a lost scheduler are recognized.
         self.worker_lost = distributed.KilledWorker
         self.scheduler_lost = import_optional("distributed.client", "client").FuturesCancelledError
         self.completed = distributed.as_completed(loop=client.loop)
@@ -368,6 +365,7 @@ def _ordered_results(
         next_index = max(next_index, index + 1)
         # Until the next result in order is there: start as many tasks as allowed, and wait for one.
         while name not in results:
+            # The number of workers may change.
             limit = max_pending()
             while next_index < len(names) and len(pending) + len(results) < limit:
                 next_name = names[next_index]

@@ -108,7 +108,7 @@ class SerializedObject:
     content_hash: 32 hexadecimal digits, equal for equal contents and equal versions of this
         library, of `package_versions` and of `other_versions`.
     data: the pickle.
-    file_digests: (path, hash of the contents) of each file that the object names.
+    file_digests: for each file that the object names, its path and the hash of its contents.
     package_versions: the versions in the process that pickled the object; `deserialize` refuses
         others.
     other_versions: (name, version) of the other installed packages that the object uses.
@@ -122,7 +122,7 @@ class SerializedObject:
 
     @classmethod
     def serialize(cls, thing: Any, label: str) -> SerializedObject:
-        """Pickle an object. label: what the object is, the first word of messages.
+        """Pickle an object. label: what the object is; messages begin with it.
 
         Raises:
             ModuleNotFoundError: the extra `cluster` is not installed.
@@ -249,6 +249,7 @@ def _pickle(
                 "of arrays, numbers and the classes of this library"
             ) from error
         identifiers = frozenset(pickler.words)
+        # The pickler is complete if no module has further attributes whose names are words now.
         if all(len(attributes_named(*module)) == len(attributes_named(module[0], identifiers))
                for module in pickler.modules):  # fmt: skip
             return pickler
@@ -352,7 +353,8 @@ def _make_cacheless_pickler(base: Any) -> Callable[..., Any]:
             transient = _transient_attributes(obj_type)
             if not transient:
                 return _refuse_user_names(obj)
-            # Replace cached values in the state by their defaults, or leave them out.
+            # Replace cached values in the state by their defaults, or leave them out. A reduce value
+            # has two to six entries; a missing state counts as None.
             constructor, arguments, state, *rest = (*obj.__reduce_ex__(_PROTOCOL), None)[:6]
             if isinstance(state, dict):
                 state_attributes = cast("dict[str, Any]", state)
@@ -504,6 +506,8 @@ def _make_hashing_pickler(base: Any) -> Callable[..., Any]:
             self.note_origin(obj)
             reduced = base_pickler.reducer_override(self, obj)
             is_code = isinstance(obj, type | FunctionType | ModuleType)
+            # What pickle would do as usual is asked for here; a definition is described by its
+            # name.
             if reduced is NotImplemented and type(obj) not in base.dispatch_table:
                 reduced = obj.__qualname__ if is_code else obj.__reduce_ex__(_PROTOCOL)
             # An object that is described by its name only.

@@ -10,13 +10,6 @@ and a checkpoint folder must distinguish two states of it. But the whole module 
 since modules also hold locks, clients and pictures. So an attribute is sent only if its name occurs
 in the code that is sent. A sent module raises an error when any other attribute is used, so that
 nothing is missing silently.
-
-Code of Python itself and of installed packages is sent by name. A user's module is sent by value,
-in its present state: a worker may lack the module, or may have imported it before it was changed,
-and a checkpoint folder must distinguish two states of it. But the whole module would be too much,
-since modules also hold locks, clients and pictures. So an attribute is sent only if its name occurs
-in the code that is sent. A sent module raises an error when any other attribute is used, so that
-nothing is missing silently.
 """
 
 from __future__ import annotations
@@ -193,8 +186,8 @@ def _imports(code: CodeType) -> Iterator[tuple[int, str]]:
 
 def _imported_module(statement: tuple[int, str], package: str) -> str:
     """Return the full name of the module that an import statement imports. statement: the import as
-    (level, name), see `_imports`. package: the package of the module in which the statement
-    stands."""
+    (level, name), as `_imports` yields it. package: the package of the module in which the
+    statement stands."""
     level, name = statement
     with suppress(ImportError):  # the function will raise this error itself
         return importlib.util.resolve_name("." * level + name, package)
@@ -224,6 +217,7 @@ def is_users(module: ModuleType) -> bool:
     if name == "__main__" or sys.modules.get(name) is not module:
         return True
     location = _location_of(module)
+    # A module without a file belongs to whom its top-level module belongs.
     if location is None and root != name and (top_module := sys.modules.get(root)) is not None:
         return is_users(top_module)
     if location is None:  # a built-in module has a specification

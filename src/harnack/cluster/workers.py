@@ -39,7 +39,7 @@ def connect_client(client: Any) -> Generator[Any]:
 
     Raises:
         ModuleNotFoundError: Dask is not installed.
-        TypeError: it is neither a client nor an address.
+        TypeError: `client` is neither a client nor an address.
         OSError: there is no scheduler at the address.
         RuntimeError: a worker has no harnack, another version of it, or no LLVM that Dr.Jit can
             use. The message names the worker.

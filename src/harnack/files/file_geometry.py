@@ -33,7 +33,8 @@ class FileFormatError(ValueError):
 
 @dataclass(frozen=True)
 class FileLocation:
-    """A location in a file, which prints as 'model.obj, line 12'."""
+    """A location in a file, which prints as 'model.obj, line 12'. position: where in the file, such
+    as "line 12"; "" for the whole file."""
 
     path: Path
     position: str = ""
@@ -53,7 +54,7 @@ class FileLocations:
     """The locations in a file of all members of a list, such as of all vertices. Index k gives the
     `FileLocation` of member k.
 
-    noun: what the members are called in messages, such as "line".
+    noun: the word before the number in messages, such as "line" in "line 12".
     numbers: for each member, the number of its line, or its position in the file.
     """
 
@@ -103,8 +104,8 @@ class FileGeometry:
     path: of the file.
     vertices: (n, 3), finite.
     normals: (n, 3) normals of the vertices, or None.
-    faces: closed polygons; the last corner is joined to the first.
-    polylines: closed only if the last index equals the first.
+    faces: closed polygons; the last corner of each is joined to the first.
+    polylines: chains of edges, each closed only if its last index equals its first.
 
     All indices lie in [0, n).
     """
@@ -117,8 +118,8 @@ class FileGeometry:
 
 
 def ranks_in_lists(sizes: IntArray) -> IntArray:
-    """Return for lists that are stored one after the other in one array, the position of each entry
-    within its own list: 0, 1, ..., size - 1 for each list. sizes: (m,) the lengths of the lists."""
+    """Return the position of each entry within its own list (0, 1, ..., size - 1), for lists that
+    are stored one after the other in one array. sizes: (m,) the lengths of the lists."""
     ranks = np.arange(int(sizes.sum()), dtype=np.int64)
     ranks -= np.repeat(np.cumsum(sizes) - sizes, sizes)
     return ranks
@@ -132,7 +133,7 @@ def triangles_as_polygons(path: Path, corners: IntArray) -> PolygonList:
 
 
 def check_finite(coordinates: FloatArray, places: FileLocations) -> None:
-    """Raise a FileFormatError if some number in the rows of `coordinates` (n, k) is not finite. The
+    """Raise a FileFormatError if a number in an array `coordinates` (n, k) is not finite. The
     message names the location of the first such row. places: the locations of the rows."""
     wrong = np.flatnonzero(~np.isfinite(coordinates).all(axis=1))
     if wrong.size:
@@ -185,9 +186,9 @@ def read_bytes(path: Path) -> bytes:
 
 
 def check_element_count(place: FileLocation, count: int) -> None:
-    """Raise a FileFormatError if a file has more than MAX_ELEMENTS elements, which would be read
-    one by one. place: the location that the message names. count: the number of vertices, faces and
-    lines that the file declares."""
+    """Raise a FileFormatError if a file has more than MAX_ELEMENTS elements. It is called for files
+    whose elements are read one by one, which takes long. place: the location that the message
+    names. count: the number of vertices, faces and lines that the file declares."""
     if count > MAX_ELEMENTS:
         raise place.error(
             f"{count:,} elements are too many in a file whose faces differ in size: at most "
@@ -199,6 +200,7 @@ def have_mixed_sizes(polygons: PolygonList) -> bool:
     """Return whether polygons have different numbers of corners, or fewer than three. Such polygons
     are read one by one, which takes long."""
     sizes = polygons.sizes
+    # All sizes must be that of the first polygon, and at least 3.
     return bool(len(sizes)) and bool((sizes != max(3, int(sizes[0]))).any())
 
 
@@ -231,7 +233,7 @@ def write_atomically(path: str | os.PathLike[str]) -> Generator[Path, None, None
     finally:
         try:
             _remove(partial)
-        except KeyboardInterrupt:
+        except KeyboardInterrupt:  # it may have come before the file was removed
             _remove(partial)
             raise
 

@@ -1,7 +1,8 @@
 """Readers of files with meshes, point clouds, closed curves, blobs or molecules. The extension of
-the file's name decides its format; its contents decide what it is read as, unless the caller says
-so (`read_as`). `contents` is the geometry that was found in a file: vertices, faces, polylines.
-Results contain a summary: a text about the contents of the file, and why they are read like that.
+the file's name decides its format. Its contents decide as what it is read (a mesh, a cloud or
+curves), unless the caller decides that by `read_as`. `contents` is the geometry that was found in a
+file: vertices, faces, polylines. Results contain a summary: a text about the contents of the file,
+and why they are read like that.
 """
 
 from __future__ import annotations
@@ -77,12 +78,13 @@ def read_loops(path: str | os.PathLike[str], *, boundary: bool = False) -> list[
     Where edges are joined, equal positions count as the same vertex.
 
     boundary: whether to return, in place of the faces, the boundary of the surface they form: the
-        edges that do not cancel between neighboring faces, where equal positions count as the same
+        edges that do not cancel between neighboring faces. Equal positions count as the same
         vertex.
 
     Raises:
-        FileFormatError: unreadable, malformed or hostile; open polylines; a loop that
-            `validate_loops` rejects; a closed surface, which has no boundary.
+        FileFormatError: the file is unreadable, malformed or hostile; polylines are open;
+            `validate_loops` rejects a loop; or the boundary of a closed surface is requested, which
+            has none.
     """
     path = Path(path)
     kind = path.suffix.lower()
@@ -148,7 +150,7 @@ def _joined_polylines(contents: FileGeometry) -> list[LocatedLoop]:
     open_edges: list[Edge] = []
     places: dict[int, FileLocation] = {}
     for corners, place in contents.polylines:
-        # A vertex is known by the number that all vertices at the same position have.
+        # All vertices at the same position have the same number here.
         ids: list[int] = welded[corners].tolist()
         if ids[0] == ids[-1] and len(ids) > 3:
             loops.append((x[ids[:-1]], place))
@@ -218,8 +220,8 @@ class LoadedMesh:
     """Triangles from a file, as `validate_mesh` returns them.
 
     summary: the contents of the file, and why they are read as a mesh.
-    zero_area_faces: (k, 3) faces of zero area, left out of `faces`; they may close gaps without a
-        width.
+    zero_area_faces: (k, 3) the faces of zero area, which are not among `faces`. They may close gaps
+        that have no width.
     rounded: the number of corners that were joined with others from which rounding separated them.
     """
 
@@ -274,11 +276,11 @@ def read_geometry(path: str | os.PathLike[str], read_as: ReadAs | None = None) -
     """Read the surface, cloud, curves, blobs or molecule in a file: .obj, .ply, .stl, .off, .glb,
     .gltf, .3mf, .xyz, .loops, .blobs; molecules .pdb, .ent, .cif, .mmcif.
 
-    Faces make a mesh, except polygons of an .obj or .ply file if a polygon has more than four
-    corners and no two share an edge: these are curves, as are polylines without faces. Points alone
-    make a cloud, with normals from nx ny nz (.ply), from the same number of `vn` as of `v` (.obj)
-    or from columns 4 to 6 (.xyz). Polygons are triangulated, the nodes of a scene are transformed
-    to their positions, and faces of zero area are left out.
+    Faces make a mesh. But the polygons of an .obj or .ply file are curves if one of them has more
+    than four corners and no two share an edge; polylines without faces are curves, too. Points
+    alone make a cloud, with normals from nx ny nz (.ply), from the same number of `vn` as of `v`
+    (.obj) or from columns 4 to 6 (.xyz). Polygons are triangulated, the nodes of a scene are
+    transformed to their positions, and faces of zero area are left out.
 
     read_as: what to make of the contents. "winding": the faces, as a mesh. "dipole": the points; of
         a mesh the centers of its triangles, with their normals and areas. "loops": the result of
@@ -286,8 +288,8 @@ def read_geometry(path: str | os.PathLike[str], read_as: ReadAs | None = None) -
         triangulated. None decides as above.
 
     Raises:
-        FileFormatError: unreadable, malformed, truncated or hostile; of another format; it contains
-            nothing that can be read in this way.
+        FileFormatError: the file is unreadable, malformed, truncated or hostile, has another
+            format, or contains nothing that can be read in this way.
     """
     path = Path(path)
     kind = path.suffix.lower()
@@ -407,6 +409,7 @@ def _looks_like_curves(contents: FileGeometry) -> bool:
     end = begin[next_corner]
     # A number for each edge, the same in both directions.
     keys = np.minimum(begin, end) * len(welded) + np.maximum(begin, end)
+    # Polygons with fewer than three corners do not count.
     keys = keys[np.repeat(faces.sizes, faces.sizes) >= 3]
     return len(np.unique(keys)) == len(keys)
 
@@ -421,6 +424,8 @@ def _mesh(contents: FileGeometry) -> LoadedMesh:
     vertices, faces = without_zero_area_faces(contents.vertices, triangles)
     zero_area = triangles[zero_area_faces(vertices, triangles)]
     welded = Welded.of(vertices, faces)
+    # The net faces are what remains if equal faces are added and opposite ones cancel. Singular
+    # edges are those at which faces do not cancel.
     net_faces, singular = welded.net, welded.edges
     if not len(net_faces.faces):
         raise MeshError(f"its {len(faces):,} faces cancel each other: there is no surface")
@@ -438,6 +443,7 @@ def _mesh(contents: FileGeometry) -> LoadedMesh:
             f"{count}, {len(singular):,} singular edges: a mesh with holes or faces turned round"
         )
     if welded.rounded:
+        # Each vertex gets the position of the vertex that it was joined with.
         vertices = vertices[welded.index]
         summary += f"; {welded.rounded:,} corners joined with others that were apart by rounding"
     if len(triangles) > len(faces):

@@ -186,7 +186,7 @@ def _check_supported(place: FileLocation, header: dict[str, Any]) -> None:
 
 
 def _corner_counts(place: FileLocation, header: dict[str, Any], accessors: list[Any]) -> list[int]:
-    """Return for each mesh in the header of a scene, the number of triangle corners that it lists.
+    """Return the number of triangle corners that each mesh in the header of a scene lists.
     accessors: the header's descriptions of arrays, which contain their lengths.
 
     Raises:
@@ -209,8 +209,8 @@ def _corner_counts(place: FileLocation, header: dict[str, Any], accessors: list[
 
 
 def _check_nodes(place: FileLocation, header: dict[str, Any], corner_counts: list[int]) -> None:
-    """Raise a FileFormatError if the nodes of a scene do not form trees, or trees that are too
-    deep; or if the meshes at all nodes together have too many corners.
+    """Raise a FileFormatError if the nodes of a scene do not form trees, if the trees are too deep,
+    or if the meshes at all nodes together have too many corners.
 
     corner_counts: the number of corners of each mesh.
     """

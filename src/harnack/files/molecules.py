@@ -108,9 +108,10 @@ def parse_molecule(path: Path, data: bytes) -> Atoms:
 
 
 def _text(data: bytes, *, is_cif: bool) -> str:
-    r"""Decode the bytes of a molecule's file to text, without byte order mark, and in a .pdb file
-    with "\n" as line end. There each non-ASCII letter is replaced by a single byte: the format is
-    given by columns, which gemmi counts in bytes."""
+    r"""Decode the bytes of a molecule's file to text, without byte order mark. In the text of a
+    .pdb file, lines end with "
+    ", and each non-ASCII letter is replaced by a single byte: the format is given by columns, which
+    gemmi counts in bytes."""
     data = data.removeprefix(b"\xef\xbb\xbf")
     if is_cif:
         return data.decode("utf-8", "replace")
@@ -123,10 +124,14 @@ def _text(data: bytes, *, is_cif: bool) -> str:
 
 
 def _drop_alternate_locations(model: Any) -> list[Any]:
-    """Return the atoms of a model of a molecule, without alternatives. Of several residues at the
-    same position only the first is kept; in a residue, of several atoms with the same name that are
-    marked by different letters as alternatives, only the first. A line TER in the file ends a
-    chain; the same residue number after it stands for another position."""
+    """Return the atoms of a model of a molecule, without alternatives. Only atoms that the file
+    marks by a letter can be alternatives.
+
+    Of marked atoms with the same name in a residue, only those with the letter that comes first are
+    kept. If residues with different names are at the same position, marked atoms of the later ones
+    are dropped unless their letter is that of the first. A line TER in the file ends a chain; the
+    same residue number after it stands for another position.
+    """
     # The first marked residue at each position (its name and its letter); and the first letter of
     # each marked atom.
     residues: dict[tuple[int, str], tuple[str, str]] = {}

@@ -2,9 +2,6 @@
 regular polygons. An outline is a list of closed polygons ("loops", arrays (n, 2)) that do not cross
 and have the region on their left, as `harnack.geometry.make_outline` returns them. Curves of
 letters and SVG paths are replaced by polylines within a stated tolerance.
-
-Curves are flattened to a stated tolerance. The results are loops that do not cross, with the region
-on their left, as `harnack.geometry.make_outline` returns them.
 """
 
 from __future__ import annotations
@@ -229,6 +226,7 @@ def svg(
     """
     scale = as_positive(scale, "the scale of an SVG file")
     if tolerance is not None:
+        # In the unit of the file.
         tolerance = as_positive(tolerance, "the tolerance") / scale
     source = Path(path)
     if source.stat().st_size > _MAX_SVG_BYTES:
@@ -301,6 +299,7 @@ def _filled_shapes(
     if tag == "style" and _FILL_CHANGING_RULES.search("".join(element.itertext())):
         raise ValueError("its style sheet may change what is filled: save it with plain attributes")
     if tag in _HIDDEN:
+        # (A generator that yields nothing.)
         yield from ()
         return
     styles = {**inherited, **_styles(element)}
@@ -367,6 +366,7 @@ def _path_data(element: Element) -> str:
     if tag == "path":
         return attrib.get("d", "")
     for name in _LENGTHS & attrib.keys():
+        # Letters other than e, which belongs to exponents, are units.
         if re.search(r"[%a-df-z]", attrib[name], re.IGNORECASE):
             raise ValueError(
                 f'{name}="{attrib[name]:.20}" of a <{tag}> has a unit: save the file with plain '
@@ -475,8 +475,8 @@ def _loops(segments: list[Any], matrix: FloatArray, tolerance: float) -> list[Fl
 
 
 def _arc(arc: Any, matrix: FloatArray, tolerance: float) -> FloatArray:
-    """Return a polyline within `tolerance` of an elliptic arc, moved by the transform `matrix` (3,
-    3). Returns its points (n, 2) without the first one.
+    """Approximate an elliptic arc, moved by the transform `matrix` (3, 3), by a polyline within
+    `tolerance`. Returns the points (n, 2) of the polyline without the first one.
 
     The number of chords, at least 2, follows from a bound of their error: if an arc of the angle a
     and the larger radius r is divided into n chords, they are within r (a/n)^2/8 of it. The
@@ -497,7 +497,8 @@ def _arc(arc: Any, matrix: FloatArray, tolerance: float) -> FloatArray:
 
 
 def _transform_points(matrix: FloatArray, points: list[complex]) -> FloatArray:
-    """(n, 2) points, given as complex numbers x + i y, moved by the transform `matrix` (3, 3)."""
+    """Return points, given as complex numbers x + i y, after the transform `matrix` (3, 3), as an
+    array (n, 2)."""
     return np.array([_xy(point) for point in points]) @ matrix[:2, :2].T + matrix[:2, 2]
 
 

@@ -5,10 +5,6 @@ number of its rows; its "properties" are the numbers, or lists of numbers, in ea
 Each property is read in all rows of an element at once. A "position" says where a number is in the
 file: in bytes for a binary file, in words (entries between blanks) for a text file. The position of
 a property in a row follows from the properties before it, and the lengths of the lists among these.
-
-A file is a header and rows of elements, such as one row for each vertex. Properties of a row are
-numbers or lists. Each property is read in all rows of an element at once; its position in a row
-follows from the properties before it, and the lengths of the lists among these.
 """
 
 from __future__ import annotations
@@ -114,8 +110,9 @@ class BinaryValues:
         self.byte_order = byte_order
 
     def read(self, where: IntArray, code: str) -> npt.NDArray[Any]:
-        """Return the numbers that are stored at the byte positions `where` (n,). code: their type,
-        a format character of the module `struct`.
+        """Return the numbers that are stored at the byte positions `where` (n,).
+
+        code: the type of the numbers, a format character of the module `struct`.
 
         A position outside of the file gives an arbitrary number. Callers detect such positions,
         since the rows that contain them end after the file's end.
@@ -135,8 +132,10 @@ class BinaryValues:
 
 class TextValues:
     """The numbers of all rows of an element in a text file, read at positions. A position is
-    counted in words (entries between blanks) from the first row. counts: (n,) the number of words
-    of each row."""
+    counted in words (entries between blanks) from the first row.
+
+    counts: (n,) the number of words of each row.
+    """
 
     def __init__(self, rows: TextLines) -> None:
         numbers, self.counts = read_floats(rows, convert=_any_number)
@@ -190,7 +189,7 @@ class PropertyColumn:
 @dataclass(frozen=True, eq=False)
 class ElementTable:
     """All rows of an element of a .ply file: its properties as columns by name, and the location of
-    each row in the file."""
+    each row in the file (`places`). `values` reads the numbers."""
 
     values: Values
     columns: dict[str, PropertyColumn]
@@ -295,8 +294,8 @@ def _check_end(path: Path, remainder: bytes) -> None:
 def _polygons(
     table: ElementTable, corners: npt.NDArray[Any], sizes: IntArray, count: int
 ) -> PolygonList:
-    """Return the polygons (or edges) that the rows of an element list. Raises a FileFormatError if
-    an index is not an integer in [0, count).
+    """Return the polygons (or edges) that are listed in the rows of an element. Raises a
+    FileFormatError if an index is not an integer in [0, count).
 
     table: the rows of the element, for their locations in the file.
     corners: the vertex indices, one polygon after the other.
@@ -304,6 +303,7 @@ def _polygons(
     count: the number of vertices.
     """
     polygons = PolygonList(corners.astype(np.int64), sizes, table.places)
+    # Indices are read as floats only if one of them is not whole.
     if corners.dtype.kind == "f" and corners.size:
         k = int(np.argmax(corners != np.rint(corners)))
         raise polygons.location_of_corner(k).error(
@@ -316,8 +316,8 @@ def _polygons(
 def _columns(
     section: PlyElement, values: Values, begins: IntArray, places: FileLocations
 ) -> tuple[dict[str, PropertyColumn], IntArray]:
-    """Return the properties of the element `section` in all its rows, as columns by name; and the
-    position (n,) at which each row ends.
+    """Find where the properties of the element `section` are in all its rows. Returns them as
+    columns by name, and the position (n,) at which each row ends.
 
     values: the numbers of the file.
     begins: (n,) the position at which each row begins.
@@ -334,10 +334,12 @@ def _columns(
             continue
         # What follows a list begins at another place in each row: positions are counted from there.
         lengths = values.read(positions + offset, prop.length_code)
+        # Lengths are read as floats only if one of them is not whole.
         if lengths.dtype.kind == "f":
             k = int(np.argmax(lengths != np.rint(lengths)))
             raise places[k].error(f"the length of a list is no integer, but {lengths[k]}")
-        # Lists of invalid length get one that ends after the end of the file.
+        # A list with a negative or too large length gets a length that ends after the end of the
+        # file.
         sizes = np.where(lengths < 0, values.size + 1, lengths).astype(np.int64)
         sizes = np.minimum(sizes, values.size + 1)
         offset += values.width(prop.length_code)
@@ -399,6 +401,8 @@ def _binary_tables(path: Path, data: bytes, header: PlyHeader) -> dict[str, Elem
             # In most files the lists of all rows are as long as those of the first row, and not
             # empty.
             stride = next(_row_ends(section, values, begin)) - begin
+            # Then all lists of the first row are empty. Rows without data could be declared in any
+            # number, so their number is checked.
             if stride == min_stride and any(p.length_code for p in section.properties):
                 check_element_count(FileLocation(path), header.declared_rows(len(data)))
             begins = begin + stride * np.arange(section.count, dtype=np.int64)

@@ -118,7 +118,7 @@ class Metaballs:
 
 
 def read_metaballs(path: Path, data: bytes) -> Metaballs:
-    """Return the blobs of a .blobs file: text that a person can write, with a blob on each line.
+    """Read the blobs of a .blobs file, a text with a blob on each line. Returns the `Metaballs`.
     `#` begins a comment.
 
         # x y z radius [weight [group]]
@@ -131,9 +131,9 @@ def read_metaballs(path: Path, data: bytes) -> Metaballs:
     Lines may have different numbers of columns. Either all lines name a group or none does.
 
     Raises:
-        FileFormatError: an empty file; words, numbers that are not finite, fewer than four or more
-            than six columns, a radius that is not positive, a group that is no integer, groups on
-            some lines only.
+        FileFormatError: the file is empty; an entry is not a finite number; a line has fewer than
+            four or more than six columns; a radius is not positive; a group is no integer; or only
+            some lines name a group.
     """
     lines = split_content_lines(path, data)
     if not len(lines):
@@ -144,7 +144,7 @@ def read_metaballs(path: Path, data: bytes) -> Metaballs:
         raise lines.locations[invalid[0]].error(
             f"a blob has four to six numbers, {_COLUMNS}, not {counts[invalid[0]]}"
         )
-    # Columns that a line lacks (weight and group) are 1.
+    # Columns that a line lacks (weight and group) are 1. The others are filled row by row.
     table = np.ones((len(counts), 6))
     table[np.arange(6) < counts[:, None]] = numbers
     radii, groups = table[:, 3], table[:, 5]
@@ -313,6 +313,7 @@ def _parse_obj_polygons(
         raise statements.location_of_corner(low[0]).error(
             f"vertex {corners[low[0]]} is out of range: {preceding[low[0]]} vertices precede it"
         )
+    # All indices are counted from 0 from here on.
     corners = np.where(corners > 0, corners - 1, corners + preceding)
     polygons = PolygonList(corners, sizes, lines.locations)
     check_indices(polygons, len(vertices), first=1)
@@ -348,7 +349,7 @@ def read_off(path: Path, data: bytes) -> FileGeometry:
     # Colors may follow the corners; these need not be integers, and not even numbers.
     numbers, word_counts = read_floats(rows, convert=_number_or_nan)
     begins = np.cumsum(word_counts) - word_counts
-    # The first word of a face's line is the number of its corners.
+    # The first word of a face's line (word 0) is the number of its corners.
     sizes = _integers(rows, numbers[begins], np.arange(len(rows)), np.zeros_like(begins))
     if (wrong := np.flatnonzero((sizes < 1) | (sizes >= word_counts))).size:
         k = wrong[0]
@@ -392,8 +393,8 @@ def _integers(
 
 
 def _parse_off_header(path: Path, lines: TextLines) -> tuple[int, int, TextLines]:
-    """Return the numbers of vertices and of faces that the header of an .off file declares, and the
-    lines after the header.
+    """Return the number of vertices and the number of faces that the header of an .off file
+    declares, and the lines after the header.
 
     Raises:
         FileFormatError: it is malformed, or not supported.

@@ -31,7 +31,7 @@ def _cut_mesh() -> list[Surface]:
 
 
 def _spiral_directions(n: int) -> FloatArray:
-    """n unit vectors (n, 3), spread evenly over the sphere along a spiral."""
+    """Return n unit vectors (n, 3), spread evenly over the sphere along a spiral."""
     k = np.arange(n)
     z, angle = 1.0 - (2.0 * k + 1.0) / n, 2.0 * math.pi * _GOLDEN * k
     radius = np.sqrt(1.0 - z * z)
@@ -56,8 +56,10 @@ def _cloud() -> list[Surface]:
     points = np.random.default_rng(2).uniform(-2.5, 2.5, (12000, 3))
     for _ in range(40):
         value, gradient = _tangle(points)
+        # Damped steps of Newton's method.
         points = points - 0.7 * (value / (gradient**2).sum(axis=1))[:, None] * gradient
     value, gradient = _tangle(points)
+    # Points at which Newton's method did not converge are left out.
     is_on_quartic = (np.abs(value) < 1e-9) & (np.abs(points) < 2.6).all(axis=1)
     return [Surface(DipolePotential(points[is_on_quartic], gradient[is_on_quartic]))]
 
@@ -77,6 +79,7 @@ def _knot_cloud() -> list[Surface]:
     tangents = np.roll(curve, -1, axis=0) - np.roll(curve, 1, axis=0)
     tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
     k = np.arange(count)
+    # The point of the curve around which point k of the cloud lies.
     index = k * n // count
     angle = (2 * math.pi * _GOLDEN * k)[:, None]
     # Two vectors across the knot at each point, and the normal at an angle between them.

@@ -111,22 +111,23 @@ class GridShell:
         return -2 * math.pi + self.angle
 
     def beams(self, field: SolidAngle) -> list[FloatArray]:
-        """Return the center lines of all beams, each (k, 3): "ribs", lines of curvature from the
-        outline and the holes across the shell; lines of the other family, which cross them; and the
-        outline and the holes themselves.
+        """Find the center lines of all beams, each (k, 3). Returns the "ribs", which are lines of
+        curvature from the outline and the holes across the shell; then lines of the other family,
+        which cross the ribs; then the outline and the holes themselves.
 
         field: the solid angle.
         """
         above_ground = HalfSpace((0, 0, -1), 0.0)
         points, inward = self._boundary_points_and_normals()
+        # The shell leaves the ground at half of `angle`.
         slope = 0.5 * self.angle
         upward = np.column_stack([math.cos(slope) * inward, np.full(len(points), math.sin(slope))])
         boundary_points = np.column_stack([points, np.zeros(len(points))])
 
         def lines(seeds: FloatArray) -> tuple[list[FloatArray], list[FloatArray]]:
-            """Return the lines of curvature through the points `seeds` (n, 3). Returns two lists
-            with a line for each seed: the lines along the largest curvature, and the lines along
-            the smallest."""
+            """Return the lines of curvature through the points `seeds` (n, 3), as two lists with a
+            line for each seed: the lines along the largest curvature, and the lines along the
+            smallest."""
             step = 0.25 * self.spacing
             maximum_lines, minimum_lines = (
                 curvature_lines(field, seeds, step=step, length=100 * step, family=family,
@@ -136,18 +137,18 @@ class GridShell:
             return maximum_lines, minimum_lines
 
         offset = 0.3 * self.spacing
-        # Of the two lines of curvature through each seed near the boundary, the one that rises from
-        # it; the other runs along it.
+        # Through each seed near the boundary there are two lines of curvature. The one that rises
+        # from the boundary is chosen; the other runs along it.
         candidates = [
             max(both_families, key=lambda line: _relative_height(line, offset))
             for both_families in zip(*lines(boundary_points + offset * upward), strict=True)
         ]
         ribs = _drop_parallel_lines(candidates, 0.55 * self.spacing)
-        # Seeds of the other family lie along a subset of these lines.
+        # Seeds of the other family lie along about six of the ribs.
         spines = ribs[:: max(1, len(ribs) // 6)]
         seeds = np.concatenate([spine[2:-2:2] for spine in spines])
-        # Of the two lines through each seed, the one that crosses the ribs more nearly at a right
-        # angle.
+        # Of the two lines through each seed, the one is chosen that crosses a rib more nearly at a
+        # right angle.
         crossing_lines = [
             min(
                 both_families,
@@ -191,27 +192,30 @@ class GridShell:
 
 def _relative_height(line: FloatArray, reach: float) -> float:
     """Return the difference of the largest and smallest height of a line (k, 3), divided by the
-    length `reach`; -1 for a line without points. It is small for a line that runs along the
+    length `reach`; -1 for a line without points. The result is small for a line that runs along the
     boundary."""
     return float(line[:, 2].max() - line[:, 2].min()) / reach if len(line) else -1.0
 
 
 def _crossing_cosine(line: FloatArray, other: FloatArray) -> float:
-    """cos| of the angle between two lines (k, 3) at their points that are nearest to each
-    other; 2 if `line` has fewer than three points."""
+    """Return the absolute value of the cosine of the angle between two lines (k, 3), at their
+    points that are nearest to each other: 0 for a right angle; 2 if `line` has fewer than three
+    points."""
     if len(line) < 3:
         return 2.0
     distance = np.linalg.norm(line[:, None] - other[None], axis=2)
     i, j = np.unravel_index(int(distance.argmin()), distance.shape)
+    # The tangents are taken from the points before and after; the ends have only one neighbor.
     i, j = min(max(int(i), 1), len(line) - 2), min(max(int(j), 1), len(other) - 2)
     a, b = line[i + 1] - line[i - 1], other[j + 1] - other[j - 1]
     return float(abs(a @ b) / (np.linalg.norm(a) * np.linalg.norm(b)))
 
 
 def _drop_parallel_lines(lines: Sequence[FloatArray], gap: float) -> list[FloatArray]:
-    """Return the lines (k, 3), longest first, without each line that lies within the distance `gap`
-    of longer lines for more than 60 % of its points. Of each line every second point is returned,
-    and its last."""
+    """Return the lines (k, 3) that do not run along longer ones, longest first. A line is dropped
+    if more than 60 % of its points are within the distance `gap` of the lines that are kept before
+    it, or if it has fewer than three points. Of each line, every second point is returned, and its
+    last."""
     kept: list[FloatArray] = []
     for line in sorted(lines, key=len, reverse=True):
         if len(line) < 3:

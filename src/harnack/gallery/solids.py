@@ -4,9 +4,6 @@ normals, and a molecule.
 
 Solids are distance surfaces (level sets of distances), Boolean combinations of them, noise, and
 transparent blobs.
-
-Blobs are metaballs, a surface through points with normals, and molecules. Solids are distance
-surfaces (level sets of distances), Boolean combinations of them, noise, and transparent blobs.
 """
 
 from __future__ import annotations
@@ -45,8 +42,8 @@ def _solid(field: Field, level: float) -> list[Surface]:
 
 
 def _metaballs() -> list[Surface]:
-    """Metaballs: drops around a large ball, and a blob of negative weight that carves a bite out of
-    it."""
+    """Return metaballs: drops around a large ball, and a blob of negative weight that carves a bite
+    out of it."""
     angle = np.linspace(0, 2 * math.pi, 9, endpoint=False)
     ring = np.column_stack([np.cos(angle), np.sin(angle), 0.35 * np.sin(3 * angle)])
     centers = np.concatenate([[[0.0, 0.0, 0.0]], 1.15 * ring, [[0.35, -0.55, 0.5]]])
@@ -90,6 +87,7 @@ def _helix() -> Atoms:
     positions: list[tuple[float, float, float]] = []
     for residue in range(14):
         for element, radius, degrees, height in backbone:
+            # 100 degrees a residue: 3.6 residues a turn.
             angle = math.radians(degrees + 100.0 * residue)
             elements.append(element)
             positions.append(
