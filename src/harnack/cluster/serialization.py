@@ -353,8 +353,8 @@ def _make_cacheless_pickler(base: Any) -> Callable[..., Any]:
             transient = _transient_attributes(obj_type)
             if not transient:
                 return _refuse_user_names(obj)
-            # Replace cached values in the state by their defaults, or leave them out. A reduce value
-            # has two to six entries; a missing state counts as None.
+            # Replace cached values in the state by their defaults, or leave them out. A reduce
+            # value has two to six entries; a missing state counts as None.
             constructor, arguments, state, *rest = (*obj.__reduce_ex__(_PROTOCOL), None)[:6]
             if isinstance(state, dict):
                 state_attributes = cast("dict[str, Any]", state)
