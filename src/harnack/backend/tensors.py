@@ -157,8 +157,12 @@ def wrap_for_torch(function: Callable[..., Any]) -> Callable[..., Any]:
 
         @staticmethod
         def forward(ctx: Any, arguments: list[Any], container: list[Any], *tensors: Any) -> Any:
-            """Return the results as PyTorch tensors. The result of `function` itself, whose type
-            (tuple, list, ...) the caller needs, is appended to the list `container`."""
+            """Return the results as PyTorch tensors.
+
+            arguments: the arguments of `function`, with None in place of tensors. container: a list
+            to which the result of `function` itself is appended. The caller needs its type (tuple,
+            list, ...). tensors: PyTorch's tensors among the arguments.
+            """
             inputs, outputs = run_function(arguments, tensors)
             container.append(outputs)
             # PyTorch keeps the tensors for a second backward pass, and Dr.Jit's graph serves the

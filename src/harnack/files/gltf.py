@@ -228,6 +228,7 @@ def _check_nodes(place: FileLocation, header: dict[str, Any], corner_counts: lis
             raise place.error(f"its scene is nested more than {_MAX_NODE_DEPTH} nodes deep")
     mesh_ids: list[int] = [node["mesh"] for node in nodes if "mesh" in node]
     total = sum(corner_counts[mesh] for mesh in mesh_ids)
+    # The limit for bytes serves as a limit for corners.
     if total > MAX_BYTES:
         raise place.error(f"its scene draws {total:,} corners: at most {MAX_BYTES:,} are read")
 

@@ -285,9 +285,10 @@ def transmittance(mi: Any, carriers: Any, start: Any, si: Any, d: Any) -> Any:
     start, d: the surface interactions at which rays start, and their directions (3,).
     si: the next hits of the rays.
 
-    By Beer and Lambert's law the fraction tint^t of the light is left after a length t in a solid.
-    Going in and out of a solid alternate (`CappedSolid.intersect`). So a ray that leaves a point of
-    a solid's boundary against the outward normal is inside up to the next hit.
+    If one unit of length in a solid leaves the fraction a of the light, a length t leaves the
+    fraction a^t (Beer and Lambert). Going in and out of a solid alternate
+    (`CappedSolid.intersect`). So a ray that leaves a point of a solid's boundary against the
+    outward normal is inside up to the next hit.
     """
     remaining = mi.Spectrum(1)
     for carrier in carriers:

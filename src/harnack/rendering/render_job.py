@@ -115,6 +115,7 @@ class RenderJob:
                 aov_task = replace(aov_task, background=options.backdrop.bottom)
             return aov_task
         if options.show == "shaded":
+            # In the studio, the backdrop is added to the picture afterwards: it is cut out.
             return ShadedTask(
                 mi, scene, sensor, spp=options.spp or EDGE_SPP, cut_out=stage is not None,
                 on_floor=stage is not None and stage.has_ground, cones=options.antialias == "cones",

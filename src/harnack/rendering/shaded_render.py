@@ -182,11 +182,11 @@ def ambient_visibility(
         return dr.select(is_in_picture & (sine > 0), sine * fade, 0)
 
     def add_direction(turn: Any, hidden: Any) -> tuple[Any, Any]:
-        """One step of the loop over directions. Returns the index of the next direction, and the
-        sum of hidden fractions with this direction added.
+        """Do one step of the loop over directions. Returns the index of the next direction, and the
+        sum of hidden fractions with this direction added. The hidden fraction of a direction is the
+        square of the largest sine that `tap` returns for it.
 
-        turn: the index of this direction.
-        hidden: the sum so far.
+        turn: the index of this direction. hidden: the sum so far.
         """
         s, c = dr.sincos((mi.Float(turn) + 0.5) * (dr.two_pi / _DIRECTIONS))
         highest = mi.Float(0)
@@ -422,6 +422,7 @@ class ShadedTask:
         is_open = self.mi.Bool(False)
         for carrier in self.world.proxies:
             surface = carrier.surface
+            # The zero level set of a field of the class `Solid` bounds a solid, too.
             if surface.solid_range is None and not isinstance(surface.field, Solid):
                 is_open |= si.shape == self.mi.ShapePtr(carrier)
         return is_open
