@@ -58,9 +58,8 @@ def tensor_to_vectors(
     numbers = tensor_to_array(tensor, name)
     backend = backend_of(numbers)
     count = 3 * tensor.shape[0]
-    # The numbers 0, 3, 6, ... of the rows are x coordinates, and so on.
+    # The numbers 0, 3, 6, ... of the rows are x coordinates, and so on; without rows there are none.
     indices = (dr.arange(backend.UInt32, k, count, 3) for k in range(3 if count else 0))
-    # Without rows there is nothing to gather.
     components = [dr.gather(backend.Float, numbers, index) for index in indices]
     return backend.Array3f(*components) if components else dr.zeros(backend.Array3f, 0)
 

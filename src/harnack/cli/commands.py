@@ -102,7 +102,8 @@ def _mesh(arguments: Any) -> int:
     target = check_mesh_path(_output(arguments, path, ".stl", "mesh"))
     surface = load_single_surface(arguments, path)
     given_options = options_set("mesh", arguments)
-    # The options of the surface are applied already, when it is loaded.
+    # The options of the surface were applied when it was loaded; the tolerance belongs to the mesh,
+    # too.
     settings = {
         name: value
         for name, value in given_options.items()
@@ -143,7 +144,8 @@ def _repair(arguments: Any) -> int:
         raise ValueError(f"{source} holds no mesh to repair")
     print_line(f"{source}: {python_to_cli_terms(loaded.summary)}")
     given_options = options_set("repair", arguments)
-    # Files such as .stl list the corners of each face anew.
+    # Files such as .stl list the corners of each face anew: corners at the same position are
+    # joined.
     used, faces = np.unique(weld_vertices(loaded.vertices)[loaded.faces], return_inverse=True)
     damaged = trimesh.Trimesh(loaded.vertices[used], faces.reshape(-1, 3), process=False)
     with Console().status("starting") as status:

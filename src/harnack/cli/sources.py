@@ -177,7 +177,8 @@ def load_live_content(verb: str, arguments: Any, path: Path) -> Content:
         if dropped_options:
             print_line(f"left out, as a {verb} does not have them: {', '.join(dropped_options)}")
     settings = live_options(settings) | ({} if show is None else {"show": show})
-    # A slider can move an option of the surface only if it is an option of the page.
+    # A slider can move an option of the surface only if this is an option of the page. So the
+    # options of a single surface become options of the page.
     if any(name in SURFACE_OPTIONS for name in sliders):
         surfaces, settings = _unpacked(surfaces, settings)
     settings = _with_flat_options(settings, sliders) | sliders

@@ -34,7 +34,8 @@ def accepts_dask_arrays(*names: str) -> Callable[[Function], Function]:
     """
 
     def decorate(function: Function) -> Function:
-        """Return `function` with support for Dask arrays."""
+        """Return `function` with support for Dask arrays. Its arguments `names` may be Dask
+        arrays."""
         signature = inspect.signature(function)
         # The name of the parameter **keywords, if there is one.
         variadic_name = next(
@@ -55,6 +56,7 @@ def accepts_dask_arrays(*names: str) -> Callable[[Function], Function]:
             # The first argument, `self` of a method, is passed by position, all others by name.
             first_argument = arguments.pop(next(iter(signature.parameters)))
             named = {**arguments.pop(variadic_name, {}), **arguments}
+            # `wrapper`, and not `function`, as workers find the wrapper under the function's name.
             return _map_blocks(functools.partial(wrapper, first_argument), names, named)
 
         return cast("Function", wrapper)

@@ -284,8 +284,8 @@ def read_geometry(path: str | os.PathLike[str], read_as: ReadAs | None = None) -
 
     read_as: what to make of the contents. "winding": the faces, as a mesh. "dipole": the points; of
         a mesh the centers of its triangles, with their normals and areas. "loops": the result of
-        `read_loops`; of a mesh its boundary, the singular edges joined. "polygons": the faces, not
-        triangulated. None decides as above.
+        `read_loops`; of a mesh its boundary: the edges at which its faces do not cancel, joined to
+        curves. "polygons": the faces, not triangulated. None decides as above.
 
     Raises:
         FileFormatError: the file is unreadable, malformed, truncated or hostile, has another

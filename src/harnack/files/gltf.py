@@ -158,6 +158,7 @@ def _check_header(place: FileLocation, header: dict[str, Any], size: int) -> Non
         element_bytes = _COMPONENT_BYTES[accessor["componentType"]] * _COMPONENTS[accessor["type"]]
         total += _count(accessor, "count") * element_bytes
         _count(accessor, "byteOffset", 0)
+    # Of small files, 64 KiB count as their size.
     if total > 8 * max(size, 1 << 16):
         raise place.error(
             f"its header asks for {total:,} bytes of data, many times those of the file ({size:,})"

@@ -263,7 +263,7 @@ def read_ply(path: Path, data: bytes) -> FileGeometry:
     if table and (table.has_scalars("vertex1", "vertex2") or not tables.get("face")):
         ends = np.stack([table.scalar_column("vertex1"), table.scalar_column("vertex2")], axis=1)
         edges = _polygons(table, ends.ravel(), np.full(len(ends), 2), len(vertices))
-    # Such faces are handled one by one, which takes long.
+    # Faces of different sizes are handled one by one, which takes long.
     if have_mixed_sizes(faces):
         check_element_count(FileLocation(path), header.declared_rows(len(data)))
     return FileGeometry(path, vertices, normals, faces, edges)

@@ -204,6 +204,7 @@ def read_obj(path: Path, data: bytes) -> FileGeometry:
         if statement := statements.get(keyword):
             statement[0].append(line[len(keyword) :])
             statement[1].append(number)
+        # Known keywords in capital letters are refused, too.
         elif keyword in _UNSUPPORTED_OBJ_STATEMENTS or keyword.lower() in statements:
             raise FileLocation(path, f"line {number}").error(
                 f"the statement {excerpt(keyword)} is not read: save the surface as 'v' and 'f'"
@@ -219,7 +220,7 @@ def read_obj(path: Path, data: bytes) -> FileGeometry:
     vertices = read_table(rows[b"v"], 3, too_few_message="a vertex needs three coordinates, not {}")
     faces = _parse_obj_polygons(rows[b"f"], "'f' needs at least 3 vertices", 3, rows[b"v"])
     polylines = _parse_obj_polygons(rows[b"l"], "'l' needs at least 2 vertices", 2, rows[b"v"])
-    # Such faces are handled one by one, which takes long.
+    # Faces of different sizes are handled one by one, which takes long.
     if have_mixed_sizes(faces):
         check_element_count(FileLocation(path), len(lines))
     if len(faces) or len(polylines):

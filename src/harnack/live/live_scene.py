@@ -589,6 +589,7 @@ def _kernel_data(
     # The test rays and Dr.Jit's results for them, as words in the order of the shader.
     inputs = dict(labeled_leaves("lane", lanes))
     results = {name: kernel.results.get(f"result {name}") for name in _RESULTS}
+    # All results but the last, the color, must differ between rays.
     if any(results[name] is None for name in _RESULTS[:-1]):
         raise ValueError("what rays meet is the same for all of them: there is nothing to draw")
     # Results that are the same constant for all rays are 0 here; of these only the color may be

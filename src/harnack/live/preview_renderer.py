@@ -129,6 +129,7 @@ class PreviewRenderer:
         # would then be evaluated separately.
         if has_floor and (is_idle or self.floor is None):
             self.floor = FloorShadow.of(_Casting(mi, painted), light)
+        # The width of a pixel at the hit, by its distance in the direction of view.
         width = hits["t"] * eye.pixel * dr.dot(hits["d"], _vector(mi, eye.forward))
         sky = ambient_visibility(mi, hits["position"], hits["normal"], width, size)
         reflectance = reflectance_of(ground)

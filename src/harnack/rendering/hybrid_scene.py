@@ -137,6 +137,7 @@ class HybridScene:
         if hidden is not None:
             preliminary = self._skip_emitters(ray, preliminary, active & hidden)
         t_max = dr.minimum(preliminary.t, ray.maxt)
+        # Queues trace rays at once, so their ends must be in memory.
         if self.queued:
             dr.eval(preliminary, t_max)
         hit, hit_shape = self.no_hit(dr.zeros(mi.SurfaceInteraction3f)), dr.zeros(mi.ShapePtr)

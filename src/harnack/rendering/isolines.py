@@ -317,6 +317,7 @@ class PreparedIsolines:
         # length of the table is a power of 2 minus 1.
         entries_below, bit = uint(0), (len(table) + 1) // 2
         while bit:
+            # Are at least `bit` more entries below g?
             entry = dr.gather(type(g), table, entries_below + (bit - 1))
             entries_below, bit = dr.select(entry < g, entries_below + bit, entries_below), bit // 2
         # The nearest level is one of the two neighbors of g in the table.

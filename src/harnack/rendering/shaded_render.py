@@ -145,8 +145,8 @@ _REACH = 0.16
 def ambient_visibility(
     mi: Any, position: Any, normal: Any, width: Any, size: tuple[int, int]
 ) -> Any:
-    """Estimate how much of the sky the point seen by each pixel sees: the fraction of the
-    hemisphere over it, in [0, 1], that nothing near it hides.
+    """Estimate how much of the sky reaches the point that each pixel shows: the fraction of the
+    hemisphere over the point, in [0, 1], that nothing near it hides.
 
     position: (3,) points seen by the pixels, counted by rows; NaN where nothing is seen.
     normal: (3,) unit normals there, toward the eye.
@@ -179,6 +179,7 @@ def ambient_visibility(
         point_distance = dr.norm(offset)
         fade = dr.maximum(1 - dr.square(point_distance / reach_in_space), 0)
         sine = dr.dot(offset, normal) / point_distance - 0.06  # facets and rounding stay below that
+        # The sine is NaN if nothing is seen, and then not larger than 0.
         return dr.select(is_in_picture & (sine > 0), sine * fade, 0)
 
     def add_direction(turn: Any, hidden: Any) -> tuple[Any, Any]:

@@ -166,12 +166,15 @@ def _refine_hits(prepared: SurfaceTracer, rays: _MarchedRays) -> SurfaceHit:
         sample = prepared.sample(position)
     gradient_norm = norm(sample.gradient)
     normal = dr.select(gradient_norm > 0, sample.gradient / gradient_norm, -d)
+    # A field may have another normal for shading than its gradient.
     shading_normal = normal if sample.shading_normal is None else sample.shading_normal
     uncertainty = _uncertainty(prepared, sample.gradient, t, sample.value, sample.value_error)
     # Second movement: along the gradient, by the distance to the level to first order.
     correction = prepared.levels.offset_to_nearest(sample.value) / gradient_norm
     correction = dr.select(gradient_norm > 0, dr.clip(correction, -reach, reach), 0)
-    if prepared.field.has_jumps:  # behind a facet, the value does not concern this surface
+    # If f is farther from the level than before, a facet may lie between, behind which f does not
+    # concern this surface.
+    if prepared.field.has_jumps:
         correction = dr.select(
             dr.abs(correction) * gradient_norm <= dr.abs(value_to_level), correction, 0
         )
@@ -239,6 +242,7 @@ def _hit_on_facet(
     # 1 if the ray comes from the side of smaller values, else -1.
     side = dr.mulsign(prepared.backend.Float(1), dr.dot(trace.gradient, d))
     rounding = 4 * prepared.backend.machine_epsilon * (dr.max(dr.abs(o)) + t)
+    # For |gradient| = 1, the tolerance of the value is a length.
     tolerance = prepared.tolerance.value_tolerance(prepared.backend.Float(1), t)
     return replace(
         hit,
@@ -386,6 +390,7 @@ class CappedSolid:
         # 1 where the ray leaves the solid, so that the outward normal is along it; -1 where it
         # enters. (`zero + 1` is the number 1 in the kernel's type.)
         out_along_ray = dr.select(hits_exit_cap | (side < 0), zero + 1, -1)
+        # On the wrong side, the normal is along the ray.
         normal = out_along_ray * d
         if self.prepared.volume is not None:
             cap_normal = orient_normal(
@@ -418,9 +423,9 @@ class CappedSolid:
         """Return the mask of rays o + t d, 0 <= t <= t_max, that hit the boundary of the solid.
         Rays that are not proved to miss it count as hits.
 
-        A ray hits a cap if it begins in the volume behind its origin and in the solid, or begins in
-        the solid and leaves the volume before t_max. All other active rays are tested against the
-        level sets.
+        Rays of two kinds are known to hit the boundary: rays that start outside of the volume and
+        enter it at a point of the solid, and rays that start in the solid and leave the volume
+        before t_max. All other active rays are tested against the level sets.
         """
         t_enter, t_leave = self.prepared.clip(o, d, self.prepared.backend.Float(0), t_max)
         meets_volume = active & (t_enter < t_leave)
