@@ -58,7 +58,7 @@ def tensor_to_vectors(
     numbers = tensor_to_array(tensor, name)
     backend = backend_of(numbers)
     count = 3 * tensor.shape[0]
-    # The numbers 0, 3, 6, ... of the rows are x coordinates, and so on; without rows there are none.
+    # The numbers 0, 3, 6, ... of the rows are x coordinates, and so on. No rows, no indices.
     indices = (dr.arange(backend.UInt32, k, count, 3) for k in range(3 if count else 0))
     components = [dr.gather(backend.Float, numbers, index) for index in indices]
     return backend.Array3f(*components) if components else dr.zeros(backend.Array3f, 0)
@@ -309,6 +309,7 @@ def wrap_for_jax(
     def backward(args: Any, cotangents: Any) -> Any:
         """Return the gradients with respect to all arguments. cotangents: the gradients with
         respect to the result."""
+        # The gradients with respect to the arguments that hold floats are computed by `pull_back`.
         leaves: list[Any] = jax.tree.leaves(args)
         if _is_traced(jax, (args, cotangents)):
             # Inside jax.jit only shapes are known: the gradients are computed by a callback when

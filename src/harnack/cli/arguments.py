@@ -289,6 +289,7 @@ def _add_option(group: Any, option: Option, verb: str) -> None:
     """Add an option of the table to a group of a parser. verb: the function of the library that the
     command calls, such as "render"."""
     if option.is_switch:
+        # None, and not False, if it is not given.
         group.add_argument(option.flag, action="store_true", default=None, help=option.help)
         return
     settings: dict[str, Any] = {

@@ -117,7 +117,7 @@ def load_content(
     where the fields come from, for scene files.
 
     path: the source as `source_path` returns it.
-    moved: numbers of names in a formula, besides those of --parameter.
+    moved: further numbers for names in a formula, besides those of --parameter; by name.
     """
     given_options = options_set(verb, arguments)
     if arguments.source in SCENES:
@@ -235,8 +235,8 @@ def load_single_surface(arguments: Any, path: Path) -> Field | Surface:
 
 
 def formula_field(arguments: Any, moved: Mapping[str, float] | None = None) -> Field:
-    """Return the field of the formula that is the source. moved: numbers of names in the formula,
-    besides those of --parameter."""
+    """Return the field of the formula that is the source. moved: further numbers for names in the
+    formula, besides those of --parameter; by name."""
     return expression(arguments.source, parameters={**dict(arguments.parameters), **(moved or {})})
 
 

@@ -152,6 +152,7 @@ def _joined_polylines(contents: FileGeometry) -> list[LocatedLoop]:
     for corners, place in contents.polylines:
         # All vertices at the same position have the same number here.
         ids: list[int] = welded[corners].tolist()
+        # Closed, with at least three vertices.
         if ids[0] == ids[-1] and len(ids) > 3:
             loops.append((x[ids[:-1]], place))
             continue
@@ -471,6 +472,7 @@ def _mesh_to_boundary(path: Path, mesh: LoadedMesh) -> LoadedCurves:
     Raises:
         FileFormatError: the faces have no boundary, or it is not a valid curve.
     """
+    # The weight of an edge: how often it remains after opposite edges of faces have canceled.
     edges, weights = singular_edges(weld_vertices(mesh.vertices)[mesh.faces])
     if not len(edges):
         raise FileLocation(path).error(

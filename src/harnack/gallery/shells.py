@@ -146,6 +146,7 @@ class GridShell:
         ribs = _drop_parallel_lines(candidates, 0.55 * self.spacing)
         # Seeds of the other family lie along about six of the ribs.
         spines = ribs[:: max(1, len(ribs) // 6)]
+        # Every second point, and none near the ends.
         seeds = np.concatenate([spine[2:-2:2] for spine in spines])
         # Of the two lines through each seed, the one is chosen that crosses a rib more nearly at a
         # right angle.

@@ -472,5 +472,6 @@ def _antialias(
     for (pixels, _), samples in zip(
         calls, executor.run_tasks("render_samples", calls), strict=True
     ):
+        # The samples of each pixel, in linear light.
         light = srgb_to_linear(colors(samples) / 255)
         picture.reshape(-1, 3)[pixels] = to_uint8(linear_to_srgb(light.mean(axis=1)))

@@ -163,7 +163,7 @@ def visible_points(surface: TracedSurface, backend: Backend) -> FloatArray:
         """Find the points anew, without the cache."""
         return _find_visible_points(surface, backend, ends)
 
-    if prepared is surface.field:  # the field itself is evaluated, and may have changed in place
+    if prepared is surface.field:  # without preparation, it may have been changed in place
         return find()
     settings = (
         surface.level_values,

@@ -325,6 +325,7 @@ class PathTracer:
                 dr.zeros(mi.Spectrum, width), dr.zeros(mi.Vector3f, width)
             )
             dr.make_opaque(results.features.albedo, results.features.normal)
+        # Camera rays count as sampled by a mirror: the light that they see has the weight 1.
         paths = _PathState(
             number=dr.arange(mi.UInt32, width),
             ray=mi.Ray3f(dr.detach(ray)),
@@ -485,6 +486,7 @@ class PathTracer:
         active &= light.pdf > 0
         scattered, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(light.d), active)
         active &= dr.max(scattered) > 0
+        # A BSDF cannot find a light that is a point: its weight is 1.
         mis_weight = dr.select(light.delta, 1, _power_heuristic(light.pdf, pdf))
         sent = self._clamped(paths.throughput * scattered * weight * mis_weight, paths.is_diffused)
         return _LightConnection(spawn_ray_to(mi, si, clearance, light.p), sent, active)

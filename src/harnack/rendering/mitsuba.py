@@ -312,6 +312,7 @@ def refract(normal: Any, d: Any, index: Any) -> tuple[Any, Any]:
     """
     normal_dot_d = dr.dot(normal, d)
     enters = normal_dot_d < 0
+    # The refractive index before the boundary, divided by the one behind it.
     eta = dr.select(enters, 1 / index, index)
     normal_to_ray = dr.select(enters, 1, -1) * normal
     cosine = dr.clip(dr.abs(normal_dot_d), 0, 1)
@@ -328,6 +329,7 @@ def refract(normal: Any, d: Any, index: Any) -> tuple[Any, Any]:
     reflected_fraction = dr.select(
         is_refracted, 0.5 * (perpendicular * perpendicular + parallel * parallel), 1
     )
+    # Between equal indices nothing is reflected.
     reflected_fraction = dr.select(dr.abs(index - 1) < _MIN_INDEX_DIFFERENCE, 0, reflected_fraction)
     refracted = eta * d + (eta * cosine - refracted_cosine) * normal_to_ray
     mirrored = d + 2 * cosine * normal_to_ray

@@ -366,8 +366,8 @@ def _sensor(mi: Any, pose: CameraPose, size: tuple[int, int]) -> dict[str, Any]:
         "type": "perspective",
         "fov": pose.fov,
         "fov_axis": "larger",
-        # Rays begin at a distance that is a whole multiple of a step, since it is a literal of
-        # kernels.
+        # Rays begin one to two steps before the stage, at a whole multiple of a step, since the
+        # distance is a literal of kernels.
         "near_clip": max(1e-3, _NEAR_CLIP_STEP * (distance // _NEAR_CLIP_STEP - 1)),
         "far_clip": _FAR_CLIP,
         "to_world": to_world,
