@@ -276,9 +276,8 @@ def _rays(
     grid: the number of rays along a side of the grid, a multiple of 8.
     """
     tile_count = grid // _TILE
-    # Axes: tiles down and across, and rays down and across a tile.
     # u and v are the coordinates of the rays on a side of the box, in (0, 1), tile by tile of 8 x 8
-    # rays.
+    # rays. The axes of `index` are tiles down and across, and rays down and across in a tile.
     index = np.indices((tile_count, tile_count, _TILE, _TILE), dtype=np.float64)
     u = ((_TILE * index[1] + index[3] + 0.5) / grid).ravel()
     v = ((_TILE * index[0] + index[2] + 0.5) / grid).ravel()

@@ -107,6 +107,7 @@ def _prepared(mi: Any, carrier: Any) -> tuple[PlacedSurface, Any]:
             f'antialias="cones" takes fields without jumps, and {surface.field!r} jumps: its '
             'values tell no distance. Leave antialias at "edges"'
         )
+    # Cones need a tracer that finds where f crosses the level.
     placed = replace(carrier.placed, prepared=surface.prepare(backend, crosses=True))
     return placed, inner_and_outer_ball(surface.volume, backend)
 

@@ -218,6 +218,7 @@ class StudioLight:
         key, up = _parameter(normal, self.key), _parameter(normal, self.up)
         # The key light is large: it reaches a little around the terminator.
         key_cosine = dr.clip((dr.dot(normal, key) + _WRAP) / (1 + _WRAP), 0, 1)
+        # What hides the sky hides a part of the large key light, too.
         key_visible = (1 - _KEY_HIDDEN * (1 - visible)) * reached
         upper_fraction = 0.5 + 0.5 * dr.dot(normal, up)
         # Light of the hemisphere, between its color below and its color above.
