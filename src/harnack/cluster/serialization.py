@@ -399,9 +399,9 @@ def _make_cacheless_pickler(base: Any) -> Callable[..., Any]:
 
 
 def _without_generated_id(reduced: Any) -> Any:
-    """Remove the id that cloudpickle generated from its description `reduced` of how a class is
-    rebuilt. By this id cloudpickle would find a class that it rebuilt before, and replace the
-    methods of that class."""
+    """Return cloudpickle's description of how a class is rebuilt, without the id that cloudpickle
+    generated for the class. By this id cloudpickle would find a class that it rebuilt before, and
+    replace the methods of that class. reduced: the description."""
     if not isinstance(reduced, tuple):
         return reduced
     constructor, arguments, *rest = cast("tuple[Any, ...]", reduced)

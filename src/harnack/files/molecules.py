@@ -109,9 +109,8 @@ def parse_molecule(path: Path, data: bytes) -> Atoms:
 
 def _text(data: bytes, *, is_cif: bool) -> str:
     r"""Decode the bytes of a molecule's file to text, without byte order mark. In the text of a
-    .pdb file, lines end with "
-    ", and each non-ASCII letter is replaced by a single byte: the format is given by columns, which
-    gemmi counts in bytes."""
+    .pdb file, lines end with "\n", and each non-ASCII letter is replaced by a single byte: the
+    format is given by columns, which gemmi counts in bytes."""
     data = data.removeprefix(b"\xef\xbb\xbf")
     if is_cif:
         return data.decode("utf-8", "replace")

@@ -242,8 +242,8 @@ class HybridScene:
         normal_dot_d = dr.dot(normal, d)
 
         def to_neighbor(o: Any, along: Any) -> Any:
-            """Return the vector from the hit to the point at which a neighboring pixel's ray o + t
-            along meets the tangent plane."""
+            """Return the vector from the hit to the point at which the ray of a neighboring pixel
+            meets the tangent plane. o, along: (3,) the origin and the direction of this ray."""
             offset = o + t * along - ray.o - t * ray.d
             return offset - d * (dr.dot(offset, normal) / normal_dot_d)
 

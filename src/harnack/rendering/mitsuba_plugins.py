@@ -213,8 +213,8 @@ def register_surfaces(plugin: str, surface: Callable[[Any], TracedSurface]) -> A
 
 def surface_from_properties(props: Any) -> TracedSurface:
     """Return the surface that the properties of a `harnack` shape describe. The properties "low"
-    and "high" are the ends of the values of the field on a closed solid; one of them may be
-    missing.
+    and "high" make the shape a closed solid, on which the field lies between them; one of them may
+    be missing.
 
     Raises:
         ValueError: the properties describe no surface, or contradict each other.
