@@ -129,6 +129,7 @@ class PreviewRenderer:
         # would then be evaluated separately.
         if has_floor and (is_idle or self.floor is None):
             self.floor = FloorShadow.of(_Casting(mi, painted), light)
+        # The width of a pixel at the hit, by its distance in the direction of view.
         width = hits["t"] * eye.pixel * dr.dot(hits["d"], _vector(mi, eye.forward))
         sky = ambient_visibility(mi, hits["position"], hits["normal"], width, size)
         reflectance = reflectance_of(ground)
@@ -180,7 +181,7 @@ class PreviewRenderer:
           floor.
         - "evaluations": the number of evaluations of all surfaces' fields.
         """
-        columns, rows = (dr.opaque(mi.UInt32, surface_normal) for surface_normal in size)
+        columns, rows = (dr.opaque(mi.UInt32, side) for side in size)
         index = dr.arange(mi.UInt32, size[0] * size[1])
         pixel = dr.opaque(mi.Float, eye.pixel)
         x = (mi.Float(index % columns) + 0.5 - 0.5 * mi.Float(columns)) * pixel
@@ -191,10 +192,13 @@ class PreviewRenderer:
         origin = _vector(mi, eye.origin)
         vector = mitsuba_backend(mi).Array3f
         o = vector(origin) + dr.zeros(vector, dr.width(d))
+        # The nearest hit so far: the floor, if the ray goes down to it.
         t, normal, color = mi.Float(dr.inf), mi.Vector3f(0, 0, 1), mi.Color3f(0)
         glossy, lost, ground = mi.Bool(False), mi.Bool(False), mi.Bool(False)
         if has_floor:
+            # Rays that do not go down are left out by `ground`; for them, the divisor is not 0.
             t_floor = (FLOOR_HEIGHT - origin.z) / dr.minimum(d.z, -1e-9)
+            # The floor is a disc of radius 100.
             ground = (d.z < 0) & (dr.norm(origin + t_floor * d) < 100.0)
             t = dr.select(ground, t_floor, t)
         evaluations = mi.UInt32(0)
@@ -214,6 +218,7 @@ class PreviewRenderer:
             color = dr.select(nearer, paint_color, color)
             glossy = dr.select(nearer, paint_is_glossy, glossy)
             ground &= ~nearer
+        # From here on, `met` is the mask of rays that hit something.
         met = dr.isfinite(t) & ~lost
         return {
             "t": t, "d": d, "normal": dr.mulsign(normal, -dr.dot(normal, d)),

@@ -218,6 +218,7 @@ class StudioLight:
         key, up = _parameter(normal, self.key), _parameter(normal, self.up)
         # The key light is large: it reaches a little around the terminator.
         key_cosine = dr.clip((dr.dot(normal, key) + _WRAP) / (1 + _WRAP), 0, 1)
+        # What hides the sky hides a part of the large key light, too.
         key_visible = (1 - _KEY_HIDDEN * (1 - visible)) * reached
         upper_fraction = 0.5 + 0.5 * dr.dot(normal, up)
         # Light of the hemisphere, between its color below and its color above.
@@ -363,6 +364,7 @@ def _visible_fractions(
     # The place of a point in its block of 4 x 4 points chooses its group of rays.
     j, i = np.indices(x.shape)
     d = towards[:, (j % _BLOCK) * _BLOCK + i % _BLOCK]
+    # A copy of each point for each of its rays.
     o = np.stack([x, y, np.zeros_like(x)], axis=-1)[:, :, None]
     o = np.broadcast_to(o, d.shape)
     ray = mi.Ray3f(_vectors(mi.Point3f, o), _vectors(mi.Vector3f, d))
@@ -383,6 +385,7 @@ def _square() -> FloatArray:
     k = np.arange(_BLOCK * _BLOCK * _RAYS)
     plastic = 1.32471795724474602596  # the real root of x^3 = x + 1
     points = np.mod(0.5 + np.outer(k, [1 / plastic, 1 / plastic**2]), 1.0)
+    # Successive points go to different groups.
     return points.reshape(_RAYS, _BLOCK * _BLOCK, 2).transpose(1, 0, 2)
 
 
@@ -390,8 +393,10 @@ def _to_key(key: Any) -> FloatArray:
     """Return 16 groups of unit directions, (16, rays, 3), to points spread over the round key
     light. key: (3,) the direction to its middle."""
     axis = np.asarray(key, dtype=np.float64)
+    # The coordinate axis that is farthest from `axis` gives a vector at right angles.
     tangent = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
     tangent /= np.linalg.norm(tangent)
+    # The square root spreads points evenly over the disc.
     radius, angle = _SPREAD * np.sqrt(_square()[..., :1]), 2 * math.pi * _square()[..., 1:]
     d = axis + radius * (np.cos(angle) * tangent + np.sin(angle) * np.cross(axis, tangent))
     d[..., 2] = np.maximum(d[..., 2], 0.05)  # the floor itself casts no shadow
@@ -401,6 +406,7 @@ def _to_key(key: Any) -> FloatArray:
 def _to_sky() -> FloatArray:
     """Return 16 groups of unit directions, (16, rays, 3), to the sky, distributed with the cosine
     of their angle to the vertical."""
+    # Uniform squares of the sine give the cosine distribution.
     sine_squared, angle = np.moveaxis(_square(), -1, 0)
     sine = np.sqrt(sine_squared)
     return np.stack([sine * np.cos(2 * math.pi * angle), sine * np.sin(2 * math.pi * angle),
@@ -447,6 +453,7 @@ def studio_wall(
     pixel = dr.arange(mi.UInt32, width * height)
     position = film_positions(mi, pixel, mi.Vector2f(0.5), (width, height))
     ray, _ = sensor.sample_ray(sensor.shutter_open(), 0.5, position, mi.Point2f(0.5))
+    # From 0 at the horizon to 1 straight above.
     rise = np.clip(to_numpy(ray.d)[:, 2], 0, 1) ** 0.7
     distant = distant_ground_radiance(ground.name, azimuth)
     if show == "shaded":
