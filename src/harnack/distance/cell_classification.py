@@ -197,6 +197,7 @@ class ClipCurveDescent:
             count(0), real(1), count(0), count(0), self.backend.Bool(True),
         )  # fmt: skip
         final = dr.while_loop(state, is_active, body, label="along the rim")
+        # The best point, and its curvature, which is the length of y'' (`ddy`).
         return final[1], safe_norm(final[5])
 
     def _at(self, y: Vec3) -> _ClipCurveState:
@@ -350,8 +351,8 @@ class CellClassifier:
         center: (n, 3) centers of the cubes.
         half: (n,) half the length of their edges.
 
-        A cube whose ball lies outside the domain is empty. If only its center lies outside, nothing
-        else is known of it.
+        A cube is empty if the ball around it lies outside the domain. If the ball does not, but the
+        cube's center lies outside, the cube is returned without a slab.
         """
         is_inside = np.ones(len(center), np.bool_)
         if self._volume is not None and len(center):
@@ -469,6 +470,7 @@ class CellClassifier:
             & dr.isfinite(linear_error)
             & (linear_error < FAR_SENTINEL * gradient_norm)
         )
+        # A slab holds the surface only if a single level, without jumps, passes through the ball.
         if len(self._levels.values) > 1 or self.surface.field.has_jumps:
             is_slab &= False
         elif self._levels.period is not None:
@@ -505,6 +507,7 @@ class CellClassifier:
         y = dr.select(is_found, point, p)
         gradient = self._field.evaluate(y).gradient
         n = gradient / safe_norm(gradient)
+        # A cell without a slab gets the tangent plane at its surface point.
         is_plane = is_found & ~(dr.squared_norm(normal) > 0) & dr.isfinite(dr.squared_norm(n))
         plane_radius, boundary = radius + safe_norm(y - p), self._field.closest_boundary_point(y)
         if boundary is not None:
@@ -542,7 +545,7 @@ class CellClassifier:
         p; `FAR_SENTINEL` if it does not converge to a point within the distance 2 `radius` of p.
 
         After six steps the method goes on only while its steps shrink, as they do towards a
-        multiple root, and they are made longer (`multiplicity`).
+        multiple root. These later steps are lengthened by the multiplicity of the root.
         """
         real, vector, count = self._backend.Float, self._backend.Array3f, self._backend.UInt32
         zero = dr.opaque(real, 0.0)  # keeps constant components of a gradient in the loop
@@ -568,6 +571,7 @@ class CellClassifier:
                 goes_on, dr.fma(vector(step / gradient_norm), sample.gradient + zero, y), y
             )
             goes_on &= shrinks & (last > 1e-9 * radius)
+            # The largest number of steps ends the loop.
             return y, last, dr.select(goes_on, k + 1, _MAX_SLOW_STEPS)
 
         def is_active(y: Vec3, last: Real, k: Any) -> Mask:

@@ -75,6 +75,7 @@ class LevelTriangles:
             return None
         vertices, faces, is_integer_off_faces = mesh
         is_jumps_only = surface.field.is_of_sheets_alone(surface.level_values)
+        # The scale is a power of two and the center has single precision: so scaling is exact.
         lower, upper = vertices[faces].min(axis=(0, 1)), vertices[faces].max(axis=(0, 1))
         size = float(2.0 ** np.ceil(np.log2(0.5 * (upper - lower).max())))
         center = round_to_single(0.5 * (lower + upper))

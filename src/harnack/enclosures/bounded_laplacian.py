@@ -199,6 +199,7 @@ class BoundedLaplacianEnclosure(Enclosure):
         # A level outside of the range is never met, and a constant function meets none.
         is_reachable = (gap <= rise) & (scale > 0)
         gap = dr.select(is_reachable, fmin(gap * inverse, _UNREACHABLE_GAP), _UNREACHABLE_GAP)
+        # The first number is sqrt(1 + gap) - 1, in a form that does not cancel.
         return _GreenCondition(
             gap / (dr.sqrt(1 + gap) + 1), w, slope, spread, fmax(mean * inverse, 0)
         )

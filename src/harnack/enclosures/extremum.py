@@ -71,6 +71,7 @@ class MaximumEnclosure(Enclosure):
         rise_length = dr.select(gaps.above == dr.inf, infinity, rise_length)
         fall_length = dr.select(gaps.below == dr.inf, infinity, fall_length)
         free = fmin(rise_length, fall_length)
+        # Without a level on either side, the enclosures themselves limit the length.
         return dr.select(free == dr.inf, self._shared_valid_length(infinity), free)
 
     def is_free(self, gaps: LevelGaps, length: Real) -> Mask:
@@ -123,6 +124,7 @@ class NegatedEnclosure(Enclosure):
     inner: Enclosure
 
     def free_length(self, gaps: LevelGaps) -> Real:
+        """Return the length on which f is proved to take no level of -f, negated."""
         return self.inner.free_length(gaps.swapped())
 
     def is_free(self, gaps: LevelGaps, length: Real) -> Mask:

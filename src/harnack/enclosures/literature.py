@@ -114,6 +114,8 @@ class LongestOfEnclosure(Enclosure):
         return cls(enclosures) if enclosures else None
 
     def free_length(self, gaps: LevelGaps) -> Real:
+        """Return the longest length that one of the enclosures proves; at least 0, even if one of
+        them gives NaN."""
         longest: Real = type(gaps.above)(0)
         for enclosure in self.enclosures:
             longest = fmax(enclosure.free_length(gaps), longest)
@@ -137,6 +139,8 @@ class BandEnclosure(Enclosure):
     reach: Real
 
     def free_length(self, gaps: LevelGaps) -> Real:
+        """Return the length on which the upper line stays below the level above, and the lower line
+        above the level below."""
         up = self._length_below(gaps.above, self.offsets.upper, self.slopes.upper)
         down = self._length_below(gaps.below, -self.offsets.lower, -self.slopes.lower)
         return fmax(fmin(up, down), 0)
@@ -171,6 +175,7 @@ class AffineEnclosure(BandEnclosure):
         if not isinstance(function, EvaluableRestriction):
             return None
         form = function.evaluate_with(lambda p, d: AffineForm.along_ray(p, d, length))
+        # The bounds are of the change of f, so the value at the start is subtracted.
         start = _value(function)
         rate = 2 * form.slope / length
         line = Interval.point(form.center) + Interval.point(-form.slope)

@@ -53,12 +53,16 @@ class ParabolaEnclosure(Enclosure):
     reach: Real
 
     def free_length(self, gaps: LevelGaps) -> Real:
+        """Return the length up to which the upper parabola stays below the level above, and the
+        lower one above the level below; at most `reach`, and 0 if a number is NaN."""
         up = first_reach(gaps.above, self.slopes.upper, self.max_second_derivative)
         down = first_reach(gaps.below, -self.slopes.lower, -self.min_second_derivative)
         is_valid = (up >= 0) & (down >= 0) & (self.reach > 0)  # and not NaN
         return fmax(dr.select(is_valid, fmin(fmin(up, down), self.reach), 0) * STEP_SAFETY, 0)
 
     def is_free(self, gaps: LevelGaps, length: Real) -> Mask:
+        """Return the mask of lanes on which both parabolas stay between the two levels on the given
+        length, and this is at most `reach`."""
         free = _stays_below(gaps.above, self.slopes.upper, self.max_second_derivative, length)
         free &= _stays_below(gaps.below, -self.slopes.lower, -self.min_second_derivative, length)
         return (length <= 0) | ((length <= self.reach) & free)
@@ -76,6 +80,8 @@ class LipschitzEnclosure(ParabolaEnclosure):
     def from_promise(
         cls, promise: Promise, value: Real, error: Real, slopes: SlopeRange
     ) -> Self | None:
+        """Return the enclosure from a `Lipschitz`; None for another kind of promise. The value of
+        f, its error and the slopes are not used."""
         if not isinstance(promise, Lipschitz):
             return None
         constant = _nan_if_negative(promise.constant)
@@ -84,11 +90,15 @@ class LipschitzEnclosure(ParabolaEnclosure):
     # Both sides in one formula, for speed: a ray along an edge uses a dozen cones at each point.
 
     def free_length(self, gaps: LevelGaps) -> Real:
+        """Return the smaller gap divided by the Lipschitz constant, at most `reach`; 0 if a gap is
+        0 or a number is NaN."""
         length = gaps.nearest / self.slopes.upper
         is_valid = (gaps.below > 0) & (gaps.above > 0) & (self.slopes.upper >= 0) & (self.reach > 0)
         return dr.select(is_valid, fmin(length, self.reach), 0) * STEP_SAFETY
 
     def is_free(self, gaps: LevelGaps, length: Real) -> Mask:
+        """Return the mask of lanes on which f can change on the given length by neither gap, and
+        the length is at most `reach`."""
         movement = self.slopes.upper * length
         free = (length <= self.reach) & (movement <= gaps.below) & (movement <= gaps.above)
         return (length <= 0) | free
@@ -107,6 +117,10 @@ class TaylorEnclosure(ParabolaEnclosure):
     def from_promise(
         cls, promise: Promise, value: Real, error: Real, slopes: SlopeRange
     ) -> Self | None:
+        """Return the enclosure from a `TaylorRemainder`; None for another kind of promise.
+
+        slopes: the range of the derivative of f along the path at the sample.
+        """
         if not isinstance(promise, TaylorRemainder):
             return None
         constant = _nan_if_negative(promise.constant)
@@ -192,6 +206,9 @@ class ConvexityEnclosure(Enclosure):
     slopes: SlopeRange
 
     def free_length(self, gaps: LevelGaps) -> Real:
+        """Return the length on which f stays above the level below; 0 if there is a level above, if
+        f is at the level below, or if the slope is NaN."""
+        # f falls at most at this rate.
         rate = -self.slopes.lower
         length = dr.select(rate > 0, gaps.below / rate, dr.select(rate <= 0, dr.inf, 0))
         length = dr.select(gaps.below > 0, length * STEP_SAFETY, 0)

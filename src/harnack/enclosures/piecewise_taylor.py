@@ -151,7 +151,9 @@ class PiecewiseTaylorEnclosure(Enclosure):
         by_line = dr.select(gap > 0, by_line, 0)
         by_parabola = first_reach(gap, slope, curvature)
         reach = fmin(fmax(by_parabola, by_line) * STEP_SAFETY, length)
-        # Both terms may cancel: the rounding error is that of each term, not that of their sum.
+        # From here on, the rise of F on the whole piece: by the parabola, by the line, and the
+        # smaller of both. The two terms of the parabola may cancel, so the rounding error is that
+        # of each term, not that of their sum.
         epsilon = 4 * float(dr.epsilon(type(gap)))
         curved, linear = 0.5 * length * length * curvature, slope * length
         by_parabola = (curved + linear) + epsilon * (dr.abs(curved) + dr.abs(linear))

@@ -123,6 +123,7 @@ def attach_derivatives(
     derivative, which would need the Hessian. At hits on facets, t is exact already and does not
     depend on the level.
     """
+    # `hit_surface` takes the function of the patch that was hit, if the field is made of patches.
     t, is_hit, prepared = end.t, end.status == int(RayStatus.HIT), prepared.hit_surface(end)
     if prepared.field.has_jumps:
         t = _on_plane(prepared, o, d, end)
@@ -153,7 +154,8 @@ def attach_derivatives(
         normal = dr.select(is_hit & (length > 0), sample.gradient / length, normal)
         dr.eval(t_hit, x, slope, normal)
     point = dr.fma(backend.Array3f(t_hit), d, o)
-    # x is the same point without derivatives.
+    # The change of f at the hit by changes of the ray: a zero with a derivative, since x is the
+    # same point without derivatives.
     change = dr.dot(sample.gradient, point - x)
     if any(dr.grad_enabled(parameter) for parameter in prepared.field.parameters()):
         # f depends on parameters, too: its own derivative has all of them.

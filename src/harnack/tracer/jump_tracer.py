@@ -267,6 +267,7 @@ class JumpTracer:
         point.
 
         first: the first of the crossings.
+        active: mask of rays whose crossings are merged.
 
         A ray through an edge or a vertex crosses several facets at once, in no particular order. f
         jumps there by the sum of their jumps, and there is no interval between them. The same holds
@@ -288,6 +289,7 @@ class JumpTracer:
 
         def add_next(now: _CoincidentJumps) -> _CoincidentJumps:
             """Add the next crossing to the sums, if it is at the same point."""
+            # The field looks for the next crossing after the place (t, facet) of the last one.
             crossing = self._next(
                 JumpCrossing(now.t, now.last, 0.0, first.normal), limit, now.active
             )
@@ -330,7 +332,7 @@ class JumpTracer:
         normal = dr.select(up, total.normal_up, dr.select(down, total.normal_down, first.normal))
         behind = JumpCrossing(total.t, total.last, first.jump, first.normal)
         is_unclear = total.folded & (total.jump == 0)
-        # Only where rounding is no small part of the ray.
+        # Only if rounding is no small part of the ray.
         is_unclear &= tolerance > _COARSE_FRACTION * (self.end - self.start)
         return JumpCrossing(first.t, facet, real(total.jump), normal), behind, is_unclear
 

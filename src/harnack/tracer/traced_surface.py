@@ -266,6 +266,7 @@ class TracedSurface:
         volume, region = self.volume, None
         self._check_size(backend)
         occupied = self._occupied() if self.largest or (many_rays and not crosses) else None
+        # Rays that look for crossings start a little outside the extent, but inside `region`.
         if crosses or self.require_crossing:
             region = intersection_of([self.field.domain, self.clip, self.section])
         field, known_volume = self.evaluator(backend), None
