@@ -120,6 +120,7 @@ class AffineForm(FormulaNumber):
         value, slopes, curvature = function.ranges(f_range)
         width = f_range.upper - f_range.lower
         epsilon = machine_epsilon(width)
+        # The ranges of phi at the two ends of the range of f; they contain the rounding of phi.
         ends = [function.ranges(Interval(end, end))[0] for end in (f_range.lower, f_range.upper)]
         chord_slope = dr.select(width > 0, (ends[1].midpoint - ends[0].midpoint) / width, 0)
         chord_slope = dr.select(dr.isfinite(chord_slope), chord_slope, 0)

@@ -304,6 +304,7 @@ def _hyperbolic_tangent(x: Real) -> Real:
 
 def _tanh(x: Interval) -> DerivativeRanges:
     """The ranges of tanh, of its derivative and of its second derivative on the interval x."""
+    # Widened once more, since the function is the quotient of two functions with errors.
     t = _increasing_range(_hyperbolic_tangent, x).widened(_MAX_ULP_ERROR * machine_epsilon(x.lower))
     upper = dr.select(x.upper == x.upper, fmin(t.upper, 1), 1)  # also if an end is NaN
     t = Interval(fmax(t.lower, -1), upper)
@@ -474,6 +475,7 @@ def power(n: float) -> ElementaryFunction:
     def of_positive(x: Any) -> Any:
         return dr.power(fmax(x, 0), n)
 
+    # With an exponent below 1 the slope is unbounded at 0; with one below 0 there is a pole.
     return ElementaryFunction(
         f"power {n}", real, of_positive, _numpy_power(n), _POSITIVE, n < 1, has_pole=n < 0
     )
@@ -567,6 +569,7 @@ def clipped_power(n: int) -> ClippedPower:
         low = fmax(x.lower, 0)
         clipped = Interval(low, low if x.lower is x.upper else fmax(x.upper, 0))
         value, slope, second = power(n).ranges(clipped)
+        # From here on, the ends of x itself.
         low, high = x.lower, x.upper
         # The derivatives of the power at 0 are those from the right only; for n = 1 and 2 those
         # from the left differ.

@@ -165,7 +165,7 @@ class Interval:
         low = high = end_products[0]
         for product in end_products[1:]:
             low, high = _minimum(low, product), _maximum(high, product)
-        # 0 times infinity is NaN: the smallest of the other products may then be wrong.
+        # On lanes where a product is NaN (0 times infinity), the result is all numbers.
         is_valid = _none_is_nan(end_products)
         if is_valid is not None:
             low, high = dr.select(is_valid, low, -dr.inf), dr.select(is_valid, high, dr.inf)

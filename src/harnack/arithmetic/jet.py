@@ -109,6 +109,7 @@ class Jet(FormulaNumber):
                 base = base.widened(machine_epsilon(x))
             at_start = _moved(base, rate, start)
             first, second = (rate,), (ZERO,)
+            # (0 * x is the number 0 in the type of x.)
             anchor = Jet(at_start, first, second, piece_length=0 * x) if anchored else None
             return Jet(at_start.hull(_moved(base, rate, end)), first, second, anchor, end - start)
 
@@ -439,6 +440,7 @@ class Jet(FormulaNumber):
         """
         if start is None:
             return self
+        # The range of the change since the start of the piece.
         rise = range_times_length(self.first_derivatives[0], width)
         first = self.first_derivatives[0]
         if self.second_derivatives:

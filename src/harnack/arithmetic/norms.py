@@ -190,11 +190,11 @@ def _jet_norm(xs: list[Jet], p: float) -> Jet:
 def _wronskian_term(
     xs: list[Jet], values: list[Interval], inverse_norm: Interval, i: int, j: int
 ) -> Interval:
-    """The range of the sum over pairs k < l of w_kl,i w_kl,j / N^3, where N is the Euclidean norm
+    """The range of the sum over pairs k < m of w_km,i w_km,j / N^3, where N is the Euclidean norm
     of functions x_k. It is the part of N's second derivative by the variables i and j that the
     first derivatives of the functions contribute (`norm` has the proof).
 
-    w_kl,i is the function x_k x_l' - x_l x_k' with derivatives by the variable i.
+    w_km,i is the function x_k x_m' - x_m x_k' with derivatives by the variable i.
 
     xs: the functions x_k.
     values: the ranges of their values.

@@ -456,7 +456,9 @@ class ParabolaBounds(FormulaNumber):
         )
 
     def _range(self) -> Interval:
-        """The range of the function on the whole path."""
+        """The range of the function on the whole path: its value at s = 0 plus the extremes of the
+        two parabolas."""
+        # `min_change` is minus the smallest change.
         h, value = self.piece_length, _on_backend(self.value, self.piece_length)
         min_change, max_change = (
             _maximum_on_piece(_negate(self.lower), h),

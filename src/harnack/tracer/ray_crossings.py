@@ -189,7 +189,8 @@ def find_crossings(
     walk = loop_while_active(begin, advance, "harnack crossings")
     final = walk.now
     ray_indices, zero = dr.arange(count, n * k) // k, real(0)
-    # The crossings as a `Contact`, for `refined_crossings`, which does not use the other values.
+    # The crossings as a `Contact`, for `refined_crossings`. It does not use the attributes that are
+    # False and zero here.
     roots = Contact(side, backend.Bool(False), t, gradient, zero, before, behind, zero)
     # Each crossing gets the ray to which it belongs, and is refined.
     origins, directions = (
