@@ -325,8 +325,8 @@ def _absolute(x: Real) -> Real:
 
 
 def _none_is_nan(numbers: tuple[Real, ...]) -> Mask | None:
-    """A mask of the lanes on which the sum of the numbers is a number. It is NaN if one of them is,
-    or if two of them are opposite infinities."""
+    """A mask of the lanes on which the sum of the numbers is a number. The sum is NaN if one of the
+    numbers is, or if two of them are opposite infinities. The result is never None."""
     total = numbers[0]
     for number in numbers[1:]:
         total = total + number

@@ -337,8 +337,9 @@ class Jet(FormulaNumber):
             theta_ij = (x y_ij - y x_ij)/r^2 - theta_i rho_j - theta_j rho_i.
 
         On a box that meets the cut of the angle (the negative x axis), the ranges of the
-        derivatives are all numbers. In the code u and v are the ranges of x and y, `inverse_r` that
-        of 1/r, and `cosine` and `sine` those of x/r and y/r.
+        derivatives are all numbers. In the code u and v are the ranges of x and y. `inverse_r` is
+        at first the range of r and then that of 1/r; `cosine` and `sine` are at first the ranges of
+        x and y times 1/r, and then these, clipped to [-1, 1].
         """
         number = x.backend_number() if self.value.is_literal else self.backend_number()
         v, u = self.value_on_backend(number), x.value_on_backend(number)

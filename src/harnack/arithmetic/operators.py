@@ -455,8 +455,8 @@ class OperationCounter(FormulaNumber):
         both sides of a place and steep between. The slopes of both numbers are recorded in the
         tally.
 
-        operations, size, rate: the number of Dr.Jit operations, and the size and the slope of the
-            result, as for `_after`.
+        operations: the number of Dr.Jit operations.
+        size, rate: estimates of the size and of the slope of the result.
         """
         if not (self.is_constant and other.is_constant):
             self.tally.steepest = max(self.tally.steepest, self.rate, other.rate)

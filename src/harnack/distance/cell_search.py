@@ -321,7 +321,7 @@ class _CellSearch:
     descent (Newton's method along the surface) from it may lead to a nearer point than the best one
     so far.
 
-    classifier: proves cells empty, and finds surface points in the others.
+    classifier: proves that cells are empty, and finds surface points in cells that may not be.
     cells: all cells, the finest so far. Subdivision replaces them.
     trees: the tree of the coarse cells and the tree of `cells`; None if there are no cells.
     guess: what was known about the closest point of each query before the search.
@@ -507,13 +507,13 @@ class _CellSearch:
         return np.where(np.isnan(distances), FAR_SENTINEL, distances)
 
     def _is_boundary(self, rows: IntArray | slice) -> BoolArray:
-        """Return the mask (k,) of those of the queries `rows` whose best point is still the initial
+        """Return a mask (k,), True for queries of `rows` whose best point is still the initial
         guess and lies on the curve at which the surface ends."""
         return self.guess.on_boundary & (self.closest[rows] == self.guess.closest[rows]).all(axis=1)
 
     def _descend_from_best_start(self, tree: CellTree) -> FloatArray:
-        """Descend for each query from the surface point of the cell with the smallest estimated
-        distance. Returns these surface points (n, 3), `FAR_SENTINEL` for none."""
+        """Descend for each query from the surface point of the cell of the tree with the smallest
+        estimated distance. Returns these surface points (n, 3), `FAR_SENTINEL` for none."""
         limit = upload_floats(self.backend, self._distance(slice(None)))
         start = to_numpy(tree.best_start(upload_vectors(self.backend, self.points), limit))
         rows = np.flatnonzero(start[:, 0] < 0.5 * FAR_SENTINEL)
@@ -617,10 +617,10 @@ class _CellSearch:
         self._update_best(ids, *self.descents.descend(x, start, self._distance(ids)))
 
     def _update_best(self, rows: IntArray, candidates: FloatArray, free: FloatArray) -> None:
-        """Replace the best points of the queries `rows` (k,), which may occur several times, by
-        those of `candidates` (k, 3) that are nearer.
+        """Replace the best points of the queries `rows` (k,) by their candidates, where these are
+        nearer. A query may occur several times in `rows`.
 
-        candidates: points of the surface, or NaN.
+        candidates: (k, 3) points of the surface, or NaN.
         free: (k,) radius about each candidate within which no surface point is nearer to the query.
         """
         distances = np.linalg.norm(self.points[rows] - candidates, axis=1)

@@ -79,7 +79,11 @@ class SurfaceCells:
 
     @classmethod
     def unknown(cls, center: FloatArray, half: FloatArray) -> SurfaceCells:
-        """Return cubes without slabs and surface points. center, half: as in the class."""
+        """Return cubes without slabs and surface points.
+
+        center: (n, 3) the centers.
+        half: (n,) half the length of an edge.
+        """
         n = len(half)
         far, zero = np.full((n, 3), FAR_SENTINEL), np.zeros(n)
         return cls(
@@ -189,7 +193,8 @@ class CellTree:
         vector = self.tree.backend.Array3f
 
         def visit_cell(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
-            """Keep the smallest estimate so far, and its surface point."""
+            """Keep the smallest estimated distance so far, and the surface point of its cell. row:
+            the cell's record. state: both so far."""
             best, point = state
             cell = _CellRecord.of(vector, row)
             estimate = cell.estimate(x)
@@ -356,7 +361,7 @@ class _CellRecord:
 
     @property
     def is_cell(self) -> Mask:
-        """Whether the record is that of a cell, not of a point of the clip curve."""
+        """Whether the record describes a cell, and not a point of the clip curve."""
         return self.number >= 0
 
     def lower_bound(self, x: Vec3) -> Real:

@@ -429,7 +429,7 @@ class _QueryEvaluator:
         real, index = surface.backend.Float, surface.backend.UInt32
 
         def nearest(p: Vec3) -> tuple[Vec3, Any, Vec3]:
-            """Return the nearest point on a facet, the index of the facet, and its normal."""
+            """Return the point on a facet that is nearest to p, the index of the facet, and its normal."""
             no_key, always = (real(-1), index(NO_FACET)), surface.backend.Bool(True)
             facet = surface.field.nearest_facet(p, no_key, real(dr.inf), always)
             return p + facet.offset, facet.facet, facet.normal
@@ -784,7 +784,8 @@ class _LinearlyShiftedField(Field):
         )
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
-        """Return the rows of the Hessian of the field; the linear function has none."""
+        """Return the rows of the Hessian of the field at p. The linear function does not change
+        it, since its second derivatives are 0."""
         return self._field.hessian(p)
 
 

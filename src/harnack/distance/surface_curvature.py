@@ -344,8 +344,8 @@ def curvature_lines(
     seeds: points near the surface, from which Newton's method leads to it.
     step: the arc length of a step.
     length: the arc length to which a line is followed, on either side of its seed.
-    family: whether to follow the direction of the larger principal curvature or of the smaller one;
-        the sign of curvatures is that of `curvature`.
+    family: "maximum" for lines along the direction of the larger principal curvature, "minimum" for
+        lines along that of the smaller one. Curvatures have the signs that `curvature` gives them.
     options, keywords: as in `curvature`; beside a bare field also `level`, `clip` and `section`.
 
     The principal directions are the eigenvectors of the Hessian restricted to the tangent plane

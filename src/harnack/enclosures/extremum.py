@@ -76,7 +76,10 @@ class MaximumEnclosure(Enclosure):
 
     def is_free(self, gaps: LevelGaps, length: Real) -> Mask:
         """Return the mask of lanes on which, for the given length, no operand rises to the level
-        above, and at least one operand is proved not to fall to the level below."""
+        above, and at least one operand is proved not to fall to the level below.
+
+        gaps: the differences between the maximum and these levels.
+        """
         # Start with True (where the gap is a number), and with whether no level lies below.
         free_above, free_below = gaps.above == gaps.above, gaps.below == dr.inf
         for operand in self.operands:
@@ -116,7 +119,8 @@ class MaximumEnclosure(Enclosure):
 
 @dataclass(frozen=True)
 class NegatedEnclosure(Enclosure):
-    """The enclosure of -f: that of f, with the levels above and below exchanged.
+    """The enclosure of -f. It uses an enclosure of f, for which the levels above and below are
+    exchanged.
 
     inner: the enclosure of f.
     """
@@ -157,8 +161,8 @@ class ScaledEnclosure(Enclosure):
         return self.inner.is_free(self._gaps(gaps), length * self.speed / STEP_SAFETY)
 
     def _gaps(self, gaps: LevelGaps) -> LevelGaps:
-        """Return the gaps of f (differences between its value and the next levels), from those of
-        value_factor * f."""
+        """Return the gaps of f (the differences between its value and the next levels) for the
+        gaps of value_factor * f."""
         factor = STEP_SAFETY / self.value_factor
         below, above = _scaled(gaps.below, factor), _scaled(gaps.above, factor)
         return LevelGaps(below, above, gaps.is_one_sided)

@@ -54,15 +54,21 @@ class ParabolaEnclosure(Enclosure):
 
     def free_length(self, gaps: LevelGaps) -> Real:
         """Return the length up to which the upper parabola stays below the level above, and the
-        lower one above the level below; at most `reach`, and 0 if a number is NaN."""
+        lower one above the level below; at most `reach`, and 0 if a number is NaN.
+
+        gaps: the differences between f at the sample and these two levels.
+        """
         up = first_reach(gaps.above, self.slopes.upper, self.max_second_derivative)
         down = first_reach(gaps.below, -self.slopes.lower, -self.min_second_derivative)
         is_valid = (up >= 0) & (down >= 0) & (self.reach > 0)  # and not NaN
         return fmax(dr.select(is_valid, fmin(fmin(up, down), self.reach), 0) * STEP_SAFETY, 0)
 
     def is_free(self, gaps: LevelGaps, length: Real) -> Mask:
-        """Return the mask of lanes on which both parabolas stay between the two levels on the given
-        length, and this is at most `reach`."""
+        """Return the mask of lanes on which both parabolas stay between the next levels below and
+        above on the given length, and this is at most `reach`.
+
+        gaps: the differences between f at the sample and these two levels.
+        """
         free = _stays_below(gaps.above, self.slopes.upper, self.max_second_derivative, length)
         free &= _stays_below(gaps.below, -self.slopes.lower, -self.min_second_derivative, length)
         return (length <= 0) | ((length <= self.reach) & free)
@@ -97,8 +103,8 @@ class LipschitzEnclosure(ParabolaEnclosure):
         return dr.select(is_valid, fmin(length, self.reach), 0) * STEP_SAFETY
 
     def is_free(self, gaps: LevelGaps, length: Real) -> Mask:
-        """Return the mask of lanes on which f can change on the given length by neither gap, and
-        the length is at most `reach`."""
+        """Return the mask of lanes on which f changes on the given length by no more than the
+        smaller gap, and the length is at most `reach`."""
         movement = self.slopes.upper * length
         free = (length <= self.reach) & (movement <= gaps.below) & (movement <= gaps.above)
         return (length <= 0) | free
@@ -258,10 +264,12 @@ class SphereArcEnclosure(Enclosure):
     squared_radius: Real
 
     def free_length(self, gaps: LevelGaps) -> Real:
-        """Return the length of the line on which f is proved to take neither level; infinite if no
-        level is ever met.
+        """Return the length of the line on which f is proved to take neither of the next levels
+        below and above; infinite if no level is ever met.
 
-        The symbols are those of the proof of the class: `square_sum` is S = c^2 + t^2,
+        gaps: the differences between f at the start and these levels.
+
+        In the symbols of the proof of the class, `square_sum` is S = c^2 + t^2,
         `length_per_angle` is dt/da = S/(2c) at the start, and `half_angle` is half the smallest
         angle psi at which f may reach a level. The result is the length s that belongs to psi.
         """

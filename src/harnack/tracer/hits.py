@@ -71,9 +71,9 @@ class Hits:
         with f on different sides of the level: at the root of the cubic through their values and
         slopes, or found by bisection if there is a crease between them.
     position: (n, 3) the point at t, NaN for a miss.
-    normal: (n, 3) the unit normal grad f/|grad f|, or that of the facet that was hit; it points to
-        the side of larger f. Zero for rays without a hit. (A facet is a flat piece of surface at
-        which f jumps, such as a triangle of a mesh.)
+    normal: (n, 3) the unit normal grad f/|grad f|, or the normal of the facet that was hit; it
+        points to the side of larger f. Zero for rays without a hit. (A facet is a flat piece of
+        surface at which f jumps, such as a triangle of a mesh.)
     value: (n,) f at the last accepted point; for an angle-valued field up to a multiple of its
         period. For hits on facets, f just before the facet.
     evaluations: (n,) the number of evaluations of the field.
@@ -425,8 +425,8 @@ def _trace_on_device(surface: TracedSurface, rays: RayBatch) -> Hits:
     directions = to_numpy(lanes["d"])
 
     def differences(rows: IntArray, expected: Arrays, computed: Arrays) -> str:
-        """Return a message on how the device's hits of some rays differ from the expected ones; ""
-        if they agree. rows: the indices of these rays."""
+        """Return a message on how the hits that the device computed for some rays differ from the
+        expected ones; "" if they agree. rows: the indices of these rays."""
         pair = Hits(**expected), Hits(**computed)
         return _compare_hits(*pair, directions[rows], surface.hit_tolerance)
 

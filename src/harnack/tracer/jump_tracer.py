@@ -338,7 +338,10 @@ class JumpTracer:
 
     def _next(self, behind: JumpCrossing, end: Real, active: Mask) -> JumpCrossing:
         """Return the next crossing of a facet after the crossing `behind`, as arrays of this
-        backend. If there is none up to the parameter `end`, its t is inf and its facet NO_FACET."""
+        backend. If there is none up to the parameter `end`, its t is inf and its facet NO_FACET.
+
+        active: mask of rays that need the result.
+        """
         real, vector, count = self.backend.Float, self.backend.Array3f, self.backend.UInt32
         ahead = self.field.next_jump(self.path.origin, self.path.direction, behind, end, active)
         is_valid = real(ahead.t) <= end

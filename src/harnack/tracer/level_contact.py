@@ -335,7 +335,8 @@ class Hysteresis:
 
         free: the masks `is_free_before` and `is_free_after` of the class: whether no level lies on
             the ray before and after the interval that is marched.
-        start, rounding: as in the class.
+        start: the ray parameter at which that interval begins.
+        rounding: the distance from a facet by which rounding may move a ray that starts on it.
         """
         period = levels.period
         spacing: Real = dr.inf if period is None else period
@@ -576,7 +577,8 @@ def refine_crossing(
     evaluations.
 
     contact: the crossings. Each has two points on different sides of the level, and a first
-        approximation of the root: that of the cubic through their values and slopes.
+        approximation of the root: the root of the cubic through the values and slopes of f at these
+        points.
     active: mask of rays with a crossing.
 
     The cubic is a bad approximation of f if f has a crease between the two points. So f is
