@@ -144,8 +144,8 @@ def _jet_norm(xs: list[Jet], p: float) -> Jet:
     """The p-norm N of the jets x_i (ranges of functions and of their derivatives), for 1 < p <
     infinity. `norm` has the proof of its ranges.
 
-    In the code `inverse_norm` is the range of 1/N, `ratios` are the ranges of x_i/N, and `pulls` the
-    ranges of sign(x_i) |x_i/N|^(p-1).
+    In the code `inverse_norm` is the range of 1/N, `ratios` are the ranges of x_i/N, and `pulls`
+    are the ranges of sign(x_i) |x_i/N|^(p-1).
     """
     number = next((f.value.lower for f in xs if not f.value.is_literal), None)
     number = xs[0].backend_number() if number is None else number

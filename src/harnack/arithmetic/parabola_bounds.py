@@ -396,9 +396,8 @@ class ParabolaBounds(FormulaNumber):
 
         Proof. Let f(s) <= f(0) + F+(s), g(s) <= g(0) + G+(s) and V = max(f(0), g(0)). Above: f is
         at most V + (f(0) - V) + F+, and g at most V + (g(0) - V) + G+. One parabola bounds both
-        (`_common_upper_bound`),
-        unless one function is larger on the whole path. Below: the maximum is at least the function
-        that is larger at s = 0.
+        (`_common_upper_bound`), unless one function is larger on the whole path. Below: the maximum
+        is at least the function that is larger at s = 0.
         """
         f, g = self.value, other.value
         h = self.piece_length
@@ -487,8 +486,8 @@ class ParabolaBounds(FormulaNumber):
         If the bounds are parabolas, the derivative of the product lies between two lines. Raise the
         upper line, if necessary, to at least 0 at both ends of [0, h]. As a line, it is then at
         least 0 on all of [0, h], and still above the derivative on [s0, s1]. So its integral is an
-        upper bound; the lower bound is found in the same way (`_extend_parabolas`). If the bounds are
-        lines, `_extend_lines` has the proof.
+        upper bound; the lower bound is found in the same way (`_extend_parabolas`). If the bounds
+        are lines, `_extend_lines` has the proof.
 
         Because of rounding, f may be positive outside of the computed [s0, s1], but is at most r =
         2 `value_error` there. The derivative of f^n is then at most `outer_slope`, n r^(n-1) (|a| +

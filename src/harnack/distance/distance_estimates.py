@@ -149,7 +149,7 @@ def closest_points(
     vertices of a solid angle, and the clip curve, at which the field's domain cuts the surface. The
     result is NaN where no surface is found; a RuntimeWarning counts these points.
 
-    The parameters are those of `signed_distance`.
+    surface, points, progress, options, keywords: as in `signed_distance`.
 
     Raises:
         TypeError, ValueError: as `signed_distance`.
@@ -199,7 +199,7 @@ def distance_bounds(
     `upper` is the distance to a point of the surface, found by several descents. Where `lower` is
     less than `upper`, the true distance may lie anywhere between the two.
 
-    The parameters are those of `signed_distance`.
+    surface, points, progress, options, keywords: as in `signed_distance`.
 
     Raises:
         TypeError, ValueError: as `signed_distance`.
