@@ -429,7 +429,7 @@ class _QueryEvaluator:
         real, index = surface.backend.Float, surface.backend.UInt32
 
         def nearest(p: Vec3) -> tuple[Vec3, Any, Vec3]:
-            """Return the point on a facet that is nearest to p, the facet's index, and its normal."""
+            """Return the point on a facet that is nearest to p, its index, and its normal."""
             no_key, always = (real(-1), index(NO_FACET)), surface.backend.Bool(True)
             facet = surface.field.nearest_facet(p, no_key, real(dr.inf), always)
             return p + facet.offset, facet.facet, facet.normal
