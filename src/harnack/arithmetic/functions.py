@@ -368,6 +368,7 @@ def _abs(x: Interval) -> DerivativeRanges:
     """The ranges of |x|, of its derivative and of its second derivative on the interval x. The
     second derivative has no upper bound at 0, where the slope jumps from -1 to 1."""
     is_positive, is_negative = x.lower > 0, x.upper < 0
+    # (The last argument of `typed_select` tells the type of the numbers only.)
     slope = Interval(
         typed_select(is_positive, 1, -1, x.lower), typed_select(is_negative, -1, 1, x.lower)
     )
@@ -466,6 +467,7 @@ def power(n: float) -> ElementaryFunction:
         second = Interval.enclosing(n * (n - 1), number_type) * _real_power(x, n - 2)
         is_defined = x.lower >= 0 if n > 0 else x.lower > 0
         value, is_none = _real_power(x, n), x.upper < 0
+        # (The last argument of `typed_select` tells the type of the numbers only.)
         value = Interval(
             typed_select(is_none, dr.nan, value.lower, x.lower),
             typed_select(is_none, dr.nan, value.upper, x.lower),

@@ -294,6 +294,7 @@ class Jet(FormulaNumber):
                 return u
             hull = u.hull(v)
             high = dr.inf if kink else hull.upper
+            # (The last argument of `typed_select` tells the type of the numbers only.)
             return Interval(
                 typed_select(
                     is_x_larger,
@@ -537,7 +538,8 @@ class Dual(FormulaNumber):
         own_value, other_value = self.value, other.value
 
         def rule(a: Any, b: Any) -> Any:
-            """The partial derivative of the product, from those of the two factors."""
+            """The partial derivative of the product, from the partial derivatives a and b of the
+            two factors."""
             return a * other_value + own_value * b
 
         return Dual(
@@ -558,7 +560,7 @@ class Dual(FormulaNumber):
         real = cast("Any", type(self.value))
 
         def rule(a: Any) -> Any:
-            """The partial derivative of the result, from that of this function."""
+            """The partial derivative of the result, from the partial derivative a of this function."""
             return dr.select(real(a) == 0, 0, a * slope)
 
         return Dual(function.on_drjit(self.value), _map_partials(rule, self.first_derivatives))
@@ -569,7 +571,7 @@ class Dual(FormulaNumber):
         u, v = x.value, self.value
 
         def rule(a: Any, b: Any) -> Any:
-            """The partial derivative of the angle, from those of x and y."""
+            """The partial derivative of the angle, from the partial derivatives a of x and b of y."""
             return (u * b - v * a) / (u * u + v * v)
 
         return Dual(
@@ -581,7 +583,8 @@ class Dual(FormulaNumber):
         is_own = self.value > other.value
 
         def rule(a: Any, b: Any) -> Any:
-            """The partial derivative of the larger function, from those of both."""
+            """The partial derivative of the larger function, from the partial derivatives a of this
+            function and b of the other one."""
             return dr.select(is_own, a, b)
 
         value = dr.select(is_own, self.value, other.value)

@@ -106,6 +106,7 @@ class FormulaNumber(abc.ABC):
         constant; None if it is not a number."""
         if isinstance(other, type(self)):
             return other
+        # An array of depth 1 holds numbers, not vectors.
         if dr.is_array_v(cast("Any", type(other))):
             return self.constant(other) if dr.depth_v(type(other)) == 1 else None
         try:

@@ -557,11 +557,12 @@ class ParabolaBounds(FormulaNumber):
     def _extend_parabolas(
         self, start: Real, length: Real, is_cut: Any, tail: Real
     ) -> tuple[Quadratic, Quadratic]:
-        """Extend parabolas that bound a function on an interval to parabolas that bound it on [0,
-        length].
+        """Extend the parabolas that bound this function on an interval to parabolas that bound the
+        extended function on [0, length].
 
-        This function is known on an interval that begins at `start`, and s counts from there. The
-        extended function equals it on the interval and is constant before and after it.
+        This function is known on an interval that begins at `start`; the s of its bounds counts
+        from there. The extended function equals it on the interval and is constant before and after
+        it.
 
         is_cut: whether the interval is not all of [0, length].
         tail: a bound of the derivative outside of the interval, which rounding may cause.
@@ -587,11 +588,11 @@ class ParabolaBounds(FormulaNumber):
     def _extend_lines(
         self, start: Real, end: Real, length: Real, value: Interval, is_cut: Any, tail: Real
     ) -> tuple[Quadratic, Quadratic]:
-        """Extend lines that bound a function on an interval [start, end] to lines that bound it on
-        [0, length].
+        """Extend the lines that bound this function on an interval [start, end] to lines that bound
+        the extended function on [0, length].
 
-        This function is known on the interval. The extended function equals it there; before the
-        interval it is constant, behind it it is 0.
+        This function is known on the interval. The extended function equals it there; it is
+        constant before the interval, and 0 behind it.
 
         value: the range of the extended function at s = 0.
         is_cut: whether the interval is not all of [0, length].

@@ -74,6 +74,7 @@ class Values(FormulaNumber):
 
     def constant(self, x: float | Real) -> Values:
         """The constant number x as a function on the same box."""
+        # False on each lane.
         is_never = self.nowhere & ~self.nowhere
         number_type = cast("Any", type(self.value.lower))
         if dr.is_array_v(cast("Any", type(x))):

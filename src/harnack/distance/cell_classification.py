@@ -1,10 +1,10 @@
 """Classifies cubes of space, the cells, by how a surface passes through them. The surface is a
 level set of a function f: f takes a given value on it, the level. A cell may be proved to hold no
 point of the surface. In other cells, if possible, a slab (the space between two parallel planes) is
-found that contains the surface, and a point of the surface.
+found that contains the surface, and a point of the surface. The boundary of the field's domain cuts
+the level set in a curve, the *clip curve*. A point of it is found in cells through which it passes.
 
-The boundary of the field's domain cuts the level set in a curve, the *clip curve*. A point of it is
-found in cells through which it passes; `ClipCurveDescent` finds the closest point of this curve.
+`ClipCurveDescent` finds the closest point of the clip curve.
 """
 
 from __future__ import annotations
@@ -204,10 +204,10 @@ class ClipCurveDescent:
         """Return the geometry at a point y near the clip curve: the derivatives of the curve there,
         and the step that leads back to it.
 
-        With u and n the unit normals of level set and domain, the tangent t is along their cross
-        product. On the curve u.y' = 0 and n.y' = 0; differentiated by arc length, u.y'' = -u'.t and
-        n.y'' = -n'.t, where u' and n' are the changes of the normals along t, computed by
-        differences.
+        Let u and n be the unit normals of the level set and of the domain. The tangent t = y' of
+        the curve is along their cross product. On the curve u.y' = 0 and n.y' = 0. Differentiated
+        by arc length, u.y'' = -u'.t and n.y'' = -n'.t, where u' and n' are the derivatives of the
+        normals along t, computed by differences.
         """
         real, vector = self.backend.Float, self.backend.Array3f
         sample = self.field.evaluate(y)
@@ -217,9 +217,10 @@ class ClipCurveDescent:
         depth = (
             -self.domain.signed_distance(y) - _DOMAIN_INSET * self.backend.machine_epsilon * scale
         )
-        # To first order, the distances to the level set along u and to the boundary along n.
+        # To first order, the distances to the level set along u, and along n to a surface just
+        # inside of the boundary, where points of the curve are placed.
         offset = self.levels.offset_to_nearest(sample.value) / gradient_norm
-        radius = dr.fma(
+        near = dr.fma(
             _LEVEL_TOLERANCE * self.backend.machine_epsilon,
             scale,
             real(sample.value_error) / gradient_norm,
@@ -234,20 +235,20 @@ class ClipCurveDescent:
             return (vector(first) * u + vector(second) * n) / sine_squared
 
         t = dr.cross(u, n) * dr.rsqrt(sine_squared)
-        # The step of the differences.
-        h = self.backend.machine_epsilon**0.5 * fmax(scale, real(1e-30))
-        next_point = dr.fma(vector(h), t, y)
+        # The step of the differences; u' . t and n' . t.
+        step = self.backend.machine_epsilon**0.5 * fmax(scale, real(1e-30))
+        next_point = dr.fma(vector(step), t, y)
         u_change = dr.dot(vector(self.field.evaluate(next_point).gradient) - gradient, t) / (
-            gradient_norm * h
+            gradient_norm * step
         )
-        n_change = dr.dot(vector(self.domain.outward_normal(next_point)) - n, t) / h
+        n_change = dr.dot(vector(self.domain.outward_normal(next_point)) - n, t) / step
         # Across an edge of the domain the normal jumps: that change is not curvature.
-        n_change = dr.select(dr.abs(n_change) * h < 1e-3, n_change, 0)
-        is_on = (dr.abs(offset) <= radius) & (
+        n_change = dr.select(dr.abs(n_change) * step < 1e-3, n_change, 0)
+        is_on = (dr.abs(offset) <= near) & (
             dr.abs(depth) <= _DEPTH_TOLERANCE * self.backend.machine_epsilon * scale
         )
         return _ClipCurveState(
-            is_on, radius, solution(offset, depth), t, solution(-u_change, -n_change), n, depth
+            is_on, near, solution(offset, depth), t, solution(-u_change, -n_change), n, depth
         )
 
 

@@ -287,6 +287,7 @@ def _split(
 
     Returns the coarse cells of an early iteration, which are few, and the cells of the last one.
     """
+    # The first cells are 8 x 8 x 8 equal cubes; `offsets` are their centers relative to the root's.
     half = root.half / _ROOT_CELLS
     offsets = (2 * np.indices((_ROOT_CELLS,) * 3).reshape(3, -1).T + 1 - _ROOT_CELLS) * half
     cells = classifier.nonempty_cells(root.center + offsets, np.full(len(offsets), half))
@@ -367,6 +368,7 @@ class _CellSearch:
         if self.trees is not None:
             self._search_cells(*self.trees, has_jumps, progress)
         else:
+            # All cells were proved empty: there is no surface.
             self.lower[:] = np.inf
         if not has_jumps:
             # One more descent begins at the query itself. Two parts of the surface may meet or

@@ -1,9 +1,8 @@
 """A tree over cells, cubes that may hold a surface. It finds the cells near a query point, and
-bounds of the distance of the surface in them.
-
-For each cell the surface in it is either unknown or proved to lie in a slab (two parallel planes).
-Some cells also have a known point of the surface. Where the boundary of the field's domain cuts the
-surface in a curve, the clip curve, cells may have a point of this curve.
+bounds of the distance of the surface in them. For each cell the surface in it is either unknown or
+proved to lie in a slab (two parallel planes). Some cells also have a known point of the surface. If
+the boundary of the field's domain cuts the surface in a curve, the clip curve, cells may have a
+point of this curve.
 """
 
 from __future__ import annotations

@@ -197,7 +197,7 @@ class JumpSurfaceSearch:
 
 def straddles_level(surface: SurfaceTracer, y: Vec3, radius: Real, active: Mask) -> Mask:
     """Return the mask of lanes on which f takes values on both sides of a level within 1.74 times
-    `radius` of y.
+    `radius` of y (the distance of the farthest samples).
 
     active: mask of lanes that are tested.
 
@@ -232,6 +232,7 @@ def straddles_level(surface: SurfaceTracer, y: Vec3, radius: Real, active: Mask)
 
     start = index(0), real(dr.inf), real(-dr.inf), backend.Bool(active)
     _, lower, upper, _ = dr.while_loop(start, is_active, body, label="sides of a level")
+    # The next level above the smallest value is below the largest value.
     return (lower < upper) & (surface.levels.gaps(lower).above < upper - lower)
 
 
@@ -459,8 +460,8 @@ def compass_search(surface: SurfaceTracer, x: Vec3, foot: Vec3) -> Vec3:
 
         d, t, foot: direction, distance and position of the best point.
         step: tangent of the angle by which rays are tilted against d.
-        angle: the direction of that tilt about d.
-        failed: the number of rays of this round, all of which failed.
+        angle: the angle about d that gives the direction of the tilt.
+        failed: the number of rays of this round so far; none of them found a nearer point.
         ray: the number of the ray.
         active: whether the search goes on.
         values: the planes of hits, `_HitPlanes.parts`.

@@ -141,6 +141,7 @@ def _proved_on_level(surface: TracedSurface, corners: FloatArray, size: float) -
     """
     backend, field = choose_backend("double"), surface.field
     prepared = surface.evaluator(backend)
+    # The same samples, and levels with the period 1: those of f modulo 1.
     smooth_field = EvaluateOnly(prepared.evaluate)
     levels = Levels(tuple(dr.opaque(backend.Float, level) for level in surface.level_values), 1.0)
 
@@ -161,4 +162,5 @@ def _proved_on_level(surface: TracedSurface, corners: FloatArray, size: float) -
     is_between = np.any(
         [(lower < level) & (level < upper) for level in surface.level_values], axis=0
     )
+    # Triangles without an area have no normal, and are not proved.
     return is_between & (clearances > radius + 2 * _SIDE_DISTANCE * size) & (length[:, 0] > 0)

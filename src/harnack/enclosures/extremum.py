@@ -318,14 +318,17 @@ class BranchPointEnclosure(Enclosure):
         # Zero, as an array.
         best = 0 * self.distance_to_limit
         for q in _TRIED_FRACTIONS:
+            # r = (q w/C)^(1/alpha), the radius of the disk.
             radius_power = fmax(q * w / self.constant, 0)
             radius = dr.power(radius_power, 1 / self.exponent) * _POWER_SAFETY
             radius = dr.select(
                 dr.isfinite(radius_power) & (radius >= 0), fmin(radius, self.max_radius), 0
             )
+            # Where the path leaves the disk.
             squared_half_chord = (radius - self.closest_distance) * (radius + self.closest_distance)
             exit_length = self.closest_parameter + dr.sqrt(fmax(squared_half_chord, 0))
             exit_length = dr.select(self.speed > 0, exit_length / self.speed, dr.inf)
+            # L = (1 - q) w/v, but no farther than the disk.
             length = dr.select(self.max_fall_rate > 0, (1 - q) * w / self.max_fall_rate, dr.inf)
             length = fmin(exit_length, length)
             starts_inside = (

@@ -65,6 +65,7 @@ class HarnackEnclosure(HarmonicBallEnclosure):
         larger of the two fractions that the bounds prove. gaps: the differences between f(p) and
         the next levels."""
         lower = upper = None
+        # For u = f - lower, "away from 0" is above.
         if self.max_fall is not None:
             lower = _fraction_from_one_side(self.max_fall, gaps.above, gaps.below, self.dimension)
         if self.max_rise is not None:  # the same for upper - f, positive and harmonic
@@ -466,14 +467,15 @@ def _two_caps(gap: Real, max_rise: Real, p: Real, rest: Real, mu: Real) -> _CapC
 @dataclass(frozen=True)
 class _CapCondition:
     """The condition (1-g) S(q) <= 1-q^2 with S = s1 s2 (s1+s2)/2, on a fraction q of the radius,
-    for f not to reach the level above. The symbols are those of `SphericalCapEnclosure`.
+    for f not to reach the level above. Here s1^2 = (1-q)^2 + 2qb and s2^2 = (1+q)^2 - 2qa, with the
+    heights b = p + shift and a = p - shift of two spherical caps (`SphericalCapEnclosure`).
 
     That is q k(q) <= g with k = (1-g) (S - 1 + q^2)/q + g q.
 
-    gap: g = (gap of f)/(C-f).
-    p: the mean of the boundary values.
+    gap: g = (gap of f)/(C-f), where C is the upper bound of f on the ball.
+    p: the mean of the boundary values, which are scaled to [0, 1].
     rest: 1 - p, accurate where it is small.
-    shift: mu/(1-p), so that the heights of the caps are p + shift and p - shift.
+    shift: mu/(1-p), where mu is the first moment of the boundary values along the ray.
     """
 
     gap: Real

@@ -66,11 +66,13 @@ class BottomUpQuadraticEnclosure(ParabolaEnclosure):
         return cls(SlopeRange(a, c), 2 * b, 2 * d, length)
 
     def free_length(self, gaps: LevelGaps) -> Real:
-        """Return the whole length of the path's piece if f is proved to take neither level on it;
+        """Return the whole length of the path's piece if f is proved to take no level on it;
         otherwise the length that `ParabolaEnclosure` proves.
 
-        The whole length is not shortened for rounding: else a ray that misses would need one more
-        sample. The gaps are, instead.
+        gaps: the differences between f at the start and the next levels below and above.
+
+        To allow for rounding, the gaps are made smaller. The whole length is not shortened: then a
+        ray that misses would need one more sample.
         """
         smaller_gaps = LevelGaps(gaps.below * STEP_SAFETY, gaps.above * STEP_SAFETY)
         is_finite = dr.isfinite(self.slopes.lower + self.slopes.upper)

@@ -76,18 +76,19 @@ class ParabolaEnclosure(Enclosure):
 
 @dataclass(frozen=True)
 class LipschitzEnclosure(ParabolaEnclosure):
-    """The Lipschitz cone, |F(s)| <= K s with a Lipschitz constant K: the step of sphere tracing.
+    """The Lipschitz cone, |F(s)| <= K s for s < reach, with a Lipschitz constant K: the step of
+    sphere tracing. K and reach come from a promise (a proved bound of f near the sample).
 
-    Proof. |F(s)| <= K s for s < radius by the promise. These are parabolas without a second-order
-    term, and the step is K^-1 times the smaller gap. Source: Hart 1996, Theorem 1.
+    Proof. The bounds are parabolas without a second-order term, and the step is K^-1 times the
+    smaller gap. Source: Hart 1996, Theorem 1.
     """
 
     @classmethod
     def from_promise(
         cls, promise: Promise, value: Real, error: Real, slopes: SlopeRange
     ) -> Self | None:
-        """Return the enclosure from a `Lipschitz`; None for another kind of promise. The value of
-        f, its error and the slopes are not used."""
+        """Return the enclosure from a `Lipschitz`, the promise of a Lipschitz constant; None for
+        another kind of promise. The value of f, its error and the slopes are not used."""
         if not isinstance(promise, Lipschitz):
             return None
         constant = _nan_if_negative(promise.constant)
@@ -113,17 +114,18 @@ class LipschitzEnclosure(ParabolaEnclosure):
 @dataclass(frozen=True)
 class TaylorEnclosure(ParabolaEnclosure):
     """Taylor's formula for F(s), the change of f along a path, with a bound H of the second
-    derivatives.
+    derivatives. H comes from a promise (a proved bound of f near the sample).
 
     Proof. If the slope at the sample is in [low, high], the promise says that F(s) lies between low
-    s - H s^2/2 and high s + H s^2/2 for s < radius.
+    s - H s^2/2 and high s + H s^2/2 for s < reach, the radius of the promise.
     """
 
     @classmethod
     def from_promise(
         cls, promise: Promise, value: Real, error: Real, slopes: SlopeRange
     ) -> Self | None:
-        """Return the enclosure from a `TaylorRemainder`; None for another kind of promise.
+        """Return the enclosure from a `TaylorRemainder`, the promise of such a bound; None for
+        another kind of promise. The value of f and its error are not used.
 
         slopes: the range of the derivative of f along the path at the sample.
         """

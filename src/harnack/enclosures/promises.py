@@ -308,6 +308,7 @@ class HarmonicBall(Promise):
             return None
         half = 0.5 * self.radius
         constant = _SECOND_DERIVATIVE_BOUND_4D if self.dimension == 4 else _SECOND_DERIVATIVE_BOUND
+        # (1.0001 allows for rounding.)
         return 1.0001 * constant * self._span(value) / (half * half), half
 
     def _span(self, value: Real) -> Real:
@@ -358,6 +359,7 @@ class BoundedLaplacian(Promise):
         half = 0.5 * self.radius
         max_laplacian = fmax(dr.abs(self.laplacian_lower), dr.abs(self.laplacian_upper))
         max_slope = 0.75 * (self.upper - self.lower) / half + 0.375 * half * max_laplacian
+        # (1.0001 allows for rounding.)
         return Lipschitz(1.0001 * max_slope, half)
 
     def weakened_for_linear_maps(self, value: Real) -> Promise:

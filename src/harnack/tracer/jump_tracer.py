@@ -199,6 +199,7 @@ class JumpTracer:
         now = self.march.advance(field, self.path, stop, now, ahead)
         # A march that ends at a facet as a miss has passed it.
         passed = active & has_facet & (now.status == int(RayStatus.MISS))
+        # Rays that look for crossings of the level have a contact.
         if now.contact is not None:
             return self._after_jump(outer, now, ahead, last, passed, active & has_facet)
         used_all_steps = passed & (now.evaluations >= self.march.max_steps)

@@ -207,8 +207,9 @@ def passes(levels: Levels, value: Real, low: Real, high: Real, gaps: LevelGaps) 
 def holds(levels: Levels, value: Real, low: Real, high: Real, gaps: LevelGaps) -> Mask:
     """Return the mask of lanes on which a level lies between `low` and `high`.
 
-    value, gaps: f at a point, and the differences between it and the next levels; used for periodic
-        levels only, which are at value - gaps.below and value + gaps.above and beyond.
+    value, gaps: f at a point, and the differences between it and the next levels. They are used for
+        periodic levels only: then the two levels next to `value` count, value - gaps.below and
+        value + gaps.above.
     """
     if levels.period is not None:
         is_held = (low - value <= -gaps.below) & (high - value >= -gaps.below)
