@@ -560,7 +560,7 @@ class Dual(FormulaNumber):
         real = cast("Any", type(self.value))
 
         def rule(a: Any) -> Any:
-            """The partial derivative of the result, from the partial derivative a of this function."""
+            """Compute the partial derivative of the result, from that of this function, a."""
             return dr.select(real(a) == 0, 0, a * slope)
 
         return Dual(function.on_drjit(self.value), _map_partials(rule, self.first_derivatives))
@@ -571,7 +571,7 @@ class Dual(FormulaNumber):
         u, v = x.value, self.value
 
         def rule(a: Any, b: Any) -> Any:
-            """The partial derivative of the angle, from the partial derivatives a of x and b of y."""
+            """Compute the partial derivative of the angle, from those of x and y, a and b."""
             return (u * b - v * a) / (u * u + v * v)
 
         return Dual(
