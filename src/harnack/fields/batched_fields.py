@@ -426,7 +426,7 @@ def cached_prepare(prepare: Prepare) -> Prepare:
     @functools.wraps(prepare)
     def cached(self: Field, backend: Backend) -> Field:
         """The prepared field: the cached one, unless the field has parameters."""
-        if self.parameters():
+        if self.differentiable_parameters():
             return prepare(self, backend)
         return caches[backend].get(self, None, lambda: prepare(self, backend))
 

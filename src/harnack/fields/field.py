@@ -33,6 +33,7 @@ from harnack.cluster.dask_arrays import accepts_dask_arrays
 from harnack.enclosures import BoundedLaplacian, HarmonicBall, Lipschitz, TaylorRemainder
 from harnack.fields.batch_evaluation import accepts_numpy_points, evaluate_points
 from harnack.fields.capabilities import CommonBoundary, JumpSurface, PatchUnion, VariableAccuracy
+from harnack.fields.parameters import Parametrized, record_call
 from harnack.fields.samples import Ray, RaySample, Sample, space_scaled, validate_samples
 from harnack.geometry.volume import check_volume
 
@@ -73,7 +74,7 @@ _SOLID_METHODS = frozenset(
 )
 
 
-class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
+class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, Parametrized, abc.ABC):
     """A scalar function f on R^3 whose level sets can be traced with a proof. A level is a number,
     and its level set is the surface f = level. A sample at a point holds value and gradient of f
     there, and promises: proved bounds of f near the point. Points p are Dr.Jit 3-vectors, one point
@@ -121,11 +122,14 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
     """Whether the gradient may jump, as it does where the surfaces of a union meet."""
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Self:
-        """Make a field. Raises NotImplementedError for arguments with derivatives enabled, unless
-        the class defines `parameters`: their derivatives would be lost."""
-        if cls.has_no_parameters():
+        """Make a field, which remembers this call (`parameters`). Raises NotImplementedError for
+        arguments with derivatives enabled, unless the class has `has_parameter_derivatives`: their
+        derivatives would be lost."""
+        if not cls.has_parameter_derivatives:
             check_no_derivatives(cls.__name__, args, kwargs)
-        return super().__new__(cls)
+        field = super().__new__(cls)
+        record_call(field, args, kwargs)
+        return field
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         """Replace methods of a new subclass. Its `evaluate` is wrapped so that the result is
@@ -278,26 +282,11 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
         levels."""
         del levels
 
-    def parameters(self) -> tuple[Any, ...]:
-        """The Dr.Jit arrays on which f depends and that may have derivatives enabled, for example
-        the vertices of a mesh that is optimized.
-
-        A class that does not define this method has no such parameters, and its constructor refuses
-        arguments with derivatives enabled.
-        """
-        return ()
-
-    @classmethod
-    def has_no_parameters(cls) -> bool:
-        """Whether the class does not define `parameters`. Then derivatives with respect to the
-        numbers in its fields would be lost."""
-        return cls.parameters is Field.parameters
-
     def refuse_hidden_parameters(self) -> None:
         """Raise NotImplementedError if the field holds numbers with derivatives enabled, for
-        example in its formula, although its class does not define `parameters`. These derivatives
-        would be lost."""
-        if self.has_no_parameters():
+        example in its formula, although its class does not have `has_parameter_derivatives`. These
+        derivatives would be lost."""
+        if not self.has_parameter_derivatives:
             kind = type(self)
             # The `evaluate` of a user's class may refer to such numbers, too.
             is_own = not kind.__module__.startswith("harnack.")
@@ -313,7 +302,7 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
         equal). A field with parameters overrides this method if `evaluate` cannot be differentiated
         in both modes.
         """
-        if any(dr.grad_enabled(parameter) for parameter in self.parameters()):
+        if any(dr.grad_enabled(parameter) for parameter in self.differentiable_parameters()):
             return self.evaluate(p).value
         self.refuse_hidden_parameters()
         at = dr.detach(p)
@@ -343,7 +332,7 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
         """
         if dr.is_array_v(type(points)):
             self.refuse_hidden_parameters()
-            if any(dr.grad_enabled(array) for array in (points, *self.parameters())):
+            if any(dr.grad_enabled(array) for array in (points, *self.differentiable_parameters())):
                 return self.differentiable_value(points)
             return self.evaluate(points).value
         return self._evaluate_points(points, precision, lambda sample: sample.value)
@@ -361,7 +350,9 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
         if not dr.is_array_v(type(points)):
             return self._evaluate_points(points, precision, lambda sample: sample.gradient)
         self.refuse_hidden_parameters()
-        check_no_derivatives(f"the gradient of {type(self).__name__}", self.parameters())
+        check_no_derivatives(
+            f"the gradient of {type(self).__name__}", self.differentiable_parameters()
+        )
         if not dr.grad_enabled(points):
             return self.evaluate(points).gradient
         with dr.suspend_grad():

@@ -154,7 +154,7 @@ def validate_samples(
                 f"{_SAMPLE_HELP}"
             )
         # Derivatives of the value that do not come from p would be lost.
-        if self.has_no_parameters() and not dr.grad_enabled(p):
+        if not self.has_parameter_derivatives and not dr.grad_enabled(p):
             check_no_derivatives(type(self).__name__, sample.value)
         return _unbox_numpy(sample).map_promises(_unbox_numpy)
 

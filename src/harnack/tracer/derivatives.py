@@ -59,7 +59,7 @@ def needs_derivatives(prepared: SurfaceTracer, o: Vec3, d: Vec3) -> bool:
     field = prepared.field
     if not _PARAMETER_FREE.get(field, None, lambda: is_plain_data(vars(field))):
         field.refuse_hidden_parameters()
-    parameters = prepared.field.parameters()
+    parameters = prepared.field.differentiable_parameters()
     field_has_derivatives = any(dr.grad_enabled(p) for p in parameters)
     if field_has_derivatives and prepared.field.has_jumps:
         name = type(prepared.field).__name__
@@ -106,7 +106,7 @@ def refuse_derivative(
         these.
     result_name: the name of the result, for the message.
     """
-    sources = [o, d, *prepared.levels.values, *prepared.field.parameters()]
+    sources = [o, d, *prepared.levels.values, *prepared.field.differentiable_parameters()]
     return dr.custom(_NoDerivative, value, result_name, sources)
 
 
@@ -160,7 +160,7 @@ def attach_derivatives(
     # The change of f at the hit by changes of the ray: a zero with a derivative, since x is the
     # same point without derivatives.
     change = dr.dot(sample.gradient, point - x)
-    if any(dr.grad_enabled(parameter) for parameter in prepared.field.parameters()):
+    if any(dr.grad_enabled(parameter) for parameter in prepared.field.differentiable_parameters()):
         # f depends on parameters, too: its own derivative has all of them.
         value = prepared.field.differentiable_value(point)
         change = value - dr.detach(value)

@@ -72,7 +72,7 @@ def largest_component_cells(
         """Compute the cells anew."""
         return _build_cells(field.with_levels(levels), levels, volume, solid, across)
 
-    if field.parameters():  # they may change in place
+    if field.differentiable_parameters():  # they may change in place
         return build()
     return _CELLS.get(field, (levels, volume, solid, across), build)
 

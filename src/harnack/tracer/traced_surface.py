@@ -217,7 +217,8 @@ class TracedSurface:
     def evaluator(self, backend: Backend) -> Field:
         """Return the field, prepared for its levels and for a backend. It is cached; a field with
         derivatives enabled and one without have separate entries."""
-        has_derivatives = any(dr.grad_enabled(parameter) for parameter in self.field.parameters())
+        parameters = self.field.differentiable_parameters()
+        has_derivatives = any(map(dr.grad_enabled, parameters))
         key = "field", backend, has_derivatives
         return self.memoize(key, lambda: self.field.with_levels(self.level_values).prepare(backend))
 

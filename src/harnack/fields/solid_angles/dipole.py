@@ -36,6 +36,7 @@ from harnack.fields.clearance import (
     round_to_single,
 )
 from harnack.fields.field import Sample, space_scaled
+from harnack.fields.parameters import record_arguments
 from harnack.fields.solid_angles.cell_options import FieldWithCells
 from harnack.fields.solid_angles.denoised_cloud import DenoisedCloud
 from harnack.fields.solid_angles.dipole_cells import DipoleCells, build_cells
@@ -380,6 +381,8 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
         self.fit_report: dict[str, Any] = {}
         if isinstance(smoothing, str):  # "auto"
             points, normals, smoothing = self._fitted(points, normals, areas, smoothing)
+            # What `replace` changes is the denoised cloud.
+            record_arguments(self, normals=normals, smoothing=smoothing)
         if isinstance(normals, str):
             normals = estimate_normals(points)
         # 1.0 is only a valid number for the check, if areas are still to be estimated.

@@ -92,7 +92,8 @@ class Morph(BatchedField):
         if not 2 <= as_real(accuracy, "accuracy") <= 100:
             raise ValueError(f"accuracy must lie between 2 and 100, not {accuracy!r}")
         self.w, self.gap = float(w), float(gap)
-        meshes = [_checked(mesh_a, "mesh_a"), _checked(mesh_b, "mesh_b")]
+        self._mesh_a, self._mesh_b = _checked(mesh_a, "mesh_a"), _checked(mesh_b, "mesh_b")
+        meshes = self._mesh_a, self._mesh_b
         # At an end of the gap the field is the winding number of the mesh that lies there.
         self._slice: MorphSlice | WindingNumber
         if 0 < w < gap:

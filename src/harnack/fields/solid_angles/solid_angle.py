@@ -149,6 +149,7 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
     period: ClassVar[float | None] = _PERIOD
     default_level: float = 2 * math.pi
     over_relaxation: float = 1.3  # by experiment
+    has_parameter_derivatives: ClassVar[bool] = True
 
     def __init__(
         self,
@@ -557,9 +558,11 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
             nearest = dr.select(circle_square < square, circle_point, nearest)
         return nearest * data.size + data.center
 
-    def parameters(self) -> tuple[Any, ...]:
-        """The loops that are Dr.Jit arrays, by whose vertices values can be differentiated."""
-        return tuple(loop for loop in self._differentiable_loops if _is_drjit(loop))
+    def constructor_arguments(self) -> dict[str, Any]:
+        """The arguments of the constructor by name. `loops` has the polygons first, those that are
+        Dr.Jit arrays as they were given, and then the circles."""
+        loops = (*(self._differentiable_loops or self._loops), *self.circles)
+        return {**super().constructor_arguments(), "loops": loops}
 
     def differentiable_value(self, p: Vec3) -> Real:
         """f at points p, modulo 4 pi, as an expression that Dr.Jit can differentiate by p and by

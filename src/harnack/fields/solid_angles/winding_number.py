@@ -355,6 +355,11 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         index of the user's face from which it comes."""
         return self.mesh.input_face
 
+    def constructor_arguments(self) -> dict[str, Any]:
+        """The arguments of the constructor by name."""
+        mesh = {"vertices": self.mesh.vertices, "faces": self.mesh.input_faces}
+        return {**super().constructor_arguments(), **mesh}
+
     def prepare(self, backend: Backend) -> Self:
         """A copy with its data on a backend, for tracing."""
         prepared = super().prepare(backend)
