@@ -356,3 +356,52 @@ def test_derivatives_are_refused_or_kept() -> None:
     assert hk.SolidAngle(_TRIANGLE).differentiable_parameters() == ()
     dr.backward(dr.sum(curve.value(backend.Array3f(0.2, 0.3, 0.5))))
     assert np.abs(to_numpy(dr.grad(loop))).max() > 0
+
+
+class MovingCharge(Charge):
+    """A charge with derivatives by its strength, if that is a Dr.Jit array."""
+
+    has_parameter_derivatives = True
+
+
+class Hidden(MovingCharge):
+    """One that does not store its argument, but in a list."""
+
+    def __init__(self, given: Any) -> None:
+        super().__init__((0.0, 0.0, 0.0))
+        self.others = given
+        self.strength = given[0]
+
+
+def test_a_users_field_has_derivatives_by_its_parameters() -> None:
+    backend = choose_backend("double")
+    strength = backend.Float(2.0)
+    field = Charge((0.0, 0.0, 0.0)).replace(strength=strength)
+    assert field.parameters()["strength"] is strength
+    assert field.differentiable_parameters() == ()
+    points = backend.Array3f(0.0, 0.0, 4.0)
+    dr.enable_grad(strength)
+    with pytest.raises(NotImplementedError, match="Charge cannot be differentiated"):
+        field.value(points)
+    with pytest.raises(NotImplementedError, match="Charge cannot be differentiated"):
+        Charge((0.0, 0.0, 0.0), strength)
+    moving = MovingCharge((0.0, 0.0, 0.0), strength)
+    assert moving.differentiable_parameters() == (strength,)
+    dr.backward(moving.value(points))
+    assert dr.grad(strength)[0] == 0.25
+    hits = hk.trace(moving, backend.Array3f(0, 0, 9), backend.Array3f(0, 0, -1), level=0.5)
+    dr.set_grad(strength, 0.0)
+    dr.backward(hits.t)  # t = 9 - strength / level
+    assert abs(dr.grad(strength)[0] + 2.0) < 1e-9
+
+
+def test_derivatives_by_what_is_no_parameter_are_refused() -> None:
+    backend = choose_backend("double")
+    strength = backend.Float(2.0)
+    dr.enable_grad(strength)
+    hidden = Hidden([strength])
+    assert hidden.differentiable_parameters() == ()
+    with pytest.raises(NotImplementedError, match="Hidden cannot be differentiated"):
+        hidden.value(backend.Array3f(0.0, 0.0, 4.0))
+    with pytest.raises(NotImplementedError, match="Hidden cannot be differentiated"):
+        hk.trace(hidden, backend.Array3f(0, 0, 9), backend.Array3f(0, 0, -1), level=0.5)

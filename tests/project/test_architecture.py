@@ -37,6 +37,7 @@ ROOMS = (
 FIELD_ROOMS = (
     "capabilities",
     "batch_evaluation",
+    "parameters",
     "samples",
     "field",
     "formula",

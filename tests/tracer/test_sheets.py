@@ -972,8 +972,10 @@ def test_the_level_moves_smooth_hits_only() -> None:
 
 def test_derivatives_by_parameters_are_refused() -> None:
     class Moving(BruteForceWinding):
-        def parameters(self) -> tuple[Any, ...]:
-            return (where,)
+        has_parameter_derivatives = True
+
+        def parameters(self) -> dict[str, Any]:
+            return {"where": where}
 
     backend = choose_backend("double")
     where = backend.Array3f(0, 0, 0)

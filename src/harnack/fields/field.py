@@ -284,13 +284,16 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, Parametri
 
     def refuse_hidden_parameters(self) -> None:
         """Raise NotImplementedError if the field holds numbers with derivatives enabled, for
-        example in its formula, although its class does not have `has_parameter_derivatives`. These
-        derivatives would be lost."""
-        if not self.has_parameter_derivatives:
-            kind = type(self)
-            # The `evaluate` of a user's class may refer to such numbers, too.
-            is_own = not kind.__module__.startswith("harnack.")
-            check_no_derivatives(kind.__name__, vars(self), kind.evaluate if is_own else None)
+        example in its formula, although its class does not have `has_parameter_derivatives`, or
+        none of them is one of its `parameters`. These derivatives would be lost."""
+        kind = type(self)
+        # The `evaluate` of a user's class may refer to such numbers, too.
+        is_own = not kind.__module__.startswith("harnack.")
+        if self.has_parameter_derivatives and (
+            not is_own or any(map(dr.grad_enabled, self.differentiable_parameters()))
+        ):
+            return
+        check_no_derivatives(kind.__name__, vars(self), kind.evaluate if is_own else None)
 
     def differentiable_value(self, p: Vec3) -> Real:
         """f(p) as an expression that Dr.Jit can differentiate with respect to p and to the field's

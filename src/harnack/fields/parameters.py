@@ -36,8 +36,9 @@ class ConstructorCall:
     maker: the name of the class method that was called; "" for the class itself.
     given: the names of the arguments that were given.
     choices: those of them that are strings, booleans or None, such as method="auto".
-    kept: those that cannot change, such as numbers, functions and volumes. Arrays, lists and
-        mappings are not kept: the object stores its own copies as attributes.
+    kept: those that are not copied by constructors, such as numbers, functions, volumes and
+        Dr.Jit arrays. NumPy arrays, lists and mappings are not kept: the object stores its own
+        copies as attributes.
     """
 
     maker: str = ""
@@ -59,9 +60,11 @@ def _is_choice(value: Any) -> bool:
 
 
 def _is_kept(value: Any) -> bool:
-    """Whether a value is a number, a path, a volume, a field, a function or a dataclass."""
+    """Whether a value is a number, a path, a volume, a field, a function, a dataclass or a Dr.Jit
+    array."""
     kinds = numbers.Number, os.PathLike, Volume, Parametrized
-    return isinstance(value, kinds) or callable(value) or dataclasses.is_dataclass(value)
+    is_structure = dataclasses.is_dataclass(value) or _is_drjit(value)
+    return isinstance(value, kinds) or callable(value) or is_structure
 
 
 @lru_cache(maxsize=256)
