@@ -326,6 +326,28 @@ def test_a_field_that_does_not_store_its_arguments_says_so() -> None:
     assert (moved.center, moved.strength) == ((1.0, 0.0, 0.0), 2.0)
 
 
+def test_numbers_are_those_that_were_given_and_arrays_those_that_are_stored() -> None:
+    class Degrees(Charge):
+        def __init__(self, angle: float, weights: Any = None, *, center: Any = (0, 0, 0)) -> None:
+            super().__init__(center)
+            self.angle = math.radians(angle)
+            self._count = 0 if weights is None else len(weights)
+
+    field = Degrees(90.0)
+    assert field.parameters()["angle"] == 90.0
+    assert field.replace(center=(1, 2, 3)).angle == math.radians(90.0)
+    assert set(field.parameters()) == {"angle", "center"}
+    with pytest.raises(TypeError, match="does not store the argument 'weights'"):
+        Degrees(90.0, [1.0, 2.0]).replace(angle=45.0)
+
+
+def test_keys_of_mappings_may_have_points() -> None:
+    surface = hk.fields.RiemannSurface({1: 0.5, 1.5: -0.5})
+    assert set(surface.parameters()) == {"function.1", "function.1.5", "height"}
+    exchanged = surface.replace(**{"function.1.5": 0.5}).parameters()
+    assert (exchanged["function.1"], exchanged["function.1.5"]) == (0.5, 0.5)
+
+
 def test_constructors_with_any_arguments() -> None:
     class Several(Charge):
         def __init__(self, *centers: Any, **options: Any) -> None:

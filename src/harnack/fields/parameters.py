@@ -9,7 +9,7 @@ import dataclasses
 import inspect
 import numbers
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any, ClassVar, cast
@@ -122,21 +122,24 @@ class Parametrized:
     def constructor_arguments(self) -> dict[str, Any]:
         """The arguments of the constructor by name, in the form in which it takes them.
 
-        The default finds an argument `name` in the attribute `_name` or `name`, which may be a
-        property. Of numbers, functions, volumes and fields that are no attributes, those that were
-        given count, and then the defaults of the constructor. A class that stores an array, a list
-        or a mapping under another name, or in another form, overrides this method.
+        The default knows the numbers, functions, volumes and fields that were given. All else it
+        finds in the attribute `_name` or `name`, which may be a property, for an argument `name`;
+        and of what was not given and is no attribute, it takes the default of the constructor. A
+        class that stores an array, a list or a mapping under another name, or in another form,
+        overrides this method.
         """
         call = _call_of(self)
         parameters = _signature(type(self), call.maker).parameters
-        found: dict[str, Any] = {}
-        for name in dict.fromkeys((*parameters, *call.given)):
-            parameter = parameters.get(name)
-            default = inspect.Parameter.empty if parameter is None else parameter.default
-            value = _stored(self, name)
-            if value is _NOTHING:
-                value = call.kept.get(name, default)
-            if value is not inspect.Parameter.empty:
+        found = {
+            name: parameter.default
+            for name, parameter in parameters.items()
+            if parameter.default is not parameter.empty and name not in call.given
+        }
+        found |= call.choices
+        for name in (*parameters, *call.given):
+            if name in call.kept:
+                found[name] = call.kept[name]
+            elif (value := _stored(self, name)) is not _NOTHING:
                 found[name] = value
         return found
 
@@ -173,9 +176,8 @@ class Parametrized:
             name: call.choices[name] if name in call.choices else arguments.get(name, _NOTHING)
             for name in call.given
         }
-        for name in {*arguments, *signature.parameters}:
-            if inside := _inside(name, changes):
-                given[name] = _exchanged(arguments.get(name), inside)
+        for name, inside in _by_part({*arguments, *signature.parameters}, changes).items():
+            given[name] = _exchanged(arguments.get(name), inside)
         for name, value in given.items():
             if value is _NOTHING:
                 raise TypeError(
@@ -266,14 +268,15 @@ def _key_name(key: Any) -> str:
     return ",".join(map(str, cast("Any", key))) if isinstance(key, tuple) else str(key)
 
 
-def _inside(name: str, changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Those of the changes that are of the part `name` or of something inside of it, by their names
-    inside of it: "" for the part itself."""
-    return {
-        changed.removeprefix(name).removeprefix("."): value
-        for changed, value in changes.items()
-        if changed == name or changed.startswith(f"{name}.")
-    }
+def _by_part(parts: Iterable[str], changes: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """For the name of each part in which something changes: the changes, by their names inside of
+    it; "" for the part itself."""
+    longest_first = sorted(parts, key=len, reverse=True)  # "1.5" before "1"
+    found: dict[str, dict[str, Any]] = {}
+    for changed, value in changes.items():
+        part = next(name for name in longest_first if f"{changed}.".startswith(f"{name}."))
+        found.setdefault(part, {})[changed.removeprefix(part).removeprefix(".")] = value
+    return found
 
 
 def _exchanged(value: Any, changes: dict[str, Any]) -> Any:
@@ -291,9 +294,7 @@ def _exchanged(value: Any, changes: dict[str, Any]) -> Any:
         return value.replace(**changes)
     parts = _parts(value)
     new = {
-        name: _exchanged(part, inside)
-        for name, part in parts.items()
-        if (inside := _inside(name, changes))
+        name: _exchanged(parts[name], inside) for name, inside in _by_part(parts, changes).items()
     }
     if isinstance(value, list | tuple):
         entries = [{**parts, **new}[name] for name in parts]
