@@ -255,6 +255,8 @@ def test_parameters_have_names_and_are_exchanged(case: str) -> None:
 
 def test_an_unknown_name_is_refused_with_a_suggestion() -> None:
     both = hk.Cuboid() | hk.Sphere(0.8)
+    names = "parts.0.sides", "parts.0.radius", "parts.1.radius", "parts.1.center"
+    assert tuple(both.parameters()) == names  # in the order of the constructors
     with pytest.raises(TypeError, match=r'did you mean "parts.1.radius"\?; there are parts.0.si'):
         both.replace(**{"parts.1.radios": 1.0})
     with pytest.raises(TypeError, match=r"has no parameter 'parts\.2'"):

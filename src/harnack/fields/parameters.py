@@ -130,16 +130,15 @@ class Parametrized:
         """
         call = _call_of(self)
         parameters = _signature(type(self), call.maker).parameters
-        found = {
-            name: parameter.default
-            for name, parameter in parameters.items()
-            if parameter.default is not parameter.empty and name not in call.given
-        }
-        found |= call.choices
-        for name in (*parameters, *call.given):
+        found: dict[str, Any] = {}
+        for name in dict.fromkeys((*parameters, *call.given)):
             if name in call.kept:
-                found[name] = call.kept[name]
-            elif (value := _stored(self, name)) is not _NOTHING:
+                value = call.kept[name]
+            elif (value := _stored(self, name)) is _NOTHING and name in call.given:
+                value = call.choices.get(name, _NOTHING)
+            elif value is _NOTHING and parameters[name].default is not inspect.Parameter.empty:
+                value = parameters[name].default
+            if value is not _NOTHING:
                 found[name] = value
         return found
 
