@@ -218,7 +218,7 @@ class BatchedField(Field):
         where f is so steep that the errors do not matter."""
 
         def kernel(backend: Backend, x: Vec3) -> tuple[Any, ...]:
-            """The values and gradients at the Dr.Jit points x."""
+            """The values, then the gradients, at the Dr.Jit points x."""
             del backend
             at = self.values_at(x, 1)
             return at.value, at.gradient
@@ -277,8 +277,9 @@ class BatchedField(Field):
         """
 
         def kernel(backend: Backend, x: Vec3) -> tuple[Any, ...]:
-            """The results that `choose` selects, at the Dr.Jit points x. If gradients but no
-            Hessians are asked for, they are computed more accurately, by `sharp_values_at`."""
+            """The tuple that `choose` selects from the values at the Dr.Jit points x. If gradients
+            but no Hessians are asked for, the gradients are computed more accurately, by
+            `sharp_values_at`."""
             del backend
             sharp = derivatives == 1
             return choose(self.sharp_values_at(x) if sharp else self.values_at(x, derivatives))
@@ -392,10 +393,10 @@ class FieldCache(Generic[Value]):
         self._kept: dict[int, tuple[Any, dict[str, Any], Value]] = {}
 
     def get(self, field: Field, key: Any, make: Callable[[], Value]) -> Value:
-        """The value of a field for this key: the cached one if it was made for the same key and no
-        attribute of the field was set since then; otherwise the result of make(), which is then
-        cached. (A value that is the field itself is not cached, as it would keep the field
-        alive.)"""
+        """The value of a field for this key. It is the cached value if that was made for the same
+        key, and no attribute of the field was set since then. Otherwise it is the result of make(),
+        which is then cached. (A value that is the field itself is not cached, as it would keep the
+        field alive.)"""
         if id(field) in self._kept:
             kept_key, attributes, value = self._kept[id(field)]
             now = vars(field)

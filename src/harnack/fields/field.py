@@ -176,8 +176,8 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
         return f"{type(self).__name__}({', '.join(arguments)})"
 
     def __getattr__(self, name: str) -> Any:
-        """Raise AttributeError, as Python calls this only for an attribute that does not exist. For
-        the name of a method that only solids have, the message says how to make a solid of the
+        """Raise AttributeError: Python calls this method only for an attribute that does not exist.
+        For the name of a method that only solids have, the message says how to make a solid of the
         field."""
         message = f"{type(self).__name__!r} object has no attribute {name!r}"
         if name in _SOLID_METHODS:
@@ -263,8 +263,8 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
     @property
     def is_steep(self) -> bool:
         """Whether f may change by any amount within the tolerance of a hit. This is so if |grad f|
-        may be unbounded in a bounded box, or has no bound that limits the change of f within the
-        rounding of coordinates. The tracer then also samples f behind the hit."""
+        may be unbounded in a bounded box, or if its bound is so large that f may change by any
+        amount within the rounding of coordinates. The tracer then also samples f behind the hit."""
         return False
 
     def gradient_change_bound(self, p: Vec3, radius: Real) -> Real:
@@ -384,7 +384,8 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
         """
 
         def kernel(backend: Backend, x: Vec3) -> tuple[Any, ...]:
-            """What `choose` takes from the samples at the Dr.Jit points x."""
+            """The number or vector that `choose` takes from the samples at the Dr.Jit points x, in
+            a tuple of one entry."""
             return (choose(self.prepare(backend).evaluate(x)),)
 
         return evaluate_points(points, kernel, precision)[0]
@@ -406,8 +407,8 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
 
     def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
         """Two error bounds at the point p of a sample: of the gradient, as a length, and of
-        `hessian`, in the spectral norm. The default is the sample's `gradient_error`, and infinity
-        for the Hessian, because its error is not known."""
+        `hessian`, in the spectral norm. The default for the gradient is the sample's
+        `gradient_error`. For the Hessian it is infinity, because its error is not known."""
         del p
         return sample.gradient_error, math.inf
 

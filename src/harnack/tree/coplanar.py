@@ -84,7 +84,7 @@ def borders_of_overlaps(
 
 
 def _edges(faces: IntArray) -> tuple[IntArray, IntArray]:
-    """The three edges of each of the faces (m, 3), with their directions.
+    """The three edges of each of the faces (m, 3), and in which direction the face runs them.
 
     Returns:
         (3 m, 2) the vertices of each edge, the lower index first; and (3 m,) 1 if the face runs the
@@ -195,14 +195,16 @@ def _next_in_plane(
     low, high = fmin(fmin(a, b), c) - _IN_PLANE, fmax(fmax(a, b), c) + _IN_PLANE
 
     def visit(node: VisitedNode, state: LoopValues) -> tuple[Mask, LoopValues]:
-        """Enter a node if its box meets the box of the lane's face."""
+        """Enter a node if its box meets the box of the lane's face. state: the lowest number of a
+        face found so far. Returns the mask of lanes that enter the node, and the state, which the
+        faces of a leaf have updated."""
         node_low, node_high = vector(*node.head[:3]), vector(*node.head[3:6])
         is_near = dr.all((node_low <= high) & (node_high >= low))
         return is_near, for_each_primitive(node, is_near & node.is_leaf, nearer, state)
 
     def nearer(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
-        """Take the face in the record `row` if it is one of those that are sought, and has a lower
-        number than the best so far."""
+        """The new state: the number of the face in the record `row` if this face is sought and its
+        number is lower than `state`, the lowest so far; otherwise `state`."""
         number = index(fmax(row[NUMBER_COLUMN], real(0)))
         other_corners = corners_of(row, vector)
         other_size = dr.gather(real, sizes, number, active)
