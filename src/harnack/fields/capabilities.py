@@ -224,8 +224,8 @@ class JumpSurface:
         self, p: Vec3, after: tuple[Real, Any], limit: Real, active: Mask
     ) -> NearestFacet | None:
         """The facet that follows the facet `after` in the order of distance from p. On lanes where
-        it would be at the distance `limit` from p or farther, and on lanes that are not active, no
-        facet is found (NO_FACET).
+        it would be farther than `limit` from p, and on lanes that are not active, no facet is found
+        (NO_FACET).
 
         after: (sort_key, index) of a facet; (-1, NO_FACET) to begin with the nearest.
         limit: a length.

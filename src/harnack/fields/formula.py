@@ -322,7 +322,7 @@ class Formula(Field):
         (`FormulaOnRay`). Dr.Jit finds equal operations, so that the kernel does them once.
 
         p: the point.
-        direction: the direction; it need not be that of a ray.
+        direction: the vector along which the derivative is taken.
         """
         zero = 0 * p.x
 

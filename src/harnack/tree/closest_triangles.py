@@ -288,7 +288,7 @@ def next_closest_triangle(
     triangles: TriangleTree, x: Vec3, after: tuple[Real, Any], limit: Real, active: Mask
 ) -> ClosestTriangle:
     """The next triangle in the order of distance from points x: the first one that comes after the
-    pair `after`, if its squared distance from x is less than `limit`. Only active lanes search.
+    pair `after`, if its squared distance from x is at most `limit`. Only active lanes search.
 
     Triangles are ordered by squared distance from x, and at equal distances by number; `after` is a
     squared distance and a number. Repeated calls, the first with (-1, NO_TRIANGLE), return each

@@ -116,7 +116,7 @@ class OctreeLookup:
         first = (((ix >> down) << _TOP_DEPTH | (iy >> down)) << _TOP_DEPTH) | (iz >> down)
 
         def is_inner(node: Any, *_: Any) -> Mask:
-            """Whether a lane has not yet reached a leaf: `node`, an encoded node, is an inner node."""
+            """Whether a lane has not yet reached a leaf: the encoded `node` is an inner node."""
             return node >= 0
 
         def step(node: Any, bit: Any) -> tuple[Any, Any]:

@@ -224,8 +224,9 @@ class BoundaryCells:
             line = RayLine(x, direction, rounding)
 
             def rates(lengths: tuple[Real, ...], lanes: Mask) -> tuple[Real, ...]:
-                """For each length T, bound the derivative of f along the line at its points within
-                T of x (`CurveCells.rates_along`). lanes: the mask of the lanes to compute."""
+                """For each length T in `lengths`, bound the derivative of the boundary's solid
+                angle along the line at all points within T of x (`CurveCells.rates_along`). lanes:
+                the mask of the lanes to compute. Returns one bound for each length."""
                 return self.cells.rates_along(cell_sums, line, lengths, lanes & inside)
 
             ray_promises = lipschitz_along(line, sums.gradient, sums.distance, rates)

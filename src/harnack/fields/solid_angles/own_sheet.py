@@ -104,7 +104,7 @@ def lies_on_own_level(mesh: WindingMesh, level: float) -> bool:
 
 
 def _spaced_rows(rows: FloatArray, max_count: int) -> FloatArray:
-    """At most `max_count` rows of an array, evenly spaced."""
+    """Select at most `max_count` rows of an array, at evenly spaced indices."""
     return rows[:: -(-len(rows) // max_count)]
 
 
@@ -115,6 +115,8 @@ def _level_gaps(
     divided by 4 pi.
 
     edges: (k, 2, 3) both ends of the directed edges of the curves.
+    points: (n, 3).
+    level: the level.
 
     Returns two arrays (n,): the absolute difference of w modulo 1 from the level; and the distance
     of the points, to first order, from the surface with this level that spans the edges. w and its

@@ -558,7 +558,8 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         return nearest * data.size + data.center
 
     def parameters(self) -> tuple[Any, ...]:
-        """The loops that are Dr.Jit arrays, by whose vertices values can be differentiated."""
+        """The loops that were given as Dr.Jit arrays or tensors, by whose vertices values can be
+        differentiated. The tuple is empty if there are none."""
         return tuple(loop for loop in self._differentiable_loops if _is_drjit(loop))
 
     def differentiable_value(self, p: Vec3) -> Real:
@@ -590,8 +591,8 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         edges = data.edges
 
         def changes(start: Vec3, end: Vec3) -> tuple[Real]:
-            """The change of the solid angle along the segment from start to end, which are in user
-            coordinates."""
+            """The change of the solid angle along the segments from `start` to `end`, which are in
+            user coordinates; in a tuple of one entry."""
             return (continuous_change(edges, data.to_unit(start), data.to_unit(end)),)
 
         return map_batches(backend, changes, p, q)[0]
@@ -626,7 +627,8 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         return self._extents[levels]
 
     def _extent(self, levels: tuple[float, ...]) -> Volume | None:
-        """Compute the volume that `extent` returns and caches.
+        """Compute the volume that `extent` returns and caches; None if a level is a multiple of 4
+        pi.
 
         Curves in convex position whose levels are all at 2 pi (modulo 4 pi) get their convex hull,
         padded by 1e-4 of their size. Otherwise the volume is the box of the proof in `extent`, from
@@ -888,8 +890,9 @@ def _line_bounds(
     line = RayLine(x, data.backend.Array3f(direction), data.rounding)
 
     def rates(lengths: tuple[Real, ...], active: Mask) -> tuple[Real, ...]:
-        """For each length T, a bound of |df/ds| at the points x + s v of the line with |s| <= T,
-        summed over edges and circles. It is infinite on lanes that are not active."""
+        """For each length T in `lengths`, a bound of |df/ds| at the points x + s v of the line with
+        |s| <= T, summed over edges and circles. Returns one bound for each length. It is infinite
+        on lanes that are not active."""
         summands: list[tuple[Real, ...]] = []
         if data.edges is not None:
             summands.append(data.edge_rates(errors, line, lengths, active))

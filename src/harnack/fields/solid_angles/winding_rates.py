@@ -81,7 +81,8 @@ class BoundaryRates:
 
     def at(self, x: Vec3, derivatives: int, closer: Real) -> PointValues:
         """The derivatives of w up to order `derivatives` (1 or 2) at points x (3, n), with error
-        bounds. The value in the result has no meaning, unless the mesh's own triangles are summed.
+        bounds. The value in the result has no meaning, unless a tree of the mesh's own triangles is
+        summed.
 
         closer: the accuracy scale of a tree; larger is more accurate.
         """
