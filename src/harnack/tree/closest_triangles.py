@@ -49,8 +49,8 @@ _LEAF_SIZE = 4
 
 @dataclass(frozen=True)
 class BoxTree:
-    """A tree of boxes on a backend, which may overlap, with a search for the boxes that a ray
-    enters. Their coordinates are at most about 1."""
+    """A tree, on a backend, of boxes that may overlap, with a search for the boxes that a ray
+    enters. The coordinates of the boxes are at most about 1."""
 
     tree: PackedTree
 

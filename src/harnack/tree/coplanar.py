@@ -48,8 +48,8 @@ def borders_of_overlaps(
     tree: a tree of the same faces, with coordinates of at most about 1.
     vertices, faces: (n, 3) and (m, 3), the mesh.
     at_every_edge: whether to cut along all edges of the covering faces. If not, an edge is left out
-        if all faces at it cover the face and run it equally often in both directions: the face is
-        then equally covered on both sides of the edge.
+        if all faces at this edge cover the face, and together run the edge equally often in both
+        directions: the face is then equally covered on both sides of the edge.
 
     Returns:
         The indices of the covered faces (k,), repeated for each border edge; and knives (k, 3, 3):

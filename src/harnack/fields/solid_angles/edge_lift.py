@@ -378,8 +378,8 @@ def edge_factor_of_views(a: VertexView, b: VertexView, direction: Real) -> tuple
 
 
 def edge_factor(a: Vec3, b: Vec3, la: Real, lb: Real) -> tuple[Real, Real]:
-    """Compute the real and the imaginary part of the factor F_e of the edge from a to b. Its
-    argument is half the solid angle of the edge's triangle (see the module).
+    """Compute the real and the imaginary part of the factor F_e of the edge from a to b. The
+    argument of F_e is half the solid angle of the edge's triangle (see the module).
 
     a, b: the ends relative to a point x, as (u, v, z), with two coordinates across the direction d
         and the coordinate along it.
@@ -395,8 +395,8 @@ def edge_factor(a: Vec3, b: Vec3, la: Real, lb: Real) -> tuple[Real, Real]:
 
 def _factor(a: tuple[Real, Real], b: tuple[Real, Real], sa: Real, sb: Real) -> tuple[Real, Real]:
     """Compute the real and the imaginary part of the factor F_e = (sa sb + a.b) - i (a x b) of an
-    edge from a to b; a x b is the number a_u b_v - a_v b_u. Its argument is half the solid angle of
-    the edge's triangle (see the module).
+    edge from a to b. Here a x b is the number a_u b_v - a_v b_u. The argument of F_e is half the
+    solid angle of the edge's triangle (see the module).
 
     a, b: the coordinates (u, v) of both ends relative to the ray, across its direction d.
     sa, sb: for both ends, the distance from x minus the component along d.

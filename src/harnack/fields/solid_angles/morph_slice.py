@@ -147,7 +147,7 @@ class SlicedKernel(RadialKernel):
         """List the numbers Q_2, ..., Q_last, but at least Q_2 and Q_3. They are defined by bounds:
         m! Q_m/D^(m+1) bounds the m-th derivatives of the kernel along lines at the distance D. Here
         they are the same for all distances. Q_2 bounds the gradient of a dipole's potential in four
-        dimensions as well."""
+        dimensions as well. last: the largest index m."""
         del distance
         return [GRADIENT_BOUND, *(1.0 for _ in range(3, last + 1))]
 

@@ -115,8 +115,6 @@ def _level_gaps(
     divided by 4 pi.
 
     edges: (k, 2, 3) both ends of the directed edges of the curves.
-    points: (n, 3).
-    level: the level.
 
     Returns two arrays (n,): the absolute difference of w modulo 1 from the level; and the distance
     of the points, to first order, from the surface with this level that spans the edges. w and its

@@ -335,6 +335,7 @@ class Treecode:
     ) -> Treecode:
         """Upload a tree with its moments and sources.
 
+        tree: the hierarchy of the tree: which sources are in which node.
         levels: the moments of the nodes, one entry for each level of the tree, from the leaves to
             the root.
         primitives: the records of the sources in their slots, as `tree.pack_tree` takes them.
