@@ -221,7 +221,8 @@ class CurveCells:
         count, center = dr.select(active, cell_sums.count, 0), cell_sums.center
 
         def runs(i: Any, *_: Any) -> Mask:
-            """Whether the loop goes on, on each lane: its cell has a record number i of near edges."""
+            """Whether the loop goes on, on each lane: its cell has a record number i of near
+            edges."""
             return i < count
 
         def body(i: Any, p: Vec3, is_certain: Mask, *products: Real) -> tuple[Any, ...]:
@@ -286,7 +287,8 @@ class CurveCells:
         count = dr.select(active, cell_sums.count, 0)
 
         def runs(i: Any, *_: Any) -> Mask:
-            """Whether the loop goes on, on each lane: its cell has a record number i of near edges."""
+            """Whether the loop goes on, on each lane: its cell has a record number i of near
+            edges."""
             return i < count
 
         def body(i: Any, p: Vec3, field: Vec3, *rates: Real) -> tuple[Any, ...]:
@@ -336,7 +338,8 @@ class CurveCells:
         real, index, vector = self.backend.Float, self.backend.UInt32, self.backend.Array3f
 
         def runs(i: Any, *_: Any) -> Mask:
-            """Whether the loop goes on, on each lane: its cell has a record number i of near edges."""
+            """Whether the loop goes on, on each lane: its cell has a record number i of near
+            edges."""
             return i < count
 
         def body(i: Any, *state: Any) -> tuple[Any, ...]:

@@ -131,7 +131,8 @@ class WindingModuloOne(Field):
         return EvaluateOnly(lambda p: self._winding.evaluate_modulo_one(p, detail))
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
-        """A volume that is proved to contain the level sets of w; None if there is no bounded one."""
+        """A volume that is proved to contain the level sets of w; None if there is no bounded
+        one."""
         return self._winding.extent(levels)
 
 
