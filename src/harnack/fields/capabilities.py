@@ -169,7 +169,7 @@ class JumpSurface:
         self, o: Vec3, d: Vec3, after: JumpCrossing, t_max: Real, active: Mask
     ) -> JumpCrossing:
         """The first crossing of the ray o + t d with a facet strictly after the crossing `after`,
-        with t <= t_max.
+        with t <= t_max, on active lanes.
 
         Crossings are ordered by (t, facet): facets that are crossed at the same t follow each other
         by index. NO_FACET is the largest index, so nothing follows it at the same t. Repeated calls
@@ -185,9 +185,10 @@ class JumpSurface:
         return JumpCrossing(float("inf"), NO_FACET, 0.0, (0.0, 0.0, 0.0))
 
     def initial_offset(self, o: Vec3, d: Vec3, t_min: Real, active: Mask) -> Real:
-        """A number that describes f at the start of a ray o + t d, of a kind that the field
-        chooses; for example the sum of the signs of the ray's crossings beyond the start. The
-        tracer adds the jump at each crossing to it, and passes the sum to `continuation`.
+        """A number that describes f at the start of a ray o + t d, on active lanes. The field
+        chooses what kind of number it is, for example the sum of the signs of the ray's crossings
+        beyond the start. The tracer adds the jump at each crossing to it, and passes the sum to
+        `continuation`.
 
         t_min: the parameter of the start. Crossings with t <= t_min lie behind the start
             (`next_jump` after (t_min, NO_FACET)); all others lie in front of it.

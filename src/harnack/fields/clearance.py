@@ -52,6 +52,7 @@ def clearance_function(
     bounds of the distance to the nearest of the level sets f = level
     (`level_distance_lower_bound`).
 
+    field: the field f.
     levels: the levels of f.
     precision: "single" or "double", in which f is evaluated.
     """
@@ -80,7 +81,8 @@ def tight_extent(
     finest: int = 5,
     points: FloatArray | None = None,
 ) -> ConvexHull:
-    """A convex polytope of few planes that contains every point of the level sets inside a box.
+    """A convex polytope of few planes that contains every point of the field's level sets, for the
+    given levels, inside a box.
 
     The box is cut into cells, in several rounds. A cell is left out if its clearance (the proved
     lower bound of the distance from its center to the level sets) is larger than the radius of the

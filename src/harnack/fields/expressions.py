@@ -210,7 +210,7 @@ def _check_tree(text: str, node: ast.expr, parameters: Iterable[str], depth: int
 
 
 def _as_float(text: str, value: float) -> float:
-    """A number in a formula as a float.
+    """The number `value`, which stands in a formula, as a float.
 
     text: the formula, for the message.
 

@@ -157,9 +157,9 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
         return other
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Restore a pickled field or a deep copy, and make its arrays read-only again, because
-        NumPy does not pickle this. (They are read-only because results were computed from them
-        already: writing to an array would not update these.)"""
+        """Restore a pickled field or a deep copy from its attributes `state`, and make its arrays
+        read-only again, because NumPy does not pickle this. (They are read-only because results
+        were computed from them already: writing to an array would not update these.)"""
         vars(self).update(state)
         make_read_only(state)
 
@@ -357,6 +357,8 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
         have derivatives with respect to the points if these have derivatives enabled and the field
         defines `hessian`. Raises the errors of `value`, and NotImplementedError if parameters of
         the field have derivatives enabled.
+
+        precision: as for `value`.
         """
         if not dr.is_array_v(type(points)):
             return self._evaluate_points(points, precision, lambda sample: sample.gradient)
@@ -476,7 +478,7 @@ def _prepared(value: Any, backend: Backend) -> Any:
 
 
 def check_is_field(value: Any) -> None:
-    """Raise TypeError unless the argument is a field whose domain is a volume or None."""
+    """Raise TypeError unless `value` is a field whose domain is a volume or None."""
     if not isinstance(value, Field):
         raise TypeError(
             f"a harnack field is needed, such as harnack.Gyroid(1.0), not {suggest_field(value)}"
@@ -485,8 +487,8 @@ def check_is_field(value: Any) -> None:
 
 
 def suggest_field(value: Any) -> str:
-    """The end of an error message about an object that is given in place of a field: what kind of
-    object it is, and how to make a field of it."""
+    """The end of an error message about an object, `value`, that is given in place of a field: what
+    kind of object it is, and how to make a field of it."""
     kind, name = type(value).__name__, getattr(value, "__name__", "")
     # An object that holds a field, a list of fields, a class, a mesh, a text, points, or a
     # function.

@@ -423,8 +423,8 @@ def is_jet(x: Any, name: str) -> bool:
 
 
 def as_jet(value: Any, like: Jet, name: str) -> Jet:
-    """The result of a formula as a jet (ranges of a number and its derivatives). A constant becomes
-    a constant jet.
+    """The result `value` of a formula as a jet (ranges of a number and its derivatives). A constant
+    becomes a constant jet.
 
     like: any jet of the same variables on the same piece.
     name: the name of the field, for the message.

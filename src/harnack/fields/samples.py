@@ -162,7 +162,7 @@ def validate_samples(
 
 
 def _unbox_numpy(record: _R) -> _R:
-    """The same sample or promise, with attributes that are NumPy scalars turned into Python
+    """The sample or promise `record`, with attributes that are NumPy scalars turned into Python
     numbers, because Dr.Jit takes no NumPy scalars."""
     scalars: dict[str, Any] = {
         key: value.item() for key, value in vars(record).items() if isinstance(value, np.generic)

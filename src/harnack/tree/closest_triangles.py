@@ -287,8 +287,9 @@ def squared_distance_in_nearby_leaf(tree: PackedTree, x: Vec3, column: int) -> R
 def next_closest_triangle(
     triangles: TriangleTree, x: Vec3, after: tuple[Real, Any], limit: Real, active: Mask
 ) -> ClosestTriangle:
-    """The next triangle in the order of distance from points x: the first one that comes after the
-    pair `after`, if its squared distance from x is at most `limit`. Only active lanes search.
+    """Find the next of the triangles in the order of distance from points x: the first one that
+    comes after the pair `after`, if its squared distance from x is at most `limit`. Only active
+    lanes search.
 
     Triangles are ordered by squared distance from x, and at equal distances by number; `after` is a
     squared distance and a number. Repeated calls, the first with (-1, NO_TRIANGLE), return each
@@ -422,8 +423,8 @@ class ClosestPointOnTriangle:
         is_qr_longest = ~is_pr_longest & (squares[1] > squares[0])
 
         def of_longest(of_pq: Any, of_qr: Any, of_pr: Any) -> Any:
-            """Select, from three numbers or vectors that belong to the edges pq, qr and pr, the one
-            of the longest edge."""
+            """Select, from three numbers or vectors that belong to the edges pq (`of_pq`), qr
+            (`of_qr`) and pr (`of_pr`), the one of the longest edge."""
             return dr.select(is_pr_longest, of_pr, dr.select(is_qr_longest, of_qr, of_pq))
 
         a, e, inverse = (

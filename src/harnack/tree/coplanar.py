@@ -147,6 +147,7 @@ def overlapping_faces(
     first and (k,) of the second faces of the pairs; each pair occurs in both orders.
 
     tree: a tree of the same faces, with coordinates of at most about 1.
+    vertices: (n, 3).
 
     The search begins at the smaller face of each pair: for each face it finds the overlapping faces
     that are at least as large, and there are few of them. The size of a face is its height above

@@ -157,7 +157,8 @@ def for_each_entry(
     body: Callable[[Any, Mask, LoopValues], LoopValues],
     state: LoopValues,
 ) -> LoopValues:
-    """Call the function `body` for each entry of each lane's list, and return the final state.
+    """Call the function `body` for each entry of each lane's list in `lists`, and return the final
+    state.
 
     body: takes an entry, the mask of the lanes that have one, and the state, a tuple of arrays;
         returns the new state.

@@ -101,8 +101,9 @@ class OctreeLookup:
         return 4 * (nodes + 8**_TOP_DEPTH)
 
     def find_leaf(self, x: Vec3) -> tuple[Any, Mask]:
-        """The index of the leaf that contains x, and a mask of whether x lies in the octree's cube.
-        For points outside of the cube, the index is that of the leaf at the lower corner.
+        """Return the index of the leaf that contains x, and a mask that tells whether x lies in the
+        octree's cube. For points outside of the cube, the index is that of the leaf at the lower
+        corner.
 
         The lookup begins in a uniform grid, and then goes from node to child until it is at a leaf.
         """

@@ -139,9 +139,11 @@ def windings_of_sides(
 def _crossing_faces(
     tree: TriangleTree, vertices: FloatArray, faces: IntArray
 ) -> tuple[IntArray, IntArray]:
-    """Pairs of faces, (k,) and (k,), that pass through one another; each pair in both orders.
+    """Find all pairs of faces (m, 3) that pass through one another. Returns the indices (k,) of the
+    first and (k,) of the second faces of the pairs; each pair occurs in both orders.
 
     tree: a tree of the same faces.
+    vertices: (n, 3).
 
     Pairs are found by the edges that cross faces: an edge that crosses a face makes a pair of that
     face with each face at the edge.
@@ -175,6 +177,9 @@ def _crossings_of_edges(
 ) -> tuple[IntArray, IntArray]:
     """All crossings of edges (m, 2) with faces that have neither end of the edge as a corner. Faces
     whose border the edge meets count as crossed.
+
+    tree: a tree of the same faces.
+    vertices: (n, 3).
 
     Returns:
         (k,) the index of the edge and (k,) the index of the face of each crossing.

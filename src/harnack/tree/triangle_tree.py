@@ -306,7 +306,8 @@ class TriangleTree:
 
     def signed_crossings_ahead(self, frame: RayFrame, t_min: Real, active: Mask = True) -> Real:
         """The sum of the signs of all crossings of each ray (of `frame`) with triangles at t >
-        t_min. The sign of a crossing is 1 if the triangle's normal points along the ray, else -1.
+        t_min, on active lanes. The sign of a crossing is 1 if the triangle's normal points along
+        the ray, else -1.
         """
         real, may_meet_box = self.tree.backend.Float, self._make_box_test(frame)
 
@@ -372,9 +373,9 @@ class TriangleTree:
         return total, is_sure
 
     def signed_crossings_vertical(self, x: Vec3, way: Real, active: Mask = True) -> Real:
-        """The sum of the signs of all crossings of rays from x along the z axis with triangles. The
-        sign of a crossing is 1 if the triangle's normal has a positive z component, else -1,
-        whichever of the two directions the ray has.
+        """The sum of the signs of all crossings of rays from x along the z axis with triangles, on
+        active lanes. The sign of a crossing is 1 if the triangle's normal has a positive z
+        component, else -1, whichever of the two directions the ray has.
 
         way: 1 for rays upwards, -1 for rays downwards.
 
@@ -585,6 +586,6 @@ def _crossing_depth(
 
 
 def _square(a: RayCoordinates, b: RayCoordinates) -> Real:
-    """The squared distance between two points across a ray; their depths do not matter."""
+    """The squared distance between the points a and b across a ray; their depths do not matter."""
     u, v = b[0] - a[0], b[1] - a[1]
     return dr.fma(u, u, v * v)

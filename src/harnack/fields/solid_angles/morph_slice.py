@@ -269,13 +269,13 @@ def quadrature_points(corners: FloatArray, longest: float) -> QuadraturePoints:
 
 
 def _longest_edges(corners: FloatArray) -> FloatArray:
-    """Compute the length (m,) of the longest edge of each triangle (m, 3, 3)."""
+    """Compute the length (m,) of the longest edge of each triangle. corners: (m, 3, 3)."""
     return np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
 
 
 def _corner_distances(corners: FloatArray, points: FloatArray) -> FloatArray:
-    """Compute for each triangle (m, 3, 3) the distance (m,) of its farthest corner from the
-    triangle's own point (m, 3)."""
+    """Compute, for each of m triangles, the distance (m,) of its farthest corner from a point that
+    belongs to the triangle. corners: (m, 3, 3). points: (m, 3) one for each triangle."""
     return np.linalg.norm(corners - points[:, None], axis=2).max(axis=1)
 
 

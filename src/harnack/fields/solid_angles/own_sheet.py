@@ -83,7 +83,7 @@ def lies_on_own_level(mesh: WindingMesh, level: float) -> bool:
     max_distance = 2 * _ON_SURFACE if has_inner else _ROUNDING
 
     def is_on(queries: FloatArray) -> BoolArray:
-        """Whether points (k, 3) are on the surface: a mask (k,)."""
+        """A mask (k,) of points `queries` (k, 3): whether each is on the surface."""
         gap, distance = _level_gaps(edges, queries, level)
         return (distance if has_inner else gap) < max_distance
 

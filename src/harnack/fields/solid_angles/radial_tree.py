@@ -351,9 +351,9 @@ def _moved_to_parents(
 def _symmetric(
     t1: FloatArray, t2: FloatArray, t3: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """The symmetric parts of k tensors each of first, second and third order: (k, 3), (k, 3, 3) and
-    (k, 3, 3, 3). The second order is symmetrized over two indices; for the third, the mean is over
-    all six orders of the indices."""
+    """The symmetric parts of tensors: of k tensors `t1` (k, 3) of first order, which stay as they
+    are; of `t2` (k, 3, 3), the mean over both orders of the indices; and of `t3` (k, 3, 3, 3), the
+    mean over all six orders. Returns three arrays of these shapes."""
     orders = itertools.permutations((1, 2, 3))
     total = sum((t3.transpose(0, *order) for order in orders), start=np.zeros_like(t3))
     return t1, 0.5 * (t2 + t2.transpose(0, 2, 1)), total / 6

@@ -424,8 +424,9 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
     def _cutoff_errors(
         self, data: _ScreenedBuffers, sums: SourceSums, unit: Real
     ) -> tuple[Real, Real, Real]:
-        """Bounds of the errors of value, gradient and second derivatives that screening causes, in
-        addition to those of plain dipoles. All is in unit coordinates.
+        """Return bounds of three errors, of the value, of the gradient and of second derivatives,
+        which screening causes in addition to the errors of plain dipoles. All is in unit
+        coordinates.
 
         data: the kernel and the dipoles on a backend.
         sums: the sums at the points.

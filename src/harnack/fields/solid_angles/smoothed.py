@@ -97,7 +97,7 @@ class SmoothedKernel(RadialKernel):
 
     def accepting_distance(self, radius: FloatArray, accuracy: float) -> FloatArray:
         """The distances (k,) beyond which k clusters of dipoles may be replaced by their moments:
-        `accuracy` times their radii (k,)."""
+        `accuracy` times their radii, which are given as `radius` (k,)."""
         return accuracy * radius + 1e-5  # not 0 for a cluster of radius 0
 
 

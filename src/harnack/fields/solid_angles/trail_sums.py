@@ -310,8 +310,8 @@ class _AngleProduct:
         return _AngleProduct(x, y, self.half + (sign_change & (bits.sign(factor[1]) | 1)))
 
     def times_product(self, bits: _FloatFormat, other: _AngleProduct) -> _AngleProduct:
-        """The product of this product and another one. The sums theta of arguments are added. bits:
-        the format of the numbers."""
+        """The product of this product and `other`. The sums theta of arguments are added. bits: the
+        format of the numbers."""
         # `times` takes the principal argument of the other product. The whole turns by which its
         # theta differs from that are an even number of half turns.
         z = self.times(bits, (other.x, other.y))
@@ -319,7 +319,8 @@ class _AngleProduct:
 
     def scaled(self, bits: _FloatFormat) -> tuple[_AngleProduct, Real]:
         """The same product, multiplied by a power of two so that |x| + |y| lies between one and
-        two; and the value of |x| + |y| before the scaling. This scaling is exact."""
+        two; and the value of |x| + |y| before the scaling. This scaling is exact. bits: the format
+        of the numbers."""
         length = dr.abs(self.x) + dr.abs(self.y)
         scale = bits.reciprocal_power_of_two(length)
         return _AngleProduct(self.x * scale, self.y * scale, self.half), length
@@ -672,8 +673,9 @@ class LiftedTrails:
         return self.records.backend.Array3f(*row[3 * k : 3 * k + 3])
 
     def _edge(self, row: list[Real], k: int) -> tuple[Real, Real]:
-        """One over the squared length of edge k of the record `row`, and its signed length:
-        negative if the edge runs from a higher to a lower vertex index, 0 if there is no edge."""
+        """Two numbers of edge k in the record `row`: one over its squared length; and its length
+        with a sign, which is negative if the edge runs from a higher to a lower vertex index. The
+        length is 0 if there is no edge."""
         first = 3 * (self.edges_per_record + 1)
         return row[first + k], row[first + self.edges_per_record + k]
 

@@ -145,7 +145,8 @@ class ExactWinding:
 
     def crossings_ahead(self, frame: RayFrame, t: Real, active: Mask) -> Real:
         """The sum (n,) of the signs of all crossings of triangles by rays of the frame, beyond the
-        ray parameter t. It is the integer that `sample_interval` takes as `turns`."""
+        ray parameter t, on active lanes. It is the integer that `sample_interval` takes as `turns`.
+        """
         return self.rays.signed_crossings_ahead(frame, t, active)
 
     def sample_interval(

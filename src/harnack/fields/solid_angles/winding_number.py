@@ -113,7 +113,7 @@ class WindingModuloOne(Field):
     has_variable_accuracy = True
 
     def __init__(self, winding: ModuloOneEvaluable) -> None:
-        """The parameter is described at the class."""
+        """The parameter `winding` is described at the class."""
         self._winding = winding
 
     def prepare(self, backend: Backend) -> Self:
@@ -173,10 +173,10 @@ def winding_extent(
 
 
 def winding_box(mesh: WindingMesh, levels: tuple[float, ...]) -> Box:
-    """A box that is proved to contain the level sets of the winding number w of a mesh. It contains
-    the mesh. Where it is larger than the box of the mesh, two proofs bound its size. By (a), the
-    level sets reach at most a certain length beyond the mesh. By (b), off the triangles they reach
-    at most another length beyond the singular edges.
+    """A box that is proved to contain the level sets, for these levels, of the winding number w of
+    a mesh. It contains the mesh. Where it is larger than the box of the mesh, two proofs bound its
+    size. By (a), the level sets reach at most a certain length beyond the mesh. By (b), off the
+    triangles they reach at most another length beyond the singular edges.
 
     (a) At distance rho from a mesh of this area |w| <= area/(4 pi rho^2). So a level lies within
     rho = sqrt(area/(4 pi |level|)) of the mesh. (b) Off the triangles 4 pi w is, modulo 4 pi, the
@@ -294,8 +294,8 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         order: int = 2,
         cells: bool | float | None = None,
     ) -> None:
-        """Validate the mesh and the options, and choose the method. The parameters (method,
-        accuracy, order, cells) are described at the class."""
+        """Validate the mesh and the options, and choose the method. The parameters (vertices,
+        faces, method, accuracy, order, cells) are described at the class."""
         super().__init__()
         if not is_one_of(method, ("auto", "exact", "tree")):
             hint = did_you_mean(method, ("auto", "exact", "tree"))
@@ -584,7 +584,7 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         self, o: Vec3, d: Vec3, after: JumpCrossing, t_max: Real, active: Mask
     ) -> JumpCrossing:
         """The next crossing of each ray o + t d with a triangle, after the crossing `after` and up
-        to t = t_max, with the jump of w there along the ray."""
+        to t = t_max, with the jump of w there along the ray. Only active lanes search."""
         data = self._data_for(o)
         frame = RayFrame.along(data.backend, data.to_unit(o), d)
         behind = (after.t / data.size, after.facet)
