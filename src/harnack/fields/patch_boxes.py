@@ -107,7 +107,7 @@ class PatchField(Field, Generic[_Buffers]):
 
     @abc.abstractmethod
     def _upload(self, backend: Backend) -> _Buffers:
-        """Upload the boxes and the data of the patches to a backend."""
+        """Upload the boxes and the data of the patches to a backend, and return them."""
 
     def with_levels(self, levels: tuple[float, ...]) -> Self:
         """This field with boxes that contain the patches of these levels, not yet prepared for a

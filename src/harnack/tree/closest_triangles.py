@@ -337,7 +337,8 @@ def next_closest_triangle(
 
 def _distance_rounding(triangles: TriangleTree, x: Vec3) -> Real:
     """A bound of the rounding error of computed distances from points x to triangles: a length, 16
-    machine epsilons of |x| + 1 (`distance_lower_bound`)."""
+    machine epsilons times 1 plus the largest coordinate of x in magnitude (`distance_lower_bound`).
+    """
     return _ROUNDING_EPSILONS * triangles.tree.backend.machine_epsilon * (1 + dr.max(dr.abs(x)))
 
 

@@ -262,8 +262,8 @@ def _cut_up(
     knives: (k, 3, 3) the triangles whose planes cut them.
 
     In each round every piece is cut by one of the knives that meet it: the knife in the middle of
-    the piece's list. The remaining knives of the list are passed on to the new pieces that they
-    meet. So the number of knives of a piece falls by about half in each round.
+    the list of the piece's knives. The remaining knives of the list are passed on to the new pieces
+    that they meet. So the number of knives of a piece falls by about half in each round.
 
     Returns:
         The pieces (j, 3, 3), and the index (j,) of the triangle that each is a piece of.

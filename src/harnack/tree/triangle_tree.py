@@ -528,7 +528,7 @@ def _crossing_depth(
     corners: (u, v, depth) of each corner a, b and c, in the frame of the ray.
     areas: the `edge_function` of the edges ab, bc and ac: twice the signed area of the triangle
         from the ray to the edge.
-    close: the distance from an edge within which the ray passes through the edge.
+    close: a ray within this distance of an edge counts as passing through the edge.
 
     The barycentric weight of a corner is an area divided by the triangle's area, which for a thin
     triangle is only rounding error. So t is computed along the longest edge, on which coordinates

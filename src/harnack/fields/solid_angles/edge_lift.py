@@ -387,8 +387,6 @@ def edge_factor(a: Vec3, b: Vec3, la: Real, lb: Real) -> tuple[Real, Real]:
 
     The number s_a = |a| - a.d is computed as |a'|^2/(|a| + a.d) where a.d > 0, so that nothing
     cancels. a' is a without its component along d.
-
-    Returns the parts for a and b in this order, whatever their vertex indices are.
     """
     return _factor((a.x, a.y), (b.x, b.y), _length_less_axial(a, la), _length_less_axial(b, lb))
 

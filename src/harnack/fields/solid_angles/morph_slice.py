@@ -274,8 +274,8 @@ def _longest_edges(corners: FloatArray) -> FloatArray:
 
 
 def _corner_distances(corners: FloatArray, points: FloatArray) -> FloatArray:
-    """Compute, for each of m triangles, the distance (m,) of its farthest corner from a point that
-    belongs to the triangle. corners: (m, 3, 3). points: (m, 3) one for each triangle."""
+    """Compute, for each of m triangles, the distance (m,) of its farthest corner from a given
+    point. corners: (m, 3, 3). points: (m, 3) one for each triangle."""
     return np.linalg.norm(corners - points[:, None], axis=2).max(axis=1)
 
 

@@ -568,7 +568,7 @@ def truncation_bounds(
 
     level: the moments of the n nodes at one level of the tree.
     nearest: (n,) the bounds hold at distances r >= nearest from the nodes' centers.
-    order: 0, 1 or 2.
+    order: from 0 to 3.
 
     Returns (E, G, H), each (n,): the omitted terms, whose degrees are l >= k = order + 2, add at
     most E/r^(k+1) to f, at most G/r^(k+2) to its gradient, and at most H/r^(k+3) to second

@@ -71,9 +71,9 @@ _MAX_LEVEL_PAIRS, _MAX_LEVEL_POINTS, _MIN_LEVEL_POINTS = 8_000_000, 512, 24
 
 
 class YukawaKernel(RadialKernel):
-    """The kernel K = exp(-kappa r)/r on a backend, with kappa one over the screening length. psi_0
-    = K, psi_(k+1) = -psi_k'/r. The numbers Q_m bound its derivatives: the m-th derivative along
-    lines is at most m! Q_m/r^(m+1).
+    """The kernel K = exp(-kappa rho)/rho on a backend, where rho is the distance from a dipole and
+    kappa is one over the screening length. psi_0 = K, psi_(k+1) = -psi_k'/rho. The numbers Q_m
+    bound its derivatives: the m-th derivative along lines is at most m! Q_m/rho^(m+1).
 
     Kernel. K(rho) = exp(-kappa rho)/rho is the Yukawa potential: Delta K = kappa^2 K away from 0.
     One has psi_k = theta_k(kappa rho) exp(-kappa rho)/rho^(2k+1), where theta_0 = 1, theta_1 = 1 +
