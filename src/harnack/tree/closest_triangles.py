@@ -70,13 +70,17 @@ class BoxTree:
     ) -> tuple[Real, Real, Any]:
         """Find, on active lanes, the next box that each ray o + t d, |d| = 1, enters. Boxes are
         ordered by the pair (t of entering, number of the box); the next box is the first one after
-        the pair `after`.
+        the pair `after`. Boxes are enlarged a little, so that rounding never skips a box that the
+        ray meets.
 
-        A ray that has not left a box before t = start enters it at max(t of its first point in the
-        box, start). start, end: the part of the ray that counts is start <= t <= end. Repeated
-        calls, the first with after = (t, NO_BOX) for any t < start, visit every box that the ray
-        meets for start <= t <= end exactly once. Boxes are enlarged a little, so that rounding
-        never skips a box that the ray meets.
+        o, d: origin and direction of each ray.
+        after: (t, number of a box), the pair after which the search begins.
+        start, end: only the part start <= t <= end of each ray counts. A ray that is in a box at t
+            = start enters this box at `start`.
+        active: the mask of the lanes that search.
+
+        Repeated calls, the first with after = (t, NO_BOX) for any t < start, visit every box that
+        the ray meets for start <= t <= end exactly once.
 
         Returns:
             The t where the ray enters the box, the t where it leaves it, and the number of the box

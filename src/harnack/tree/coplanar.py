@@ -116,12 +116,11 @@ def _candidates(corners: FloatArray, normals: FloatArray, heights: FloatArray) -
 
     A plane is a point of R^4: its unit normal and its distance from the origin. The normal is
     turned so that its first coordinate that is larger than 0.3 in magnitude is positive; a unit
-    vector always has one. For two
-    triangles in one plane these points differ only by rounding and by the effect of moving corners
-    by `_IN_PLANE`, divided by the smaller of the triangles' heights. R^4 is divided into cells. So
-    a triangle that is alone in its cell shares its plane with another triangle only in two cases:
-    its point is nearer to a wall of the cell than this difference, or a coordinate of its normal is
-    nearer to 0.3 in magnitude than this difference.
+    vector always has one. For two triangles in one plane these points differ only by rounding and
+    by the effect of moving corners by `_IN_PLANE`, divided by the smaller of the triangles'
+    heights. R^4 is divided into cells. So a triangle that is alone in its cell shares its plane
+    with another triangle only in two cases: its point is nearer to a wall of the cell than this
+    difference, or a coordinate of its normal is nearer to 0.3 in magnitude than this difference.
     """
     excess = np.abs(normals) - 0.3
     # The first coordinate larger than 0.3 in magnitude decides the orientation.

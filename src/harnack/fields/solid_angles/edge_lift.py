@@ -173,7 +173,7 @@ class LiftedEdge:
 
     def bounds(self, unit: Real) -> tuple[Real, Real, Real]:
         """Compute bounds of what the edge adds to the rounding error of the sum of solid angles,
-        and to the remainder of its linear Taylor polynomial.
+        and to the remainder of this sum beyond its linear Taylor polynomial.
 
         unit: a bound of the rounding of a coordinate (`coordinate_rounding`). Coordinates that are
             correctly rounded are off by half of it.

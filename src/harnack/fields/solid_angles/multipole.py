@@ -365,9 +365,9 @@ def _leaf_moments(
 
 
 def _power_terms(area: Real, points: Sequence[tuple[float, Vec3]]) -> list[Real]:
-    """Compute what a dipole that is spread over points adds to the moments of its node: ten numbers
-    for the entries xx, yy, zz, xy, xz, yz of `NodeMoments.second_moment`, then for `third_moment`
-    (3,) and `fourth_moment`.
+    """Compute what a dipole that is spread over points adds to the moments of its node. Returns ten
+    numbers: six for the entries xx, yy, zz, xy, xz, yz of `NodeMoments.second_moment`, then three
+    for `third_moment` and one for `fourth_moment`.
 
     area: the area of the dipole.
     points: pairs of a fraction of the area, and an offset from the node's center.

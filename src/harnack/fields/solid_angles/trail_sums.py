@@ -80,8 +80,8 @@ class RayLine:
 
     @property
     def slack(self) -> Real:
-        """A length that bounds the rounding of points of the line, and of differences p - x of
-        points p of the curve and x, which are about as long as x."""
+        """A length that bounds the rounding of points of the line, and the rounding of the
+        differences p - x, for points p of the curve. Such a difference is about as long as x."""
         return dr.fma(8 * float(dr.epsilon(self.x)), dr.norm(self.x), self.rounding)
 
 
