@@ -161,9 +161,9 @@ def refine_cells(
     max_rounds: int,
     margin: float = 0.0,
 ) -> RefinedCells:
-    """Split cells into octants, and split the octants that are not proved empty again, for several
-    rounds. Returns the cells of the last round that are not proved empty, and all cells proved
-    empty.
+    """Split cells into octants, for several rounds. In each further round, those octants are split
+    that are not proved empty. Returns the cells of the last round that are not proved empty, and
+    all cells proved empty.
 
     clearance: gives proved lower bounds of the distances of points from a set. An empty cell holds
         no point of the set.

@@ -279,8 +279,8 @@ def _carve_boxes(
 
     Returns the lower and the upper corners of the new boxes, both (k, 3).
 
-    Only cells at the sides of a box can make it smaller. So all cells are split twice, and then
-    only those at the sides, until they are small or the work is too large.
+    A box becomes smaller only if cells at its sides are removed. So all cells are split twice, and
+    then only the cells at the sides, until they are small or the work is too large.
     """
     curves = FaceLoops.upload(choose_backend("double"), faces)
     box_sizes, pair_count = upper - lower, 0

@@ -387,7 +387,8 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
     def sharp_values_at(self, x: Vec3) -> PointValues:
         """w and its gradient at points x (3, n) in user coordinates, with error bounds. With a
         tree, gradients come from the singular edges (`winding_rates`), unless the user chose the
-        accuracy. Their error is then about 1 % of their length in most places, or far less."""
+        accuracy. The error of a gradient is then about 1 % of the gradient's length in most places,
+        or far less."""
         data = self._batch_data(backend_of(x))
         winding = data.winding
         if not isinstance(winding, TreeWinding) or self.accuracy is not None:
