@@ -169,14 +169,14 @@ class Julia(Solid):
         return Sample(value, gradient, tuple(promises), error)
 
     def _parameter(self, name: str) -> Any:
-        """The attribute with this name, a number of the backend (of the prepared solid)."""
+        """The attribute `name` of the prepared solid, a number (or a tuple) on the backend."""
         return getattr(self, name)
 
     def _orbit(self, p: Vec3, radii: tuple[Real, ...]) -> tuple[Any, ...]:
         """Compute the orbit of p. Returns four results: f at p; its gradient; a bound of the error
         of f; and for each radius a bound of |grad f| on the ball of that radius about p.
 
-        radii: the first must be 0, so that the error of f is that of rounding alone.
+        radii: of the balls. The first must be 0: it gives the rounding error of f.
 
         In the notation of the class docstring `Julia`, `size` is |c|, b is B, and for each radius
         `change` holds e_n, `slopes` d_n, `min_q` m_n and `rates` g_n. `jac` is the Jacobian of q_n
@@ -200,8 +200,8 @@ class Julia(Solid):
             """The state of the loop after one more iteration.
 
             The state consists of the number n of iterations; the four components of q_n; the 12
-            entries of its Jacobian with respect to x, y and z, row by row; and `change`, `slopes`,
-            `min_q` and `rates`.
+            entries of its Jacobian with respect to x, y and z, row by row; and, each with one
+            number for each radius, `change`, `slopes`, `min_q` and `rates`.
             """
             q, jac = list(state[:4]), state[4:16]
             change, slopes, min_q, rates = _split_in_four(state[16:])

@@ -198,11 +198,12 @@ class OutlineEdges:
     def _add_edges_by_chains(
         self, chains: RecordTable, query: _OutlineQuery, state: tuple[Any, ...]
     ) -> tuple[Any, ...]:
-        """Loop over the chains: the state of the loop over edges (see `_OutlineQuery`) with all
-        edges added. A chain that is too far away to hold the nearest edge is added by its box, in
-        place of its edges.
+        """Loop over the chains of edges, and return the state of the loop over edges with all edges
+        added; `_OutlineQuery` lists the members of this tuple. A chain that is too far away to hold
+        the nearest edge is added by its box, in place of its edges.
 
         chains: the records of the chains.
+        query: the query points and the lines from them.
         state: the state before any edge.
         """
         # A distance within which some chain must have a point, so that the nearest edge is not
@@ -212,8 +213,8 @@ class OutlineEdges:
         index = type(chains.iteration_count)(0)
 
         def visit_chain(i: Any, *state: Any) -> tuple[Any, ...]:
-            """The index of the next chain; and the state with chain i added, by its edges if it is
-            near, else by its box."""
+            """Return the index of the next chain; and the state of the loop over edges with chain i
+            added, by its edges if it is near, else by its box."""
             record = chains.read_record(i)
             # A near chain has `count` edges to visit. A far one has 0, and its box is already in
             # the state.
@@ -221,7 +222,7 @@ class OutlineEdges:
             first_edge, count = type(i)(record[6]), type(i)(count)
 
             def each(j: Any, *edge_state: Any) -> tuple[Any, ...]:
-                """The next index, and the state with edge j of the chain added."""
+                """Return the next index, and the state with edge j of the chain added."""
                 return j + 1, *query.with_edge(self.edges.read_record(first_edge + j), edge_state)
 
             def has_more(j: Any, *_: Any) -> Mask:
@@ -265,9 +266,10 @@ class _OutlineQuery:
     unit: float
 
     def with_edge(self, row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
-        """The state of the loop after one more edge was visited.
+        """Return the state of the loop after one more edge was visited: a tuple, whose members the
+        class docstring lists.
 
-        row: the record of the edge: (ax, ay, bx, by, 1/length^2).
+        row: the record of the edge from a to b: (ax, ay, bx, by, 1/length^2).
         state: the state before.
         """
         nearest, error, away_x, away_y, normal_x, normal_y, on_edge, inside, *bounds = state
@@ -337,7 +339,7 @@ class _OutlineQuery:
 
         row: the record of the chain.
         limit: a distance within which the nearest edge lies.
-        state: the state before (see the class).
+        state: the state of the loop before, whose members the class docstring lists.
         """
         nearest, error, away_x, away_y, normal_x, normal_y, on_edge, inside, *bounds = state
         to_x, to_y = self.x - clamp(self.x, row[0], row[2]), self.y - clamp(self.y, row[1], row[3])
@@ -356,8 +358,9 @@ class _OutlineQuery:
     def _with_tangent(
         self, bounds: list[Real], x: Real, y: Real, distance: Real, error: Real
     ) -> list[Real]:
-        """The lower bounds at the knots after one more edge or box: the smaller of the bounds so
-        far and of the tangent of the distance from it at the start of the line.
+        """The lower bounds at the knots after one more edge or box was visited. Along the line, the
+        distance from the edge or box lies above its tangent at the start. So at each knot the new
+        bound is the smaller of the bound so far and of the tangent's value.
 
         bounds: the bounds so far, one for each knot.
         x, y: the vector from the nearest point of the edge or box to the query point.
@@ -418,7 +421,7 @@ class SignedDistanceEnclosure(Enclosure):
     def around(
         cls, nearest: OutlineSample, slope: Real, knots: tuple[Real, ...]
     ) -> SignedDistanceEnclosure:
-        """The enclosure from a sample of d at the start of the line.
+        """The enclosure of d, from the sample of d at the start of the line.
 
         nearest: the sample, with lower bounds at the knots.
         slope: the derivative of d along the line at its start.

@@ -58,8 +58,8 @@ def ball_around(center: tuple[float, float, float], radius: float) -> Volume:
 
 
 def set_frozen(shape: Any, name: str, value: Any) -> None:
-    """Set an attribute of a solid although its class is a frozen dataclass, whose attributes cannot
-    be set in the usual way."""
+    """Set the attribute `name` of a solid, `shape`. Its class is a frozen dataclass, whose
+    attributes cannot be set in the usual way."""
     object.__setattr__(shape, name, value)
 
 
@@ -154,8 +154,8 @@ class Solid(Field):
         )
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
-        """Wrap the method `prepare` of a new subclass: a prepared solid keeps a reference to the
-        original."""
+        """Wrap the method `prepare` of a new subclass, so that a prepared solid keeps a reference
+        to the original."""
         super().__init_subclass__(**kwargs)
         if "prepare" in vars(cls):
             cls.prepare = _with_source(cls.prepare)  # type: ignore[method-assign]
@@ -176,8 +176,8 @@ class Solid(Field):
     @abc.abstractmethod
     def map_operands(self, change: Callable[[Solid], Solid]) -> Solid:
         """The same combination with each operand replaced by change(operand). (Operands are the
-        solids that are combined.) A solid that is not a combination is its own operand: the result
-        is change(self)."""
+        solids that are combined.) For a solid that is not a combination the result is
+        change(self)."""
 
     # Combinations. Operands that are not solids are refused.
 
