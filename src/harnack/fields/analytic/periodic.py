@@ -188,8 +188,9 @@ class ExtensionBounds:
         return fmin(fmax(at_critical_point, near_rise - f), self.largest)
 
     def _descent_at_zero(self, slope: float) -> float:
-        """The bound `_max_descent` at a point where f = 0 and the gradient has the length `slope`,
-        from samples and without rounding: to choose the radius."""
+        """About the bound `_max_descent` at a point where f = 0 and the gradient has the length
+        `slope`. It is computed from samples and without rounding, as it only serves to choose the
+        radius."""
         r, alpha, spread = self.radius, self.alpha, self.spread
         rise = min(self.largest_gradient * r, slope * r + 0.5 * self.curvature * r * r)
         x = np.linspace(0.0, 1.0, 101)
@@ -306,7 +307,10 @@ class EigenfunctionSum(Field):
         return x, y, z
 
     def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
-        """Bounds of the rounding errors of the gradient and of the Hessian of f at p."""
+        """Two bounds, of the rounding errors of the gradient and of the Hessian of f at p.
+
+        sample: not used.
+        """
         del sample
         return self._rounding.derivative_errors(p)
 
@@ -392,7 +396,10 @@ class _CubicSurface(EigenfunctionSum):
     _steepness: float
 
     def __init__(self, cell: float, terms: tuple[Term, ...], domain: Volume | None) -> None:
-        """Set up the sum of waves, with the wavenumber that belongs to the cell."""
+        """Set up the sum of the waves `terms`, which repeats after the length `cell`.
+
+        domain: the volume in which f is drawn; None for the ball of radius `cell` about the origin.
+        """
         self.cell = float(cell)
         self._wavenumber = _wavenumber(cell)
         super().__init__(terms, domain=Ball(radius=self.cell) if domain is None else domain)

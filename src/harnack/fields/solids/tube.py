@@ -589,8 +589,8 @@ class TubeNetwork(PatchField["_TubeBuffers"]):
         self.radius: FloatArray = _checked_radius(radius, len(self.segments))
 
     def boxes(self, levels: tuple[float, ...] | None = None) -> tuple[FloatArray, FloatArray]:
-        """Return two arrays (m, 3), the lower and the upper corners of a box for each segment, which
-        contains the segment's tube.
+        """Return two arrays (m, 3): the lower and the upper corners of boxes. There is a box for
+        each segment, which contains the segment's tube.
 
         levels: values of f that are drawn; the largest is added to the radii. None for the levels
             of the field.
