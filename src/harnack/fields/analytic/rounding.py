@@ -314,9 +314,9 @@ class WaveRounding:
         return cls((moves[0], moves[1], moves[2]), a, b, c, d)
 
     def errors(self, p: Vec3, gradient: Vec3) -> tuple[Real, Real]:
-        """Bounds of the errors of the computed value and gradient of the sum at p. That of the
-        gradient is the difference from the exact gradient at the point moved by `move`, as a
-        length.
+        """Two bounds, of the errors of the computed value and of the computed gradient of the sum
+        at p. The error of the gradient is a length: its difference from the exact gradient at the
+        point p moved by `move`.
 
         gradient: the computed gradient at p.
         """
@@ -332,8 +332,9 @@ class WaveRounding:
         return roundoff * (value + 0 * p.x), roundoff * (slope + 0 * p.x)
 
     def derivative_errors(self, p: Vec3) -> tuple[Real, Real]:
-        """Bounds of the errors of the computed gradient and Hessian of the sum, compared with the
-        exact ones at p itself: a length, and a matrix norm."""
+        """Two bounds, of the error of the computed gradient of the sum, as a length, and of the
+        error of the computed Hessian, as a matrix norm. Both are compared with the exact ones at p
+        itself."""
         roundoff = float(dr.epsilon(type(p.x)))
 
         def at(parts: _LinearBound) -> Real:
@@ -345,17 +346,19 @@ class WaveRounding:
 
 
 def _wave_vector(term: Term) -> tuple[float, ...]:
-    """The wave vector of a plane wave; for a product of sines and cosines the frequencies of its
-    factors."""
+    """The wave vector of a term that is a plane wave. For a product of sines and cosines, the
+    frequencies of its factors."""
     if isinstance(term, PlaneWave):
         return term.wave_vector
     return tuple(factor.frequency for _, factor in term.factors)
 
 
 def _common_frequency(terms: Sequence[Term], axis: int) -> float | None:
-    """The absolute frequency of all factors (sines and cosines) of one coordinate; None if they
-    differ, if there are none, or if a plane wave has a component along this axis.
+    """The absolute frequency that all factors (sines and cosines) of one coordinate have in common;
+    None if their frequencies differ, if there are no factors, or if a plane wave has a component
+    along this axis.
 
+    terms: the terms of a sum of waves.
     axis: the index of the coordinate.
     """
     frequencies: set[float] = set()
@@ -384,8 +387,9 @@ def _term_roundings(term: Term, common: Sequence[float | None]) -> tuple[float, 
     common: for each axis the frequency that all terms share, or None. The error of a product with a
         shared frequency is left out, as it counts as a move of the point.
 
-    Returns the constant part of the errors of its angles; their part for each axis, in units of the
-    absolute value of that coordinate; and the error of the other operations.
+    Returns three results: the part of the errors of its angles that is constant; for each axis, the
+    part that is proportional to the absolute value of that coordinate, as a factor; and the error
+    of the other operations.
     """
     if isinstance(term, PlaneWave):
         operations = _SINE + 2

@@ -440,8 +440,11 @@ class BallRange:
         return total
 
     def at(self, s: Real) -> tuple[Real, Real]:
-        """A lower and an upper bound of f on the ball |y| <= s, the tighter ones of those by degree
-        and those on spheres. s: a Dr.Jit array."""
+        """A lower and an upper bound of f on the ball |y| <= s. Each is the tighter one of two
+        bounds: that of `by_degree`, and that on the smallest sphere with a radius of s or more.
+
+        s: a Dr.Jit array.
+        """
         lower, upper = self.by_degree(s)
         for radius, low, high in self.spheres:
             # The range on a sphere holds for all smaller balls.
@@ -451,8 +454,10 @@ class BallRange:
         return lower, upper
 
     def on_ball(self, s: float) -> tuple[float, float]:
-        """A lower and an upper bound of f on the ball |y| <= s, the tighter ones of those by degree
-        and those on spheres. s: a Python number."""
+        """A lower and an upper bound of f on the ball |y| <= s, as `at` returns them.
+
+        s: a Python number.
+        """
         bounds = [self.by_degree(s), *((low, high) for r, low, high in self.spheres if s <= r)]
         return max(low for low, _ in bounds), min(high for _, high in bounds)
 
@@ -478,8 +483,8 @@ def _values(weights: Weights, points: FloatArray) -> dict[int, FloatArray]:
 
 
 def sphere_range(values: dict[int, FloatArray], s: float, covering: float) -> tuple[float, float]:
-    """A proved range (low, high) of a harmonic polynomial on the sphere of radius s, the sum of its
-    parts f_l of each degree l.
+    """A proved range (low, high) of a harmonic polynomial f on the sphere of radius s about the
+    origin. f is the sum of its parts f_l of each degree l.
 
     values: the values of each f_l at sample points of the unit sphere, by degree l.
     covering: an angle. Every point of the unit sphere is within this angle of one of these points.
