@@ -173,10 +173,11 @@ def sum_along(
     def add_blob(row: list[Real], state: State) -> State:
         """Return the sums so far (`state`), with one more blob added. row: the blob's record.
 
-        The state is that of `_add_value`. Then come, for each piece, the ends of the range of the
-        first derivative and those of the second. The last three numbers are for the rounding
-        errors: the sums of the slope scales and of the scales of second derivatives, and the number
-        of blobs near the path.
+        The state begins with the numbers that `_add_value` lists. Then come, for each piece, the
+        ends of the range of the first derivative and those of the second. The last three numbers
+        are for the rounding errors. With A the amplitude of a blob and R the radius of its support,
+        they are the sums, over the blobs near the path, of |A|/R and of |A|/R^2, each times a
+        weight; and the number of these blobs.
         """
         start, sums = state[:_VALUE_STATE_SIZE], list(state[_VALUE_STATE_SIZE:])
         inverse_radius, amplitude = row[6], row[7]
@@ -424,7 +425,8 @@ def _with_jumps(
     inner_range: the range (lower, upper) on the part of the piece inside the support.
     half_chord_squared: S^2, with S half the length of the line's part inside the support.
     margin: a bound of the rounding of squared positions.
-    begin, end: the positions of the ends of the piece, measured from the middle of the chord.
+    begin, end: the positions of the ends of the piece, measured from the middle of the line's part
+        inside the support.
 
     Lengths are in units of the support's radius.
     """

@@ -209,8 +209,8 @@ class HRBF(Formula):
         pairs = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
         def add_point(row: list[Real], state: State) -> State:
-            """The sums so far of the second derivatives xx, xy, xz, yy, yz, zz (`state`), with the
-            term of one more point added. row: the point's record."""
+            """Return the sums so far of the second derivatives xx, xy, xz, yy, yz, zz (`state`),
+            with the term of one more point added. row: the point's record."""
             # The vector from the point, its length, and three times the vector of the point.
             v, b, r, inverse_r = _offset_of_point(p, row)
             b_dot_e = dr.dot(b, v) * inverse_r
@@ -219,9 +219,10 @@ class HRBF(Formula):
             def entry(i: int, j: int) -> Real:
                 """The second derivative of the point's term by coordinates i and j.
 
-                Let v be the vector from the point, r its length, e = v/r, and b three times the
-                vector b_i of the point. Then it is 3 a (r delta_ij + v_i e_j) + (b . e) (delta_ij -
-                e_i e_j) + b_i e_j + b_j e_i.
+                Let v be the vector from the point, r its length and e = v/r; let a be the number of
+                the point's record, and b the vector of its entries 7 to 9. With the indices i and j
+                for components of vectors, the derivative is 3 a (r delta_ij + v_i e_j) + (b . e)
+                (delta_ij - e_i e_j) + b_i e_j + b_j e_i.
                 """
                 delta = 1.0 if i == j else 0.0
                 vector_part = b_dot_e * (delta - e[i] * e[j]) + b[i] * e[j] + b[j] * e[i]

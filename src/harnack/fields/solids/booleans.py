@@ -301,9 +301,8 @@ class BooleanSolid(Solid):
         with a smaller error may exclude most of that range. Then the value is set to the middle of
         the remaining range. Without this, a large rounding error of one operand could make a ray
         hit that operand's surface where it lies inside of another operand. The tracer reduces the
-        differences
-        between f and the levels by the error of the combination. If the error of an operand is
-        larger than that, the bounds of its deficit are widened by the excess.
+        differences between f and the levels by the error of the combination. If the error of an
+        operand is larger than that, the bounds of its deficit are widened by the excess.
         """
         sign = -1.0 if self.is_union else 1.0
         values = [sign * operand.value for operand in samples]

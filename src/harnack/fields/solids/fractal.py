@@ -463,8 +463,9 @@ class _Octave:
         starts: the jets where the piece starts; for a point, `coordinates` themselves. Their values
             lie within `start_error` of the octave's point q.
 
-        Proof. Within the distance m of q, the gradient differs from the gradient at q by at most
-        bend m (mean value theorem). Derivatives along a line follow by the chain rule. The value is
+        Proof. Let `bend` bound all second derivatives of the octave along lines. Within the
+        distance m of q, the gradient differs from the gradient at q by at most bend m (mean value
+        theorem). Derivatives along a line follow by the chain rule. The value is
         the value at the start plus the integral of the slope.
         """
         error = self.error + self.slope * start_error * (1 + 1e-5)
@@ -495,7 +496,7 @@ class _Octave:
         jets: the jets of the coordinates, whose values lie within `distance` of the octave's point.
         value: the range of the value.
         is_point: whether second derivatives are computed from the Hessian; else they are bounded by
-            `bend`.
+            `bend`, which bounds all second derivatives of the octave along lines.
         """
         change = self.bend * distance + self.slope_error
         # The gradient within `distance` of the point, and never longer than `slope`. (-max(-a, -b)

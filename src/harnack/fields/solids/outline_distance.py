@@ -241,8 +241,11 @@ class OutlineEdges:
 class _OutlineQuery:
     """Query points of the plane, one per lane, at which the signed distance from an outline is
     wanted, and lines from these points along which it is bounded at given positions, the knots. A
-    loop visits the edges of the outline one by one; the methods update its state, a tuple, by an
-    edge or by a chain of edges. Edges and chains are read as records (`OutlineEdges`).
+    loop visits the edges of the outline one by one; the methods update its state by an edge or by a
+    chain of edges. The state is a tuple: the distance from the nearest edge so far, with numbers
+    about this edge; whether the ray from the point towards +x has crossed an odd number of edges,
+    so that the point is inside; and the bounds at the knots. Edges and chains are read as records
+    (`OutlineEdges`).
 
     x, y: the query points, relative to the outline's center.
     velocity: the direction of the lines, of length 1 at most; None without lines.
@@ -250,7 +253,7 @@ class _OutlineQuery:
     error: a bound of the rounding of distances from boxes.
     unit: the machine epsilon.
 
-    The state consists of these parts: the distance from the nearest edge so far, and its rounding
+    In detail, the state consists of these parts: the distance from the nearest edge so far, and its rounding
     error; x and y of the vector from the nearest point of that edge to the query point; x and y of
     the edge's unit normal; whether the nearest point lies inside the edge, so that it is no vertex;
     whether the ray towards +x has crossed an odd number of edges; and for each knot a lower bound

@@ -99,9 +99,9 @@ def not_a_solid(other: Any) -> str:
 
 
 def _with_source(prepare: Callable[[Any, Backend], Field]) -> Callable[[Any, Backend], Field]:
-    """Decorator of the method `prepare` of a solid: the prepared solid, whose numbers lie on a
-    backend, keeps a reference to the original in its attribute `_source`. Python knows the
-    original's numbers, from which `Solid.extent` is computed."""
+    """Decorator of the method `prepare` of a solid. The prepared solid, whose numbers lie on a
+    backend, keeps a reference to the original in its attribute `_source`. The original has Python
+    numbers, from which `Solid.extent` is computed."""
 
     @functools.wraps(prepare)
     def remembering(self: Any, backend: Backend) -> Field:
@@ -146,8 +146,8 @@ class Solid(Field):
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
         """A volume that is proved to contain the level sets of f at these levels; None if none is
         known. It is a volume that contains all points with f at most the highest level; if none is
-        known, one that contains all points with f at least the lowest level. A prepared solid asks
-        the original, whose numbers are known to Python."""
+        known, one that contains all points with f at least the lowest level. For a prepared solid
+        it is computed from the original, which has Python numbers."""
         original: Solid = vars(self).get("_source", self)
         return original.sublevel_extent(max(levels)) or original.sublevel_extent(
             min(levels), above=True

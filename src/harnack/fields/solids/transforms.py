@@ -385,7 +385,7 @@ class _InverseMap:
 
     @classmethod
     def of(cls, change: AffineMap) -> _InverseMap:
-        """The inverse of an affine map, in Python numbers."""
+        """The inverse of the affine map `change`, in Python numbers."""
         inverse = change.inverse
         stretch = float(np.linalg.svd(inverse, compute_uv=False)[0]) * (1 + 1e-6)
         return cls(
