@@ -298,10 +298,10 @@ def _bounded_laplacian(rng: np.random.Generator, rows: int, *, mirrored: bool) -
     rows: the number of functions.
 
     The sources are a constant density in the unit ball, two balls of constant density, and a
-    multiple of the Legendre polynomial P_2 of the latitude (the wave). The latter has the potential
-    q^2 ln(q) P_2/5 at the distance q from the center, and so the logarithm that occurs in the
-    bound. The bound is attained if there is only a constant density that is not negative, and mass
-    only at the poles.
+    multiple of the Legendre polynomial P_2 of the latitude (the wave). At the distance q from the
+    center, the potential of P_2 is q^2 ln(q) P_2/5 up to its sign; such a logarithm also occurs in
+    the bound of `BoundedLaplacian`. The bound is attained if there is only a constant density that
+    is not negative, and mass only at the poles.
     """
     radius, mass = _log_uniform(rng, rows, -3, 3), _log_uniform(rng, rows, -3, 3)
     latitudes, weights = rng.uniform(-1, 1, (rows, 3)), rng.dirichlet([0.7] * 3, rows)

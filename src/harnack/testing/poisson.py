@@ -154,7 +154,7 @@ class AxialFunctions:
 
     @property
     def slope(self) -> FloatArray:
-        """(rows,) the derivatives of the functions along the axis, at the center."""
+        """The derivatives (rows,) of the functions along the axis, at the center."""
         if self.measure == "points":
             slopes = self.dimension * self.latitudes_or_heights
         else:
@@ -224,7 +224,7 @@ class GreenPotentials:
 
 def _newton(q: FloatArray, y: FloatArray, size: FloatArray) -> FloatArray:
     """Newton's potential of a ball of density 1, at the position q on the axis, minus its value at
-    0.
+    the position 0.
 
     y, size: the position of the ball's center on the axis, and its radius.
     """

@@ -311,8 +311,8 @@ class Branches(abc.ABC):
         return z
 
     def clearance(self, z: Complex) -> Real:
-        """The distance from z to the nearest singular point. If there are no singular points it is
-        2, because it limits the size of the disks on which the branches are bounded."""
+        """The distance from z to the nearest singular point. If there are no singular points, the
+        result is 2, since it limits the size of the disks on which the branches are bounded."""
         nearest = 0 * z.real + (dr.inf if self.branch_points else _CLEARANCE_WITHOUT_POINTS)
         for point in self.points_on(z):
             nearest = fmin(abs(z - point.at), nearest)

@@ -62,9 +62,9 @@ def fit_cosines(grid: FloatArray, terms: tuple[int, int, int]) -> FloatArray:
     grid: (n_x, n_y, n_z) the values.
     terms: the numbers of terms (K_x, K_y, K_z).
 
-    They come from the discrete cosine transform of type 2. With as many terms as values the series
-    passes through all values. With fewer terms it is the best fit in mean square, since the cosines
-    are orthogonal on the midpoints.
+    The coefficients come from the discrete cosine transform of type 2. With as many terms as values
+    the series passes through all values. With fewer terms it is the best fit in mean square, since
+    the cosines are orthogonal on the midpoints.
     """
     from scipy import fft  # imported here, as it takes time and is rarely needed
 

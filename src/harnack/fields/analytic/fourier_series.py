@@ -219,7 +219,7 @@ class FourierSeries(Field):
 
     def _near(self, level: float, rng: int) -> tuple[FloatArray, FloatArray]:
         """Two results: points (n, 3) on or next to the surface of the series at this level; and the
-        difference (n,) between the fitted function and the series at each of them.
+        fitted function minus the series (n,) at each of them.
 
         level: the level of the surface.
         rng: the seed of the random points, if a callable was fitted. They are moved to the surface

@@ -91,7 +91,8 @@ class _OrderTerm:
     def of(cls, l: int, j: int, weights: Weights) -> _OrderTerm:  # noqa: E741
         """The part S(y) C(w) that belongs to this j of a function of degree l.
 
-        weights: (j, m) -> coefficient of the solid harmonic in S, the factor N_lj included.
+        weights: (j, m) -> coefficient of the solid harmonic in S. It includes N_lj, the factor that
+            normalizes the harmonic polynomial of R^4.
         """
         bounds = value_bound(weights), gradient_bound(weights), hessian_bound(weights)
         rounding = HarmonicRounding.of(weights, is_divided=True)
@@ -247,10 +248,10 @@ class HypersphericalHarmonic(Field):
 
         Let s = 1/total, y = 2 s p and w = 1 - 2 s. f is a sum of S(y) C(w). Since S is homogeneous
         of degree j, grad f = 2 s (sum of C grad S + p S (2 s C' - j C)). The errors, to first order
-        in the unit roundoff u, come from y, from w, and from S, grad S and C. The error of y is
-        `_SCALE_ERROR` of its size, the same for all coordinates, and two roundings of each
-        coordinate (`is_divided`). The error of w is `_W_ERROR`. Those of S, grad S and C come from
-        their recurrences.
+        in the unit roundoff u, come from y, from w, and from S, grad S and C. The relative error of
+        y is `_SCALE_ERROR` u, the same for all coordinates, and two roundings of each coordinate,
+        which `HarmonicRounding` includes. The error of w is `_W_ERROR` u. The errors of S, grad S
+        and C come from their recurrences.
         """
         s = 1 / total
         y, w, norm_p = 2 * s * p, 1 - 2 * s, dr.norm(p)
@@ -298,8 +299,8 @@ class HypersphericalHarmonic(Field):
         )
 
     def _min_square(self, square: Real, fraction: float) -> Real:
-        """A lower bound of 1 + |y|^2 for points y of space in the ball of radius fraction * sqrt(1
-        + |p|^2) about p.
+        """A lower bound of 1 + |q|^2 for all points q of space in the ball of radius fraction *
+        sqrt(1 + |p|^2) about p.
 
         square: |p|^2.
         """
@@ -413,8 +414,8 @@ class HypersphericalHarmonic(Field):
         """The three rows of the Hessian of f at p. Its trace is not 0: f is harmonic on S^3 and not
         in space.
 
-        Let s = 1/(1 + |x|^2) at the point x, and d_ik = 1 for i = k, else 0. The chain rule is
-        applied with
+        Let x be the point p, s = 1/(1 + |x|^2), and d_ik = 1 for i = k, else 0. The chain rule is
+        applied to f = P(y, w), with
 
         - first derivatives dy_i/dx_k = 2s (d_ik - 2s x_i x_k) and dw/dx_k = 4 s^2 x_k;
         - second derivatives 4 s^2 (4s x_i x_k x_m - x_m d_ik - x_k d_im - x_i d_km) of y_i and 4

@@ -252,9 +252,9 @@ class Lobes(Field):
         most G = |slope| + 1.05 q L^2 M, and |Y| <= H = |Y(u)| + 1.05 q G. Second derivatives along
         a unit vector with the radial component c and the tangential component t are, for r^2 Y^2, 2
         Y^2 + 2 Y (2 c t Y' + t^2 Y") + 2 t^2 Y'^2. This is at most 2 H^2 + 2 H b + 2 G^2, where b
-        is the bound N^2 A of `Lobes` for Y itself. The second derivatives of r^4 are at most 12
-        r^2. As f = r^4 - r^2 Y^2, its second derivatives are between minus the first bound and 12
-        r^2 + 2 H b.
+        bounds |2 c t Y' + t^2 Y"| (the class docstring has such bounds, here for Y itself). The
+        second derivatives of r^4 are at most 12 r^2. As f = r^4 - r^2 Y^2, its second derivatives
+        are between minus the first bound and 12 r^2 + 2 H b.
         """
         max_value, degree = max(map(abs, self.value_range)), self.degree
         # Near the surface |Y| is r. Where its slope is 0, it changes by about r within the angle

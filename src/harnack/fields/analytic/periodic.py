@@ -125,8 +125,9 @@ class ExtensionBounds:
 
     @classmethod
     def at(cls, waves: WaveBounds, radius: float) -> ExtensionBounds:
-        """The bounds for the radius R. The wavenumber kappa, which the proof may choose, is the
-        weighted median of all, which makes E smallest.
+        """The bounds for the radius R. The proof compares F with cosh(kappa w) f for a wavenumber
+        kappa of our choice, and E bounds their difference on the ball. kappa is the median of all
+        wavenumbers, weighted by the amplitudes, which makes E smallest.
 
         waves: bounds of the sum of waves f.
         """
@@ -170,7 +171,8 @@ class ExtensionBounds:
         to four dimensions. With -f in place of f, it is a bound of F. The class has the proof.
 
         f: the value at p, without the constant term.
-        rise: the number D, for which |f(y) - f(p)| <= D |y-p|/R.
+        rise: the number D, for which |f(y) - f(p)| <= D |y-p|/R at all points y of space in the
+            ball.
         """
         alpha, spread = self.alpha, self.spread
         alpha_f_minus_spread = alpha * f - spread
@@ -254,8 +256,8 @@ class EigenfunctionSum(Field):
         )
 
     def _bounds(self) -> WaveBounds:
-        """Proved bounds of the sum and of its derivatives; classes with sharper proved constants
-        override it."""
+        """Proved bounds of the sum and of its derivatives. Subclasses with sharper proved constants
+        override this method."""
         return WaveBounds.of(self.terms)
 
     @property
@@ -405,8 +407,8 @@ class _CubicSurface(EigenfunctionSum):
         super().__init__(terms, domain=Ball(radius=self.cell) if domain is None else domain)
 
     def _bounds(self) -> WaveBounds:
-        """Proved bounds of the sum of waves and of its derivatives, with the constants of the class
-        in place of two of them."""
+        """Proved bounds of the sum of waves and of its derivatives. The bounds of |f| and |grad f|
+        are those that the class states."""
         return replace(
             super()._bounds(),
             largest_value=self._largest_value,

@@ -280,7 +280,7 @@ def _try_bound(second_bound: Callable[[Any, Any], Any], z: Any, radius: Any) -> 
 def _refuse_settings(context: str, **settings: Any) -> None:
     """Raise ValueError if a setting was given, that is, if one is not None.
 
-    context: what the settings do not belong to, for the message.
+    context: the kind of function that does not have these settings, for the message.
     """
     names = [name for name, value in settings.items() if value is not None]
     if names:

@@ -204,8 +204,9 @@ class HarmonicPromises:
         rho, r: the distances of the point from the z axis and from the origin.
         curvature: the bound of the Hessian on the smallest ball about the point.
 
-        Let E bound the rounding error of the gradient, and let H bound the Hessian. The constant in
-        `curvature` is (1 + h) H with h = `_SLOPE_SHARE`. For all lengths t
+        Let E bound the rounding error of the gradient, let H bound the Hessian, and let u be the
+        unit roundoff. The constant in `curvature` is (1 + h) H with h = `_SLOPE_SHARE`. For all
+        lengths t
 
             E t <= E^2/(2 h H) + h H t^2/2   (since 2 a b <= a^2 + b^2),
 
@@ -250,7 +251,8 @@ class HarmonicPromises:
         return fmax(radius, _MIN_DISTANCE * self.boundary_radius)
 
     def _underflow(self, r: Real) -> float:
-        """A bound of the error of any of these sums by underflow, in the precision of r."""
+        """A bound of the error by underflow in any of the sums that this class computes or bounds
+        (f, its derivatives, their bounds), in the precision of r."""
         return self.rounding.underflow * max(1, self.degree) ** 2 * float(dr.smallest(type(r)))
 
 

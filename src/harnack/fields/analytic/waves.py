@@ -332,8 +332,9 @@ def mean_wavelength(amplitudes: npt.ArrayLike, wavenumbers: npt.ArrayLike) -> fl
 
 
 def _plane_waves(term: Term) -> list[tuple[tuple[float, ...], complex]]:
-    """The plane waves whose sum is the term, as pairs (k, A) with term = sum of Re(A exp(i k . p))
-    and complex A. The first nonzero component of each wave vector k is positive (`_canonical`).
+    """The plane waves whose sum is the term, as pairs (k, A) of a wave vector and a complex
+    amplitude: the term is the sum of all Re(A exp(i k . p)). The first nonzero component of each
+    wave vector k is positive (`_canonical`).
 
     A product cos a cos b cos c is the mean of cos(a +- b +- c) over the signs.
     """

@@ -394,8 +394,8 @@ class ExtrusionEnclosure(Enclosure):
         gaps: the differences between f at the start and its next levels.
 
         In the code `end_distance` is w, and names with `side` belong to d. The deficits are upper
-        bounds of f - w and f - d at the start. So w is above the level below by at least
-        gaps.below minus its deficit, and so is d with its own.
+        bounds of f - w and f - d at the start. So w is above the level below by at least gaps.below
+        minus its deficit, and so is d with its own.
         """
         inf = type(gaps.below)(dr.inf)
         end_distance = dr.abs(self.height) - self.half

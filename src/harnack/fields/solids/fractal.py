@@ -465,8 +465,8 @@ class _Octave:
 
         Proof. Let `bend` bound all second derivatives of the octave along lines. Within the
         distance m of q, the gradient differs from the gradient at q by at most bend m (mean value
-        theorem). Derivatives along a line follow by the chain rule. The value is
-        the value at the start plus the integral of the slope.
+        theorem). Derivatives along a line follow by the chain rule. The value is the value at the
+        start plus the integral of the slope.
         """
         error = self.error + self.slope * start_error * (1 + 1e-5)
         value = Interval(self.value - error, self.value + error)

@@ -240,8 +240,8 @@ class Julia(Solid):
             return n + 1, *next_q, *next_jac, *next_change, *next_slopes, *next_min_q, *next_rates
 
         def is_active(n: Any, *state: Any) -> Any:
-            """A mask of the lanes on which iterations are left and the orbit has not escaped.
-            n, state: as in `iterate`."""
+            """A mask of the lanes on which iterations are left and the orbit has not escaped. n,
+            state: as in `iterate`."""
             return (n < self.iterations) & (_squared_norm(state[:4]) <= escape * escape)
 
         index = dr.uint32_array_t(real)

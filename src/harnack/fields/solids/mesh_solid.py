@@ -647,9 +647,9 @@ def _boundary_pieces(
     one way than the opposite way, each of these is a piece of the boundary.
 
     Triangles thinner than `_THIN_HEIGHT` (about 1e-9 of the mesh's size) have no reliable normal,
-    and so the winding numbers on their two sides are not reliable. If the boundary is all faces, it includes these triangles,
-    too. Otherwise their computed winding numbers decide whether they are part of it; a wrong
-    decision moves the surface by no more than their height.
+    and so the winding numbers on their two sides are not reliable. If the boundary is all faces, it
+    includes these triangles, too. Otherwise their computed winding numbers decide whether they are
+    part of it; a wrong decision moves the surface by no more than their height.
 
     Raises:
         MeshError: the mesh is inside out, or faces lie on each other.

@@ -253,12 +253,12 @@ class _OutlineQuery:
     error: a bound of the rounding of distances from boxes.
     unit: the machine epsilon.
 
-    In detail, the state consists of these parts: the distance from the nearest edge so far, and its rounding
-    error; x and y of the vector from the nearest point of that edge to the query point; x and y of
-    the edge's unit normal; whether the nearest point lies inside the edge, so that it is no vertex;
-    whether the ray towards +x has crossed an odd number of edges; and for each knot a lower bound
-    of the distance there. The distance from an edge lies above its tangent at the start of the
-    line, so the bound is the smallest value at the knot of all these tangents.
+    In detail, the state consists of these parts: the distance from the nearest edge so far, and its
+    rounding error; x and y of the vector from the nearest point of that edge to the query point; x
+    and y of the edge's unit normal; whether the nearest point lies inside the edge, so that it is
+    no vertex; whether the ray towards +x has crossed an odd number of edges; and for each knot a
+    lower bound of the distance there. The distance from an edge lies above its tangent at the start
+    of the line, so the bound is the smallest value at the knot of all these tangents.
     """
 
     x: Real
