@@ -1,7 +1,7 @@
 """Reading .glb and .gltf scenes through trimesh, after their headers were checked. A "scene" is a
 tree of nodes; each has a transform, and may draw a mesh. A "buffer" is a block of bytes, an
 "accessor" describes an array in it (type and length), and a "primitive" is a part of a mesh that
-draws triangles, points or lines. `place` is the file, for messages of errors.
+draws triangles, points or lines. `place` is the file, for error messages.
 
 A glTF file is a JSON header and buffers of bytes. The header says which bytes to read, and a
 hostile header can ask for more memory than there is; so it is compared with the sizes of the

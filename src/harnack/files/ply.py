@@ -1,7 +1,7 @@
 """Reading Stanford .ply files, text and binary: vertices, faces and edges. Other elements are
 ignored. A .ply file is a header and rows. An "element" is a kind of row, such as "vertex", with the
 number of its rows; its "properties" are the numbers, or lists of numbers, in each row. `data` are
-the bytes of a file, and a `place` is a location in it, for messages of errors.
+the bytes of a file, and a `place` is a location in it, for error messages.
 
 Each property is read in all rows of an element at once. A "position" says where a number is in the
 file: in bytes for a binary file, in words (entries between blanks) for a text file. The position of

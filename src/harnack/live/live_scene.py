@@ -212,7 +212,7 @@ class LiveScene:
         backend = choose_backend("single")
         points = [*self.points]
         for values in places:
-            # Every error of making or finding the surfaces becomes a SliderValueError and is ignored.
+            # Errors at these values become SliderValueErrors, which are ignored here.
             with suppress(SliderValueError), slider_values_in_errors(values):
                 for body in _objects_at(self.content, values):
                     with suppress(NothingVisibleError):

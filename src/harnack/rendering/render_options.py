@@ -266,8 +266,8 @@ def check_integer(name: str, number: Any) -> int:
 
 
 def check_chunks(chunks: Any, *, is_divided: bool) -> int | None:
-    """Return the number of parts into which a picture is divided; None if the option is not set, so
-    that the cluster or the checkpoint decides.
+    """Return the number of parts into which a picture is divided; None if the option is not set;
+    then the number is chosen to suit the workers.
 
     is_divided: whether it is divided at all, as it is with a client or a checkpoint.
 

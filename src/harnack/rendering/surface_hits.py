@@ -259,8 +259,8 @@ def _hit_on_facet(
 def _uncertainty(
     prepared: SurfaceTracer, gradient: Vec3, t: Real, f: Real, error: Real = 0.0
 ) -> Real:
-    """Return a bound, to first order, of the distance from the level set of a point that the march
-    accepts as a hit.
+    """Return a distance: to first order, a point that the march accepts as a hit lies within this
+    distance of the level set.
 
     gradient, t, f, error: at the point, the gradient (3,) of f, the ray parameter, the value of f,
         and the bound of the rounding error of the value.
