@@ -171,8 +171,8 @@ class Executor:
                     self.checkpoint.save(name, arrays)
 
     def _max_pending(self) -> int:
-        """Return the largest number of tasks that may have been started without their results
-        having been yielded: three for each thread of the workers, or one in this process."""
+        """Return the largest number of tasks that may be started ahead, that is before their
+        results are yielded: three for each thread of the workers, or one in this process."""
         return 1 if self.client is None else _PENDING_PER_THREAD * self._threads()
 
     def _threads(self) -> int:
@@ -343,8 +343,8 @@ def _ordered_results(
     arguments: the arguments of each task.
     folder: the folder in which results are looked up and stored; None for no folder.
     runner: runs the tasks.
-    max_pending: returns the largest number of tasks that may have been started without their
-        results having been yielded.
+    max_pending: returns the largest number of tasks that may be started ahead, that is before their
+        results are yielded.
     """
     results: dict[str, TaskResult] = {}
     pending: set[str] = set()

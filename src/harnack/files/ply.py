@@ -164,8 +164,8 @@ Values: TypeAlias = BinaryValues | TextValues
 
 
 def _any_number(word: bytes, place: FileLocation) -> float:
-    """Return the number that a word stands for, also NaN or infinite. Raises a FileFormatError that
-    names its `place` if it stands for none."""
+    """Return the number that a word (an entry between blanks) stands for, also NaN or infinite.
+    Raises a FileFormatError that names its `place` if it stands for none."""
     try:
         return float(word)
     except ValueError as error:

@@ -237,7 +237,8 @@ class Session:
         return values
 
     def _loops(self, curves: Any) -> list[FloatArray] | None:
-        """Return the vertices (n, 3) of each edited loop; None if `curves` is None, for no edits.
+        """Return the vertices (n, 3) of each edited loop; None if there are no edits. curves: a
+        list of points for each loop, or None.
 
         Raises:
             RequestError: malformed or too many points.

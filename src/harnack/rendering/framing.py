@@ -151,8 +151,8 @@ def visible_points(surface: TracedSurface, backend: Backend) -> FloatArray:
 
     If preparing the field for tracing makes a new object, the points are cached for this object and
     for the options of the surface. So no ray is traced for the framing if only the camera has
-    moved. A field that is its own preparation may have been changed in place, so its points are
-    found anew.
+    moved. If the field is traced as it is, without preparation, it may have been changed in place
+    since the last call, so the points are found anew.
 
     Raises:
         UnboundedSurfaceError: no box around the surface is known.
