@@ -98,8 +98,8 @@ class Material:
 
         solid: whether the surface is the boundary of a solid; otherwise it is open.
         traced_light: whether light paths are to be traced at it. Otherwise only its diffuse
-            reflectance and whether it is glossy are needed, and the dictionary may describe a
-            similar BSDF that Mitsuba loads faster.
+            reflectance and whether it is glossy or transparent are needed, and the dictionary may
+            describe a similar BSDF that Mitsuba loads faster.
 
         Raises:
             ValueError: the material is transparent, and the surface is open.
