@@ -437,8 +437,8 @@ class ClosestPointDescent:
             trial = trial.flat_after(is_flat, current)
             is_better = active & (is_first | (dr.abs(new_residual) < dr.abs(residual)))
             # The fraction of Newton's step that the next iteration tries.
-            new_factor = dr.select(is_better, fmin(2 * factor, 1), 0.25 * factor)
-            factor = dr.select(is_first, factor, new_factor)
+            step_factor = dr.select(is_better, fmin(2 * factor, 1), 0.25 * factor)
+            factor = dr.select(is_first, factor, step_factor)
             on_level |= is_better & self._is_on_level(new_residual, trial)
             active &= ~on_level & (iteration <= _MAX_LEVEL_STEPS) & (factor > _MIN_STEP_FRACTION)
             residual = dr.select(is_better, new_residual, residual)

@@ -259,9 +259,9 @@ def _with_singular_points(
     surface: TracedSurface, points: FloatArray, closest: FloatArray
 ) -> FloatArray:
     """Return the closest points of queries, each replaced by the nearest singular point of the
-    field if that is nearer to the query. Beside a singular point, at which f has no limit, the
-    surface is a tiny loop, which descents miss. Singular points outside the clip volume do not
-    count.
+    field if that is nearer to the query. Singular points are those to which all level sets come
+    arbitrarily near; there the surface is a tiny loop, which descents miss. Singular points outside
+    the clip volume do not count.
 
     points, closest: (n, 3) the queries, and their closest points so far, NaN for none.
     """
@@ -726,8 +726,8 @@ class _QueryEvaluator:
         approximate = self._descent
 
         def truncation(y: Vec3) -> tuple[Vec3, Vec3]:
-            """Return the truncation errors at y, approximate minus exact function or the reverse:
-            of the value (as a vector of equal components), and of the gradient."""
+            """Return the exact function minus the approximate one at y: the difference of the
+            values (as a vector of equal components), and that of the gradients."""
             full, sample = exact.field.evaluate(y), approximate.field.evaluate(y)
             vector = self.backend.Array3f
             return vector(full.value - sample.value), vector(full.gradient) - vector(
