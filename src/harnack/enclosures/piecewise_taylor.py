@@ -31,16 +31,16 @@ class PiecewiseTaylorEnclosure(Enclosure):
     slopes: the range of F' at s = 0.
     pieces: the pieces, in their order along the path.
 
-    Proof of the step. At the start of a piece let F <= A and F' <= D, and on the piece let F' <= k
-    and F'' <= c. Then F <= A + min(k s, D s + c s^2/2) on the piece, s measured from its start. The
-    next piece starts with the value of this bound at the end of the piece, and with a slope of at
-    most min(D + c w, k), where w is the length of the piece. The first s at which the bound reaches
-    the gap is the root of a line or of a parabola. For the level below the same holds of -F. With
-    exact ranges the bound converges to F with the third power of the length of the pieces, so that
-    one sample may prove much of a ray.
+    Proof of the step. Take a level above. At the start of a piece let F <= A and F' <= D, and on
+    the piece let F' <= k and F'' <= c. Then F <= A + min(k s, D s + c s^2/2) on the piece, s
+    measured from its start. The next piece starts with the value of this bound at the end of the
+    piece, and with a slope of at most min(D + c w, k), where w is the length of the piece. The
+    first s at which the bound reaches the gap is the root of a line or of a parabola. For the level
+    below the same holds of -F. With exact ranges the bound converges to F with the third power of
+    the length of the pieces, so that one sample may prove much of a ray.
 
-    Source: new in harnack. One piece is the linear and the quadratic Taylor form together
-        (Aydinlilar and Zanni 2023, section 6.1).
+    Source: new in harnack. With one piece it is the tighter of the linear and the quadratic Taylor
+        form (Aydinlilar and Zanni 2023, section 6.1).
     """
 
     slopes: SlopeRange
@@ -55,6 +55,7 @@ class PiecewiseTaylorEnclosure(Enclosure):
 
         function: f along the path.
         slopes: the range of its derivative at the start.
+        length: the length of the path on which the enclosure is wanted.
 
         The first two pieces are equally long; each of the others is twice as long as the one before
         it.
@@ -113,8 +114,9 @@ class PiecewiseTaylorEnclosure(Enclosure):
         """
 
         def one_sided(upper: Real, lower: Real) -> Real:
-            """Return the largest value for F (`upper`) or, if the level is below, the largest value
-            for -F (-`lower`)."""
+            """Return the upper bound of a quantity of F (a slope or a second derivative) that lies
+            between `lower` and `upper`; if the level is below, the upper bound -lower of the same
+            quantity of -F."""
             return dr.select(rises, upper, -lower)
 
         slope = one_sided(self.slopes.upper, self.slopes.lower)
@@ -188,8 +190,8 @@ class QuadraticTaylorEnclosure(SinglePieceEnclosure):
     def _advance_piece(
         cls, gap: Real, slope: Real, max_slope: Real, curvature: Real, length: Real
     ) -> tuple[Real, Real, Real]:
-        """Advance the parabola over the piece, as the base class does it for the parabola and a
-        line; the largest slope on the piece is not used."""
+        """Advance the bound of F over one piece, by the parabola alone: as the base class does with
+        an infinite `max_slope`. Parameters and results are those of the base class."""
         del max_slope
         return super()._advance_piece(gap, slope, type(gap)(dr.inf), curvature, length)
 
@@ -206,8 +208,8 @@ class LinearTaylorEnclosure(SinglePieceEnclosure):
     def _advance_piece(
         cls, gap: Real, slope: Real, max_slope: Real, curvature: Real, length: Real
     ) -> tuple[Real, Real, Real]:
-        """Advance the line over the piece, as the base class does it for a parabola and the line;
-        the slope at the start and the second derivative are not used."""
+        """Advance the bound of F over one piece, by the line of slope `max_slope` alone: `slope`
+        and `curvature` are not used. Parameters and results are those of the base class."""
         del slope, curvature
         return super()._advance_piece(gap, max_slope, max_slope, type(gap)(0), length)
 
@@ -225,7 +227,9 @@ class SegmentTracingEnclosure(SinglePieceEnclosure):
     ) -> Self | None:
         """Return the enclosure from the largest |F'| on the whole length. The result is never None.
 
-        function: f along the path. slopes: the range of its derivative at the start; not used.
+        function: f along the path.
+        slopes: the range of its derivative at the start; not used.
+        length: the length of the path on which the enclosure is wanted.
         """
         (piece,) = function.derivative_ranges([0.0, length])
         max_slope = fmax(piece.slope_range.upper, -piece.slope_range.lower)
