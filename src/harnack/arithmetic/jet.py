@@ -486,9 +486,9 @@ def range_times_length(slope: Interval, width: Real) -> Interval:
 
     width: a length >= 0, a number of the backend.
 
-    Overflow: if the product for the lower end of `slope` is +infinity, or that for the upper end
-        -infinity, rounding outwards makes it NaN. The end of the result is then 0, as it should be,
-        since s t = 0 at s = 0: fmin and fmax with 0 return 0 rather than NaN.
+    If the product for the lower end of `slope` overflows to +infinity, or that for the upper end to
+    -infinity, rounding outwards makes it NaN. The end of the result is then 0, as it should be,
+    since s t = 0 at s = 0: fmin and fmax with 0 return 0 rather than NaN.
     """
     if slope.is_zero:
         return ZERO
