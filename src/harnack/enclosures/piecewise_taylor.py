@@ -190,8 +190,9 @@ class QuadraticTaylorEnclosure(SinglePieceEnclosure):
     def _advance_piece(
         cls, gap: Real, slope: Real, max_slope: Real, curvature: Real, length: Real
     ) -> tuple[Real, Real, Real]:
-        """Advance the bound of F over one piece, by the parabola alone: as the base class does with
-        an infinite `max_slope`. Parameters and results are those of the base class."""
+        """Advance the bound of F over one piece of the path, by the parabola alone. `max_slope` is
+        not used; it counts as infinite. The other parameters (gap, slope, curvature, length) and
+        the three results are those of the base class."""
         del max_slope
         return super()._advance_piece(gap, slope, type(gap)(dr.inf), curvature, length)
 
@@ -208,8 +209,9 @@ class LinearTaylorEnclosure(SinglePieceEnclosure):
     def _advance_piece(
         cls, gap: Real, slope: Real, max_slope: Real, curvature: Real, length: Real
     ) -> tuple[Real, Real, Real]:
-        """Advance the bound of F over one piece, by the line of slope `max_slope` alone: `slope`
-        and `curvature` are not used. Parameters and results are those of the base class."""
+        """Advance the bound of F over one piece of the path, by the line of slope `max_slope`
+        alone: `slope` and `curvature` are not used. The other parameters (gap, length) and the
+        three results are those of the base class."""
         del slope, curvature
         return super()._advance_piece(gap, max_slope, max_slope, type(gap)(0), length)
 

@@ -104,8 +104,8 @@ class PlainLevels:
         return fmax(scale, 1) if field.has_unknown_branch else scale
 
     def read(self, ray_sample: RaySample, before: Real, step: Real, size: Real) -> LevelReading:
-        """Compare samples with the levels. Parameters are those of `LevelRule.read`; `before` and
-        `step` are not used."""
+        """Compare the samples `ray_sample` with the levels. size: a bound of the absolute values of
+        coordinates on the rays. `before` and `step` are not used."""
         del before, step
         return read_plainly(self.levels, ray_sample, size)
 

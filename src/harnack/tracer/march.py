@@ -354,8 +354,10 @@ class March:
     ) -> MarchState:
         """Sample one more trial point of each ray, and return the state after it.
 
-        now: the state before. The other parameters and the proof are those of `advance`, whose loop
-            calls this function.
+        now: the state before.
+
+        The loop of `advance` calls this function; field, path, end, ahead and the proof are
+        described there.
 
         If the point is accepted, the ray moves there. Otherwise it stays, and tries a shorter step
         (`fallback`) or, if the sample was too coarse, the same step with a more accurate sample.
@@ -442,10 +444,12 @@ class March:
     ) -> _Arrival:
         """Find out whether accepted trial points are hits, facets or crossings of a level, and from
         which values the ray goes on behind them.
+
         path, now: the rays, and their state before the trial points.
         accepted: mask of the accepted points.
         ahead: for a function with jumps, the crossing of the facet at the end of the interval; else
-            None."""
+            None.
+        """
         is_hit, gaps, jump = accepted & trial.is_near, trial.gaps, None
         if ahead is not None:
             jump = test_jump(
