@@ -123,8 +123,7 @@ class PlaneTable:
             return (k + _PLANES_PER_ITERATION, *folded)
 
         def may_continue(*values: Any) -> Mask:
-            """The mask of lanes in which further planes may change the state. values: the index of
-            the next row, and the state."""
+            """The mask of lanes in which further planes may change the state. values: the state."""
             return self.backend.Bool(True) if may_change is None else may_change(*values)
 
         while_loop: Any = dr.while_loop  # its overloads do not know run-time array types

@@ -307,6 +307,7 @@ def _mesh_patches(
     seed: the seed of the random moves of points.
     is_last: whether this is the last attempt; then a filling that cannot be refined to the
         tolerance is accepted.
+    report: called with messages about the progress.
 
     Raises:
         MeshingError: no filling ends at the edges, or a check of the mesh fails. It is a
@@ -385,6 +386,7 @@ def _refine_patches(
     function: f, whose level set {f = 0} is meshed.
     x, faces: (n, 3), (m, 3) the filling before refinement.
     tolerance: a length.
+    report: called with messages about the progress.
 
     Raises:
         LocalizedMeshingError: all results pass through themselves, as small triangles do that turn

@@ -166,7 +166,10 @@ def isotopy_of(
 def _has_bounds(function: LevelFunction, corners: FloatArray) -> bool:
     """Whether the field gives a finite bound of the change of its gradient, so that something can
     be proved: tried on about a hundred of the tetrahedra with corners (n, 4, 3), of which one must
-    have a bound."""
+    have a bound.
+
+    function: f - level for a field f; it is 0 on the level set.
+    """
     tried = corners[:: max(1, len(corners) // _MAX_TRIED)]
     center, radius = _balls(tried)
     return not len(tried) or bool((function.gradient_bounds(center, radius)[1] < _NO_BOUND).any())

@@ -579,8 +579,11 @@ def split_faces_off_level(
     """Cut into three each face whose center is farther than `farthest` (a length) from the level
     set, as happens where the face cuts across a crease. Returns the new mesh.
 
+    function: f - level for a field f; it is 0 on the level set.
+
     The new vertex is the face's center, moved onto the level set. The new faces are examined in the
-    same way, in `times` rounds at most. All edges stay."""
+    same way, in `times` rounds at most. All edges stay.
+    """
     vertices, faces = surface.vertices, surface.faces
     pending = np.arange(len(faces))
     for _ in range(times):

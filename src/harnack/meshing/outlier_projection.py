@@ -98,6 +98,7 @@ def _project_and_split(
     half of `tolerance` (a length), or at its center if there are none. The new vertices are moved
     onto the level set.
 
+    function: f - level for a field f; it is 0 on the level set.
     is_new: (m,) the mask of the faces that earlier calls made.
 
     Returns:
