@@ -340,10 +340,10 @@ def _halves(vertices: FloatArray, ring: list[IntArray]) -> tuple[IntArray, IntAr
 
 
 def _sides(points: TetrahedronPoints, tets: Tetrahedra, crossings: EdgeCrossings) -> IntArray:
-    """(m, 4) for each corner of each of m tetrahedra, on which side of the level it lies: the
-    number of level crossings (upward minus downward) on the edge to this corner from the first
-    corner of the tetrahedron that is not on the level. It is 0 for that corner and for corners on
-    the level.
+    """(m, 4) for each corner of each of m tetrahedra, an integer that tells on which side of the
+    level it lies. It is counted from the first corner of the tetrahedron that is not on the level:
+    the number of level crossings (upward minus downward) on the edge from there to this corner. It
+    is 0 for that first corner and for corners on the level.
 
     Raises:
         LocalizedMeshingError: the crossings of three edges of a face do not add up.

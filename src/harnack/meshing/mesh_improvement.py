@@ -126,7 +126,9 @@ def _independent_flips(
     gain: (n,) how much the smallest angle grows by the flip of each pair (as a difference of
         cosines).
     pairs: (n, 2) the two faces of each pair.
-    key: (n,) a number that identifies the new edge of each pair."""
+    key: (n,) a number that identifies the new edge of each pair.
+    face_count: the number of faces of the mesh.
+    """
     rows = rows[np.argsort(-gain[rows], kind="stable")]
     rank = np.arange(len(rows))
     # For each face the rank of the best candidate that changes it; rank 0 gains most.
@@ -142,10 +144,10 @@ def _independent_flips(
 def _flips_stay_near(
     function: LevelFunction, vertices: FloatArray, new: IntArray, tolerance: float
 ) -> BoolArray:
-    """(k,) for each of k flips, whether the mesh stays near the level set. That is so if the middle
-    of the new edge and the centers of both new triangles are within `tolerance` (a length) of the
-    level set, estimated by the gradient there, and if the normals of both triangles are within 60
-    degrees of the gradient.
+    """(k,) for each of k flips, whether the mesh stays near the level set. Two conditions must
+    hold. The middle of the new edge and the centers of both new triangles are within `tolerance` (a
+    length) of the level set, estimated by the gradient there. And the normals of both triangles are
+    within 60 degrees of the gradient.
 
     function: f - level for a field f; it is 0 on the level set.
     new: (k, 2, 3) the corners of the two new triangles of each flip.
@@ -399,13 +401,14 @@ def _best_places(
 def _least_at(
     positions: FloatArray, stars: _VertexStars, a: FloatArray, b: FloatArray, normal: FloatArray
 ) -> FloatArray:
-    """(k,) for each of k vertices, the smallest angle (in radians) of the triangles around it if it
-    is moved to its position in `positions` (k, 3); -1 if that turns one of these triangles by more
-    than 60 degrees.
+    """(k,) for each of k vertices that is moved to its position in `positions` (k, 3), the smallest
+    angle (in radians) of the triangles around it after the move; -1 if the move turns one of these
+    triangles by more than 60 degrees.
 
     stars: the faces around the vertices, as p pairs of a vertex and a face.
     a, b: (p, 3) the other two corners of the face of each pair.
-    normal: (p, 3) the unit normal of the face of each pair, before the move."""
+    normal: (p, 3) the unit normal of the face of each pair, before the move.
+    """
     center = positions[stars.owner]
     cross = np.cross(a - center, b - center)
     size = row_norms(cross)
@@ -423,7 +426,10 @@ def _independent_moves(
     Returns the chosen ones of `rows`.
 
     rows: (j,) the candidates, as positions in `stars.centers`.
-    gain: (k,) for all k stars, how much the smallest angle grows by the move, in radians."""
+    gain: (k,) for all k stars, how much the smallest angle grows by the move, in radians.
+    stars, faces: the faces around the k vertices, and all faces (m, 3) of the mesh.
+    vertex_count: the number of vertices of the mesh.
+    """
     rank = np.full(vertex_count, len(rows))
     ordered = rows[np.argsort(-gain[rows], kind="stable")]
     rank[stars.centers[ordered]] = np.arange(len(rows))
@@ -441,8 +447,8 @@ def _moves_stay_near(
     rows: IntArray,
     tolerance: float,
 ) -> BoolArray:
-    """(j,) for each of j vertices, whether it may move to its target without the mesh leaving the
-    level set. Three conditions must hold: the target is on the level set; the centers of the
+    """(j,) for each of j vertices, whether the mesh stays near the level set if the vertex moves to
+    its target. Three conditions must hold: the target is on the level set; the centers of the
     triangles around it are within `tolerance` (a length) of the level set; and the normals of these
     triangles are within 60 degrees of the gradient.
 

@@ -266,7 +266,8 @@ def _checked_settings(
     report: Callable[[str], None],
 ) -> _RepairOptions:
     """Check the arguments of `repair`, and collect them in one object. patches: the argument
-    `filling`. spacing: the argument `cell_size`. The others have the same names.
+    `filling`. spacing: the argument `cell_size`. report: the argument `progress`. The others (keep,
+    tolerance, seed) have the same names.
 
     seed: the seed of the random choice.
     report: called with messages about the progress.
@@ -450,6 +451,8 @@ def _remesh(
 
     If cells of a 48th of the mesh's size (and larger ones) fail, cells 0.6 times as large are
     tried.
+
+    intended: the damaged mesh, whose winding number it is.
     """
     intended.check_encloses()
     mesh_arrays = without_zero_area_faces(intended.vertices, intended.oriented)
@@ -509,8 +512,8 @@ def _mesh_half_level(
 def _keep_valid(
     intended: IntendedSolid, settings: _RepairOptions
 ) -> tuple[TriangleMesh, dict[str, Any]]:
-    """Stage "cleaned" of the repair: keep the valid triangles, remove the others, and fill all
-    holes.
+    """Stage "cleaned" of the repair: keep the valid triangles of the damaged mesh `intended`,
+    remove the others, and fill all holes.
 
     settings: the options of the repair.
 
@@ -558,9 +561,9 @@ def _count_turned(intended: IntendedSolid, cleaned: CleanedMesh) -> int:
 def _weld_loose(
     intended: IntendedSolid, settings: _RepairOptions
 ) -> tuple[TriangleMesh, dict[str, Any]]:
-    """Stage "welded" of the repair, for loose triangles, which share no vertices: merge corners
-    that are near to each other, clean the mesh and fill its holes. Vertices move, so no triangle
-    counts as kept.
+    """Stage "welded" of the repair, for loose triangles, which share no vertices: merge corners of
+    the damaged mesh `intended` that are near to each other, clean the mesh and fill its holes.
+    Vertices move, so no triangle counts as kept.
 
     settings: the options of the repair.
 
@@ -593,7 +596,8 @@ def _weld_loose(
 def _fill_only(
     intended: IntendedSolid, settings: _RepairOptions
 ) -> tuple[TriangleMesh, dict[str, Any]]:
-    """Stage "filled" of the repair: keep all triangles of the mesh, and fill its holes.
+    """Stage "filled" of the repair: keep all triangles of the damaged mesh `intended`, and fill its
+    holes.
 
     settings: the options of the repair.
 

@@ -413,8 +413,8 @@ def _march(
 def _collapse_slivers(
     raw: _RawIsosurface, tolerance: float
 ) -> tuple[FloatArray, IntArray, FloatArray, bool]:
-    """Simplify a mesh: contract short edges, and remove vertices whose faces lie in a plane. The
-    surface moves by at most `tolerance` (a length).
+    """Simplify the mesh `raw`: contract short edges, and remove vertices whose faces lie in a
+    plane. The surface moves by at most `tolerance` (a length).
 
     The mesh stays unchanged if it is open, or if triangles of the simplified mesh would intersect.
 

@@ -136,7 +136,8 @@ def _medial_diameters(solid: MeshSolid, start: FloatArray, normal: FloatArray) -
     surface. Then the point of the surface nearest to the ball's center is computed. If it is inside
     of the ball and its normal differs from the start's by more than 120 degrees, the ball is
     replaced by the smaller one that touches both. This is repeated for each ball until its nearest
-    point is no longer like that, and at most 30 times."""
+    point does not meet both conditions, and at most 30 times.
+    """
     size = solid.surface.size
     start_depth = _START_DEPTH * size
     # The tolerance is relative to the mesh: with a fixed one, rays into a small mesh would end
