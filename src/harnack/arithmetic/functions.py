@@ -543,17 +543,17 @@ class ClippedPower(ElementaryFunction):
     """The function x -> max(x, 0)^n for an integer n >= 1, which is a common kernel (shape) of
     blobs.
 
-    It is convex and n - 1 times continuously differentiable. If a formula has maximum(x, 0)**n
-    instead, no bound of the second derivative is known, since the maximum has none at 0. An
-    arithmetic may use that the function is 0 for x <= 0.
+    It is convex and n - 1 times continuously differentiable. Written as maximum(x, 0)**n, no bound
+    of its second derivative would be known, since the maximum has none at 0. An arithmetic may use
+    that the function is 0 for x <= 0.
     """
 
     exponent: int = 1
 
 
 def clipped_power(n: int) -> ClippedPower:
-    """The function x -> max(x, 0)^n for an integer n >= 1. Unlike maximum(x, 0)**n in a formula, it
-    is a single function, whose second derivative is known to be bounded if n >= 2.
+    """The function x -> max(x, 0)^n for an integer n >= 1. As a single function it has, for n >= 2,
+    a bounded second derivative, unlike the power of a maximum.
 
     Raises:
         ValueError: n is less than 1 or no integer.

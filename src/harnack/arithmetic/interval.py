@@ -120,7 +120,7 @@ class Interval:
         )
 
     def shifted(self, x: Real) -> Interval:
-        """The interval of all y + x for y in this interval, where x is an exact number."""
+        """The interval of all y + x for y in this interval, with the exact number x."""
         return self + Interval(x, x)
 
     def __neg__(self) -> Interval:

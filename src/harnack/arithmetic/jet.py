@@ -96,8 +96,8 @@ class Jet(FormulaNumber):
 
         direction: d.
         anchored: whether ranges are narrowed from their values at the start of the piece.
-        is_rounded: whether p stands for all points that round to p. Ranges then hold for the paths
-            along d through all these points.
+        is_rounded: whether the path passes p only up to the rounding of p's coordinates. Ranges
+            then hold for all such paths, each along d.
         """
 
         def coordinate(x: Real, slope: Real) -> Jet:

@@ -190,9 +190,8 @@ class QuadraticTaylorEnclosure(SinglePieceEnclosure):
     def _advance_piece(
         cls, gap: Real, slope: Real, max_slope: Real, curvature: Real, length: Real
     ) -> tuple[Real, Real, Real]:
-        """Advance the bound of F over one piece of the path, by the parabola alone. `max_slope` is
-        not used; it counts as infinite. The other parameters (gap, slope, curvature, length) and
-        the three results are those of the base class."""
+        """Advance the parabola over the piece, as the base class does it for the parabola and a
+        line; the largest slope on the piece is not used."""
         del max_slope
         return super()._advance_piece(gap, slope, type(gap)(dr.inf), curvature, length)
 
@@ -209,9 +208,8 @@ class LinearTaylorEnclosure(SinglePieceEnclosure):
     def _advance_piece(
         cls, gap: Real, slope: Real, max_slope: Real, curvature: Real, length: Real
     ) -> tuple[Real, Real, Real]:
-        """Advance the bound of F over one piece of the path, by the line of slope `max_slope`
-        alone: `slope` and `curvature` are not used. The other parameters (gap, length) and the
-        three results are those of the base class."""
+        """Advance the line over the piece, as the base class does it for a parabola and the line;
+        the slope at the start and the second derivative are not used."""
         del slope, curvature
         return super()._advance_piece(gap, max_slope, max_slope, type(gap)(0), length)
 
@@ -229,9 +227,7 @@ class SegmentTracingEnclosure(SinglePieceEnclosure):
     ) -> Self | None:
         """Return the enclosure from the largest |F'| on the whole length. The result is never None.
 
-        function: f along the path.
-        slopes: the range of its derivative at the start; not used.
-        length: the length of the path on which the enclosure is wanted.
+        function: f along the path. slopes: the range of its derivative at the start; not used.
         """
         (piece,) = function.derivative_ranges([0.0, length])
         max_slope = fmax(piece.slope_range.upper, -piece.slope_range.lower)

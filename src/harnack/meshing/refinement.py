@@ -390,8 +390,7 @@ def _normals_turn(function: LevelFunction, corner: FloatArray) -> BoolArray:
     at two corners differ by more than 20 degrees.
 
     function: f - level for a field f; it is 0 on the level set.
-    corner: (k, 3, 3) the corners of the faces.
-    """
+    corner: (k, 3, 3) the corners of the faces."""
     gradient = function.sample(corner.reshape(-1, 3)).gradient
     normal = (gradient / np.maximum(row_norms(gradient), 1e-300)[:, None]).reshape(-1, 3, 3)
     cosines = [row_dots(normal[:, k], normal[:, k - 1]) for k in range(3)]
