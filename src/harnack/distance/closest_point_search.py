@@ -576,8 +576,9 @@ class _QueryEvaluator:
         """
 
         def arc_to_level(p: Vec3, b: Vec3, lengths: Vec3) -> tuple[Real]:
-            """Return the first-order distance |f - level|/|grad f| at the point that lies at the
-            distance lengths.x from b in the direction of p, as a tuple of one."""
+            """Return the first-order signed distance (level - f)/|grad f| of the level from the
+            point that lies at the distance lengths.x from b in the direction of p, as a tuple of
+            one."""
             to_query = p - b
             sample = self._field.evaluate(b + lengths.x / safe_norm(to_query) * to_query)
             return (

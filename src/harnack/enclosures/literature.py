@@ -217,8 +217,7 @@ class IntervalEnclosure(BandEnclosure):
 
 
 def _parabolas(function: EvaluableRestriction, length: Real, degree: int) -> ParabolaBounds:
-    """Return bounds of the function along the path, by lines (degree 1) or parabolas (degree 2).
-    length: that of the path."""
+    """Return bounds of the function along the path, by lines (degree 1) or parabolas (degree 2)."""
     return function.evaluate_with(
         lambda p, d: ParabolaBounds.along_ray(p, d, length, degree=degree)
     )

@@ -103,8 +103,9 @@ def seen_distance(backend: Backend, field: Field, levels: Levels, hits: Doubtful
     smallest = 4 * backend.machine_epsilon * hits.size
 
     def offset_of(sample: Any) -> tuple[Real, Real, Mask]:
-        """Return three results for a sample of f: f minus the nearest level; a bound of the error
-        of f; and the mask of lanes on which it is certain on which side of the level f is."""
+        """Return three results for a sample of f: f minus the level that is nearest to f at the
+        hit; a bound of the error of f; and the mask of lanes on which it is certain on which side
+        of the level f is."""
         offset, error = (
             sample.value - level,
             value_error_bound(sample, safe_norm(sample.gradient), hits.size),

@@ -542,7 +542,9 @@ class SurfaceTracer:
 
         def tracer(path: Ray, start: Real, end: Real) -> RayTracer:
             """Return the tracer for this kind of field: smooth, with jumps, or a union of patches.
-            path, start, end: the rays, and the ray parameters between which they are traced."""
+
+            path, start, end: the rays, and the ray parameters between which they are traced.
+            """
             to_end = replace(march, ray_end=end)
             if self.field.has_jumps:
                 return JumpTracer(to_end, self.field, path, start, end)
