@@ -334,9 +334,9 @@ def curvature_lines(
     options: TraceOptions | None = None,
     **keywords: Unpack[TraceKeywords],
 ) -> list[FloatArray]:
-    """Trace the lines of curvature of a level set through seeds (n, 3): n polylines (k, 3), k >= 1.
-
-    They are curves on the level set along which it bends most, or least.
+    """Trace the lines of curvature of a level set through seeds (n, 3). Returns n polylines (k, 3),
+    each with a number k of its own. Lines of curvature are curves on the level set along which it
+    bends most, or least.
 
     A line that comes back to its seed ends there, and its first point is its last.
 

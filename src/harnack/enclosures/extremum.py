@@ -280,9 +280,9 @@ class BranchPointEnclosure(Enclosure):
     Proof. Let y = |h - c| at the start, and v the largest rate at which it decreases along the
     path. On a disk of radius r <= R about the line, and for a length L of the path, all |h - u_j|
     are at least y - v L - C r^alpha. Let w = y - (|f| - gap). For any 0 < q < 1, the choice r = (q
-    w/C)^(1/alpha) and L = (1 - q) w/v makes this |f| - gap. The sign of f changes only where one of
-    the h - u_j is 0. So |f| does not fall by the gap on the length L, as long as the path does not
-    leave the disk.
+    w/C)^(1/alpha) and L = (1 - q) w/v makes this bound |f| - gap. The sign of f changes only where
+    one of the h - u_j is 0. So |f| does not fall by the gap on the length L, as long as the path
+    does not leave the disk.
 
     distance_to_limit: y.
     max_fall_rate: v.

@@ -137,7 +137,7 @@ class Promise(abc.ABC):
         return dataclasses.replace(self, **numbers)
 
     def negated(self) -> Self:
-        """Return the promise of -f: the ends of each range are negated and exchanged."""
+        """Return the promise of -f: a range from a to b becomes the range from -b to -a."""
         numbers = {
             name: -getattr(self, opposite)
             for lower, upper in self.interval_pairs
@@ -237,9 +237,10 @@ class HarmonicBall(Promise):
         degree: the degree of T, 1 or 2.
 
         Proof for a harmonic f >= c on a ball of radius R in n dimensions. f - c is the integral of
-        Poisson's kernel P(q, s), q = length/R, with a measure of mass f(p) - c. P is the sum over l
-        of the zonal harmonics of degree l, which are all largest at s = 1. Those of degree 0 and 1
-        give the value and the gradient. The sum of all others is at most P - 1 - n q at s = 1, in
+        Poisson's kernel P(q, s) with a measure of mass f(p) - c. Here q = length/R, and s is the
+        cosine of the angle between y - p and a point of the sphere. P is the sum over l of the
+        zonal harmonics of degree l, which are all largest at s = 1. Those of degree 0 and 1 give
+        the value and the gradient. The sum of all others is at most P - 1 - n q at s = 1, in
         absolute value, where P = (1 + q)/(1 - q)^(n - 1). So the error is at most this number times
         f(p) - c. The same holds for C - f with f <= C, and the smaller of the two bounds is
         returned. For degree 2, the harmonic of degree 2 is left out, too: at s = 1 it is 2, 5 and 9

@@ -270,8 +270,8 @@ class Polytope(Volume):
         backend = backend_of(p)
 
         def step(state: tuple[Real, Vec3], n: Vec3, h: Real) -> tuple[Real, Vec3]:
-            """The larger of two signed distances from planes, with the normal of its plane: of
-            `state`, the largest distance so far with its normal, and of the distance from the plane
+            """The larger of two signed distances, and the normal of the plane to which it belongs.
+            One distance is that of `state`, the largest so far; the other is that from the plane
             n.x = h."""
             distance = dr.dot(n, p) - h
             is_larger = distance > state[0]

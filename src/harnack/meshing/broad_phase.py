@@ -266,8 +266,8 @@ def _are_apart(a: Corners, b: Corners, shared: list[list[Mask]]) -> Mask:
         return ((count < 1.5) & ~may_pierce) | _are_beside_edge(*reordered, count)
 
     def never(*arguments: Any) -> Mask:
-        """False in all lanes. It stands for the other conditions where the first one holds
-        already."""
+        """False in all lanes. It takes the place of the conditions on edges and on a line
+        (`_are_apart`) where the condition on a plane holds already."""
         return arguments[12] < 0
 
     arguments = (*a, *b, *is_shared_a, *is_shared_b, shared_count)

@@ -273,8 +273,8 @@ class CsgMesher:
 
         If there are many cells, cells in which the solids `intersected_with` are proved to leave
         nothing are left out. If there are few cells, all are meshed, so that copies of a surface
-        are the same bit by bit. If that fails, cells are left out as well: in these cells a
-        function may jump, as the angle about an axis does, or have no finite value.
+        are the same bit by bit. If meshing all cells fails, cells are left out as well: in these
+        cells a function may jump, as the angle about an axis does, or have no finite value.
 
         Raises:
             MeshingError: the level set cannot be meshed.

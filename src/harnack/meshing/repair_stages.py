@@ -269,9 +269,6 @@ def _checked_settings(
     `filling`. spacing: the argument `cell_size`. report: the argument `progress`. The others (keep,
     tolerance, seed) have the same names.
 
-    seed: the seed of the random choice.
-    report: called with messages about the progress.
-
     Raises:
         ValueError: one of them is not among the allowed values.
     """

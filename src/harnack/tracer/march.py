@@ -582,8 +582,8 @@ class March:
 
         f must take the level within the hit tolerance, or within twice the rounding of the point if
         that is larger. This is proved by the enclosures of f along the ray, or by a sample at the
-        level or on its other side (`steep.beyond`). A point at which |f - level| is within the
-        tolerance `value` always counts.
+        level or on its other side (`steep.beyond`). A point at which |f - level| is at most
+        `HitTolerance.value` always counts.
         """
         sample, p = ray_sample.sample, path.point(t)
         tolerance = dr.fma(t, self.tolerance.per_length, self.tolerance.distance)
