@@ -110,9 +110,9 @@ class PolygonFaces:
     @functools.cached_property
     def in_convex_position(self) -> BoolArray:
         """(m,) whether each face is a single loop without self-intersections that is proved to lie
-        on the boundary of a convex set; False where there is no proof. Faces for which a convex
-        projection does not prove that are examined by `is_convex_position`, but no more than 20,000
-        of them."""
+        on the boundary of a convex set; False where there is no proof. A convex projection proves
+        it for most faces (`_projects_to_convex_polygon`). Other faces of a single loop are examined
+        by `is_convex_position`, but no more than 20,000 of them."""
         is_convex = self._projects_to_convex_polygon()
         is_single = np.bincount(self.face_of_loop, minlength=self.face_count) == 1
         unproved = np.flatnonzero(is_single & ~is_convex)[:_MAX_EXAMINED_FACES]

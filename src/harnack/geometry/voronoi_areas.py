@@ -227,7 +227,7 @@ def _clip_bisectors(
     def clip_by_line(i: Any, *state: Any) -> tuple[Any, ...]:
         """Clip the intervals of all own lines by line i. Note for each own line whether the
         neighbor of line i is to the left of the own line's neighbor. The state has three entries
-        for each own line: lower, upper, has_left."""
+        for each own line: lower, upper, has_left. Returns the next i, and the new state."""
         other, clipped = bisector(i, i < line_count), list[Any]()
         for t, (index, own_line) in enumerate(zip(indices, own_lines, strict=True)):
             lower, upper, has_left = state[3 * t : 3 * t + 3]
