@@ -347,9 +347,8 @@ class ClosedMesh(trimesh.Trimesh):
         return copied
 
     def export(self, file_obj: Any = None, file_type: str | None = None, **options: Any) -> Any:
-        """Write the mesh to a file. The parameters file_obj, file_type and options, and the result,
-        are those of trimesh.Trimesh.export. Metadata is not written: no file format holds its
-        arrays.
+        """Write the mesh to a file, with the parameters and the result of trimesh.Trimesh.export.
+        Metadata is not written: no file format holds its arrays.
 
         Raises:
             MeshingError: the mesh is closed, but would not be in the file: components touch, or the
@@ -423,9 +422,9 @@ def _quantize(mesh: trimesh.Trimesh, step: float) -> trimesh.Trimesh:
 
 
 def _simplify_until_valid(original: TriangleMesh, step: float) -> TriangleMesh | None:
-    """Simplify the closed mesh `original` by manifold3d and round it to the grid of spacing `step`,
-    so that no triangles cross. Two strengths of simplification are tried. The result is None if
-    both fail, or if no triangle is left."""
+    """Simplify a closed mesh by manifold3d and round it to the grid of spacing `step`, so that no
+    triangles cross. Two strengths of simplification are tried; None if both fail, or if no triangle
+    is left."""
     for steps in _SIMPLIFY_STEPS:
         simpler = from_manifold(without_short_edges(to_manifold(original), steps * step))
         x, faces, is_kept = _merge_on_grid(simpler, step)
