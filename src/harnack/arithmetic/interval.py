@@ -100,10 +100,6 @@ class Interval:
         contains 0."""
         return _maximum(-self.upper, _maximum(self.lower, 0.0))
 
-    def contains(self, x: Real) -> Mask:
-        """A mask of the lanes on which the number x lies in the interval."""
-        return ~((x < self.lower) | (x > self.upper))
-
     def hull(self, other: Interval) -> Interval:
         """The smallest interval that contains this interval and the other one."""
         low = -_maximum_or_nan(-self.lower, -other.lower)
@@ -118,10 +114,6 @@ class Interval:
             _minimum_ignoring_nan(self.upper, other.upper),
             self.is_single or other.is_single,
         )
-
-    def shifted(self, x: Real) -> Interval:
-        """The interval of all y + x for y in this interval, with the exact number x."""
-        return self + Interval(x, x)
 
     def __neg__(self) -> Interval:
         """The interval of all -x for x in the interval. A point interval stays one."""

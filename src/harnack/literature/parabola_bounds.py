@@ -335,7 +335,7 @@ class ParabolaBounds(FormulaNumber):
         )
         # The slopes of the chords of phi from f(0) to the smallest and to the largest value of f.
         chords = [
-            ((function.ranges(start.shifted(x))[0] - value) * Interval.point(x).reciprocal())
+            ((function.ranges(start + Interval(x, x))[0] - value) * Interval.point(x).reciprocal())
             for x in (min_change, max_change)
         ]
         slope_to_min, slope_to_max = (bound.intersect(slopes) for bound in chords)
