@@ -33,13 +33,14 @@ from harnack.fields.analytic.waves import PlaneWave, WaveProduct, cosine_factor,
 from harnack.fields.capabilities import NO_FACET, JumpCrossing
 from harnack.geometry import example_curves
 from harnack.geometry.example_meshes import bumpy_sphere, icosphere, remove_faces
-from harnack.testing import BrokenPromiseError, check_field, check_ray_samples, mutated_enclosure
+from harnack.testing import BrokenPromiseError, check_field, check_ray_samples
 from harnack.testing.enclosure_contracts import PromiseCase
 from tests.enclosures.test_bounded_laplacian import FIELDS as SOURCED
 from tests.fields.test_shapes import SHAPES
 from tests.literature.test_enclosures_of_formulas import PROOFS
 from tests.oracles.direct_sums import dipole_sum, winding_sum
 from tests.oracles.exact import BOUNDS
+from tests.oracles.mutated_enclosure import mutated_enclosure
 from tests.oracles.step_contracts import check_steps
 
 
