@@ -6,7 +6,6 @@ import operator
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 
 from harnack.backend.validation import FloatArray
 from harnack.geometry.curves import MAX_VERTICES, CurveError, validate_loops
@@ -112,6 +111,8 @@ def _spline(x: FloatArray, samples: int, closed: bool, power: float) -> FloatArr
             f"points {k} and {(k + 1) % len(x)} are nearer to each other than rounding, beside the "
             "length of the curve: remove one of them"
         )
+    from scipy.interpolate import CubicSpline  # imported here: it takes half a second
+
     spline = CubicSpline(parameters, knots, bc_type="periodic" if closed else "not-a-knot")
     inner = parameters[:-1, None] + np.diff(parameters)[:, None] * (np.arange(samples) / samples)
     vertices = spline(inner.ravel())
