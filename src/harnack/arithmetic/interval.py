@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TypeAlias, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import drjit as dr
 import numpy as np
@@ -23,8 +23,6 @@ from harnack.backend.elementary import fmax, fmin
 
 if TYPE_CHECKING:
     from harnack.backend import Mask, Real
-
-Number: TypeAlias = "Interval | float"
 
 
 @dataclass(frozen=True)
