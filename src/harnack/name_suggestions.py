@@ -8,13 +8,13 @@ from collections.abc import Iterable
 
 
 def is_one_of(name: object, names: Iterable[str]) -> bool:
-    """Whether a value is a string and one of the known names."""
+    """Return whether a value is a string and one of the known names."""
     return isinstance(name, str) and name in names
 
 
 def did_you_mean(misspelled: object, candidates: Iterable[str]) -> str:
-    """The end of an error message about a misspelled name: '; did you mean "gold"?' for the most
-    similar candidate; '' if no candidate is similar, or the name is not a string."""
+    """Return the end of an error message about a misspelled name: '; did you mean "gold"?' for the
+    most similar candidate; '' if no candidate is similar, or the name is not a string."""
     if not isinstance(misspelled, str):
         return ""
     name_of_lowercase = {name.lower(): name for name in candidates}

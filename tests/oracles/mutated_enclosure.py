@@ -41,5 +41,6 @@ def mutated_enclosure(kind: type[Enclosure], factor: float, *, covers: float | N
 
 
 def original_enclosure(kind: type[Enclosure]) -> type[Enclosure]:
-    """The class from which `mutated_enclosure` derived a class; any other class itself."""
+    """Return the class from which `mutated_enclosure` made the class `kind`. A class that it did
+    not make is returned as it is."""
     return getattr(kind, "original", kind)
