@@ -10,6 +10,7 @@ from . import gallery as gallery
 from . import geometry as geometry
 from . import io as io
 from . import kernels as kernels
+from . import literature as literature
 from . import live as live
 from . import math as math
 from . import meshing as meshing

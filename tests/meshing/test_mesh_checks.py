@@ -21,7 +21,7 @@ from harnack.meshing.checks import (
     check_near_level,
     check_no_self_intersection,
 )
-from harnack.meshing.closed_mesh import ClosedMesh
+from harnack.meshing.closed_export import ClosedMesh
 from harnack.meshing.finishing import simplify_mesh
 from harnack.meshing.lattice_meshing import TriangleMesh
 from harnack.meshing.level_function import LevelFunction

@@ -38,12 +38,12 @@ from harnack.fields import Field, Sample
 from harnack.fields.capabilities import NO_FACET, JumpCrossing
 from harnack.fields.samples import Ray as RayPath
 from harnack.rendering.surface_hits import intersect_surface
-from harnack.testing import mutated_enclosure
 from harnack.testing.enclosure_contracts import PromiseCase
 from harnack.tracer import traced_surface
 from harnack.tracer.level_contact import test_jump as jump_test
 from tests.oracles.exact import exact_step, on_host
 from tests.oracles.jump_oracle import first_side_changes, judge
+from tests.oracles.mutated_enclosure import mutated_enclosure
 
 FOUR_PI = 4 * math.pi
 

@@ -52,7 +52,7 @@ def write_mesh(mesh: trimesh.Trimesh, path: str | os.PathLike[str]) -> None:
         ValueError, ImportError, OSError: the path is refused by `check_mesh_path`.
         MeshingError: the mesh cannot be written as a closed one.
     """
-    from harnack.meshing.closed_mesh import ClosedMesh
+    from harnack.meshing.closed_export import ClosedMesh
 
     target = check_mesh_path(path)
     kind = target.suffix.lower()[1:]

@@ -277,7 +277,7 @@ def to_trimesh(surface: TriangleMesh, facts: dict[str, Any], is_closed: bool) ->
     Raises:
         MeshingError: the mesh must be closed, but is not, or has no positive volume.
     """
-    from harnack.meshing.closed_mesh import ClosedMesh
+    from harnack.meshing.closed_export import ClosedMesh
 
     mesh = ClosedMesh(surface.vertices, surface.faces, process=False, validate=False)
     pairs = half_edges(surface.faces)

@@ -303,7 +303,7 @@ class _Result:
 
         more: entries that are added to `metadata["harnack"]`.
         largest: whether to keep only the body with the largest volume."""
-        from harnack.meshing.closed_mesh import ClosedMesh
+        from harnack.meshing.closed_export import ClosedMesh
 
         surface = self.surface
         facts: dict[str, Any] = {**self.facts, **more, "differs": None}

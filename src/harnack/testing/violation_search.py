@@ -14,11 +14,11 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend import BoolArray, FloatArray, choose_backend, to_numpy, to_vector3
-from harnack.enclosures import BoundedLaplacian, Enclosure, HarmonicBall, LevelGaps, SlopeRange
+from harnack.enclosures import BoundedLaplacian, HarmonicBall, SlopeRange
 from harnack.fields.capabilities import NO_FACET, JumpCrossing
 
 if TYPE_CHECKING:
-    from harnack.backend import Mask, Precision, Real
+    from harnack.backend import Precision
     from harnack.enclosures import Promise
     from harnack.fields.field import Field, Sample
 
@@ -28,8 +28,6 @@ __all__ = [
     "RayLift",
     "accumulated_jumps",
     "lift_along_rays",
-    "mutated_enclosure",
-    "original_enclosure",
     "random_directions",
     "random_points",
     "require",
@@ -69,41 +67,6 @@ def require(
     raise BrokenPromiseError(
         f"{message}{size}: point {points[worst].tolist()}{at}; {ids.size} of {len(points)} points"
     )
-
-
-def mutated_enclosure(kind: type[Enclosure], factor: float, *, covers: float | None = None) -> Any:
-    """A class of enclosures that is wrong on purpose, to test that the checks detect it: its free
-    lengths (lengths proved to hold no level) are multiplied by a factor.
-
-    kind: the class from which it is derived.
-    factor: multiplies every free length.
-    covers: multiplies every length that `is_free` accepts; None for the same factor.
-    """
-    covers_factor = factor if covers is None else covers
-    # Type checkers accept no variable as a base class.
-    base: Any = kind
-
-    class Scaled(base):
-        """The class `kind` with all lengths scaled."""
-
-        original = kind
-
-        def free_length(self, gaps: LevelGaps) -> Real:
-            parent: Any = super()
-            return factor * parent.free_length(gaps)
-
-        def is_free(self, gaps: LevelGaps, length: Real) -> Mask:
-            parent: Any = super()
-            return parent.is_free(gaps, length / covers_factor)
-
-    Scaled.__name__ = f"Scaled{kind.__name__}"
-    return Scaled
-
-
-def original_enclosure(kind: type[Enclosure]) -> type[Enclosure]:
-    """The class from which `mutated_enclosure` made the class `kind`. A class that it did not make
-    is returned as it is."""
-    return getattr(kind, "original", kind)
 
 
 # Fields from outside: values, gradients and continuous lifts.

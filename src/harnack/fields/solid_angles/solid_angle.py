@@ -61,7 +61,7 @@ from harnack.fields.solid_angles.planar import PlanarRegion, planar_region
 from harnack.fields.solid_angles.trail_sums import RayLine, line_rates, lipschitz_along
 from harnack.fields.source_sums import SECOND_ROUNDINGS, SLOPE_ROUNDINGS, SUM_MARGIN
 from harnack.geometry import Circle, ConvexHull, is_convex_position, total_length
-from harnack.geometry.curves import CurveShapeError, Loops, cancel_opposite_circles, validate_curves
+from harnack.geometry.curves import CurveError, Loops, cancel_opposite_circles, validate_curves
 from harnack.geometry.polygons import cancel_opposite_edges, remaining_edges
 from harnack.name_suggestions import did_you_mean
 
@@ -926,8 +926,7 @@ def _movable_loops(loops: Any) -> tuple[Any, tuple[Any, ...]]:
     if not any(map(_is_drjit, parts)):
         return loops, ()
     parts = [
-        tensor_to_vectors(loop, "a loop", CurveShapeError) if is_tensor(loop) else loop
-        for loop in parts
+        tensor_to_vectors(loop, "a loop", CurveError) if is_tensor(loop) else loop for loop in parts
     ]
     curves = [to_numpy(loop) if _is_drjit(loop) else loop for loop in parts]
     movable = tuple(loop for loop in parts if not isinstance(loop, Circle))
