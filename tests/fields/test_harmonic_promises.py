@@ -149,6 +149,8 @@ def test_sums_of_powers() -> None:
         expected = sum(c * rho**i * r**j for (i, j), c in terms.items())
         assert bound(rho, r) == pytest.approx(expected, rel=1e-14)
     assert AxialBound.of({})(0.5, 0.5) == 0
+    # A power of r that occurs with two powers of rho counted twice.
+    assert AxialBound.of({(1, 2): 1.0, (0, 2): 0.5})(0.5, 0.5) == 0.25
     assert order_on_axis({(0, 0): 1.0, (9, -4): 1.0, (12, 7): 2.0}) == 4
 
 

@@ -191,7 +191,7 @@ def test_scales_that_a_precision_has_no_room_for_are_refused(precision: str) -> 
     """Found by an attack: at 1e-24 the first hit was missed in single precision."""
     o, d = [[0, 0, 1.0]], [[0, 0, -1.0]]
     for lobes in (hk.fields.Lobes(2, 0, scale=1e-70), hk.fields.Lobes.combined({(2, 0): 1e70})):
-        with pytest.raises(ValueError, match="another unit of length"):
+        with pytest.raises(ValueError, match=r"another unit of length|units nearer to 1"):
             hk.trace(lobes, o, d, precision=precision)
     small = hk.fields.Lobes(2, 0, scale=1e-5)
     reach = small.extent_radius()

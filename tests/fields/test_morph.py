@@ -285,6 +285,15 @@ def test_ends_are_the_meshes(w: float, mesh: Any) -> None:
     assert field.describe()["shows"] == ("mesh a" if w == 0 else "mesh b")
 
 
+def test_an_end_is_traced_as_its_mesh_is() -> None:
+    """With cells where there are many rays, and without jumps for distances: both were lost."""
+    vertices, faces = icosphere(3)
+    end = hk.fields.Morph((vertices, faces[:900]), (0.5 * vertices, faces), gap=1.0, w=0.0)
+    mesh = hk.WindingNumber(vertices, faces[:900])
+    assert type(end.for_ray_count(10**7)) is type(mesh.for_ray_count(10**7))
+    assert type(end.without_jumps()) is type(mesh.without_jumps())
+
+
 @pytest.mark.slow
 def test_slices_near_an_end_are_near_the_mesh_in_proportion() -> None:
     o, d = rays(200, 8)

@@ -513,3 +513,17 @@ def test_gradients_at_points_are_good_by_default() -> None:
     assert (off <= field.gradient_error_bound(x, precision="double") + 1e-12 * size).all()
     rough = field.rough_value_and_gradient(x, precision="double")[1]
     assert np.quantile(np.linalg.norm(rough - exact, axis=1) / size, 0.95) > 0.1
+
+
+def test_solids_of_a_sum_sample_it_as_coarsely_as_the_sum_itself() -> None:
+    """The solid had the coarsest accuracy of the field before it was prepared."""
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(3000, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    cloud = hk.DipolePotential(points, points, cells=False)
+    solid = hk.solid(cloud, above=2 * math.pi)
+    backend = choose_backend("single")
+    coarsest = cloud.prepare(backend).coarsest_accuracy
+    assert coarsest < 1
+    assert solid.prepare(backend).coarsest_accuracy == coarsest
+    assert (solid | solid.translated((5, 0, 0))).prepare(backend).coarsest_accuracy == coarsest

@@ -55,7 +55,7 @@ class AffineForm(FormulaNumber):
         """
 
         def coordinate(x: Real, rate: Real) -> AffineForm:
-            """The function x + s rate. Its error is that of rounding."""
+            """The function x + s rate. Its error is caused by rounding alone."""
             half = 0.5 * length * rate
             return cls(x + half, half, _rounding_bound(dr.abs(x) + dr.abs(half)))
 
@@ -71,8 +71,8 @@ class AffineForm(FormulaNumber):
         return Interval(self.center - half_width - rounding, self.center + half_width + rounding)
 
     def constant(self, x: float | Real) -> AffineForm:
-        """The constant number x as a function along the same path. Its error is that of rounding;
-        small integers and Dr.Jit numbers are exact."""
+        """The constant number x as a function along the same path. Its error is caused by rounding
+        alone; it is 0 for small integers and Dr.Jit numbers."""
         kind = cast("Any", type(self.center))
         value = kind(x)
         exact = not isinstance(x, int | float) or (float(x).is_integer() and abs(x) < 2**20)
@@ -120,6 +120,7 @@ class AffineForm(FormulaNumber):
         value, slopes, curvature = function.ranges(f_range)
         width = f_range.upper - f_range.lower
         epsilon = machine_epsilon(width)
+        # The ranges of phi at the two ends of the range of f; they contain the rounding of phi.
         ends = [function.ranges(Interval(end, end))[0] for end in (f_range.lower, f_range.upper)]
         chord_slope = dr.select(width > 0, (ends[1].midpoint - ends[0].midpoint) / width, 0)
         chord_slope = dr.select(dr.isfinite(chord_slope), chord_slope, 0)
@@ -167,7 +168,7 @@ class AffineForm(FormulaNumber):
 
     def pointwise_maximum(self, other: Any) -> AffineForm:
         """The maximum of this function f and another function g, as g + max(f - g, 0). On lanes on
-        which f or g is proved to be the larger one everywhere, it is that function itself."""
+        which f or g is proved to be the larger one on the whole path, it is f or g itself."""
         difference = self.sum(-other)
         difference_range = difference.range
         is_self_larger, is_other_larger = difference_range.lower >= 0, difference_range.upper <= 0
@@ -236,8 +237,8 @@ def _entries(x: AffineForm) -> tuple[Real, Real, Real]:
 def _smaller_error(
     first: tuple[Real, Real, Real], second: tuple[Real, Real, Real]
 ) -> tuple[Real, Real, Real]:
-    """Of two lines, each given by (center, slope, error), the one with the smaller error. If one of
-    them is not finite, it is the other."""
+    """Of two lines, each given by (center, slope, error), the line with the smaller error. If one
+    line has a number that is not finite, it is the other line."""
     is_first_finite = dr.isfinite(first[0]) & dr.isfinite(first[1]) & dr.isfinite(first[2])
     is_second_finite = dr.isfinite(second[0]) & dr.isfinite(second[1]) & dr.isfinite(second[2])
     use_first = is_first_finite & ((first[2] <= second[2]) | ~is_second_finite)

@@ -304,6 +304,7 @@ def _hyperbolic_tangent(x: Real) -> Real:
 
 def _tanh(x: Interval) -> DerivativeRanges:
     """The ranges of tanh, of its derivative and of its second derivative on the interval x."""
+    # Widened once more, since the function is the quotient of two functions with errors.
     t = _increasing_range(_hyperbolic_tangent, x).widened(_MAX_ULP_ERROR * machine_epsilon(x.lower))
     upper = dr.select(x.upper == x.upper, fmin(t.upper, 1), 1)  # also if an end is NaN
     t = Interval(fmax(t.lower, -1), upper)
@@ -367,6 +368,7 @@ def _abs(x: Interval) -> DerivativeRanges:
     """The ranges of |x|, of its derivative and of its second derivative on the interval x. The
     second derivative has no upper bound at 0, where the slope jumps from -1 to 1."""
     is_positive, is_negative = x.lower > 0, x.upper < 0
+    # (The last argument of `typed_select` tells the type of the numbers only.)
     slope = Interval(
         typed_select(is_positive, 1, -1, x.lower), typed_select(is_negative, -1, 1, x.lower)
     )
@@ -465,6 +467,7 @@ def power(n: float) -> ElementaryFunction:
         second = Interval.enclosing(n * (n - 1), number_type) * _real_power(x, n - 2)
         is_defined = x.lower >= 0 if n > 0 else x.lower > 0
         value, is_none = _real_power(x, n), x.upper < 0
+        # (The last argument of `typed_select` tells the type of the numbers only.)
         value = Interval(
             typed_select(is_none, dr.nan, value.lower, x.lower),
             typed_select(is_none, dr.nan, value.upper, x.lower),
@@ -474,6 +477,7 @@ def power(n: float) -> ElementaryFunction:
     def of_positive(x: Any) -> Any:
         return dr.power(fmax(x, 0), n)
 
+    # With an exponent below 1 the slope is unbounded at 0; with one below 0 there is a pole.
     return ElementaryFunction(
         f"power {n}", real, of_positive, _numpy_power(n), _POSITIVE, n < 1, has_pole=n < 0
     )
@@ -567,6 +571,7 @@ def clipped_power(n: int) -> ClippedPower:
         low = fmax(x.lower, 0)
         clipped = Interval(low, low if x.lower is x.upper else fmax(x.upper, 0))
         value, slope, second = power(n).ranges(clipped)
+        # From here on, the ends of x itself.
         low, high = x.lower, x.upper
         # The derivatives of the power at 0 are those from the right only; for n = 1 and 2 those
         # from the left differ.

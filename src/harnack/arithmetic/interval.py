@@ -165,7 +165,7 @@ class Interval:
         low = high = end_products[0]
         for product in end_products[1:]:
             low, high = _minimum(low, product), _maximum(high, product)
-        # 0 times infinity is NaN: the smallest of the other products may then be wrong.
+        # On lanes where a product is NaN (0 times infinity), the result is all numbers.
         is_valid = _none_is_nan(end_products)
         if is_valid is not None:
             low, high = dr.select(is_valid, low, -dr.inf), dr.select(is_valid, high, dr.inf)
@@ -325,8 +325,8 @@ def _absolute(x: Real) -> Real:
 
 
 def _none_is_nan(numbers: tuple[Real, ...]) -> Mask | None:
-    """A mask of the lanes on which the sum of the numbers is a number. It is NaN if one of them is,
-    or if two of them are opposite infinities."""
+    """A mask of the lanes on which the sum of the numbers is a number. The sum is NaN if one of the
+    numbers is, or if two of them are opposite infinities. The result is never None."""
     total = numbers[0]
     for number in numbers[1:]:
         total = total + number

@@ -109,6 +109,7 @@ class Jet(FormulaNumber):
                 base = base.widened(machine_epsilon(x))
             at_start = _moved(base, rate, start)
             first, second = (rate,), (ZERO,)
+            # (0 * x is the number 0 in the type of x.)
             anchor = Jet(at_start, first, second, piece_length=0 * x) if anchored else None
             return Jet(at_start.hull(_moved(base, rate, end)), first, second, anchor, end - start)
 
@@ -293,6 +294,7 @@ class Jet(FormulaNumber):
                 return u
             hull = u.hull(v)
             high = dr.inf if kink else hull.upper
+            # (The last argument of `typed_select` tells the type of the numbers only.)
             return Interval(
                 typed_select(
                     is_x_larger,
@@ -336,8 +338,9 @@ class Jet(FormulaNumber):
             theta_ij = (x y_ij - y x_ij)/r^2 - theta_i rho_j - theta_j rho_i.
 
         On a box that meets the cut of the angle (the negative x axis), the ranges of the
-        derivatives are all numbers. In the code u and v are the ranges of x and y, `inverse_r` that
-        of 1/r, and `cosine` and `sine` those of x/r and y/r.
+        derivatives are all numbers. In the code u and v are the ranges of x and y. `inverse_r` is
+        at first the range of r and then that of 1/r; `cosine` and `sine` are at first the ranges of
+        x and y times 1/r, and then these, clipped to [-1, 1].
         """
         number = x.backend_number() if self.value.is_literal else self.backend_number()
         v, u = self.value_on_backend(number), x.value_on_backend(number)
@@ -439,6 +442,7 @@ class Jet(FormulaNumber):
         """
         if start is None:
             return self
+        # The range of the change since the start of the piece.
         rise = range_times_length(self.first_derivatives[0], width)
         first = self.first_derivatives[0]
         if self.second_derivatives:
@@ -534,7 +538,8 @@ class Dual(FormulaNumber):
         own_value, other_value = self.value, other.value
 
         def rule(a: Any, b: Any) -> Any:
-            """The partial derivative of the product, from those of the two factors."""
+            """The partial derivative of the product, from the partial derivatives a and b of the
+            two factors."""
             return a * other_value + own_value * b
 
         return Dual(
@@ -555,7 +560,7 @@ class Dual(FormulaNumber):
         real = cast("Any", type(self.value))
 
         def rule(a: Any) -> Any:
-            """The partial derivative of the result, from that of this function."""
+            """Compute the partial derivative of the result, from that of this function, a."""
             return dr.select(real(a) == 0, 0, a * slope)
 
         return Dual(function.on_drjit(self.value), _map_partials(rule, self.first_derivatives))
@@ -566,7 +571,7 @@ class Dual(FormulaNumber):
         u, v = x.value, self.value
 
         def rule(a: Any, b: Any) -> Any:
-            """The partial derivative of the angle, from those of x and y."""
+            """Compute the partial derivative of the angle, from those of x and y, a and b."""
             return (u * b - v * a) / (u * u + v * v)
 
         return Dual(
@@ -578,7 +583,8 @@ class Dual(FormulaNumber):
         is_own = self.value > other.value
 
         def rule(a: Any, b: Any) -> Any:
-            """The partial derivative of the larger function, from those of both."""
+            """The partial derivative of the larger function, from the partial derivatives a of this
+            function and b of the other one."""
             return dr.select(is_own, a, b)
 
         value = dr.select(is_own, self.value, other.value)

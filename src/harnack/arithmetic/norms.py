@@ -145,7 +145,7 @@ def _jet_norm(xs: list[Jet], p: float) -> Jet:
     infinity. `norm` has the proof of its ranges.
 
     In the code `inverse_norm` is the range of 1/N, `ratios` are the ranges of x_i/N, and `pulls`
-    those of sign(x_i) |x_i/N|^(p-1).
+    are the ranges of sign(x_i) |x_i/N|^(p-1).
     """
     number = next((f.value.lower for f in xs if not f.value.is_literal), None)
     number = xs[0].backend_number() if number is None else number
@@ -190,11 +190,11 @@ def _jet_norm(xs: list[Jet], p: float) -> Jet:
 def _wronskian_term(
     xs: list[Jet], values: list[Interval], inverse_norm: Interval, i: int, j: int
 ) -> Interval:
-    """The range of the sum over pairs k < l of w_kl,i w_kl,j / N^3, where N is the Euclidean norm
+    """The range of the sum over pairs k < m of w_km,i w_km,j / N^3, where N is the Euclidean norm
     of functions x_k. It is the part of N's second derivative by the variables i and j that the
     first derivatives of the functions contribute (`norm` has the proof).
 
-    w_kl,i is the function x_k x_l' - x_l x_k' with derivatives by the variable i.
+    w_km,i is the function x_k x_m' - x_m x_k' with derivatives by the variable i.
 
     xs: the functions x_k.
     values: the ranges of their values.
@@ -271,8 +271,8 @@ def _clip_magnitude(x: Interval, limit: Interval) -> Interval:
 
 
 def _product(a: Interval, b: Interval) -> Interval:
-    """The range of the product of two numbers, each in its interval. If both intervals are the same
-    object, they stand for one number, and it is the range of its square."""
+    """The range of the product of two numbers, one in each of the intervals a and b. If a and b are
+    the same object, they stand for a single number, and the result is the range of its square."""
     return a.square() if a is b else a * b
 
 

@@ -106,6 +106,7 @@ class FormulaNumber(abc.ABC):
         constant; None if it is not a number."""
         if isinstance(other, type(self)):
             return other
+        # An array of depth 1 holds numbers, not vectors.
         if dr.is_array_v(cast("Any", type(other))):
             return self.constant(other) if dr.depth_v(type(other)) == 1 else None
         try:
@@ -334,7 +335,8 @@ class Tally:
 
         max(-1, min(1, 1e9 y)) is an example: flat, steep, and flat again.
 
-        finest: the smallest change within which a bent number may turn.
+        finest: the smallest change within which a bent number may turn, such as the attribute
+            `finest`.
 
         This is an estimate from the numbers of the formula, and no proof. Sums and products of
         coordinates alone do not get flat again. A function of 1e9 y does, such as tanh, and so does
@@ -420,6 +422,8 @@ class OperationCounter(FormulaNumber):
         return self._bent(_FUNCTION, self, size, self.rate)
 
     def pointwise_maximum(self, other: OperationCounter) -> OperationCounter:
+        """The larger of this number and another one, an operation that may bend both. Its size and
+        its slope count as the larger ones of the two."""
         rate = max(self.rate, other.rate)
         return self._bent(_FUNCTION, other, max(self.size, other.size), rate)
 
@@ -431,6 +435,9 @@ class OperationCounter(FormulaNumber):
         return self._bent(_FUNCTION + _PRODUCT, x, 1.0, self.rate + x.rate)
 
     def norm_of_powers(self, p: float) -> OperationCounter:
+        """The p-norm of some numbers, where this number is the sum of their powers. The root may
+        bend the sum, but it is not steep."""
+        # The derivative of x^(1/p) is 1/(p size^(p-1)), with size = x^(1/p).
         size = max(self.size, 1.0) ** (1 / p)
         return self._bent(_FUNCTION, self, size, self.rate / (p * size ** (p - 1)))
 
@@ -449,8 +456,8 @@ class OperationCounter(FormulaNumber):
         both sides of a place and steep between. The slopes of both numbers are recorded in the
         tally.
 
-        operations, size, rate: the number of Dr.Jit operations, and the size and the slope of the
-            result, as for `_after`.
+        operations: the number of Dr.Jit operations.
+        size, rate: estimates of the size and of the slope of the result.
         """
         if not (self.is_constant and other.is_constant):
             self.tally.steepest = max(self.tally.steepest, self.rate, other.rate)

@@ -195,8 +195,9 @@ class ParabolaBounds(FormulaNumber):
         """Bounds of the product of this and another function, both polynomials of degree 1: the
         product itself, up to rounding.
 
-        In the code v and w are the midpoints of the two values at s = 0, a and c those of the two
-        slopes; rv, rw, ra and rc are the radii of these ranges.
+        In the code v and w are the midpoints of the ranges of the two values at s = 0, and a and c
+        the midpoints of the ranges of the two slopes; rv, rw, ra and rc are the radii of these
+        ranges.
         """
         a, ra = _midpoint_and_half_width(self.lower[0], self.upper[0])
         c, rc = _midpoint_and_half_width(other.lower[0], other.upper[0])
@@ -393,10 +394,10 @@ class ParabolaBounds(FormulaNumber):
     def pointwise_maximum(self, other: Any) -> ParabolaBounds:
         """The maximum of this function f and another function g at each point.
 
-        Proof. Let f(s) <= f(0) + F+(s), the same for g, and V = max(f(0), g(0)). Above: f is below
-        V + (f(0) - V) + F+, and g likewise. One parabola bounds both (`_common_upper_bound`),
-        unless one function is larger on the whole path. Below: the maximum is at least the function
-        that is larger at s = 0.
+        Proof. Let f(s) <= f(0) + F+(s), g(s) <= g(0) + G+(s) and V = max(f(0), g(0)). Above: f is
+        at most V + (f(0) - V) + F+, and g at most V + (g(0) - V) + G+. One parabola bounds both
+        (`_common_upper_bound`), unless one function is larger on the whole path. Below: the maximum
+        is at least the function that is larger at s = 0.
         """
         f, g = self.value, other.value
         h = self.piece_length
@@ -436,7 +437,7 @@ class ParabolaBounds(FormulaNumber):
 
         Proof. For any vector c = (a, b), the angle of z = (x, y) and the angle of (x a + y b, y a -
         x b) differ by a constant along a path that does not meet the cut of the angle. Where x a +
-        y b > 0 the latter is an arc tangent. Elsewhere nothing is known beyond the start: the
+        y b > 0 the second angle is an arc tangent. Elsewhere nothing is known beyond the start: the
         bounds are infinite.
 
         In the code c is about the direction of z at the start.
@@ -456,7 +457,9 @@ class ParabolaBounds(FormulaNumber):
         )
 
     def _range(self) -> Interval:
-        """The range of the function on the whole path."""
+        """The range of the function on the whole path: its value at s = 0 plus the extremes of the
+        two parabolas."""
+        # `min_change` is minus the smallest change.
         h, value = self.piece_length, _on_backend(self.value, self.piece_length)
         min_change, max_change = (
             _maximum_on_piece(_negate(self.lower), h),
@@ -483,8 +486,8 @@ class ParabolaBounds(FormulaNumber):
         If the bounds are parabolas, the derivative of the product lies between two lines. Raise the
         upper line, if necessary, to at least 0 at both ends of [0, h]. As a line, it is then at
         least 0 on all of [0, h], and still above the derivative on [s0, s1]. So its integral is an
-        upper bound; the lower bound is found likewise (`_extend_parabolas`). If the bounds are
-        lines, `_extend_lines` has the proof.
+        upper bound; the lower bound is found in the same way (`_extend_parabolas`). If the bounds
+        are lines, `_extend_lines` has the proof.
 
         Because of rounding, f may be positive outside of the computed [s0, s1], but is at most r =
         2 `value_error` there. The derivative of f^n is then at most `outer_slope`, n r^(n-1) (|a| +
@@ -554,11 +557,12 @@ class ParabolaBounds(FormulaNumber):
     def _extend_parabolas(
         self, start: Real, length: Real, is_cut: Any, tail: Real
     ) -> tuple[Quadratic, Quadratic]:
-        """Extend parabolas that bound a function on an interval to parabolas that bound it on [0,
-        length].
+        """Extend the parabolas that bound this function on an interval to parabolas that bound the
+        extended function on [0, length].
 
-        This function is known on an interval that begins at `start`, and s counts from there. The
-        extended function equals it on the interval and is constant before and after it.
+        This function is known on an interval that begins at `start`; the s of its bounds counts
+        from there. The extended function equals it on the interval and is constant before and after
+        it.
 
         is_cut: whether the interval is not all of [0, length].
         tail: a bound of the derivative outside of the interval, which rounding may cause.
@@ -584,11 +588,11 @@ class ParabolaBounds(FormulaNumber):
     def _extend_lines(
         self, start: Real, end: Real, length: Real, value: Interval, is_cut: Any, tail: Real
     ) -> tuple[Quadratic, Quadratic]:
-        """Extend lines that bound a function on an interval [start, end] to lines that bound it on
-        [0, length].
+        """Extend the lines that bound this function on an interval [start, end] to lines that bound
+        the extended function on [0, length].
 
-        This function is known on the interval. The extended function equals it there; before the
-        interval it is constant, behind it it is 0.
+        This function is known on the interval. The extended function equals it there; it is
+        constant before the interval, and 0 behind it.
 
         value: the range of the extended function at s = 0.
         is_cut: whether the interval is not all of [0, length].

@@ -57,8 +57,8 @@ class Values(FormulaNumber):
 
         slack: a length by which the box is larger on all sides; None for 0.
         """
+        # Any mask in the width of p, and then False on each lane.
         is_never = p.x != p.x
-        # False on each lane, in the width of p.
         is_never = is_never & ~is_never
         padding = ZERO if slack is None else Interval(-slack, slack)
         x, y, z = (
@@ -74,6 +74,7 @@ class Values(FormulaNumber):
 
     def constant(self, x: float | Real) -> Values:
         """The constant number x as a function on the same box."""
+        # False on each lane.
         is_never = self.nowhere & ~self.nowhere
         number_type = cast("Any", type(self.value.lower))
         if dr.is_array_v(cast("Any", type(x))):
@@ -118,7 +119,7 @@ class Values(FormulaNumber):
             nowhere, gaps = nowhere | (x.upper < domain_low), gaps | ~(x.lower >= domain_low)
         if domain_high < math.inf:
             nowhere, gaps = nowhere | (x.lower > domain_high), gaps | ~(x.upper <= domain_high)
-        # The range of a box with a pole is all numbers.
+        # On a box with a pole the range of the function is all numbers.
         may_have_pole = _is_lost(value, 0.0 if function.has_pole else _LARGE_EXPONENT)
         return Values(value, nowhere, self.jumps | _is_lost(x) | may_have_pole, gaps)
 

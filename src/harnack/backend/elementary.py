@@ -51,9 +51,8 @@ def safe_norm(v: Vec3) -> Real:
     component is NaN.
 
     `drjit.norm` squares the components first: in single precision it is 0 for vectors shorter than
-    1e-19. Such a vector is the gradient of a polynomial of degree 12 near a zero of order 12, at a
-    fiftieth of the polynomial's scale. Here very short and very long vectors are multiplied by a
-    power of 2 first.
+    1e-19. Such a vector is, for example, the gradient of x^12 at x = 0.01. Here very short and very
+    long vectors are multiplied by a power of 2 first.
     """
     largest = max_norm(v)
     real = cast("Any", type(largest))
@@ -67,6 +66,7 @@ def safe_norm(v: Vec3) -> Real:
 def safe_normalize(v: Vec3) -> Vec3:
     """Return the unit vector v / |v|. This holds for every vector whose largest component is a
     normal floating-point number, also if its square would underflow or overflow."""
+    # This factor cancels, so it needs no derivative.
     largest = dr.detach(max_norm(v))
     (low, _), (high, _) = _norm_scaling_exponents(largest)
     is_ordinary = (largest >= 2.0**low) & (largest <= 2.0**high)
@@ -158,6 +158,7 @@ def orthonormal_basis(d: Vec3) -> tuple[Vec3, Vec3]:
     """Return two unit vectors u and v for each unit vector d such that (u, v, d) is orthonormal and
     right-handed (Duff et al. 2017, "Building an Orthonormal Basis, Revisited")."""
     vector = cast("Any", type(d))
+    # With this sign, the divisor is at least 1 in absolute value.
     sign = dr.select(d.z >= 0, type(d.z)(1), -1)
     a = -1 / (sign + d.z)
     b = d.x * d.y * a

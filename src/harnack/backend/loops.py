@@ -74,7 +74,7 @@ def update_where_active(
     change: returns the new arrays of the state from its arrays.
     label: the name of the loop in Dr.Jit's output.
     """
-    index = dr.uint32_array_t(active)
+    uint = dr.uint32_array_t(active)
 
     def run_once(iteration: Any, *state: Any) -> tuple[Any, ...]:
         """Do the only iteration: count it, and change the state."""
@@ -84,7 +84,7 @@ def update_where_active(
         """Return the mask of lanes on which the loop runs its only iteration."""
         return active & (iteration < 1)
 
-    return dr.while_loop((index(0), *state), is_first, run_once, label=label)[1:]
+    return dr.while_loop((uint(0), *state), is_first, run_once, label=label)[1:]
 
 
 def array_leaves(record: Any) -> Iterator[Any]:
@@ -210,6 +210,7 @@ def loop_with_queue(
     """
     dr.eval(*array_leaves(start))
     width = max(dr.width(leaf) for leaf in array_leaves(start))
+    # A mask with an entry for each ray.
     active = dr.full(type(start.active), True, width) & start.active
     ray_indices, ray_count = active_lanes(active)
     # Rays that are not active from the start have the results of their initial states.
@@ -250,9 +251,11 @@ def _run_queue(
     """
     index_type = cast("Any", type(ray_indices))
     opaque_ray_count = dr.opaque(index_type, ray_count)
-    # The number of lanes is fixed by the device, and not by the number of rays.
+    # The number of lanes is fixed by the device, and not by the number of rays, unless there are
+    # fewer rays. (On a GPU, `threads` is 0.)
     threads = dr.thread_count() if dr.backend_v(ray_indices) == dr.JitBackend.LLVM else 0
     width = min(len(ray_indices), _LANES_PER_THREAD * threads or _LANES_ON_GPU)
+    # The first rays of the queue have lanes already; the next position is the number of lanes.
     next_position, first_indices = _evaluate_in_own_memory(
         lambda: [dr.full(index_type, width, 1), dr.arange(index_type, width)]
     )

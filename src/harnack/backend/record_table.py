@@ -128,7 +128,7 @@ class RecordTable:
         A packet of lanes, which a processor computes together, skips the loop if all of its lanes
         are inactive.
         """
-        # Inactive lanes make no iteration.
+        # Inactive lanes make no iteration. (`active` is Python's True if all lanes are active.)
         iterations = (
             self.iteration_count if active is True else dr.select(active, self.iteration_count, 0)
         )

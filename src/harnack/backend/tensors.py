@@ -58,7 +58,7 @@ def tensor_to_vectors(
     numbers = tensor_to_array(tensor, name)
     backend = backend_of(numbers)
     count = 3 * tensor.shape[0]
-    # The numbers 0, 3, 6, ... of the rows are x coordinates, and so on.
+    # The numbers 0, 3, 6, ... of the rows are x coordinates, and so on. No rows, no indices.
     indices = (dr.arange(backend.UInt32, k, count, 3) for k in range(3 if count else 0))
     components = [dr.gather(backend.Float, numbers, index) for index in indices]
     return backend.Array3f(*components) if components else dr.zeros(backend.Array3f, 0)
@@ -106,6 +106,7 @@ def accepts_tensors(method: Method) -> Method:
         """Call the method, with a tensor converted to vectors and the result converted back."""
         if not is_tensor(points):
             return method(self, points, **settings)
+        # A tensor without axes is refused by `tensor_to_vectors` below.
         *shape, _ = points.shape or (0,)
         # A single point is a table of one row.
         rows = cast("Any", type(points))(points.array, (1, 3)) if points.shape == (3,) else points
@@ -155,8 +156,12 @@ def wrap_for_torch(function: Callable[..., Any]) -> Callable[..., Any]:
 
         @staticmethod
         def forward(ctx: Any, arguments: list[Any], container: list[Any], *tensors: Any) -> Any:
-            """Return the results as PyTorch tensors. The result of `function` itself, whose type
-            (tuple, list, ...) the caller needs, is appended to the list `container`."""
+            """Return the results as PyTorch tensors.
+
+            arguments: the arguments of `function`, with None in place of tensors. container: a list
+            to which the result of `function` itself is appended. The caller needs its type (tuple,
+            list, ...). tensors: PyTorch's tensors among the arguments.
+            """
             inputs, outputs = run_function(arguments, tensors)
             container.append(outputs)
             # PyTorch keeps the tensors for a second backward pass, and Dr.Jit's graph serves the
@@ -304,6 +309,7 @@ def wrap_for_jax(
     def backward(args: Any, cotangents: Any) -> Any:
         """Return the gradients with respect to all arguments. cotangents: the gradients with
         respect to the result."""
+        # The gradients with respect to the arguments that hold floats are computed by `pull_back`.
         leaves: list[Any] = jax.tree.leaves(args)
         if _is_traced(jax, (args, cotangents)):
             # Inside jax.jit only shapes are known: the gradients are computed by a callback when

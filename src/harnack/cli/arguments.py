@@ -41,7 +41,8 @@ class _Parser(argparse.ArgumentParser):
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
-        # argparse takes -1 for a number and would take -1,0,0 and the axis -x for options.
+        # Arguments that match are no options. By itself, argparse takes -1 for a number, but would
+        # take -1,0,0 and the axis -x for options.
         self._negative_number_matcher = re.compile(r"-([\d.]|[xyz]$)")
 
     def error(self, message: str) -> NoReturn:
@@ -49,7 +50,7 @@ class _Parser(argparse.ArgumentParser):
         self.exit(2, f"{printable(f'{self.prog}: error: {message}')} (see {self.prog} --help)\n")
 
     def options(self) -> list[str]:
-        """The names of all options of this parser as they are written, such as "--level"."""
+        """Return the names of all options of this parser as they are written, such as "--level"."""
         return [name for action in self._actions for name in action.option_strings]
 
 
@@ -75,7 +76,8 @@ def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
     attribute for each option, and the name of the command in `command`.
 
     Ends the process with exit code 2 for wrong usage, and after printing a help text if there are
-    no arguments."""
+    no arguments.
+    """
     whole, commands = parsers()
     if not (sys.argv[1:] if arguments is None else arguments):
         whole.print_help(sys.stderr)
@@ -268,7 +270,8 @@ def _add_options(
 
     verb: the name of the function, such as "render".
     only: the names of the options to add; None for all.
-    without: names of options to leave out."""
+    without: names of options to leave out.
+    """
     groups: dict[str, Any] = {}
     for option in options_of(verb):
         if option.name in without or not option.is_on_command_line:
@@ -286,6 +289,7 @@ def _add_option(group: Any, option: Option, verb: str) -> None:
     """Add an option of the table to a group of a parser. verb: the function of the library that the
     command calls, such as "render"."""
     if option.is_switch:
+        # None, and not False, if it is not given.
         group.add_argument(option.flag, action="store_true", default=None, help=option.help)
         return
     settings: dict[str, Any] = {
@@ -380,7 +384,7 @@ def _argument(parse_text: Callable[[str], Any]) -> Callable[[str], Any]:
     errors of argparse, so that they are shown as errors of that option."""
 
     def parsed(value: str) -> Any:
-        """The parsed value of an option's text."""
+        """Return the parsed value of an option's text."""
         try:
             return parse_text(value)
         except (ValueError, TypeError) as wrong:
@@ -390,13 +394,13 @@ def _argument(parse_text: Callable[[str], Any]) -> Callable[[str], Any]:
 
 
 def _parse_smoothing(value: str) -> float | str:
-    """The number that a text gives, a positive length; or "auto", which stays as it is."""
+    """Return the number that a text gives, a positive length; or "auto", which stays as it is."""
     return value if value == "auto" else text.parse_positive(value)
 
 
 def _parse_parameter(value: str) -> tuple[str, float]:
-    """A name and a number from text: "a=0.5" as ("a", 0.5). Raises a ValueError for any other
-    text."""
+    """Return a name and a number from text: "a=0.5" as ("a", 0.5). Raises a ValueError for any
+    other text."""
     name, equals, number = value.partition("=")
     if not equals or not name.strip().isidentifier():
         raise ValueError(f"{text.quoted(value)}: write a name and a number as a=0.5")
@@ -404,7 +408,7 @@ def _parse_parameter(value: str) -> tuple[str, float]:
 
 
 def _parse_slider(value: str) -> tuple[str, Slider]:
-    """A name and a slider from text: "a=0:2:0.5" as ("a", Slider(0, 2, step=0.5)). Raises a
+    """Return a name and a slider from text: "a=0:2:0.5" as ("a", Slider(0, 2, step=0.5)). Raises a
     ValueError for any other text."""
     name, _, interval_text = value.partition("=")
     numbers = interval_text.split(":")

@@ -87,8 +87,8 @@ def _view(arguments: Any) -> int:
 
 
 def _output(arguments: Any, path: Path, suffix: str, kind: str) -> str:
-    """The path of the file to write: the argument -o or, without it, the name of the source with
-    the extension `suffix`. path: of the source. kind: what is written, such as "picture", for
+    """Return the path of the file to write: the argument -o or, without it, the name of the source
+    with the extension `suffix`. path: of the source. kind: what is written, such as "picture", for
     messages."""
     if arguments.output == "":
         raise ValueError(f"-o is empty: name the {kind} to write, such as a{suffix}")
@@ -102,7 +102,8 @@ def _mesh(arguments: Any) -> int:
     target = check_mesh_path(_output(arguments, path, ".stl", "mesh"))
     surface = load_single_surface(arguments, path)
     given_options = options_set("mesh", arguments)
-    # The options of the surface are applied already, when it is loaded.
+    # The options of the surface were applied when it was loaded; the tolerance belongs to the mesh,
+    # too.
     settings = {
         name: value
         for name, value in given_options.items()
@@ -143,7 +144,8 @@ def _repair(arguments: Any) -> int:
         raise ValueError(f"{source} holds no mesh to repair")
     print_line(f"{source}: {python_to_cli_terms(loaded.summary)}")
     given_options = options_set("repair", arguments)
-    # Files such as .stl list the corners of each face anew.
+    # Files such as .stl list the corners of each face anew: corners at the same position are
+    # joined.
     used, faces = np.unique(weld_vertices(loaded.vertices)[loaded.faces], return_inverse=True)
     damaged = trimesh.Trimesh(loaded.vertices[used], faces.reshape(-1, 3), process=False)
     with Console().status("starting") as status:
@@ -167,7 +169,8 @@ def _repaired(facts: dict[str, Any], old: int, new: int) -> str:
     """Describe a repair in one line: what was kept, changed and added, and why not more was kept.
 
     facts: the metadata that `harnack.repair` returns with a mesh.
-    old, new: the numbers of triangles before and after."""
+    old, new: the numbers of triangles before and after.
+    """
     parts = _counted(len(facts["parts"]), "part")
     if facts["dropped"]:
         parts += f", of which {facts['dropped']:,} dropped"
@@ -194,7 +197,7 @@ def _repaired(facts: dict[str, Any], old: int, new: int) -> str:
 
 
 def _counted(count: int, noun: str) -> str:
-    """A count and its noun, as text such as "1 hole" or "2 holes"."""
+    """Return a count and its noun, as text such as "1 hole" or "2 holes"."""
     return f"{count:,} {noun}" + ("" if count == 1 else "s")
 
 

@@ -20,8 +20,8 @@ MESH_FILES = (".stl", ".ply", ".obj", ".glb", ".3mf")
 
 
 def check_mesh_path(path: str | os.PathLike[str]) -> Path:
-    """The path of a mesh file to be written. Everything that can be checked before the mesh is
-    computed is checked here.
+    """Return the path of a mesh file to be written. Everything that can be checked before the mesh
+    is computed is checked here.
 
     Raises:
         ValueError: the extension is not that of a mesh format.

@@ -2,7 +2,7 @@
 library name keywords of Python, such as `max_steps=`; here they become options of the command line,
 such as --max-steps.
 
-Errors are printed on a single line, with options of the command line in place of Python's keywords.
+Errors are printed on a single line.
 """
 
 from __future__ import annotations
@@ -101,20 +101,20 @@ _PARAMETER = re.compile(r'parameters=\{"(\w+)": 1\.0\}')
 
 
 def error_line(error: Exception) -> str:
-    """The line that is printed for an exception: "error: ..." without line breaks and control
-    characters."""
+    """Return the line that is printed for an exception: "error: ..." without line breaks and
+    control characters."""
     return printable(re.sub(r"\s*\n\s*", " ", f"error: {_explanation(error)}".strip()))
 
 
 def printable(text: str) -> str:
-    """The text with its unprintable characters, such as control characters that a terminal would
-    obey, written as escapes."""
+    """Return the text with its unprintable characters, such as control characters that a terminal
+    would obey, written as escapes."""
     return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
 
 
 def _explanation(error: Exception) -> str:
-    """The message of an exception in the terms of the command line; for the most frequent errors,
-    with an option to try."""
+    """Return the message of an exception in the terms of the command line; for the most frequent
+    errors, with an option to try."""
     if isinstance(error, UnboundedSurfaceError):
         if error.bounded_level is not None:
             return (
@@ -134,8 +134,8 @@ def python_to_cli_terms(text: str) -> str:
 
 
 def _option(match: re.Match[str]) -> str:
-    """The option of the command line that replaces a match of `_KEYWORD`, with its value if the
-    match has one. A call such as f(level=1) stays as it is."""
+    """Return the option of the command line that replaces a match of `_KEYWORD`, with its value if
+    the match has one. A call such as f(level=1) stays as it is."""
     if match["call"]:
         return match["call"]
     name = match["name"] or match["first"] or match["quoted"] or match["alone"]
@@ -146,8 +146,8 @@ def _option(match: re.Match[str]) -> str:
 
 
 def level_text(level: float | None) -> str:
-    """A level as it is written on the command line, such as "2pi" or "0.5": as a multiple of pi if
-    it is a multiple of pi/2."""
+    """Return a level as it is written on the command line, such as "2pi" or "0.5": as a multiple of
+    pi if it is a multiple of pi/2."""
     ratio = (level or 0.0) / 3.141592653589793
     if ratio and abs(2 * ratio - round(2 * ratio)) < 1e-9:
         return f"{ratio:g}pi" if ratio != 1 else "pi"

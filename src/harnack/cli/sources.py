@@ -38,8 +38,8 @@ Content = tuple[Any, dict[str, Any], FieldSources]
 
 
 def options_set(verb: str, arguments: Any) -> dict[str, Any]:
-    """The options of a function that were given on the command line, by their names in Python.
-    verb: the name of the function, such as "render".
+    """Return the options of a function that were given on the command line, by their names in
+    Python. verb: the name of the function, such as "render".
 
     Raises:
         ValueError: a style of isolines was given without isolines.
@@ -61,8 +61,8 @@ def options_set(verb: str, arguments: Any) -> dict[str, Any]:
 
 
 def source_path(arguments: Any) -> Path:
-    """The source as a path: a file, the name of a scene, or "formula" for a formula. The output
-    file is named after it.
+    """Return the source as a path: a file, the name of a scene, or "formula" for a formula. The
+    output file is named after it.
 
     Raises:
         ValueError: the source is none of these, or --parameter was given without a formula.
@@ -82,20 +82,20 @@ def source_path(arguments: Any) -> Path:
 
 
 def is_formula(name: str) -> bool:
-    """Whether the source with this name is a formula, and neither a scene of the gallery nor a
-    file."""
+    """Return whether the source with this name is a formula, and neither a scene of the gallery nor
+    a file."""
     is_file = Path(name).suffix.lower() in _SUFFIXES
     return name not in SCENES and not is_file and looks_like_formula(name)
 
 
 def is_mitsuba_scene(arguments: Any, path: Path) -> bool:
-    """Whether the source is the file of a Mitsuba scene (.xml). path: the source as `source_path`
-    returns it."""
+    """Return whether the source is the file of a Mitsuba scene (.xml). path: the source as
+    `source_path` returns it."""
     return arguments.source not in SCENES and path.suffix.lower() == ".xml"
 
 
 def load_mitsuba_scene(arguments: Any) -> tuple[str, dict[str, Any]]:
-    """The path of a Mitsuba scene, and the options of its picture.
+    """Return the path of a Mitsuba scene, and the options of its picture.
 
     Raises:
         ValueError: an option was given that the scene sets in its own file, such as a material.
@@ -117,13 +117,15 @@ def load_content(
     where the fields come from, for scene files.
 
     path: the source as `source_path` returns it.
-    moved: numbers of names in a formula, besides those of --parameter."""
+    moved: further numbers for names in a formula, besides those of --parameter; by name.
+    """
     given_options = options_set(verb, arguments)
     if arguments.source in SCENES:
         _refuse_file_options(arguments)
         return _of_scene(SCENES[arguments.source], arguments, given_options)
     if is_formula(arguments.source):
         _refuse_file_options(arguments)
+        # A formula has no camera of its own.
         camera = _camera(arguments, Camera())
         return formula_field(arguments, moved), {**camera, **given_options}, ()
     if path.suffix.lower() == ".json":
@@ -175,7 +177,8 @@ def load_live_content(verb: str, arguments: Any, path: Path) -> Content:
         if dropped_options:
             print_line(f"left out, as a {verb} does not have them: {', '.join(dropped_options)}")
     settings = live_options(settings) | ({} if show is None else {"show": show})
-    # A slider can move an option of the surface only if it is an option of the page.
+    # A slider can move an option of the surface only if this is an option of the page. So the
+    # options of a single surface become options of the page.
     if any(name in SURFACE_OPTIONS for name in sliders):
         surfaces, settings = _unpacked(surfaces, settings)
     settings = _with_flat_options(settings, sliders) | sliders
@@ -184,7 +187,7 @@ def load_live_content(verb: str, arguments: Any, path: Path) -> Content:
     formula_text, fixed = arguments.source, dict(arguments.parameters)
 
     def field(**values: float) -> Field:
-        """The formula's field for these values of its sliders."""
+        """Return the formula's field for these values of its sliders."""
         return expression(formula_text, parameters={**fixed, **values})
 
     keyword_only = inspect.Parameter.KEYWORD_ONLY
@@ -232,8 +235,8 @@ def load_single_surface(arguments: Any, path: Path) -> Field | Surface:
 
 
 def formula_field(arguments: Any, moved: Mapping[str, float] | None = None) -> Field:
-    """The field of the formula that is the source. moved: numbers of names in the formula, besides
-    those of --parameter."""
+    """Return the field of the formula that is the source. moved: further numbers for names in the
+    formula, besides those of --parameter; by name."""
     return expression(arguments.source, parameters={**dict(arguments.parameters), **(moved or {})})
 
 
@@ -244,8 +247,8 @@ def print_line(line: str) -> None:
 
 
 def _of_scene(scene: Scene, arguments: Any, given_options: dict[str, Any]) -> Content:
-    """A scene of the gallery as content (surfaces, options, and where the fields come from). The
-    given options replace the scene's.
+    """Return a scene of the gallery as content (surfaces, options, and where the fields come from).
+    The given options replace the scene's.
 
     Raises:
         ValueError: a level or side was given, and the scene has several surfaces.
@@ -270,8 +273,8 @@ def _of_scene(scene: Scene, arguments: Any, given_options: dict[str, Any]) -> Co
 
 
 def _of_scene_file(scene: SceneFile, arguments: Any, given_options: dict[str, Any]) -> Content:
-    """The scene that a scene file (.json) describes as content (surfaces, options, and where the
-    fields come from). The given options replace the file's.
+    """Return the scene that a scene file (.json) describes as content (surfaces, options, and where
+    the fields come from). The given options replace the file's.
 
     Raises:
         ValueError: a level was given, and the scene has several surfaces.
@@ -291,8 +294,8 @@ def _of_scene_file(scene: SceneFile, arguments: Any, given_options: dict[str, An
 
 
 def _of_file(path: Path, arguments: Any, given_options: dict[str, Any]) -> Content:
-    """A surface file as content (its field, options, and where the field comes from). What the file
-    was taken for is printed."""
+    """Return a surface file as content (its field, options, and where the field comes from). What
+    the file was taken for is printed."""
     given_options = {name: value for name, value in given_options.items() if name != "up"}
     opened = field_from_file(path, **_file_options(arguments))
     print_line(f"{path}: {python_to_cli_terms(opened.summary)}")
@@ -307,7 +310,7 @@ def _of_file(path: Path, arguments: Any, given_options: dict[str, Any]) -> Conte
 
 
 def _file_options(arguments: Any) -> dict[str, Any]:
-    """The options for surface files, by name, also those that were not given."""
+    """Return the options for surface files, by name, also those that were not given."""
     return {name: getattr(arguments, name) for name in FILE_OPTIONS}
 
 
@@ -330,9 +333,9 @@ def _split(values: Mapping[str, Any], names: Sequence[str]) -> tuple[dict[str, A
 
 
 def _replaced(surface: Field | Surface, keywords: Mapping[str, Any]) -> Field | Surface:
-    """A copy of a surface with the given keywords of `Surface` changed; of a field, the surface
-    with these keywords. Without keywords it is returned unchanged. A new level of a solid that lies
-    between two levels turns it into a level set."""
+    """Return a copy of a surface with the given keywords of `Surface` changed; of a field, the
+    surface with these keywords. Without keywords it is returned unchanged. A new level of a solid
+    that lies between two levels turns it into a level set."""
     if not keywords:
         return surface
     if isinstance(surface, Field):
@@ -365,9 +368,9 @@ def _unpacked(surfaces: Any, settings: dict[str, Any]) -> tuple[Any, dict[str, A
 
 
 def _with_flat_options(settings: dict[str, Any], sliders: Mapping[str, Any]) -> dict[str, Any]:
-    """The settings by name. If one of the sliders (by name) moves an option of traces, the entry
-    "options" (a `TraceOptions`) is replaced by two entries, its tolerance and its number of steps,
-    since a slider can only be the value of an entry."""
+    """Return the settings by name. If one of the sliders (by name) moves an option of traces, the
+    entry "options" (a `TraceOptions`) is replaced by two entries, its tolerance and its number of
+    steps, since a slider can only be the value of an entry."""
     options = settings.get("options")
     if not isinstance(options, TraceOptions) or not any(name in TRACE_OPTIONS for name in sliders):
         return settings
@@ -376,26 +379,28 @@ def _with_flat_options(settings: dict[str, Any], sliders: Mapping[str, Any]) -> 
 
 
 def _camera_options(arguments: Any) -> dict[str, Any]:
-    """The options of the camera that were given, by name."""
+    """Return the options of the camera that were given, by name."""
     values = {name: getattr(arguments, name, None) for name in CAMERA_OPTIONS}
     return {name: value for name, value in values.items() if value is not None}
 
 
 def _camera(arguments: Any, camera: Camera) -> dict[str, Any]:
-    """The entry {"camera": camera}, in which `camera` was changed by the given options; an empty
-    dictionary if no option of the camera was given."""
+    """Return the entry {"camera": camera}, in which `camera` was changed by the given options; an
+    empty dictionary if no option of the camera was given."""
     given_options = _camera_options(arguments)
     if not given_options:
         return {}
     if "position" in given_options:  # in place of where the camera stands by its angles
         camera = replace(camera, azimuth=None, elevation=None, distance=None)
+    # Angles and distance say where the camera stands, in place of a position.
     elif {"azimuth", "elevation", "distance"} & set(given_options):
         camera = replace(camera, position=None)
     return {"camera": replace(camera, **given_options)}
 
 
 def _described(field: Field) -> str:
-    """One line about a field: the name of its class and the facts of its method `describe`."""
+    """Return one line about a field: the name of its class and the facts of its method
+    `describe`."""
     facts = ", ".join(
         f"{key}: {f'{value:.6g}' if isinstance(value, float) else value}"
         for key, value in field.describe().items()

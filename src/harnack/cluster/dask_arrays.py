@@ -20,7 +20,7 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def is_dask_array(value: Any) -> bool:
-    """Whether a value is a Dask array. This does not import Dask."""
+    """Return whether a value is a Dask array. This does not import Dask."""
     return type(value).__module__.startswith("dask.array") and hasattr(value, "dask")
 
 
@@ -30,10 +30,12 @@ def accepts_dask_arrays(*names: str) -> Callable[[Function], Function]:
     each of their blocks is the function's result for the same block of the arguments. All other
     arguments, such as a field, are sent to each worker once.
 
-    It must be the outermost decorator, since workers look the function up by its name."""
+    It must be the outermost decorator, since workers look the function up by its name.
+    """
 
     def decorate(function: Function) -> Function:
-        """Return `function` with support for Dask arrays."""
+        """Return `function` with support for Dask arrays. Its arguments `names` may be Dask
+        arrays."""
         signature = inspect.signature(function)
         # The name of the parameter **keywords, if there is one.
         variadic_name = next(
@@ -54,6 +56,7 @@ def accepts_dask_arrays(*names: str) -> Callable[[Function], Function]:
             # The first argument, `self` of a method, is passed by position, all others by name.
             first_argument = arguments.pop(next(iter(signature.parameters)))
             named = {**arguments.pop(variadic_name, {}), **arguments}
+            # `wrapper`, and not `function`, as workers find the wrapper under the function's name.
             return _map_blocks(functools.partial(wrapper, first_argument), names, named)
 
         return cast("Function", wrapper)
@@ -99,6 +102,7 @@ def _map_blocks(call: Callable[..., Any], names: tuple[str, ...], arguments: dic
         (serialized.content_hash, [(name, array.name) for name, array in dask_args.items()]),
         purpose,
     )
+    # traverse=False: Dask need not look for Dask arrays in it.
     sent_call = delayed(serialized, name=f"harnack-{serialized.content_hash}", traverse=False)
     run_block = delayed(_run_block, pure=False)
     block_lists = [array.to_delayed().reshape(-1).tolist() for array in dask_args.values()]
@@ -107,6 +111,7 @@ def _map_blocks(call: Callable[..., Any], names: tuple[str, ...], arguments: dic
     # One delayed call for each block; it returns the result's arrays by name.
     for block_index, blocks in enumerate(zip(*block_lists, strict=True)):
         block_of_argument = dict(zip(dask_args, blocks, strict=True))
+        # The third argument is the index of the first row of the block.
         output = run_block(
             sent_call,
             block_of_argument,
@@ -137,6 +142,7 @@ def _align_blocks(
     first_name, reference = next(iter(dask_args.items()))
     if reference.ndim == 0:
         raise ValueError(f"{first_name} must have shape (n, 3) or (n,), not ()")
+    # Unknown lengths are NaN in Dask.
     if any(np.isnan(array) for array in reference.chunks[0]):
         raise ValueError(
             f"{first_name}: the lengths of its blocks are not known; call its method "
@@ -154,21 +160,24 @@ def _align_blocks(
             raise ValueError(f"{name} must have shape (n, 3) or (n,), not {array.shape}")
         if array.shape[0] != count:
             raise ValueError(f"{name} has {array.shape[0]} entries, and {first_name} has {count}")
+    # -1: columns are not divided.
     chunks = reference.chunks[0]
     return {name: array.rechunk((chunks, -1)[: array.ndim]) for name, array in aligned.items()}
 
 
 def _arrays_of(result: Any) -> dict[str, np.ndarray[Any, Any]]:
-    """The arrays of a function's result by name: the attributes of a dataclass, or the array itself
-    under the name ""."""
+    """Return the arrays of a function's result by name: the attributes of a dataclass, or the array
+    itself under the name ""."""
     return dict(vars(result)) if is_dataclass(result) else {"": np.asarray(result)}
 
 
 def _run_block(packed: SerializedObject, blocks: dict[str, Any], start: int) -> dict[str, Any]:
     """Apply the function to one block of rows, on a worker. Returns the result's arrays by name.
 
-    packed: the serialized function. blocks: the block of each Dask array by the argument's name.
-    start: the first row of the block, for messages."""
+    packed: the serialized function.
+    blocks: the block of each Dask array by the argument's name.
+    start: the first row of the block, for messages.
+    """
     with exclusive_compute():
         try:
             return _arrays_of(packed.deserialize()(**blocks))

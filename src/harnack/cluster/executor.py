@@ -7,11 +7,6 @@ Each task is named by a hash of its contents, including files and users' code bu
 can be used again after a crash, with other workers, or for a film with more frames: finished tasks
 are not repeated, and results of other jobs are left alone.
 
-Each task is named by a hash of its contents, including files and users' code but not cached values
-(`serialization`, `users_code`). The name alone identifies a stored result. So a checkpoint folder
-can be used again after a crash, with other workers, or for a film with more frames: finished tasks
-are not repeated, and results of other jobs are left alone.
-
 All jobs take the same path. A picture is always computed band by band, in this process or on Dask's
 workers (`shading`, `RenderExecutor`), so that the result is the same bit for bit. Steps that need
 the whole picture (hidden sky, outlines) run in the process that assembles it. A job is sent as a
@@ -86,7 +81,8 @@ class CheckpointFolder:
         return cls(folder)
 
     def load(self, name: str) -> TaskResult | None:
-        """The stored result of the task with this name; None if the folder has none.
+        """Read and return the stored result of the task with this name; None if the folder has
+        none.
 
         Raises:
             ValueError: the file is damaged.
@@ -103,7 +99,7 @@ class CheckpointFolder:
             ) from None
 
     def has(self, name: str) -> bool:
-        """Whether the folder has a result of the task with this name."""
+        """Return whether the folder has a result of the task with this name."""
         return self._file(name).exists()
 
     def save(self, name: str, arrays: TaskResult) -> None:
@@ -112,7 +108,7 @@ class CheckpointFolder:
             np.savez(partial, allow_pickle=False, **arrays)
 
     def _file(self, name: str) -> Path:
-        """The path of the file for the result of the task with this name."""
+        """Return the path of the file for the result of the task with this name."""
         return self.path / f"{name}.npz"
 
 
@@ -131,8 +127,8 @@ class Executor:
 
     def split_range(self, count: int, max_size: int) -> list[tuple[int, int]]:
         """Split range(count) into intervals (start, stop) of at most `max_size` numbers each; each
-        interval is to be a task. They are made shorter if there would be fewer tasks than `chunks`
-        or, if `chunks` is None and there is a client, fewer than six for each thread of its
+        interval is to be a task. With `chunks`, they are made shorter until there are about so many
+        tasks. Without it but with a client, until there are about six for each thread of its
         workers."""
         size = max(1, min(max_size, count))
         if self.chunks is not None:
@@ -152,7 +148,8 @@ class Executor:
         step: the name of a method that returns arrays by name.
         parts: for each task, a tuple of the method's arguments.
 
-        Raises the errors of the method."""
+        Raises the errors of the method.
+        """
         if self.client is None and self.checkpoint is None:
             method: TaskFunction = getattr(job, step)
             for part in parts:
@@ -174,12 +171,12 @@ class Executor:
                     self.checkpoint.save(name, arrays)
 
     def _max_pending(self) -> int:
-        """The largest number of tasks that may be running or whose results wait to be yielded:
-        three for each thread of the workers, or one in this process."""
+        """Return the largest number of tasks that may be running or whose results wait to be
+        yielded: three for each thread of the workers, or one in this process."""
         return 1 if self.client is None else _PENDING_PER_THREAD * self._threads()
 
     def _threads(self) -> int:
-        """The number of threads of all workers of the client, at least 1."""
+        """Return the number of threads of all workers of the client, at least 1."""
         return max(1, sum(worker_threads(self.client).values()))
 
 
@@ -213,7 +210,8 @@ class _LocalTasks:
     `_DaskTasks`.
 
     do: the job's method that a task calls.
-    waiting: (name, arguments) of the tasks that were submitted and not run yet."""
+    waiting: (name, arguments) of the tasks that were submitted and not run yet.
+    """
 
     def __init__(self, packed: SerializedObject, step: str) -> None:
         """Prepare the tasks of the serialized job `packed`. step: the name of the job's method that
@@ -232,8 +230,8 @@ class _LocalTasks:
         return name, self.do(*part)
 
     def cancel(self) -> list[tuple[str, TaskResult]]:
-        """The (name, result) of the tasks that are finished but whose results were not fetched:
-        always none here."""
+        """Return the (name, result) of the tasks that are finished but whose results were not
+        fetched: always none here, since a task is run only when its result is fetched."""
         return []
 
 
@@ -244,13 +242,15 @@ class _DaskTasks:
     completed: Dask's iterator of finished futures.
     names: the name of the task of each future that was not fetched yet.
     checked_workers: addresses of the workers whose rounding was compared with that of this process.
-    packed: the future of the serialized job."""
+    packed: the future of the serialized job.
+    """
 
     def __init__(self, client: Any, packed: SerializedObject, step: str) -> None:
         """Send the serialized job `packed` to the cluster of `client`. step: the name of the job's
         method that a task calls."""
         distributed = import_optional("distributed", "client")
         self.client, self.step = client, step
+        # Classes of errors of Dask, by which lost workers and a lost scheduler are recognized.
         self.worker_lost = distributed.KilledWorker
         self.scheduler_lost = import_optional("distributed.client", "client").FuturesCancelledError
         self.completed = distributed.as_completed(loop=client.loop)
@@ -344,7 +344,8 @@ def _ordered_results(
     folder: the folder in which results are looked up and stored; None for no folder.
     runner: runs the tasks.
     max_pending: returns the largest number of tasks that may be running or whose results wait to be
-        yielded."""
+        yielded.
+    """
     results: dict[str, TaskResult] = {}
     pending: set[str] = set()
     uses_left, next_index = Counter(names), 0
@@ -364,6 +365,7 @@ def _ordered_results(
         next_index = max(next_index, index + 1)
         # Until the next result in order is there: start as many tasks as allowed, and wait for one.
         while name not in results:
+            # The number of workers may change.
             limit = max_pending()
             while next_index < len(names) and len(pending) + len(results) < limit:
                 next_name = names[next_index]

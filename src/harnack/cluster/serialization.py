@@ -85,8 +85,8 @@ def import_optional(name: str, feature: str) -> Any:
 
 @functools.cache
 def package_versions() -> str:
-    """The versions, as one text, of this library and of the libraries on which the bits of its
-    results depend."""
+    """Return the versions, as one text, of this library and of the libraries on which the bits of
+    its results depend."""
     versions = (f"{name} {importlib.metadata.version(name)}" for name in _PACKAGES)
     return ", ".join((f"harnack {__version__}", *versions))
 
@@ -96,7 +96,7 @@ class TransientCache(dict[Key, Value]):
     the object."""
 
     def __reduce__(self) -> Any:
-        """How pickle rebuilds the cache: as an empty one."""
+        """Return how pickle rebuilds the cache: as an empty one."""
         return TransientCache, ()
 
 
@@ -108,10 +108,11 @@ class SerializedObject:
     content_hash: 32 hexadecimal digits, equal for equal contents and equal versions of this
         library, of `package_versions` and of `other_versions`.
     data: the pickle.
-    file_digests: (path, hash of the contents) of each file that the object names.
+    file_digests: for each file that the object names, its path and the hash of its contents.
     package_versions: the versions in the process that pickled the object; `deserialize` refuses
         others.
-    other_versions: (name, version) of the other installed packages that the object uses."""
+    other_versions: (name, version) of the other installed packages that the object uses.
+    """
 
     content_hash: str
     data: bytes
@@ -121,7 +122,7 @@ class SerializedObject:
 
     @classmethod
     def serialize(cls, thing: Any, label: str) -> SerializedObject:
-        """Pickle an object. label: what the object is, the first word of messages.
+        """Pickle an object. label: what the object is; messages begin with it.
 
         Raises:
             ModuleNotFoundError: the extra `cluster` is not installed.
@@ -180,7 +181,7 @@ def _deserialize_cached(packed: SerializedObject) -> Any:
 
 
 def content_hash(thing: Any, label: str) -> str:
-    """A hash of 32 hexadecimal digits that depends on everything an object contains, on the
+    """Return a hash of 32 hexadecimal digits that depends on everything an object contains, on the
     contents of the files that it names, and on `package_versions`. label: what the object is, for
     messages.
 
@@ -197,12 +198,14 @@ def content_hash(thing: Any, label: str) -> str:
 def _hash_and_files(
     value: Any, label: str, identifiers: frozenset[str] = frozenset()
 ) -> tuple[str, Any]:
-    """The content hash of a value, and the pickler that wrote it. The pickler has noted the hashes
-    of the files (`files`) and the versions of the packages (`other_versions`) that the value uses.
+    """Return the content hash of a value, and the pickler that wrote it. The pickler has noted the
+    hashes of the files (`files`) and the versions of the packages (`other_versions`) that the value
+    uses.
 
     label: what the value is, for messages.
     identifiers: identifiers in users' code that are known already; they select the attributes of
-        users' modules that are written."""
+        users' modules that are written.
+    """
     # The fast way writes equal parts at each place, so it fails for an object that contains itself.
     # The other way writes a reference for a part that was written before.
     try:
@@ -246,15 +249,16 @@ def _pickle(
                 "of arrays, numbers and the classes of this library"
             ) from error
         identifiers = frozenset(pickler.words)
+        # The pickler is complete if no module has further attributes whose names are words now.
         if all(len(attributes_named(*module)) == len(attributes_named(module[0], identifiers))
                for module in pickler.modules):  # fmt: skip
             return pickler
 
 
 def _by_value(definition: Any, reduce: Callable[[Any], Any]) -> Any:
-    """How pickle rebuilds a function, class or type variable: the result of cloudpickle's function
-    `reduce`. If the definition is in a user's module, the result describes its contents; otherwise
-    its name."""
+    """Return how pickle rebuilds a function, class or type variable: the result of cloudpickle's
+    function `reduce`. If the definition is in a user's module, the result describes its contents;
+    otherwise its name."""
     module = sys.modules.get(str(getattr(definition, "__module__", None)))
     if module is None or not is_sent_itself(module):
         return reduce(definition)
@@ -271,7 +275,8 @@ def _by_value(definition: Any, reduce: Callable[[Any], Any]) -> Any:
 
 
 def _file_digest(name: str) -> str | None:
-    """A hash of the contents of the file with this name, as text; None if there is no such file."""
+    """Return a hash of the contents of the file with this name, as text; None if there is no such
+    file."""
     try:
         if not Path(name).is_file():  # pipes never end
             return None
@@ -313,7 +318,8 @@ def _make_cacheless_pickler(base: Any) -> Callable[..., Any]:
     modules: for each user's module pickled so far, the module and the words known when it was
         pickled, which decided which of its attributes were written.
     spaces: the objects that stand for the global names of modules, by the id of the module's
-        dictionary."""
+        dictionary.
+    """
 
     class CachelessPickler(base):
         """A pickler that leaves out cached values and writes users' code by value. It writes into
@@ -329,7 +335,7 @@ def _make_cacheless_pickler(base: Any) -> Callable[..., Any]:
             self.spaces: dict[int, Namespace] = {}
 
         def reducer_override(self, obj: Any) -> Any:
-            """How an object is rebuilt: a function, its arguments and a state without cached
+            """Return how an object is rebuilt: a function, its arguments and a state without cached
             values, as `pickle.Pickler.reducer_override` returns it; NotImplemented to pickle the
             object as usual."""
             if isinstance(obj, ModuleType):
@@ -347,7 +353,8 @@ def _make_cacheless_pickler(base: Any) -> Callable[..., Any]:
             transient = _transient_attributes(obj_type)
             if not transient:
                 return _refuse_user_names(obj)
-            # Replace cached values in the state by their defaults, or leave them out.
+            # Replace cached values in the state by their defaults, or leave them out. A reduce
+            # value has two to six entries; a missing state counts as None.
             constructor, arguments, state, *rest = (*obj.__reduce_ex__(_PROTOCOL), None)[:6]
             if isinstance(state, dict):
                 state_attributes = cast("dict[str, Any]", state)
@@ -356,8 +363,8 @@ def _make_cacheless_pickler(base: Any) -> Callable[..., Any]:
             return constructor, arguments, state, *rest[:3]
 
         def of_module(self, module: ModuleType) -> Any:
-            """How a module is rebuilt: by its name; or, if it is a user's module, as a new module
-            with those of its attributes whose names are among the words."""
+            """Return how a module is rebuilt: by its name; or, if it is a user's module, as a new
+            module with those of its attributes whose names are among the words."""
             if not is_sent_itself(module):
                 return importlib.import_module, (module.__name__,)
             words = frozenset(self.words)
@@ -367,10 +374,11 @@ def _make_cacheless_pickler(base: Any) -> Callable[..., Any]:
             return itself, (self.space(vars(module)),), (attributes, left_out), None, None, fill
 
         def of_function(self, function: FunctionType, reduced: Any) -> Any:
-            """How a user's function is rebuilt, with its global names looked up in its rebuilt
-            module. Its identifiers and strings are added to the words.
+            """Return how a user's function is rebuilt, with its global names looked up in its
+            rebuilt module. Its identifiers and strings are added to the words.
 
-            reduced: how cloudpickle rebuilds it; returned unchanged if that is by name only."""
+            reduced: how cloudpickle rebuilds it; returned unchanged if that is by name only.
+            """
             if not isinstance(reduced, tuple):
                 return reduced
             refuse_imports_within(function)
@@ -379,20 +387,21 @@ def _make_cacheless_pickler(base: Any) -> Callable[..., Any]:
             return function_in, (self.space(function.__globals__), code, closure), *rest
 
         def space(self, names: dict[str, Any]) -> Namespace:
-            """The `Namespace` that stands for the global names of a module in the pickle. It is the
-            same object at each call for the same module, so that all functions of the module share
-            their global names after unpickling.
+            """Return the `Namespace` that stands for the global names of a module in the pickle. It
+            is the same object at each call for the same module, so that all functions of the module
+            share their global names after unpickling.
 
-            names: the dictionary of the module, `vars(module)`."""
+            names: the dictionary of the module, `vars(module)`.
+            """
             return self.spaces.setdefault(id(names), Namespace.of(names))
 
     return CachelessPickler
 
 
 def _without_generated_id(reduced: Any) -> Any:
-    """Remove the id that cloudpickle generated from its description `reduced` of how a class is
-    rebuilt. By this id cloudpickle would find a class that it rebuilt before, and replace the
-    methods of that class."""
+    """Return cloudpickle's description of how a class is rebuilt, without the id that cloudpickle
+    generated for the class. By this id cloudpickle would find a class that it rebuilt before, and
+    replace the methods of that class. reduced: the description."""
     if not isinstance(reduced, tuple):
         return reduced
     constructor, arguments, *rest = cast("tuple[Any, ...]", reduced)
@@ -404,9 +413,9 @@ def _without_generated_id(reduced: Any) -> Any:
 
 
 def _refuse_user_names(obj: Any) -> Any:
-    """How to rebuild an object that pickle would describe only by its name in a user's module. A
-    cached function is rebuilt from its contents. The result is NotImplemented for all other
-    objects, which are pickled as usual.
+    """Return how to rebuild an object that pickle would describe only by its name in a user's
+    module. A cached function is rebuilt from its contents. The result is NotImplemented for all
+    other objects, which are pickled as usual.
 
     Raises:
         TypeError: the contents cannot be determined.
@@ -435,7 +444,8 @@ def _make_hashing_pickler(base: Any) -> Callable[..., Any]:
     files: the hash of each file by its path.
     other_versions: the versions of the installed packages that are used, by name.
     begun: the functions, classes and modules whose writing has begun: by the id of each, the object
-        itself and its number in the order in which they were begun."""
+        itself and its number in the order in which they were begun.
+    """
     base_pickler: Any = _make_cacheless_pickler(base)
 
     class HashingPickler(base_pickler):
@@ -455,7 +465,8 @@ def _make_hashing_pickler(base: Any) -> Callable[..., Any]:
 
             A function, class or module whose writing has begun is replaced by its number, as it may
             refer to itself. A set is replaced by the sorted hashes of its members, since its order
-            changes from run to run. The name of a file is replaced by a hash of the file."""
+            changes from run to run. The name of a file is replaced by a hash of the file.
+            """
             obj_type = cast("type[Any]", type(obj))
             if id(obj) in self.begun:  # classes, functions and modules may name themselves
                 return f"number {self.begun[id(obj)][1]}"
@@ -472,9 +483,9 @@ def _make_hashing_pickler(base: Any) -> Callable[..., Any]:
             return self.of_file(obj) if isinstance(obj, str | os.PathLike) else None
 
         def of_file(self, obj: Any) -> str | None:
-            """The text "file" and a hash of the contents, if the object is the name or path of an
-            existing file; None for a file of code and for any other string. The hash is noted in
-            `files`."""
+            """Return the text "file" and a hash of the contents, if the object is the name or path
+            of an existing file; None for a file of code and for any other string. The hash is noted
+            in `files`."""
             path = os.fsdecode(cast("str | os.PathLike[str]", obj))
             if path.endswith(_CODE_SUFFIXES) or (contents := _file_digest(path)) is None:
                 return None
@@ -495,6 +506,8 @@ def _make_hashing_pickler(base: Any) -> Callable[..., Any]:
             self.note_origin(obj)
             reduced = base_pickler.reducer_override(self, obj)
             is_code = isinstance(obj, type | FunctionType | ModuleType)
+            # What pickle would do as usual is asked for here; a definition is described by its
+            # name.
             if reduced is NotImplemented and type(obj) not in base.dispatch_table:
                 reduced = obj.__qualname__ if is_code else obj.__reduce_ex__(_PROTOCOL)
             # An object that is described by its name only.
@@ -537,8 +550,8 @@ _NAMESPACE_ATTRIBUTES = ("__globals__", "__kwdefaults__")
 
 
 def _with_encoded_keys(state: Any) -> Any:
-    """The state of an object, with the names of its attributes as bytes instead of strings. Strings
-    would be taken for names of files, and hashed as such if there is such a file."""
+    """Return the state of an object, with the names of its attributes as bytes instead of strings.
+    Strings would be taken for names of files, and hashed as such if there is such a file."""
     if isinstance(state, tuple):
         return tuple(map(_with_encoded_keys, cast("tuple[Any, ...]", state)))
     if not isinstance(state, dict):
@@ -555,8 +568,8 @@ def _with_encoded_keys(state: Any) -> Any:
 
 
 def _encoded(names: Any) -> Any:
-    """A string as bytes; a dictionary as a list of pairs, with its strings as bytes; any other
-    value unchanged."""
+    """Return a string as bytes; a dictionary as a list of pairs, with its strings as bytes; any
+    other value unchanged."""
     if isinstance(names, dict):
         mapping = cast("dict[Any, Any]", names)
         return [(_encoded(key), _encoded(value)) for key, value in mapping.items()]
@@ -570,15 +583,16 @@ _CODE_ATTRIBUTES = (
 
 
 def _is_generated_id(argument: Any) -> bool:
-    """Whether a value is an id that cloudpickle generated for a class: 32 hexadecimal digits."""
+    """Return whether a value is an id that cloudpickle generated for a class: 32 hexadecimal
+    digits."""
     return isinstance(argument, str) and _GENERATED_ID.fullmatch(argument) is not None
 
 
 @functools.lru_cache(maxsize=1024)
 def _transient_attributes(kind: type) -> dict[str, Any]:
-    """The attributes in which objects of the class `kind` cache computed values. The value of each
-    entry is what replaces the cached value in a pickle: the default of a private dataclass field,
-    or `_OMIT` to leave the attribute out."""
+    """Return the attributes in which objects of the class `kind` cache computed values. The value
+    of each entry is what replaces the cached value in a pickle: the default of a private dataclass
+    field, or `_OMIT` to leave the attribute out."""
     replacements: dict[str, Any] = {
         name: _OMIT
         for definition in kind.__mro__

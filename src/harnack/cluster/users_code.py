@@ -10,13 +10,6 @@ and a checkpoint folder must distinguish two states of it. But the whole module 
 since modules also hold locks, clients and pictures. So an attribute is sent only if its name occurs
 in the code that is sent. A sent module raises an error when any other attribute is used, so that
 nothing is missing silently.
-
-Code of Python itself and of installed packages is sent by name. A user's module is sent by value,
-in its present state: a worker may lack the module, or may have imported it before it was changed,
-and a checkpoint folder must distinguish two states of it. But the whole module would be too much,
-since modules also hold locks, clients and pictures. So an attribute is sent only if its name occurs
-in the code that is sent. A sent module raises an error when any other attribute is used, so that
-nothing is missing silently.
 """
 
 from __future__ import annotations
@@ -70,17 +63,20 @@ class Namespace:
     """A stand-in, in a pickle, for the module in which pickled functions look up global names.
     Unpickling it gives a `SentModule`.
 
-    known: the attributes that are sent whatever names the functions use, such as `__name__`."""
+    known: the attributes that are sent whatever names the functions use, such as `__name__`.
+    """
 
     known: Mapping[str, Any]
 
     @classmethod
     def of(cls, names: Mapping[str, Any]) -> Namespace:
-        """The namespace that stands for a module. names: the attributes of the module by name."""
+        """Return the namespace that stands for a module. names: the attributes of the module by
+        name."""
         return cls({key: names[key] for key in _ALWAYS_SENT if key in names})
 
     def __reduce__(self) -> Any:
-        """How pickle rebuilds it: by `sent_module`, as a module with the known attributes."""
+        """Return how pickle rebuilds it: by `sent_module`, as a module with the known
+        attributes."""
         return sent_module, (self.known,)
 
 
@@ -110,8 +106,8 @@ def function_in(module: SentModule, code: CodeType, closure: Any) -> FunctionTyp
 
 
 def attributes_named(module: ModuleType, words: frozenset[str] | set[str]) -> dict[str, Any]:
-    """The attributes of a module that code may use, by name, in alphabetical order: those whose
-    names are among `words`, or all of them if `words` contains a function such as `vars`.
+    """Return the attributes of a module that code may use, by name, in alphabetical order: those
+    whose names are among `words`, or all of them if `words` contains a function such as `vars`.
     Attributes that belong to a process are left out. words: identifiers and strings in the code."""
     uses_all = bool(words & _ALL_ATTRIBUTES)
     return {
@@ -131,8 +127,8 @@ def codes_within(code: CodeType) -> Iterator[CodeType]:
 
 
 def words_of(function: FunctionType) -> set[str]:
-    """The words of a function: all names in its code, and its string constants, as attributes may
-    be looked up by them."""
+    """Return the words of a function: all names in its code, and its string constants, as
+    attributes may be looked up by them."""
     return {
         word
         for code in codes_within(function.__code__)
@@ -189,9 +185,9 @@ def _imports(code: CodeType) -> Iterator[tuple[int, str]]:
 
 
 def _imported_module(statement: tuple[int, str], package: str) -> str:
-    """The full name of the module that an import statement imports. statement: the import as
-    (level, name), see `_imports`. package: the package of the module in which the statement stands.
-    """
+    """Return the full name of the module that an import statement imports. statement: the import as
+    (level, name), as `_imports` yields it. package: the package of the module in which the
+    statement stands."""
     level, name = statement
     with suppress(ImportError):  # the function will raise this error itself
         return importlib.util.resolve_name("." * level + name, package)
@@ -199,8 +195,8 @@ def _imported_module(statement: tuple[int, str], package: str) -> str:
 
 
 def _is_user_root(root: str) -> bool:
-    """Whether the top-level module named `root` is a user's module. It may be imported already
-    or not."""
+    """Return whether the top-level module named `root` is a user's module. It may be imported
+    already or not."""
     module = sys.modules.get(root)
     if module is not None:
         return is_users(module)
@@ -214,13 +210,14 @@ def _is_user_root(root: str) -> bool:
 
 
 def is_users(module: ModuleType) -> bool:
-    """Whether a module is a user's: not a part of Python, of an installed package or of this
+    """Return whether a module is a user's: not a part of Python, of an installed package or of this
     library. `__main__` is one, and so is a module that is not in sys.modules."""
     name = module.__name__
     root = name.partition(".")[0]
     if name == "__main__" or sys.modules.get(name) is not module:
         return True
     location = _location_of(module)
+    # A module without a file belongs to whom its top-level module belongs.
     if location is None and root != name and (top_module := sys.modules.get(root)) is not None:
         return is_users(top_module)
     if location is None:  # a built-in module has a specification
@@ -229,7 +226,7 @@ def is_users(module: ModuleType) -> bool:
 
 
 def is_sent_itself(module: ModuleType) -> bool:
-    """Whether a module is sent by value: it is a user's module and not a compiled one."""
+    """Return whether a module is sent by value: it is a user's module and not a compiled one."""
     location = _location_of(module)
     return is_users(module) and (
         location is None or location.endswith(_SOURCES) or not Path(location).suffix
@@ -237,15 +234,15 @@ def is_sent_itself(module: ModuleType) -> bool:
 
 
 def compiled_file(module: ModuleType) -> str | None:
-    """The path of the file of a user's module, if it is a compiled one; None for any other
+    """Return the path of the file of a user's module, if it is a compiled one; None for any other
     module."""
     path = _location_of(module)
     return path if path is not None and is_users(module) and not is_sent_itself(module) else None
 
 
 def _location_of(module: ModuleType) -> str | None:
-    """The file of a module, or the folder of a package without a file; None if the module has
-    neither."""
+    """Return the file of a module, or the folder of a package without a file; None if the module
+    has neither."""
     attributes = vars(module)
     location = attributes.get("__file__") or next(iter(attributes.get("__path__", ())), None)
     return location if isinstance(location, str) else None
@@ -253,8 +250,8 @@ def _location_of(module: ModuleType) -> str | None:
 
 @functools.cache
 def _is_user_location(root: str, location: str) -> bool:
-    """Whether the file or folder `location` belongs to a user, not to Python, an installed package
-    or this library. root: the name of the top-level module that it is a part of."""
+    """Return whether the file or folder `location` belongs to a user, not to Python, an installed
+    package or this library. root: the name of the top-level module that it is a part of."""
     if root == "harnack":
         return False
     path = Path(location).resolve()
@@ -269,8 +266,8 @@ def _is_user_location(root: str, location: str) -> bool:
 
 @functools.cache
 def installed_version(root: str) -> str | None:
-    """The version of the installed package that has the top-level module `root`; None if no package
-    has it, as for Python's own modules and users' modules."""
+    """Return the version of the installed package that has the top-level module `root`; None if no
+    package has it, as for Python's own modules and users' modules."""
     if root in sys.stdlib_module_names or root in ("__main__", "harnack") or _is_user_root(root):
         return None
     with suppress(importlib.metadata.PackageNotFoundError, ValueError):

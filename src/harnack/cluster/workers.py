@@ -39,7 +39,7 @@ def connect_client(client: Any) -> Generator[Any]:
 
     Raises:
         ModuleNotFoundError: Dask is not installed.
-        TypeError: it is neither a client nor an address.
+        TypeError: `client` is neither a client nor an address.
         OSError: there is no scheduler at the address.
         RuntimeError: a worker has no harnack, another version of it, or no LLVM that Dr.Jit can
             use. The message names the worker.
@@ -99,7 +99,7 @@ def exclusive_compute() -> Generator[str]:
 
 
 def worker_threads(client: Any) -> dict[str, int]:
-    """The number of threads of each worker of a client, by the worker's address.
+    """Return the number of threads of each worker of a client, by the worker's address.
 
     Raises:
         RuntimeError: the scheduler is gone.
@@ -172,22 +172,23 @@ def adopt_worker_threads(has_nanny: bool, threads: int) -> None:
     process belongs to this worker alone.
 
     has_nanny: whether Dask runs a supervising process (a nanny) for this worker; then the process
-        belongs to it alone."""
+        belongs to it alone.
+    """
     if has_nanny:
         dr.set_thread_count(threads)
 
 
 def rounding_fingerprint() -> str:
-    """A text that is equal on machines whose kernels give the same bits: the backend's name, and a
-    hash of numbers that kernels compute on this machine."""
+    """Return a text that is equal on machines whose kernels give the same bits: the backend's name,
+    and a hash of numbers that kernels compute on this machine."""
     name = choose_backend().name
     return f"{name} {_rounding(name)}"
 
 
 @functools.cache
 def _rounding(_name: str) -> str:
-    """A hash of numbers that kernels of the chosen backend compute: functions that processors may
-    round differently. _name: the backend's name, by which the hash is cached."""
+    """Return a hash of numbers that kernels of the chosen backend compute: functions that
+    processors may round differently. _name: the backend's name, by which the hash is cached."""
     x = dr.linspace(choose_backend().Float, 0.01, 40, 4096)
     s, c = dr.sincos(x)
     results = (dr.rcp(x), dr.rsqrt(x), s, c, dr.exp(-x), dr.log(x), dr.fma(s, c, x), dr.sqrt(x),

@@ -138,13 +138,14 @@ def _open_or_create(zarr: Any, array: Any, target: Path) -> Any:
 
 
 def _chunk_path(file: Any, target: Path, index: tuple[int, ...]) -> Path:
-    """The path of the file of the chunk with this index. This file exists only if the chunk is
-    complete: Zarr writes it under another name first, and then renames it."""
+    """Return the path of the file of the chunk with this index. This file exists only if the chunk
+    is complete: Zarr writes it under another name first, and then renames it."""
     return target / file.metadata.encode_chunk_key(index)
 
 
 def _chunk_slices(array: Any, index: tuple[int, ...]) -> tuple[slice, ...]:
-    """The slices, one for each axis, that select the chunk with this index from the array."""
+    """Return the slices, one for each axis, that select the chunk with this index from the
+    array."""
     starts = [sum(lengths[:k]) for lengths, k in zip(array.chunks, index, strict=True)]
     ends = [sum(lengths[: k + 1]) for lengths, k in zip(array.chunks, index, strict=True)]
     return tuple(slice(a, b) for a, b in zip(starts, ends, strict=True))

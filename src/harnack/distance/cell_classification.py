@@ -1,10 +1,10 @@
 """Classifies cubes of space, the cells, by how a surface passes through them. The surface is a
 level set of a function f: f takes a given value on it, the level. A cell may be proved to hold no
 point of the surface. In other cells, if possible, a slab (the space between two parallel planes) is
-found that contains the surface, and a point of the surface.
+found that contains the surface, and a point of the surface. The boundary of the field's domain cuts
+the level set in a curve, the *clip curve*. A point of it is found in cells through which it passes.
 
-The boundary of the field's domain cuts the level set in a curve, the *clip curve*. A point of it is
-found in cells through which it passes; `ClipCurveDescent` finds the closest point of this curve.
+`ClipCurveDescent` finds the closest point of the clip curve.
 """
 
 from __future__ import annotations
@@ -197,16 +197,17 @@ class ClipCurveDescent:
             count(0), real(1), count(0), count(0), self.backend.Bool(True),
         )  # fmt: skip
         final = dr.while_loop(state, is_active, body, label="along the rim")
+        # The best point, and its curvature, which is the length of y'' (`ddy`).
         return final[1], safe_norm(final[5])
 
     def _at(self, y: Vec3) -> _ClipCurveState:
         """Return the geometry at a point y near the clip curve: the derivatives of the curve there,
         and the step that leads back to it.
 
-        With u and n the unit normals of level set and domain, the tangent t is along their cross
-        product. On the curve u.y' = 0 and n.y' = 0; differentiated by arc length, u.y'' = -u'.t and
-        n.y'' = -n'.t, where u' and n' are the changes of the normals along t, computed by
-        differences.
+        Let u and n be the unit normals of the level set and of the domain. The tangent t = y' of
+        the curve is along their cross product. On the curve u.y' = 0 and n.y' = 0. Differentiated
+        by arc length, u.y'' = -u'.t and n.y'' = -n'.t, where u' and n' are the derivatives of the
+        normals along t, computed by differences.
         """
         real, vector = self.backend.Float, self.backend.Array3f
         sample = self.field.evaluate(y)
@@ -216,9 +217,10 @@ class ClipCurveDescent:
         depth = (
             -self.domain.signed_distance(y) - _DOMAIN_INSET * self.backend.machine_epsilon * scale
         )
-        # To first order, the distances to the level set along u and to the boundary along n.
+        # To first order, the distances to the level set along u, and along n to a surface just
+        # inside of the boundary, where points of the curve are placed.
         offset = self.levels.offset_to_nearest(sample.value) / gradient_norm
-        radius = dr.fma(
+        near = dr.fma(
             _LEVEL_TOLERANCE * self.backend.machine_epsilon,
             scale,
             real(sample.value_error) / gradient_norm,
@@ -233,20 +235,20 @@ class ClipCurveDescent:
             return (vector(first) * u + vector(second) * n) / sine_squared
 
         t = dr.cross(u, n) * dr.rsqrt(sine_squared)
-        # The step of the differences.
-        h = self.backend.machine_epsilon**0.5 * fmax(scale, real(1e-30))
-        next_point = dr.fma(vector(h), t, y)
+        # The step of the differences; u' . t and n' . t.
+        step = self.backend.machine_epsilon**0.5 * fmax(scale, real(1e-30))
+        next_point = dr.fma(vector(step), t, y)
         u_change = dr.dot(vector(self.field.evaluate(next_point).gradient) - gradient, t) / (
-            gradient_norm * h
+            gradient_norm * step
         )
-        n_change = dr.dot(vector(self.domain.outward_normal(next_point)) - n, t) / h
+        n_change = dr.dot(vector(self.domain.outward_normal(next_point)) - n, t) / step
         # Across an edge of the domain the normal jumps: that change is not curvature.
-        n_change = dr.select(dr.abs(n_change) * h < 1e-3, n_change, 0)
-        is_on = (dr.abs(offset) <= radius) & (
+        n_change = dr.select(dr.abs(n_change) * step < 1e-3, n_change, 0)
+        is_on = (dr.abs(offset) <= near) & (
             dr.abs(depth) <= _DEPTH_TOLERANCE * self.backend.machine_epsilon * scale
         )
         return _ClipCurveState(
-            is_on, radius, solution(offset, depth), t, solution(-u_change, -n_change), n, depth
+            is_on, near, solution(offset, depth), t, solution(-u_change, -n_change), n, depth
         )
 
 
@@ -350,8 +352,8 @@ class CellClassifier:
         center: (n, 3) centers of the cubes.
         half: (n,) half the length of their edges.
 
-        A cube whose ball lies outside the domain is empty. If only its center lies outside, nothing
-        else is known of it.
+        A cube is empty if the ball around it lies outside the domain. If the ball does not, but the
+        cube's center lies outside, the cube is returned without a slab.
         """
         is_inside = np.ones(len(center), np.bool_)
         if self._volume is not None and len(center):
@@ -469,6 +471,7 @@ class CellClassifier:
             & dr.isfinite(linear_error)
             & (linear_error < FAR_SENTINEL * gradient_norm)
         )
+        # A slab holds the surface only if a single level, without jumps, passes through the ball.
         if len(self._levels.values) > 1 or self.surface.field.has_jumps:
             is_slab &= False
         elif self._levels.period is not None:
@@ -505,6 +508,7 @@ class CellClassifier:
         y = dr.select(is_found, point, p)
         gradient = self._field.evaluate(y).gradient
         n = gradient / safe_norm(gradient)
+        # A cell without a slab gets the tangent plane at its surface point.
         is_plane = is_found & ~(dr.squared_norm(normal) > 0) & dr.isfinite(dr.squared_norm(n))
         plane_radius, boundary = radius + safe_norm(y - p), self._field.closest_boundary_point(y)
         if boundary is not None:
@@ -542,7 +546,7 @@ class CellClassifier:
         p; `FAR_SENTINEL` if it does not converge to a point within the distance 2 `radius` of p.
 
         After six steps the method goes on only while its steps shrink, as they do towards a
-        multiple root, and they are made longer (`multiplicity`).
+        multiple root. These later steps are lengthened by the multiplicity of the root.
         """
         real, vector, count = self._backend.Float, self._backend.Array3f, self._backend.UInt32
         zero = dr.opaque(real, 0.0)  # keeps constant components of a gradient in the loop
@@ -568,6 +572,7 @@ class CellClassifier:
                 goes_on, dr.fma(vector(step / gradient_norm), sample.gradient + zero, y), y
             )
             goes_on &= shrinks & (last > 1e-9 * radius)
+            # The largest number of steps ends the loop.
             return y, last, dr.select(goes_on, k + 1, _MAX_SLOW_STEPS)
 
         def is_active(y: Vec3, last: Real, k: Any) -> Mask:

@@ -42,7 +42,7 @@ _MAX_SUBDIVISIONS = 40
 _MIN_COARSE_CELLS = 300
 # Number of cells along an edge of the first cube.
 _ROOT_CELLS = 8
-# Number of times that surface points of other parts of the surface are tried, from the same cells.
+# Largest number of rounds of descents from surface points of further cells, before cells are split.
 _MAX_CANDIDATE_ROUNDS = 4
 # In tolerances: the distance from the boundary curve at which the surface is looked for.
 _BOUNDARY_OFFSET = 100.0
@@ -168,7 +168,7 @@ def search(
 
     known: what is already known about the closest points.
     descents: the iterations that lead from a point near the surface to a closest point.
-    tolerance: when the search ends.
+    tolerance: the condition under which the search ends.
     progress: called with a message before each stage.
 
     If no box is known to contain the surface, a cube around the queries is searched. Queries whose
@@ -287,6 +287,7 @@ def _split(
 
     Returns the coarse cells of an early iteration, which are few, and the cells of the last one.
     """
+    # The first cells are 8 x 8 x 8 equal cubes; `offsets` are their centers relative to the root's.
     half = root.half / _ROOT_CELLS
     offsets = (2 * np.indices((_ROOT_CELLS,) * 3).reshape(3, -1).T + 1 - _ROOT_CELLS) * half
     cells = classifier.nonempty_cells(root.center + offsets, np.full(len(offsets), half))
@@ -321,8 +322,9 @@ class _CellSearch:
     descent (Newton's method along the surface) from it may lead to a nearer point than the best one
     so far.
 
-    classifier: proves cells empty, and finds surface points in the others.
-    trees: the tree of the coarse cells and that of `cells`; None if there are none.
+    classifier: proves that cells are empty, and finds surface points in cells that may not be.
+    cells: all cells, the finest so far. Subdivision replaces them.
+    trees: the tree of the coarse cells and the tree of `cells`; None if there are no cells.
     guess: what was known about the closest point of each query before the search.
     closest: (n, 3) the best point of each query so far, a point of the surface, or NaN.
     free: (n,) the radius of a ball about the best point in which no surface point is nearer to the
@@ -366,10 +368,12 @@ class _CellSearch:
         if self.trees is not None:
             self._search_cells(*self.trees, has_jumps, progress)
         else:
+            # All cells were proved empty: there is no surface.
             self.lower[:] = np.inf
         if not has_jumps:
-            # Two parts of the surface may meet or cross within a cell, and descents may not have
-            # begun on both of them. Also, cells may be missing if a promise does not hold.
+            # One more descent begins at the query itself. Two parts of the surface may meet or
+            # cross within a cell, and descents may not have begun on both of them. Also, cells may
+            # be missing if a promise (a proved bound of f near a point) does not hold.
             ids = np.flatnonzero(self._is_unproved() | np.isnan(self.closest[:, 0]))
             ids = ids[self.guess.estimate[ids] < _MIN_GAIN * self._distance(ids)]
             self._descend(ids, self.points[ids])
@@ -380,13 +384,13 @@ class _CellSearch:
     ) -> None:
         """Search the cells of both trees, and subdivide cells if proofs are wanted.
 
-        coarse, tree: the tree of the coarse cells, and that of all cells.
+        coarse, tree: the tree of the coarse cells, and the tree of all cells.
         has_jumps: whether f jumps at facets.
 
         For each query the first descent begins at the surface point of the coarse cell with the
-        smallest estimated distance; the next ones at surface points of other cells that may hold a
-        nearer point. Then all cells that may hold a point nearer than the best one are split and
-        searched again, until there are none or too many.
+        smallest estimated distance. The next ones begin at surface points of a few cells that may
+        hold a point nearer than its result. Then all cells that may hold a point nearer than the
+        best one are split and searched again, until there are none or too many.
         """
         # A mark for each cell that may hold a nearer point, if cells are to be split.
         marks = dr.zeros(self.backend.Bool, len(self.cells)) if self.max_cells else None
@@ -421,11 +425,12 @@ class _CellSearch:
     ) -> tuple[IntArray, FloatArray]:
         """Make the first searches for all queries in a single kernel: a descent from the surface
         point of the coarse cell with the smallest estimated distance; then descents from the
-        surface points of a few other cells that may hold a nearer point. Queries for which Newton's
-        method does not converge in the kernel are finished by `_descend`.
+        surface points of a few cells that may hold a point nearer than its result. Queries for
+        which Newton's method does not converge in the kernel are finished by `_descend`.
 
-        coarse, tree: the tree of the coarse cells, and that of all cells.
-        marks: None, or a Bool array in which the cells that may hold a nearer point are marked.
+        coarse, tree: the tree of the coarse cells, and the tree of all cells.
+        marks: a Bool array with an entry for each cell, or None. The entries of cells that may hold
+            a nearer point for some query are set to True here.
 
         Returns the indices (k,) of the queries for which another round of descents is worthwhile;
         and the surface points (n, 3) at which the first descents started.
@@ -439,6 +444,8 @@ class _CellSearch:
             the next round, and 1 where Newton's method did not converge."""
             real, missing = backend.Float, backend.Array3f(FAR_SENTINEL)
             limit = safe_norm(guess_point - x)
+            # Without a guess the limit is a huge number. `best_start` returns such coordinates for
+            # a missing start, which comparisons with half of it recognize.
             limit = dr.select(dr.isfinite(limit), limit, FAR_SENTINEL)
             start = coarse.best_start(x, limit)
             y, free, unresolved = self.descents.newton_in_kernel(x, start, limit)
@@ -502,13 +509,13 @@ class _CellSearch:
         return np.where(np.isnan(distances), FAR_SENTINEL, distances)
 
     def _is_boundary(self, rows: IntArray | slice) -> BoolArray:
-        """Return the mask (k,) of those of the queries `rows` whose best point is still the initial
+        """Return a mask (k,), True for queries of `rows` whose best point is still the initial
         guess and lies on the curve at which the surface ends."""
         return self.guess.on_boundary & (self.closest[rows] == self.guess.closest[rows]).all(axis=1)
 
     def _descend_from_best_start(self, tree: CellTree) -> FloatArray:
-        """Descend for each query from the surface point of the cell with the smallest estimated
-        distance. Returns these surface points (n, 3), `FAR_SENTINEL` for none."""
+        """Descend for each query from the surface point of the cell of the tree with the smallest
+        estimated distance. Returns these surface points (n, 3), `FAR_SENTINEL` for none."""
         limit = upload_floats(self.backend, self._distance(slice(None)))
         start = to_numpy(tree.best_start(upload_vectors(self.backend, self.points), limit))
         rows = np.flatnonzero(start[:, 0] < 0.5 * FAR_SENTINEL)
@@ -518,16 +525,19 @@ class _CellSearch:
     def _improve(
         self, tree: CellTree, rows: IntArray, tried: Sequence[FloatArray], marks: Any
     ) -> None:
-        """Improve the best points of the queries `rows` by descents from surface points of other
-        cells, in rounds.
+        """Improve the best points of the queries `rows` (k,) by descents, in rounds. The descents
+        start at surface points of cells in which none of the query's descents has started yet.
 
-        A query continues to the next round if the last one helped. As long as it has candidates it
-        also continues if the field has jump surfaces (their cells have no tangent planes) or is
-        expensive to evaluate. For expensive fields each round tries one candidate only.
+        A query continues to the next round if the last one improved its best point. Without an
+        improvement it continues in two cases, as long as there are cells to start in. In the first
+        case f has jump surfaces: then distances are only roughly estimated, so that one failure
+        says little. In the second case f is expensive to evaluate: then each round tries one start
+        instead of several.
 
         tree: the tree of the cells.
         tried: arrays (k, 3) of surface points at which descents have started already.
-        marks: None, or a Bool array in which the cells that may hold a nearer point are marked.
+        marks: a Bool array with an entry for each cell, or None. The entries of cells that may hold
+            a nearer point for some query are set to True here.
         """
         for _ in range(_MAX_CANDIDATE_ROUNDS):
             if not len(rows):
@@ -540,6 +550,7 @@ class _CellSearch:
             active = np.isin(rows, improved_ids)
             if self._is_expensive or self.classifier.surface.field.has_jumps:
                 active |= starts[0][:, 0] < 0.5 * FAR_SENTINEL
+            # Only the last of the points tried before is kept, with those of this round.
             rows, tried = (
                 rows[active],
                 [candidates[active] for candidates in (*tried[-1:], *starts)],
@@ -563,7 +574,8 @@ class _CellSearch:
 
         tree: the tree of the cells.
         skipped: arrays (k, 3) of surface points near which no candidates are wanted.
-        marks: None, or a Bool array in which the cells that may hold a nearer point are marked.
+        marks: a Bool array with an entry for each cell, or None. The entries of cells that may hold
+            a nearer point for some query are set to True here.
 
         Returns the surface points as a list of arrays (k, 3), with `FAR_SENTINEL` for none.
         """
@@ -588,6 +600,7 @@ class _CellSearch:
         ids = np.flatnonzero(self._is_boundary(slice(None)))
         distance = self._distance(ids)
         ids, distance = ids[distance > 0], distance[distance > 0]
+        # How far beside the curve the descent starts.
         aside = np.minimum(0.25 * distance, _BOUNDARY_OFFSET * self.tolerance)
         queries = self.points[ids]
         self._update_best(
@@ -606,10 +619,10 @@ class _CellSearch:
         self._update_best(ids, *self.descents.descend(x, start, self._distance(ids)))
 
     def _update_best(self, rows: IntArray, candidates: FloatArray, free: FloatArray) -> None:
-        """Replace the best points of the queries `rows` (k,), which may occur several times, by
-        those of `candidates` (k, 3) that are nearer.
+        """Replace the best points of the queries `rows` (k,) by their candidates, where these are
+        nearer. A query may occur several times in `rows`.
 
-        candidates: points of the surface, or NaN.
+        candidates: (k, 3) points of the surface, or NaN.
         free: (k,) radius about each candidate within which no surface point is nearer to the query.
         """
         distances = np.linalg.norm(self.points[rows] - candidates, axis=1)

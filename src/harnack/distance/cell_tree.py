@@ -1,9 +1,8 @@
 """A tree over cells, cubes that may hold a surface. It finds the cells near a query point, and
-bounds of the distance of the surface in them.
-
-For each cell the surface in it is either unknown or proved to lie in a slab (two parallel planes).
-Some cells also have a known point of the surface. Where the boundary of the field's domain cuts the
-surface in a curve, the clip curve, cells may have a point of this curve.
+bounds of the distance of the surface in them. For each cell the surface in it is either unknown or
+proved to lie in a slab (two parallel planes). Some cells also have a known point of the surface. If
+the boundary of the field's domain cuts the surface in a curve, the clip curve, cells may have a
+point of this curve.
 """
 
 from __future__ import annotations
@@ -33,7 +32,8 @@ FAR_SENTINEL = 1e150
 """Coordinates of missing surface points, and the thickness of slabs that bound nothing."""
 # Cells per leaf: a visit of a node takes a tenth of the time of a visit of a cell.
 _LEAF_SIZE = 1
-# Number of candidates (surface points of other cells) that one traversal of the tree returns.
+# Number of candidates (surface points from which a descent may lead to a nearer point) that one
+# traversal of the tree returns.
 _CANDIDATES_PER_WALK = 4
 # Two surface points that are closer to each other than this many half edges of a cell are taken to
 # lead to the same closest point. The first number is for cells in which the surface is in one piece
@@ -78,7 +78,11 @@ class SurfaceCells:
 
     @classmethod
     def unknown(cls, center: FloatArray, half: FloatArray) -> SurfaceCells:
-        """Return cubes without slabs and surface points. center, half: as in the class."""
+        """Return cubes without slabs and surface points.
+
+        center: (n, 3) the centers.
+        half: (n,) half the length of an edge.
+        """
         n = len(half)
         far, zero = np.full((n, 3), FAR_SENTINEL), np.zeros(n)
         return cls(
@@ -113,8 +117,8 @@ class BestCandidate:
     distance: its distance from the query.
     exclusion_radius: the radius of a ball about `point` that is proved to hold no surface point
         nearer to the query.
-    separation_factor: the surface point of another cell is taken to lead to the same closest point,
-        and is skipped, if it is closer to `point` than this factor times the cell's `separation`.
+    separation_factor: the surface point of a cell is taken to lead to `point` again, and is
+        skipped, if it is closer to `point` than this factor times the cell's `separation`.
     """
 
     point: Vec3
@@ -143,8 +147,8 @@ class CellTree:
         count, cell_of_record = len(cells), np.concatenate([np.arange(len(cells)), clip_rows])
         is_plain = cells.is_single_piece & (cells.clip_point[:, 0] == FAR_SENTINEL)
         separations = np.where(is_plain, _SEPARATION, _SEPARATION_IN_PIECES) * cells.half
-        # How far the surface may be from its plane: by its curvature, but at most to the end of the
-        # slab.
+        # How far the surface may be from its plane: a fraction of curvature times radius^2, but not
+        # farther than its slab allows. It decides only in which cells descents start.
         bulge = 0.15 * cells.curvature * np.square(cells.plane_radius)
         slack = np.where(cells.is_single_piece, np.minimum(cells.thickness, bulge), 0.0)
         records = np.column_stack(
@@ -161,6 +165,7 @@ class CellTree:
                 separations,
             ]
         )[cell_of_record]
+        # The same for the clip curve and its tangent line.
         radius = _CLIP_CURVE_RADIUS * cells.half[clip_rows]
         bulge = radius * np.minimum(0.25, cells.clip_curvature[clip_rows] * radius)
         # The records of clip points: another point, no slab, and the index -1.
@@ -187,14 +192,16 @@ class CellTree:
         vector = self.tree.backend.Array3f
 
         def visit_cell(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
-            """Keep the smallest estimate so far, and its surface point."""
+            """Keep the smallest estimated distance so far, and the surface point of its cell. row:
+            the cell's record. state: both so far."""
             best, point = state
             cell = _CellRecord.of(vector, row)
             estimate = cell.estimate(x)
             is_best = active & (estimate < best)
             return dr.select(is_best, estimate, best), dr.select(is_best, cell.surface_point, point)
 
-        # The surface point of a cell near x limits the walk from the start.
+        # The distance of the surface point of a cell near x limits the traversal from the start.
+        # (4 is the place of the surface point in a record.)
         upper_bound = (1 + 1e-9) * dr.sqrt(squared_distance_in_nearby_leaf(self.tree, x, 4))
         start = fmin(upper_bound, limit), vector(FAR_SENTINEL)
         return self._walk(x, visit_cell, start, lambda state: dr.square(state[0]))[1]
@@ -229,7 +236,7 @@ class CellTree:
             """
             lower, *listed = state
             cell = _CellRecord.of(vector, row)
-            # Cells in the ball about the best point hold no nearer point.
+            # Cells in the exclusion ball about the best point hold no nearer point.
             is_relevant = active & ~cell.is_within(best.point, best.exclusion_radius)
             cell_bound = cell.lower_bound(x)
             is_open_cell = is_relevant & (cell_bound < best.distance - tolerance)
@@ -353,7 +360,7 @@ class _CellRecord:
 
     @property
     def is_cell(self) -> Mask:
-        """Whether the record is that of a cell, not of a point of the clip curve."""
+        """Whether the record describes a cell, and not a point of the clip curve."""
         return self.number >= 0
 
     def lower_bound(self, x: Vec3) -> Real:

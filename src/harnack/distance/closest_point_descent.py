@@ -1,5 +1,5 @@
 """Finds the point of a level set closest to a query x by descent: from a start point onto the level
-set, then along it. f is the function, a point of the level set has f = level, and y is the current
+set, then along it. f is the function, `level` is its value on the level set, and y is the current
 point of the descent.
 
 The result is a point of the level set, to rounding, at which x - y is normal to the surface and no
@@ -102,7 +102,7 @@ class ClosestPointDescent:
     uncertainty of the level is the length by which rounding may have moved the level set.
 
     field: the function f, prepared for the backend.
-    levels: the levels; the one nearest in value counts.
+    levels: the values of f on the surface. At a point the level nearest to f counts.
     has_hessian: whether f knows its second derivatives.
     """
 
@@ -123,10 +123,10 @@ class ClosestPointDescent:
         x: the query.
         limit: a closest point that is farther from x than this is not pursued.
 
-        Returns y, to which `finish` adds the last step; the first-order distance of `start` from
-        the level; the mask of lanes that failed, because the last step was longer than half the
-        radius of the ball in which f is smooth; and the mask of lanes that stopped early, because
-        their closest point is farther from x than `limit`.
+        Returns four results. The last point y, to which `finish` adds the last step. The
+        first-order distance |f - level|/|grad f| of `start` from the level. The mask of lanes that
+        failed: their last step was longer than half the radius of the ball in which f is smooth.
+        The mask of lanes that stopped early: their closest point is farther from x than `limit`.
 
         Each step combines the step of `descend` along the surface, which follows its curvature,
         with a Newton step to the level; both use derivatives at the same point. Convergence is
@@ -148,7 +148,8 @@ class ClosestPointDescent:
             k: the number of steps.
             active: whether the search goes on.
             """
-            # The rounding error of f takes as long as f itself, and does not matter here.
+            # The rounding error of f is not needed here. Without it the compiler drops the code
+            # that computes it, which takes as long as that of f itself.
             sample = dataclasses.replace(self.field.evaluate(y), value_error=0.0)
             # The step to the level and the step along the surface, both from y.
             residual, state = self._state_at(y, sample)
@@ -170,6 +171,7 @@ class ClosestPointDescent:
                 & (next_length <= dr.fma(_NEWTON_TOLERANCE, distance, state.level_uncertainty))
             )
             active &= ~is_far & dr.isfinite(length)
+            # A step that is too long ends at its limit.
             y = dr.select(active, y + dr.select(is_lost, max_length / length, 1) * move, y)
             active &= ~is_last & (k + 1 < _MAX_NEWTON_STEPS)
             return y, first_step, length, is_lost, is_far, k + 1, active
@@ -187,9 +189,9 @@ class ClosestPointDescent:
         """Finish a search for the surface point closest to x: make one Newton step along the
         gradient, from the last iterate y onto the level.
 
-        Returns the end of the step; the mask of lanes in which it is a local minimum of the
-        distance from x, up to rounding; and the radius of a ball about y in which no point of the
-        surface is nearer to x, 0 if the first is not proved.
+        Returns the end of the step; the mask of lanes in which this end is on the surface and a
+        local minimum of the distance from x, up to rounding; and the radius of a ball about y in
+        which no point of the surface is nearer to x, 0 on lanes on which the mask is False.
 
         Proof that the step, of length s along grad f, ends on the level: it is Newton's step, so f
         differs from the level at its end by at most the remainder, within s, of the Taylor
@@ -204,12 +206,13 @@ class ClosestPointDescent:
         step = -residual / gradient_norm
         # Rounding is no part of the remainder: the step cannot reduce it.
         exact = dataclasses.replace(sample, value_error=0.0, gradient_error=0.0)
-        # The step ends on the level up to its uncertainty.
+        # Whether the step ends on the level, up to the uncertainty of the level.
         is_arriving = (
             taylor_remainder(exact, dr.abs(step)) <= gradient_norm * state.level_uncertainty
         )
         end, is_short = self._step_to_level(x, residual, state)
         is_arriving &= is_short
+        # Either y was on the level before the step, or the step ends there.
         is_found = is_minimum & (
             self._is_on_level(residual, state) | (self._is_level_resolved(state) & is_arriving)
         )
@@ -228,8 +231,9 @@ class ClosestPointDescent:
         along the surface is Newton's for this function. If an eigenvalue of B is not positive, its
         absolute value is used, so that the step still decreases the distance. If t vanishes as
         well, y is a saddle or a maximum of the distance (x is farther than a center of curvature),
-        and the step is along that eigenvector. After the step Newton's method leads back to the
-        level. The step is accepted if the result is no farther from x; else a quarter is tried.
+        and the step goes along the eigenvector of the smaller eigenvalue. After the step Newton's
+        method leads back to the level. The step is accepted if the result is no farther from x;
+        otherwise a quarter of it is tried.
 
         y is accepted if |t| <= 4 sqrt(epsilon) |r| plus a few rounding errors: then, by the same
         formula, |r| exceeds the local minimum by a fraction of at most 8 epsilon/(smallest
@@ -265,10 +269,12 @@ class ClosestPointDescent:
             factor = dr.select(is_first, factor, new_factor)
             accepted |= active & is_minimum
             on_level = dr.select(is_first, is_arrived, on_level)
-            # The surface ends where f ceases to be smooth: the minimum is at its boundary then.
+            # The surface ends where f is not smooth. A point near there is its boundary, which the
+            # descent cannot cross; then it ends.
             is_inner = trial.smooth_radius > _MIN_SINGULARITY_FRACTION * dr.norm(x - trial.y)
             is_inner &= (iteration <= _MAX_SURFACE_STEPS) & (factor > _MIN_STEP_FRACTION)
             active = goes_on & dr.select(is_first, is_arrived, is_inner)
+            # Iteration 0 keeps the point on the level, whatever its distance from x.
             return (
                 *trial.where(is_better | is_first, current),
                 factor,
@@ -312,14 +318,17 @@ class ClosestPointDescent:
 
     def _step_to_level(self, x: Vec3, residual: Real, state: _DescentState) -> tuple[Vec3, Mask]:
         """Make one Newton step from the point of a state to the level, along the gradient. Returns
-        the end of the step; and whether the step is so short that, if its start is closest to x
-        except for the distance from the level, its end is closest to x up to rounding.
+        the end of the step; and a mask that is True where the step is short enough to end the
+        search: if x - y is along the gradient at the start y, the end of the step is closest to x
+        up to rounding.
 
         residual: f - level at the start.
         """
         gradient_norm = lengths.safe_norm(state.gradient)
         step = -residual / gradient_norm
         end = dr.fma(self.backend.Array3f(step / gradient_norm), state.gradient, state.y)
+        # A step s turns the normal by about s times the curvature. This changes the distance from x
+        # by the order of s^2 only: so the limit is a square root of epsilon.
         limit = self.backend.machine_epsilon**0.5 * dr.norm(x - state.y) + state.level_uncertainty
         return end, dr.abs(step) <= limit
 
@@ -332,8 +341,8 @@ class ClosestPointDescent:
 
         sample: the sample of f at y.
 
-        f counts as smooth on the largest ball for which its promises imply that; without such a
-        promise, everywhere.
+        f counts as smooth on the largest ball about y on which the sample's promises (proved bounds
+        of f near y) imply that; everywhere if none of them implies it.
         """
         real = self.backend.Float
         scale = lengths.max_norm(y)
@@ -345,6 +354,7 @@ class ClosestPointDescent:
         for promise in sample.all_promises:
             if not promise.implies_smooth:
                 continue
+            # A radius that is not finite sets no limit to steps.
             promised_radius = real(promise.radius)
             smooth_radius = fmax(
                 smooth_radius, dr.select(dr.isfinite(promised_radius), promised_radius, 0)
@@ -358,8 +368,8 @@ class ClosestPointDescent:
 
     @staticmethod
     def _is_on_level(residual: Real, state: _DescentState) -> Mask:
-        """Return whether the point of a state is on the level, up to rounding. It is False where
-        rounding errors are so large that nothing can be said.
+        """Return whether the point of a state is on the level, up to rounding. The mask is False in
+        lanes in which rounding errors are so large that nothing can be said.
 
         residual: f - level there.
         """
@@ -371,8 +381,8 @@ class ClosestPointDescent:
     @staticmethod
     def _is_level_resolved(state: _DescentState) -> Mask:
         """Return whether the position of the level set near the point of a state is known in spite
-        of rounding: its uncertainty is at most a sixteenth of the coordinates or of the ball on
-        which f is smooth."""
+        of rounding: its uncertainty is at most a sixteenth of the largest coordinate, or a
+        sixteenth of the radius of the ball on which f is smooth."""
         size = lengths.max_norm(state.y)
         return state.level_uncertainty <= _MAX_RELATIVE_UNCERTAINTY * fmax(
             size, state.smooth_radius
@@ -380,17 +390,17 @@ class ClosestPointDescent:
 
     def _to_level(self, start: Vec3, active: Mask) -> tuple[_DescentState, Mask]:
         """Run Newton's method along the gradient, from `start` to the nearest level. Returns the
-        state at the end, and whether that is on a level to rounding.
+        state at the end, and the mask of lanes in which its point is on a level, up to rounding.
 
         active: mask of lanes that search.
 
-        A step is no longer than the radius of the ball on which f is known to be smooth, and is
-        accepted if the result is nearer to a level; else a quarter of it is tried.
+        A step is no longer than the radius of the ball on which f is known to be smooth. It is
+        accepted if f at its end is nearer to a level; otherwise a quarter of it is tried.
 
         If f - level is a power u^m of a smooth function u, grad f is 0 on the surface, and each
-        step is only 1 - 1/m times the one before. After `_SIMPLE_ROOT_STEPS` such steps, they are
-        made `multiplicity` times as long. If a step ends where f - level and its gradient are 0,
-        the last direction of the gradient is used.
+        step is only 1 - 1/m times the one before. After `_SIMPLE_ROOT_STEPS` steps, the next ones
+        are made longer by an estimate of m (`multiplicity`). If a step ends where f - level and its
+        gradient are 0, the state gets the last gradient before.
         """
         real, vector, count = self.backend.Float, self.backend.Array3f, self.backend.UInt32
 
@@ -413,7 +423,8 @@ class ClosestPointDescent:
                 lengths.safe_norm(g),
                 iteration == 0,
             )
-            # Iteration 0 evaluates the start; later ones try a step from y.
+            # Iteration 0 evaluates the start; later ones try a step from y. `step_factor` is the
+            # estimated multiplicity of the root.
             step = -residual / gradient_norm
             step_factor = dr.select(iteration > _SIMPLE_ROOT_STEPS, multiplicity(step, last), 1)
             length = factor * clamp(step_factor * step, -radius, radius)
@@ -422,7 +433,7 @@ class ClosestPointDescent:
             is_flat = ~is_first & (new_residual == 0) & (lengths.safe_norm(trial.gradient) == 0)
             trial = trial.flat_after(is_flat, current)
             is_better = active & (is_first | (dr.abs(new_residual) < dr.abs(residual)))
-            # The fraction for the next step.
+            # The fraction of Newton's step that the next iteration tries.
             step_factor = dr.select(is_better, fmin(2 * factor, 1), 0.25 * factor)
             factor = dr.select(is_first, factor, step_factor)
             on_level |= is_better & self._is_on_level(new_residual, trial)
@@ -443,10 +454,10 @@ class ClosestPointDescent:
             return state[-1]
 
         # Iteration 0 evaluates the start.
-        is_first = _DescentState(vector(start), vector(0), real(0), real(0))
+        initial = _DescentState(vector(start), vector(0), real(0), real(0))
         on_level = self.backend.Bool(False)
         going = self.backend.Bool(active)
-        state = (real(dr.inf), *is_first.parts(), real(dr.inf), real(1), on_level, count(0), going)
+        state = (real(dr.inf), *initial.parts(), real(dr.inf), real(1), on_level, count(0), going)
         _, *end, _, _, on_level, _, _ = dr.while_loop(state, is_active, body, label="to the level")
         return _DescentState(*end), on_level
 
@@ -454,12 +465,12 @@ class ClosestPointDescent:
         self, x: Vec3, state: _DescentState, factor: Real, rows: Rows | None = None
     ) -> tuple[Vec3, Mask]:
         """Make one step along the surface from a point y of it, toward the point closest to x.
-        Returns the step as a vector, and whether y already is a local minimum of the distance from
-        x. (The formula is derived in `descend`.)
+        Returns the step as a vector, and the mask of lanes in which y already is a local minimum of
+        the distance from x, up to rounding. (The formula is derived in `descend`.)
 
         state: the point y, and f there.
         factor: the fraction of the largest permitted step that is used.
-        rows: the rows of the Hessian at y; None if they are not known.
+        rows: the rows of the Hessian at y. If None, they are computed.
         """
         plane = TangentPlane.of(state.gradient)
         to_x = x - state.y
@@ -470,10 +481,11 @@ class ClosestPointDescent:
             uu, vv, uv = self._second_derivatives(
                 state.y, plane, fmin(state.smooth_radius, distance)
             )
+        # The matrix B = 1 + (r.n) A/|g| of `descend` in the basis of the tangents u and v.
         height_ratio = dr.dot(to_x, plane.n) / plane.gradient_norm
         eigen = SymmetricEigen2.of(
             dr.fma(height_ratio, uu, 1), dr.fma(height_ratio, vv, 1), height_ratio * uv
-        )  # of B
+        )
         # The tangential part of x - y. If it is 0 up to rounding, x - y is normal to the surface.
         tu, tv = dr.dot(to_x, plane.u), dr.dot(to_x, plane.v)
         tangential = dr.sqrt(dr.fma(tu, tu, tv * tv))
@@ -481,21 +493,22 @@ class ClosestPointDescent:
             4 * self.backend.machine_epsilon**0.5, distance, 8 * state.level_uncertainty
         )
         is_saddle = is_normal & (eigen.smallest < _INDEFINITE)
-        # Newton's step in the basis of eigenvectors; at a saddle along that of the smaller
-        # eigenvalue.
+        # Newton's step in the basis of B's eigenvectors. At a saddle it is half the distance from
+        # x, along the eigenvector of the smaller eigenvalue.
         along_largest, along_smallest = eigen.coordinates(tu, tv)
         along_largest = along_largest / fmax(dr.abs(eigen.largest), _MIN_EIGENVALUE)
         along_smallest = along_smallest / fmax(dr.abs(eigen.smallest), _MIN_EIGENVALUE)
         along_smallest = dr.select(is_saddle, 0.5 * distance, along_smallest)
         length = dr.sqrt(dr.fma(along_largest, along_largest, along_smallest * along_smallest))
-        # No longer than the ball on which f is smooth and the distance from x allow.
+        # At most the radius of the ball on which f is smooth, and the distance from x.
         max_length = factor * dr.select(is_saddle, length, fmin(state.smooth_radius, distance))
         scale = dr.select(length > 0, fmin(max_length / length, 1), 0)
         # The step w = a u + b v along the surface.
         a, b = eigen.combination(scale * along_largest, scale * along_smallest)
         vector = self.backend.Array3f
         drop = a * dr.fma(a, uu, 2 * b * uv) + b * b * vv  # w.Aw
-        # How far the surface bends away from its tangent plane, to second order; at most the step.
+        # How far the surface bends away from its tangent plane, to second order: w.Aw/(2|g|). It is
+        # limited by the length of w, as the formula holds for small bends only.
         drop = clamp(0.5 * drop / plane.gradient_norm, -scale * length, scale * length)
         tangent_step = dr.fma(vector(a), plane.u, vector(b) * plane.v)
         return dr.fma(vector(-drop), plane.n, tangent_step), is_normal & ~is_saddle
@@ -506,21 +519,21 @@ class ClosestPointDescent:
         """Return the numbers u.Au, v.Av and u.Av, where A is the Hessian of f at y, and u and v are
         the two unit tangents of the plane.
 
-        If f has no Hessian, they are computed by central differences of the gradient over
-        sqrt(epsilon) times `length`. Errors of these differences make a descent slower, but not
-        wrong.
+        If the field has no Hessian, they are computed by central differences of the gradient with
+        the step sqrt(epsilon) times `length`. Errors of these differences make a descent slower,
+        but not wrong.
         """
         if self.has_hessian:
             return plane.restrict_hessian(self.field.hessian(y))
         vector, count = self.backend.Array3f, self.backend.UInt32
-        h = fmax(self.backend.machine_epsilon**0.5 * length, 1e-30)
+        h = fmax(self.backend.machine_epsilon**0.5 * length, 1e-30)  # not 0, as it divides
 
         def body(along_u: Vec3, along_v: Vec3, k: Any) -> tuple[Any, ...]:
             """Add the term of node k to the central differences. The four nodes are y + h u, y - h
             u, y + h v and y - h v. An even node begins a difference, an odd node completes it.
 
-            along_u, along_v: the derivatives of the gradient along u and v, as far as they are
-                summed.
+            along_u, along_v: the derivatives of the gradient along u and v; in them the terms of
+                the nodes before k are summed.
             """
             direction, step = dr.select(k < 2, plane.u, plane.v), dr.select((k & 1) == 0, h, -h)
             gradient = self.field.evaluate(dr.fma(vector(step), direction, y)).gradient
@@ -532,8 +545,8 @@ class ClosestPointDescent:
         def is_active(*state: Any) -> Mask:
             return state[-1] < 4
 
-        # The loop starts at NaN, as a sum that stays 0 (of a constant field) would be no loop
-        # state.
+        # The sums start at NaN, which even nodes overwrite. If they started at 0, the sums of a
+        # constant field would stay 0, and Dr.Jit would not keep them in the state of the loop.
         state = (vector(dr.nan), vector(dr.nan), count(0))
         along_u, along_v, _ = dr.while_loop(state, is_active, body, label="second derivatives")
         mixed = 0.5 * (dr.dot(plane.v, along_u) + dr.dot(plane.u, along_v))

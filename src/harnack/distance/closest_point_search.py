@@ -89,7 +89,7 @@ class ClosestPoints:
     """The points of a surface that are closest to n query points, and bounds of their distances. f
     is the function whose level is the surface.
 
-    points: (n, 3) the query points, rounded to the precision in use.
+    points: (n, 3) the query points, as rounded to the precision of the computation.
     closest: (n, 3) the closest points of the surface, NaN where none was found.
     distance: (n,) the distances of the queries from these points; NaN where none was found.
     signed_value: (n,) f - level at the queries, for the level nearest in value.
@@ -112,7 +112,7 @@ def find_closest(
 ) -> ClosestPoints:  # fmt: skip
     """Find the closest point of a surface to each query point.
 
-    levels: the levels of the surface, on the backend.
+    levels: the values of f on the surface, on the backend.
     points: (n, 3) the queries, in any order.
     progress: called with a message before each stage.
     is_proved: whether cells are subdivided to make `lower` as large as they can prove.
@@ -195,7 +195,8 @@ def _search_smooth_part(
     smooth: a function without jumps that differs from f by a constant between jump surfaces
         (`JumpSurface.without_jumps`).
     points: (n, 3) the query points.
-    known: for each query, a point of the surface on a jump surface, if one is known.
+    known: for each query, a point of the surface on a jump surface (NaN if none is known), and an
+        estimate of its distance from the surface.
     tolerance: when the search ends.
     progress: called with a message before each stage.
 
@@ -223,7 +224,7 @@ def _search_smooth_part(
     )
     lower = np.maximum(np.minimum(result.lower_bounds, jump_gap - rounding), 0)
     distance, closest = _length(points - known.closest), known.closest.copy()
-    # Only these can improve the result: points nearer than the known ones on jump surfaces.
+    # Only the points that are nearer than the known ones on jump surfaces improve the result.
     nearer_rows = np.flatnonzero(
         _length(points - result.closest) < np.nan_to_num(distance, nan=np.inf) - rounding
     )
@@ -234,7 +235,7 @@ def _search_smooth_part(
     values = np.asarray(surface.field.value(candidates, precision="double"))
     is_level = np.abs(values[:, None] - surface.level_values).min(axis=1) < _LEVEL_MATCH
     closest[nearer_rows[is_level]] = candidates[is_level]
-    # No jump surface is nearer than the accepted point.
+    # A query needs no further search if no jump surface is nearer than its accepted point.
     is_settled = _length(points - closest) <= jump_gap + rounding + tolerance.length
     is_settled[nearer_rows[~is_level]] = False
     unsettled_rows = np.flatnonzero(~is_settled)
@@ -267,6 +268,7 @@ def _with_singular_points(
 
     spatial: Any = scipy.spatial
     distance, rows = spatial.cKDTree(singular).query(points)
+    # Written with `not <=`, so that it is True where there is no closest point (NaN).
     is_nearer = ~(_length(points - closest) <= distance)
     return np.where(is_nearer[:, None], singular[rows], closest)
 
@@ -304,6 +306,7 @@ def _with_mesh_points(points: FloatArray, guess: FloatArray, mesh: LevelTriangle
     backend = choose_backend("double")
     nearest = mesh.upload(backend)
     (offset,) = in_batches(backend, lambda p: (nearest(p),), points)  # pyright: ignore
+    # Written with `not <=`, so that it is True where the guess is NaN.
     is_nearer = ~(_length(points - guess) <= _length(offset))
     return np.where(is_nearer[:, None], points + offset, guess)
 
@@ -399,13 +402,16 @@ class _QueryEvaluator:
         return x, self._inside_domain_or_nan(surface_point), residual, lower, estimate
 
     def with_jump_points(self, points: FloatArray, guess: FloatArray) -> FloatArray:
-        """Return surface points near queries, each replaced by a point of the surface on a facet
-        (at which f jumps) if that is nearer.
+        """Return surface points (n, 3) near queries. They are those of `guess`, except for queries
+        to which a facet (at which f jumps) is nearer than their guess. These get a point of the
+        surface on a facet instead, or NaN if none is found.
 
         points, guess: (n, 3) the queries, and the surface points; NaN counts as infinitely far.
         """
         distance, guess = _length(points - guess), guess.copy()
+        # 1e-12 allows for rounding; `not <=` is True for NaN.
         searched_rows = np.flatnonzero(~(distance <= self.distance_to_jumps(points) * (1 + 1e-12)))
+        # First the nearest triangle alone; where that is not on the surface, all facets in turn.
         guess[searched_rows] = self._nearest_face_points(points[searched_rows])
         searched_rows = searched_rows[np.isnan(guess[searched_rows, 0])]
         if len(searched_rows):
@@ -423,12 +429,13 @@ class _QueryEvaluator:
         real, index = surface.backend.Float, surface.backend.UInt32
 
         def nearest(p: Vec3) -> tuple[Vec3, Any, Vec3]:
-            """Return the nearest point on a facet, the index of the facet, and its normal."""
+            """Return the point on a facet that is nearest to p, its index, and its normal."""
             no_key, always = (real(-1), index(NO_FACET)), surface.backend.Bool(True)
             facet = surface.field.nearest_facet(p, no_key, real(dr.inf), always)
             return p + facet.offset, facet.facet, facet.normal
 
         y, facet_id, normal = in_batches(surface.backend, nearest, points)
+        # `mesh` holds the vertices and the faces.
         corners = mesh[0][mesh[1][facet_id.astype(np.int64)]]
         y_within = y + _WITHIN_FACE * (corners.mean(axis=1) - y)
         offset = _BESIDE_FACE * _size(self.surface, points) * normal
@@ -458,6 +465,7 @@ class _QueryEvaluator:
         """Return the closest points (n, 3) that `JumpSurfaceSearch` finds on facets, nearer than
         `guess` (n, 3); `guess` where it finds none. It examines at most `_MAX_JUMPS_EXAMINED`
         facets for each query."""
+        # The search takes an upper bound of all coordinates.
         coordinates = np.concatenate([points, np.nan_to_num(guess)])
         search = JumpSurfaceSearch(
             self._tracer, max(float(np.abs(coordinates).max(initial=0)), 1e-30), _MAX_JUMPS_EXAMINED
@@ -507,6 +515,7 @@ class _QueryEvaluator:
                 len(points)
             )
         is_unknown = (start == points).all(axis=1)
+        # Without a start, Newton's method along the gradient leads to the surface, if it converges.
         if is_unknown.any():
 
             def to_level(p: Vec3) -> tuple[Vec3]:
@@ -519,7 +528,7 @@ class _QueryEvaluator:
         closest, y, free, is_unfinished, is_far = in_batches(
             self.backend, self._newton_with_float_masks, points, start, limits
         )
-        # Newton's method did not converge there: the slower descent goes on from its last point.
+        # If Newton's method did not converge, the slower descent goes on from its last point.
         rows = np.flatnonzero(is_unfinished)
         if len(rows):
             closest[rows], free[rows] = in_batches(
@@ -527,7 +536,8 @@ class _QueryEvaluator:
             )
         closest = self._inside_domain_or_nan(closest)
         ids, clip = np.flatnonzero(np.isnan(closest[:, 0]) & (is_far == 0)), self._clip
-        if clip is not None and len(ids):  # out of the domain
+        # Closest points outside the domain are replaced by points of the clip curve.
+        if clip is not None and len(ids):
 
             def to_clip_curve(p: Vec3, y: Vec3) -> tuple[Vec3]:
                 return (clip.closest(p, y)[0],)
@@ -601,6 +611,7 @@ class _QueryEvaluator:
         afterwards: those in which the method did not converge, or led out of the domain or to its
         boundary.
         """
+        # x has the types of the other kernel, perhaps of another precision; the results get them.
         p, vector = self.backend.Array3f(x), cast("Any", type(x))
         closest, _, free, is_unfinished, _ = self._newton(p, self.backend.Array3f(start), limit)
         if self._domain is not None:
@@ -624,6 +635,7 @@ class _QueryEvaluator:
         # rounding.
         bound = (safe_norm(p - start) + 2 * first_step) * (1 + 64 * self.backend.machine_epsilon)
         bound = dr.fma(64 * self.backend.machine_epsilon, max_norm(y), bound)
+        # Lanes that stopped at the limit have no result, and need no further search.
         is_lost |= is_far
         is_closest = is_converged & ~is_lost & (safe_norm(p - closest) <= bound)
         return dr.select(is_closest, closest, dr.nan), y, free, ~(is_converged | is_lost), is_far
@@ -759,8 +771,9 @@ class _LinearlyShiftedField(Field):
         self._field, self._anchor, self._offset, self._slope = field, anchor, value, slope
 
     def evaluate(self, p: Vec3) -> Sample:
-        """Return the sample of the sum at p. The value error of the field includes its truncation
-        error, which is subtracted here."""
+        """Return the sample of the sum at p. The value error of the field's sample is the sum of
+        its rounding error and its truncation error. In the result it is the rounding error alone:
+        the linear function corrects the truncation error."""
         sample = self._field.evaluate(p)
         shifted = sample.shifted(dr.dot(self._slope, p - self._anchor) + self._offset)
         return replace(
@@ -771,7 +784,8 @@ class _LinearlyShiftedField(Field):
         )
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
-        """Return the rows of the Hessian of the field; the linear function has none."""
+        """Return the rows of the Hessian of the field at p. The linear function does not change
+        it, since its second derivatives are 0."""
         return self._field.hessian(p)
 
 

@@ -149,6 +149,8 @@ def closest_points(
     vertices of a solid angle, and the clip curve, at which the field's domain cuts the surface. The
     result is NaN where no surface is found; a RuntimeWarning counts these points.
 
+    surface, points, progress, options, keywords: as in `signed_distance`.
+
     Raises:
         TypeError, ValueError: as `signed_distance`.
     """
@@ -163,7 +165,7 @@ class DistanceBounds:
     <= upper.
 
     closest_points: (n, 3) points of the surface, NaN where none was found.
-    upper: (n,) distances to these points; NaN likewise.
+    upper: (n,) distances to these points; NaN where none was found.
     lower: (n,) proved lower bounds; infinite where it is proved that there is no surface.
     """
 
@@ -196,6 +198,8 @@ def distance_bounds(
 
     `upper` is the distance to a point of the surface, found by several descents. Where `lower` is
     less than `upper`, the true distance may lie anywhere between the two.
+
+    surface, points, progress, options, keywords: as in `signed_distance`.
 
     Raises:
         TypeError, ValueError: as `signed_distance`.

@@ -58,14 +58,18 @@ def exclusion_radius(sample: Sample, rows: Rows | None, x: Vec3, y: Vec3) -> Rea
     hessian = None if rows is None else _HessianBounds.of(sample, rows, x - y)
     largest = 0 * d
     for exponent in _RADIUS_EXPONENTS:
-        r = fmax(d, 1e-12) * 2.0**exponent
+        r = fmax(d, 1e-12) * 2.0**exponent  # not 0, as it divides
+        # R1/r^2 of the proof; `second_order` is R2/r^2.
         first_order = taylor_remainder(sample, r) / (r * r)
         # By the bounds of first and of second order: |x - y - w|^2 is at least d^2 + margin |w|^2.
         margin = 1 - 2 * d * first_order / gradient_norm
         if hessian is not None:
             second_order = taylor_remainder(sample, r, 2) / (r * r)
-            c = fmin(first_order, hessian.half_norm + second_order) * r / gradient_norm
-            bound = hessian.least_tangential - c * (2 * hessian.across + c * hessian.along)
+            # c r of the proof, a bound of |n . w|/|w|.
+            max_slope = fmin(first_order, hessian.half_norm + second_order) * r / gradient_norm
+            bound = hessian.least_tangential - max_slope * (
+                2 * hessian.across + max_slope * hessian.along
+            )
             margin = fmax(margin, 1 + d / gradient_norm * (bound - 2 * second_order))
         # Radii are tried from the largest down; the first that is proved stays.
         largest = dr.select((largest == 0) & (margin >= _PROOF_MARGIN), r, largest)

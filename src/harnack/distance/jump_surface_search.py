@@ -174,8 +174,8 @@ class JumpSurfaceSearch:
             facet = _nearest_jump_by_differences(backend, field, x)
 
             def single_facet(after: tuple[Real, Any], limit: Real, active: Mask) -> NearestFacet:
-                """Return the nearest facet if `after` stands for the start of the list, otherwise
-                no facet."""
+                """Return the nearest facet if it is nearer than `limit` and `after` stands for the
+                start of the list (a sort key below 0); otherwise no facet."""
                 del active
                 is_first = (after[0] < 0) & (facet.sort_key < limit)
                 sort_key = dr.select(is_first, facet.sort_key, dr.inf)
@@ -186,7 +186,7 @@ class JumpSurfaceSearch:
 
         def listed_facet(after: tuple[Real, Any], limit: Real, active: Mask) -> NearestFacet:
             """Return the facet that follows the facet `after` (its sort key and index) in the
-            field's list, if it is not farther than `limit`."""
+            field's list, if it is not farther than `limit`, on the active lanes."""
             nearest = field.nearest_facet(x, after, limit, active)
             if nearest is None:
                 raise RuntimeError("nearest_sheet tells sheets at some times and not at others")
@@ -197,7 +197,7 @@ class JumpSurfaceSearch:
 
 def straddles_level(surface: SurfaceTracer, y: Vec3, radius: Real, active: Mask) -> Mask:
     """Return the mask of lanes on which f takes values on both sides of a level within 1.74 times
-    `radius` of y.
+    `radius` of y (the distance of the farthest samples).
 
     active: mask of lanes that are tested.
 
@@ -232,6 +232,7 @@ def straddles_level(surface: SurfaceTracer, y: Vec3, radius: Real, active: Mask)
 
     start = index(0), real(dr.inf), real(-dr.inf), backend.Bool(active)
     _, lower, upper, _ = dr.while_loop(start, is_active, body, label="sides of a level")
+    # The next level above the smallest value is below the largest value.
     return (lower < upper) & (surface.levels.gaps(lower).above < upper - lower)
 
 
@@ -322,15 +323,15 @@ class _HitPlane:
         return cls(normal, dr.select(mask, first.offset, second.offset))
 
     def is_apart(self, other: _HitPlane) -> Mask:
-        """Return the mask of lanes in which both this and the other one are planes (not the
-        placeholder for none), and not nearly parallel."""
+        """Return the mask of lanes in which neither this plane nor the other one is the placeholder
+        for no plane, and the two are not nearly parallel."""
         return (
             dr.squared_norm(dr.cross(self.normal, other.normal)) > _MIN_PLANE_SINE * _MIN_PLANE_SINE
         )
 
     def nearest_on_line(self, other: _HitPlane) -> Vec3:
-        """Return the shortest vector from x to the line in which both planes intersect; not finite
-        if they are parallel.
+        """Return the shortest vector from x to the line in which this plane and the other one
+        intersect; not finite if they are parallel.
 
         It is a combination of the two normals whose inner products with them are the two offsets.
         """
@@ -459,8 +460,8 @@ def compass_search(surface: SurfaceTracer, x: Vec3, foot: Vec3) -> Vec3:
 
         d, t, foot: direction, distance and position of the best point.
         step: tangent of the angle by which rays are tilted against d.
-        angle: the direction of that tilt about d.
-        failed: the number of rays of this round, all of which failed.
+        angle: the angle about d that gives the direction of the tilt.
+        failed: the number of rays of this round so far; none of them found a nearer point.
         ray: the number of the ray.
         active: whether the search goes on.
         values: the planes of hits, `_HitPlanes.parts`.

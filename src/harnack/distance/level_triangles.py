@@ -75,6 +75,7 @@ class LevelTriangles:
             return None
         vertices, faces, is_integer_off_faces = mesh
         is_jumps_only = surface.field.is_of_sheets_alone(surface.level_values)
+        # The scale is a power of two and the center has single precision: so scaling is exact.
         lower, upper = vertices[faces].min(axis=(0, 1)), vertices[faces].max(axis=(0, 1))
         size = float(2.0 ** np.ceil(np.log2(0.5 * (upper - lower).max())))
         center = round_to_single(0.5 * (lower + upper))
@@ -140,6 +141,7 @@ def _proved_on_level(surface: TracedSurface, corners: FloatArray, size: float) -
     """
     backend, field = choose_backend("double"), surface.field
     prepared = surface.evaluator(backend)
+    # The same samples, and levels with the period 1: those of f modulo 1.
     smooth_field = EvaluateOnly(prepared.evaluate)
     levels = Levels(tuple(dr.opaque(backend.Float, level) for level in surface.level_values), 1.0)
 
@@ -160,4 +162,5 @@ def _proved_on_level(surface: TracedSurface, corners: FloatArray, size: float) -
     is_between = np.any(
         [(lower < level) & (level < upper) for level in surface.level_values], axis=0
     )
+    # Triangles without an area have no normal, and are not proved.
     return is_between & (clearances > radius + 2 * _SIDE_DISTANCE * size) & (length[:, 0] > 0)

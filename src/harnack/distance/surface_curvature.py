@@ -106,8 +106,8 @@ def curvature(
     """
     target, choices = surface_and_options("curvature", surface, options, keywords, ("precision",))
     field, backend = target.field, choose_backend(choices.precision or "double")
-    # Fields that are evaluated within a kernel, and fields that are evaluated in batches by tree
-    # sums.
+    # Most fields are evaluated inside a kernel. A `BatchedField` is evaluated by tree sums, for
+    # many points at once.
     if not isinstance(field, BatchedField):
         prepared = field.prepare(backend)
 
@@ -180,6 +180,7 @@ def _refine_accuracy(
     # The allowed error where the mean curvature itself is nearly 0.
     flat_error = _ACCURACY / _size(field, x)
     for acceptance in _ACCEPTANCE_FACTORS[1:]:
+        # `columns` are the results of `_Derivatives.curvatures` but for the last one.
         mean, error = columns[0], columns[3]
         with np.errstate(invalid="ignore"):
             is_accurate = error <= np.maximum(_ACCURACY * np.abs(mean), flat_error)
@@ -224,8 +225,8 @@ class _Derivatives:
 
     def curvatures(self) -> tuple[Real | Vec3, ...]:
         """Compute the curvatures of the level set. Returns the mean and the Gaussian curvature; the
-        unit normal; bounds of the errors of both curvatures; and a number, which is 0 where the
-        field states that its derivatives have no error, and 1 elsewhere.
+        unit normal; bounds of the errors of both curvatures; and a number: 0 if the field states
+        that its derivatives have no error at the point, otherwise 1.
 
         Bounds. Let g, A be the computed gradient and Hessian, G = |g|, n = g/G, (u, v) an
         orthonormal basis of the plane at right angles to n, and M = (u, v)^T A (u, v) with T = tr M
@@ -343,8 +344,8 @@ def curvature_lines(
     seeds: points near the surface, from which Newton's method leads to it.
     step: the arc length of a step.
     length: the arc length to which a line is followed, on either side of its seed.
-    family: whether to follow the direction of the larger principal curvature or of the smaller one;
-        the sign of curvatures is that of `curvature`.
+    family: "maximum" for lines along the direction of the larger principal curvature, "minimum" for
+        lines along that of the smaller one. Curvatures have the signs that `curvature` gives them.
     options, keywords: as in `curvature`; beside a bare field also `level`, `clip` and `section`.
 
     The principal directions are the eigenvectors of the Hessian restricted to the tangent plane
@@ -501,6 +502,7 @@ class _CurvatureLineTracer:
         """
         plane = TangentPlane.of(self.field.evaluate(x).gradient)
         eigen = SymmetricEigen2.of(*plane.restrict_hessian(self.field.hessian(x)))
+        # The eigenvector of the larger eigenvalue if `largest` is 1, of the smaller one if 0.
         u, v = eigen.combination(self.largest, 1 - self.largest)
         direction = u * plane.u + v * plane.v
         if previous is not None:
@@ -522,6 +524,7 @@ class _CurvatureLineTracer:
             """Make one Newton step from x."""
             sample = self.field.evaluate(x)
             gap = sample.value - self.level
+            # Of a periodic function, the level that is nearest in value counts.
             if self.field.period is not None:
                 gap = gap - self.field.period * dr.round(gap / self.field.period)
             return x - gap / dr.squared_norm(sample.gradient) * sample.gradient
@@ -565,6 +568,7 @@ def _join_halves(
     if len(ahead) > 3:
         # At this fraction of each step it is nearest to the seed.
         moves, to_seed = np.diff(ahead, axis=0), ahead[0] - ahead[:-1]
+        # (1e-300 avoids a division by 0 for a step of length 0.)
         fraction = (moves * to_seed).sum(axis=1) / np.maximum((moves * moves).sum(axis=1), 1e-300)
         is_near_seed = np.linalg.norm(to_seed - fraction[:, None] * moves, axis=1) < 0.25 * step
         is_same_way = moves @ moves[0] > 0
@@ -577,6 +581,7 @@ def _join_halves(
         )
         if closing.size:
             return np.concatenate([ahead[: closing[0] + 1], ahead[:1]])
+    # `behind` is reversed, without the seed, which `ahead` contains already.
     return np.concatenate([behind[:0:-1], ahead])
 
 

@@ -123,7 +123,8 @@ def first_order_distance(above: Real, gradient: Vec3) -> Real:
     along this line, from x back to y, and |grad f(x)| = |grad f(y)| + O(d) give
     above = d N.grad f(x) + O(d^2) = d |grad f(x)| + O(d^2).
 
-    Where the gradient is zero it is infinite with the sign of above; zero on the level itself.
+    If the gradient is zero, the estimate is infinite with the sign of above; on the level itself it
+    is zero.
     """
     return dr.select(above == 0, 0, above / safe_norm(gradient))
 

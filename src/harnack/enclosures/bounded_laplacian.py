@@ -138,7 +138,7 @@ class BoundedLaplacianEnclosure(Enclosure):
 
     def free_length(self, gaps: LevelGaps) -> Real:
         """Return the shorter of the lengths on which f is proved not to reach the level above and
-        the level below."""
+        the level below. gaps: the differences between f(p) and these levels."""
         above, below = self._conditions(gaps)
         q = fmin(
             largest_free_fraction(above, self.solver_iterations),
@@ -147,7 +147,8 @@ class BoundedLaplacianEnclosure(Enclosure):
         return dr.select(self._is_known(gaps), q * self.radius, 0)
 
     def is_free(self, gaps: LevelGaps, length: Real) -> Mask:
-        """Return the mask of lanes on which f is proved to reach neither level on the length."""
+        """Return the mask of lanes on which f is proved to reach neither the level above nor the
+        level below on the length. gaps: the differences between f(p) and these levels."""
         above, below = self._conditions(gaps)
         q = length / self.radius
         is_inside = (q <= 1) & self._is_known(gaps)
@@ -175,11 +176,11 @@ class BoundedLaplacianEnclosure(Enclosure):
         )
 
     def _growth(self, gap: Real, u: Real, rise: Real, mean: Real, slope: Real) -> _GreenCondition:
-        """Return the condition for f not to rise to the level above. With the numbers of -f in
-        place of those of f, it is the condition for f not to fall to the level below.
+        """Return the condition for f not to rise to the level above. For the numbers of -f as
+        arguments, it is the condition for f not to fall to the level below.
 
-        All numbers of the condition are divided by w + l R^2, with R, l and w as in the proof of
-        the class.
+        All numbers of the condition are divided by w + l R^2. R, l and w are the symbols of the
+        proof of the class.
 
         gap: the difference between f(p) and the level.
         u: f(p) - c, how far f may fall on the ball.
@@ -199,6 +200,7 @@ class BoundedLaplacianEnclosure(Enclosure):
         # A level outside of the range is never met, and a constant function meets none.
         is_reachable = (gap <= rise) & (scale > 0)
         gap = dr.select(is_reachable, fmin(gap * inverse, _UNREACHABLE_GAP), _UNREACHABLE_GAP)
+        # The first number is sqrt(1 + gap) - 1, in a form that does not cancel.
         return _GreenCondition(
             gap / (dr.sqrt(1 + gap) + 1), w, slope, spread, fmax(mean * inverse, 0)
         )

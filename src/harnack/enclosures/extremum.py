@@ -71,11 +71,15 @@ class MaximumEnclosure(Enclosure):
         rise_length = dr.select(gaps.above == dr.inf, infinity, rise_length)
         fall_length = dr.select(gaps.below == dr.inf, infinity, fall_length)
         free = fmin(rise_length, fall_length)
+        # Without a level on either side, the enclosures themselves limit the length.
         return dr.select(free == dr.inf, self._shared_valid_length(infinity), free)
 
     def is_free(self, gaps: LevelGaps, length: Real) -> Mask:
         """Return the mask of lanes on which, for the given length, no operand rises to the level
-        above, and at least one operand is proved not to fall to the level below."""
+        above, and at least one operand is proved not to fall to the level below.
+
+        gaps: the differences between the maximum and these levels.
+        """
         # Start with True (where the gap is a number), and with whether no level lies below.
         free_above, free_below = gaps.above == gaps.above, gaps.below == dr.inf
         for operand in self.operands:
@@ -115,7 +119,8 @@ class MaximumEnclosure(Enclosure):
 
 @dataclass(frozen=True)
 class NegatedEnclosure(Enclosure):
-    """The enclosure of -f: that of f, with the levels above and below exchanged.
+    """The enclosure of -f. It uses an enclosure of f, for which the levels above and below are
+    exchanged.
 
     inner: the enclosure of f.
     """
@@ -123,6 +128,7 @@ class NegatedEnclosure(Enclosure):
     inner: Enclosure
 
     def free_length(self, gaps: LevelGaps) -> Real:
+        """Return the length on which f is proved to take no level of -f, negated."""
         return self.inner.free_length(gaps.swapped())
 
     def is_free(self, gaps: LevelGaps, length: Real) -> Mask:
@@ -155,8 +161,8 @@ class ScaledEnclosure(Enclosure):
         return self.inner.is_free(self._gaps(gaps), length * self.speed / STEP_SAFETY)
 
     def _gaps(self, gaps: LevelGaps) -> LevelGaps:
-        """Return the gaps of f (differences between its value and the next levels), from those of
-        value_factor * f."""
+        """Return the gaps of f (the differences between its value and the next levels) for the
+        gaps of value_factor * f."""
         factor = STEP_SAFETY / self.value_factor
         below, above = _scaled(gaps.below, factor), _scaled(gaps.above, factor)
         return LevelGaps(below, above, gaps.is_one_sided)
@@ -312,14 +318,17 @@ class BranchPointEnclosure(Enclosure):
         # Zero, as an array.
         best = 0 * self.distance_to_limit
         for q in _TRIED_FRACTIONS:
+            # r = (q w/C)^(1/alpha), the radius of the disk.
             radius_power = fmax(q * w / self.constant, 0)
             radius = dr.power(radius_power, 1 / self.exponent) * _POWER_SAFETY
             radius = dr.select(
                 dr.isfinite(radius_power) & (radius >= 0), fmin(radius, self.max_radius), 0
             )
+            # Where the path leaves the disk.
             squared_half_chord = (radius - self.closest_distance) * (radius + self.closest_distance)
             exit_length = self.closest_parameter + dr.sqrt(fmax(squared_half_chord, 0))
             exit_length = dr.select(self.speed > 0, exit_length / self.speed, dr.inf)
+            # L = (1 - q) w/v, but no farther than the disk.
             length = dr.select(self.max_fall_rate > 0, (1 - q) * w / self.max_fall_rate, dr.inf)
             length = fmin(exit_length, length)
             starts_inside = (

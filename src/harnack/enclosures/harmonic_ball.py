@@ -56,13 +56,16 @@ class HarnackEnclosure(HarmonicBallEnclosure):
     """
 
     def free_length(self, gaps: LevelGaps) -> Real:
-        """Return the length on which Harnack's inequality proves that f takes no level."""
+        """Return the length on which Harnack's inequality proves that f takes no level. gaps: the
+        differences between f(p) and the next levels."""
         return dr.select(self.is_valid(gaps), self.radius * self._fraction(gaps), 0)
 
     def _fraction(self, gaps: LevelGaps) -> Real:
         """Return the free length divided by the radius. If f is bounded on both sides, it is the
-        larger of the two fractions that the bounds prove."""
+        larger of the two fractions that the bounds prove. gaps: the differences between f(p) and
+        the next levels."""
         lower = upper = None
+        # For u = f - lower, "away from 0" is above.
         if self.max_fall is not None:
             lower = _fraction_from_one_side(self.max_fall, gaps.above, gaps.below, self.dimension)
         if self.max_rise is not None:  # the same for upper - f, positive and harmonic
@@ -81,7 +84,7 @@ def _fraction_from_one_side(u: Real, gap_away: Real, gap_toward: Real, dimension
     u: its value at the center.
     gap_away, gap_toward: the differences from u to the next level above, which is away from 0, and
         to the next level below, toward 0.
-    dimension: that of the ball; 2, 3 or 4.
+    dimension: the dimension of the ball; 2, 3 or 4.
     """
     growing, falling = _FRACTION_FORMULAS[dimension]
     # u = 0 forces u to vanish identically: no level is ever reached. Levels below 0 never are.
@@ -198,7 +201,8 @@ class HarnackSlopeEnclosure(HarmonicBallEnclosure):
 
     def free_length(self, gaps: LevelGaps) -> Real:
         """Return the shorter of the lengths proved for the level above and for the level below. For
-        each level this is the longest length that one of its conditions proves."""
+        each level this is the longest length that one of its conditions proves. gaps: the
+        differences between f(p) and these levels."""
         q = type(gaps.above)(1)
         for alternatives in self._conditions(gaps):
             best = type(q)(0)
@@ -208,8 +212,9 @@ class HarnackSlopeEnclosure(HarmonicBallEnclosure):
         return dr.select(self.is_valid(gaps), q * self.radius, 0)
 
     def is_free(self, gaps: LevelGaps, length: Real) -> Mask:
-        """Return the mask of lanes on which, for each of the two levels, at least one condition
-        proves that f does not reach it on the length."""
+        """Return the mask of lanes on which, for each of the levels above and below, at least one
+        condition proves that f does not reach it on the length. gaps: the differences between f(p)
+        and these levels."""
         q = length / self.radius
         is_covered = q <= 1
         q = clamp(q, 0, 1)
@@ -394,12 +399,13 @@ class SphericalCapEnclosure(HarmonicBallEnclosure):
 
     @classmethod
     def applies_to(cls, dimension: int, is_bounded_below: bool, is_bounded_above: bool) -> bool:
-        """Return whether the ball is one of space and f is bounded on both sides."""
+        """Return whether this class has a proof: the ball has dimension 3, and f is bounded on both
+        sides."""
         return dimension == 3 and is_bounded_below and is_bounded_above
 
     def free_length(self, gaps: LevelGaps) -> Real:
         """Return the shorter of the lengths on which f is proved not to reach the level above and
-        the level below."""
+        the level below. gaps: the differences between f(p) and these levels."""
         up, down = self._conditions(gaps)
         q = fmin(
             largest_free_fraction(up, self.solver_iterations),
@@ -408,7 +414,8 @@ class SphericalCapEnclosure(HarmonicBallEnclosure):
         return dr.select(self.is_valid(gaps), q * self.radius, 0)
 
     def is_free(self, gaps: LevelGaps, length: Real) -> Mask:
-        """Return the mask of lanes on which f is proved to reach neither level on the length."""
+        """Return the mask of lanes on which f is proved to reach neither the level above nor the
+        level below on the length. gaps: the differences between f(p) and these levels."""
         up, down = self._conditions(gaps)
         q = length / self.radius
         is_inside = (q <= 1) & self.is_valid(gaps)
@@ -460,14 +467,15 @@ def _two_caps(gap: Real, max_rise: Real, p: Real, rest: Real, mu: Real) -> _CapC
 @dataclass(frozen=True)
 class _CapCondition:
     """The condition (1-g) S(q) <= 1-q^2 with S = s1 s2 (s1+s2)/2, on a fraction q of the radius,
-    for f not to reach the level above. The symbols are those of `SphericalCapEnclosure`.
+    for f not to reach the level above. Here s1^2 = (1-q)^2 + 2qb and s2^2 = (1+q)^2 - 2qa, with the
+    heights b = p + shift and a = p - shift of two spherical caps (`SphericalCapEnclosure`).
 
     That is q k(q) <= g with k = (1-g) (S - 1 + q^2)/q + g q.
 
-    gap: g = (gap of f)/(C-f).
-    p: the mean of the boundary values.
+    gap: g = (gap of f)/(C-f), where C is the upper bound of f on the ball.
+    p: the mean of the boundary values, which are scaled to [0, 1].
     rest: 1 - p, accurate where it is small.
-    shift: mu/(1-p), so that the heights of the caps are p + shift and p - shift.
+    shift: mu/(1-p), where mu is the first moment of the boundary values along the ray.
     """
 
     gap: Real

@@ -66,11 +66,13 @@ class BottomUpQuadraticEnclosure(ParabolaEnclosure):
         return cls(SlopeRange(a, c), 2 * b, 2 * d, length)
 
     def free_length(self, gaps: LevelGaps) -> Real:
-        """Return the whole length of the path's piece if f is proved to take neither level on it;
+        """Return the whole length of the path's piece if f is proved to take no level on it;
         otherwise the length that `ParabolaEnclosure` proves.
 
-        The whole length is not shortened for rounding: else a ray that misses would need one more
-        sample. The gaps are, instead.
+        gaps: the differences between f at the start and the next levels below and above.
+
+        To allow for rounding, the gaps are made smaller. The whole length is not shortened: then a
+        ray that misses would need one more sample.
         """
         smaller_gaps = LevelGaps(gaps.below * STEP_SAFETY, gaps.above * STEP_SAFETY)
         is_finite = dr.isfinite(self.slopes.lower + self.slopes.upper)
@@ -108,12 +110,18 @@ class LongestOfEnclosure(Enclosure):
     def from_restriction(
         cls, function: PathRestriction, slopes: SlopeRange, length: Real
     ) -> Self | None:
-        """Return all enclosures that the classes in `kinds` prove for f; None if there is none."""
+        """Return all enclosures that the classes in `kinds` prove for f; None if there is none.
+
+        function, slopes, length: f along the path, the range of its derivative at the start, and
+            the length on which the enclosures are wanted.
+        """
         candidates = [kind.from_restriction(function, slopes, length) for kind in cls.kinds]
         enclosures = tuple(enclosure for enclosure in candidates if enclosure is not None)
         return cls(enclosures) if enclosures else None
 
     def free_length(self, gaps: LevelGaps) -> Real:
+        """Return the longest length that one of the enclosures proves; at least 0, even if one of
+        them gives NaN. gaps: the differences between f at the start and the next levels."""
         longest: Real = type(gaps.above)(0)
         for enclosure in self.enclosures:
             longest = fmax(enclosure.free_length(gaps), longest)
@@ -137,6 +145,8 @@ class BandEnclosure(Enclosure):
     reach: Real
 
     def free_length(self, gaps: LevelGaps) -> Real:
+        """Return the length on which the upper line stays below the level above, and the lower line
+        above the level below. gaps: the differences between f at the start and these levels."""
         up = self._length_below(gaps.above, self.offsets.upper, self.slopes.upper)
         down = self._length_below(gaps.below, -self.offsets.lower, -self.slopes.lower)
         return fmax(fmin(up, down), 0)
@@ -165,12 +175,15 @@ class AffineEnclosure(BandEnclosure):
         """Return the two lines from evaluating the formula of f with affine forms; None if f is no
         formula.
 
+        function: f along the path. slopes: the range of its derivative at the start; not used.
+
         An affine form is center + slope e + error, with e from -1 at the start of the path to 1 at
         its end. So f rises by 2 slope on the length, and starts at center - slope.
         """
         if not isinstance(function, EvaluableRestriction):
             return None
         form = function.evaluate_with(lambda p, d: AffineForm.along_ray(p, d, length))
+        # The bounds are of the change of f, so the value at the start is subtracted.
         start = _value(function)
         rate = 2 * form.slope / length
         line = Interval.point(form.center) + Interval.point(-form.slope)
@@ -191,7 +204,11 @@ class IntervalEnclosure(BandEnclosure):
         cls, function: PathRestriction, slopes: SlopeRange, length: Real
     ) -> Self | None:
         """Return the range from evaluating the formula of f with intervals; None if f is no
-        formula."""
+        formula.
+
+        function: f along the path. slopes: the range of its derivative at the start; not used.
+        length: the length of the piece of the path.
+        """
         if not isinstance(function, EvaluableRestriction):
             return None
         jet = function.evaluate_with(lambda p, d: Jet.along_ray(p, d, 0.0, length, anchored=False))

@@ -53,12 +53,22 @@ class ParabolaEnclosure(Enclosure):
     reach: Real
 
     def free_length(self, gaps: LevelGaps) -> Real:
+        """Return the length up to which the upper parabola stays below the level above, and the
+        lower one above the level below; at most `reach`, and 0 if a number is NaN.
+
+        gaps: the differences between f at the sample and these two levels.
+        """
         up = first_reach(gaps.above, self.slopes.upper, self.max_second_derivative)
         down = first_reach(gaps.below, -self.slopes.lower, -self.min_second_derivative)
         is_valid = (up >= 0) & (down >= 0) & (self.reach > 0)  # and not NaN
         return fmax(dr.select(is_valid, fmin(fmin(up, down), self.reach), 0) * STEP_SAFETY, 0)
 
     def is_free(self, gaps: LevelGaps, length: Real) -> Mask:
+        """Return the mask of lanes on which both parabolas stay between the next levels below and
+        above on the given length, and this is at most `reach`.
+
+        gaps: the differences between f at the sample and these two levels.
+        """
         free = _stays_below(gaps.above, self.slopes.upper, self.max_second_derivative, length)
         free &= _stays_below(gaps.below, -self.slopes.lower, -self.min_second_derivative, length)
         return (length <= 0) | ((length <= self.reach) & free)
@@ -66,16 +76,19 @@ class ParabolaEnclosure(Enclosure):
 
 @dataclass(frozen=True)
 class LipschitzEnclosure(ParabolaEnclosure):
-    """The Lipschitz cone, |F(s)| <= K s with a Lipschitz constant K: the step of sphere tracing.
+    """The Lipschitz cone, |F(s)| <= K s for s < reach, with a Lipschitz constant K: the step of
+    sphere tracing. K and reach come from a promise (a proved bound of f near the sample).
 
-    Proof. |F(s)| <= K s for s < radius by the promise. These are parabolas without a second-order
-    term, and the step is K^-1 times the smaller gap. Source: Hart 1996, Theorem 1.
+    Proof. The bounds are parabolas without a second-order term, and the step is K^-1 times the
+    smaller gap. Source: Hart 1996, Theorem 1.
     """
 
     @classmethod
     def from_promise(
         cls, promise: Promise, value: Real, error: Real, slopes: SlopeRange
     ) -> Self | None:
+        """Return the enclosure from a `Lipschitz`, the promise of a Lipschitz constant; None for
+        another kind of promise. The value of f, its error and the slopes are not used."""
         if not isinstance(promise, Lipschitz):
             return None
         constant = _nan_if_negative(promise.constant)
@@ -84,11 +97,15 @@ class LipschitzEnclosure(ParabolaEnclosure):
     # Both sides in one formula, for speed: a ray along an edge uses a dozen cones at each point.
 
     def free_length(self, gaps: LevelGaps) -> Real:
+        """Return the smaller gap divided by the Lipschitz constant, at most `reach`; 0 if a gap is
+        0 or a number is NaN."""
         length = gaps.nearest / self.slopes.upper
         is_valid = (gaps.below > 0) & (gaps.above > 0) & (self.slopes.upper >= 0) & (self.reach > 0)
         return dr.select(is_valid, fmin(length, self.reach), 0) * STEP_SAFETY
 
     def is_free(self, gaps: LevelGaps, length: Real) -> Mask:
+        """Return the mask of lanes on which f changes on the given length by no more than the
+        smaller gap, and the length is at most `reach`."""
         movement = self.slopes.upper * length
         free = (length <= self.reach) & (movement <= gaps.below) & (movement <= gaps.above)
         return (length <= 0) | free
@@ -97,16 +114,21 @@ class LipschitzEnclosure(ParabolaEnclosure):
 @dataclass(frozen=True)
 class TaylorEnclosure(ParabolaEnclosure):
     """Taylor's formula for F(s), the change of f along a path, with a bound H of the second
-    derivatives.
+    derivatives. H comes from a promise (a proved bound of f near the sample).
 
     Proof. If the slope at the sample is in [low, high], the promise says that F(s) lies between low
-    s - H s^2/2 and high s + H s^2/2 for s < radius.
+    s - H s^2/2 and high s + H s^2/2 for s < reach, the radius of the promise.
     """
 
     @classmethod
     def from_promise(
         cls, promise: Promise, value: Real, error: Real, slopes: SlopeRange
     ) -> Self | None:
+        """Return the enclosure from a `TaylorRemainder`, the promise of such a bound; None for
+        another kind of promise. The value of f and its error are not used.
+
+        slopes: the range of the derivative of f along the path at the sample.
+        """
         if not isinstance(promise, TaylorRemainder):
             return None
         constant = _nan_if_negative(promise.constant)
@@ -192,6 +214,9 @@ class ConvexityEnclosure(Enclosure):
     slopes: SlopeRange
 
     def free_length(self, gaps: LevelGaps) -> Real:
+        """Return the length on which f stays above the level below; 0 if there is a level above, if
+        f is at the level below, or if the slope is NaN."""
+        # f falls at most at this rate.
         rate = -self.slopes.lower
         length = dr.select(rate > 0, gaps.below / rate, dr.select(rate <= 0, dr.inf, 0))
         length = dr.select(gaps.below > 0, length * STEP_SAFETY, 0)
@@ -241,10 +266,12 @@ class SphereArcEnclosure(Enclosure):
     squared_radius: Real
 
     def free_length(self, gaps: LevelGaps) -> Real:
-        """Return the length of the line on which f is proved to take neither level; infinite if no
-        level is ever met.
+        """Return the length of the line on which f is proved to take neither of the next levels
+        below and above; infinite if no level is ever met.
 
-        The symbols are those of the proof of the class: `square_sum` is S = c^2 + t^2,
+        gaps: the differences between f at the start and these levels.
+
+        In the symbols of the proof of the class, `square_sum` is S = c^2 + t^2,
         `length_per_angle` is dt/da = S/(2c) at the start, and `half_angle` is half the smallest
         angle psi at which f may reach a level. The result is the length s that belongs to psi.
         """

@@ -50,7 +50,8 @@ class PiecewiseTaylorEnclosure(Enclosure):
     def from_restriction(
         cls, function: PathRestriction, slopes: SlopeRange, length: Real
     ) -> Self | None:
-        """Return the enclosure from ranges on a few pieces of the path up to `length`.
+        """Return the enclosure from ranges on a few pieces of the path up to `length`. The result
+        is never None.
 
         function: f along the path.
         slopes: the range of its derivative at the start.
@@ -73,7 +74,7 @@ class PiecewiseTaylorEnclosure(Enclosure):
 
     def free_length(self, gaps: LevelGaps) -> Real:
         """Return the shorter of the lengths on which F does not reach the level above and the level
-        below."""
+        below. gaps: the differences between f at the start and these levels."""
         # With a single level, one side is enough: the one with the finite gap.
         if gaps.is_one_sided:
             rises = gaps.below == dr.inf
@@ -89,6 +90,8 @@ class PiecewiseTaylorEnclosure(Enclosure):
 
     def arrives(self, gaps: LevelGaps, length: Real) -> Mask:
         """Return the mask of lanes on which f is proved to take a level for some 0 <= s <= length.
+
+        gaps: the differences between f at the start and the next levels.
 
         Proof. On the first piece F' is known, so F is continuous, and F(s) is at most s times the
         upper end of the range of F'. If that end is negative, F falls to the level below by s =
@@ -151,7 +154,9 @@ class PiecewiseTaylorEnclosure(Enclosure):
         by_line = dr.select(gap > 0, by_line, 0)
         by_parabola = first_reach(gap, slope, curvature)
         reach = fmin(fmax(by_parabola, by_line) * STEP_SAFETY, length)
-        # Both terms may cancel: the rounding error is that of each term, not that of their sum.
+        # From here on, the rise of F on the whole piece: by the parabola, by the line, and the
+        # smaller of both. The two terms of the parabola may cancel, so the rounding error is that
+        # of each term, not that of their sum.
         epsilon = 4 * float(dr.epsilon(type(gap)))
         curved, linear = 0.5 * length * length * curvature, slope * length
         by_parabola = (curved + linear) + epsilon * (dr.abs(curved) + dr.abs(linear))
@@ -183,7 +188,8 @@ class QuadraticTaylorEnclosure(SinglePieceEnclosure):
     def _advance_piece(
         cls, gap: Real, slope: Real, max_slope: Real, curvature: Real, length: Real
     ) -> tuple[Real, Real, Real]:
-        """Advance the parabola over the piece; the largest slope on the piece is not used."""
+        """Advance the parabola over the piece, as the base class does it for the parabola and a
+        line; the largest slope on the piece is not used."""
         del max_slope
         return super()._advance_piece(gap, slope, type(gap)(dr.inf), curvature, length)
 
@@ -200,7 +206,8 @@ class LinearTaylorEnclosure(SinglePieceEnclosure):
     def _advance_piece(
         cls, gap: Real, slope: Real, max_slope: Real, curvature: Real, length: Real
     ) -> tuple[Real, Real, Real]:
-        """Advance the line over the piece; the second derivative is not used."""
+        """Advance the line over the piece, as the base class does it for a parabola and the line;
+        the slope at the start and the second derivative are not used."""
         del slope, curvature
         return super()._advance_piece(gap, max_slope, max_slope, type(gap)(0), length)
 
@@ -216,7 +223,10 @@ class SegmentTracingEnclosure(SinglePieceEnclosure):
     def from_restriction(
         cls, function: PathRestriction, slopes: SlopeRange, length: Real
     ) -> Self | None:
-        """Return the enclosure from the largest |F'| on the whole length."""
+        """Return the enclosure from the largest |F'| on the whole length. The result is never None.
+
+        function: f along the path. slopes: the range of its derivative at the start; not used.
+        """
         (piece,) = function.derivative_ranges([0.0, length])
         max_slope = fmax(piece.slope_range.upper, -piece.slope_range.lower)
         interval = SlopeRange(-max_slope, max_slope)

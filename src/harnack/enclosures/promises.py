@@ -225,7 +225,8 @@ class HarmonicBall(Promise):
     holds_outside_domain = True
 
     def movement_bounds(self, value: Any, slopes: SlopeRange, length: Any) -> tuple[Any, Any]:
-        """Return the bounds of f(y) - f(p) on the ball: those of f, less f(p)."""
+        """Return a lower and an upper bound of f(y) - f(p) on the ball: the bounds of f, less f(p).
+        They do not depend on the slopes and the length. value: f(p)."""
         return self.lower - value, self.upper - value
 
     def taylor_remainder_bound(self, value: Real, length: Real, degree: int = 1) -> Real:
@@ -259,7 +260,7 @@ class HarmonicBall(Promise):
 
     def implied_lipschitz(self, value: Real) -> Lipschitz | None:
         """Return a Lipschitz constant of f on half the ball; None if f is not bounded on both
-        sides.
+        sides. value: f(p).
 
         Proof. Let f be within M of a constant on a ball of radius r in R^n. At the center f_v is
         n/r times the mean of f s over the sphere, where s is the cosine of the angle to v. So |f_v|
@@ -274,7 +275,8 @@ class HarmonicBall(Promise):
         )
 
     def weakened_for_linear_maps(self, value: Real) -> Promise:
-        """Return a `TaylorRemainder` on half the ball: a bound of the second derivatives.
+        """Return a `TaylorRemainder` on half the ball: a bound of the second derivatives. value:
+        f(p).
 
         Proof in space (and so in the plane). At the center of a ball of radius R, f_vv is R^-2
         times the mean of 5 (3 s^2 - 1) f over the sphere, where s is the cosine of the angle to v.
@@ -297,14 +299,16 @@ class HarmonicBall(Promise):
         """Return a bound of |f_vv| for all unit vectors v on half the ball, and the radius R/2 of
         that half; None if f is not bounded on both sides.
 
-        Proof: that of `weakened_for_linear_maps`, at the centers of balls of radius R/2. In R^4,
-            where f_vv is R^-2 times the mean of 6 (4 s^2 - 1) f, the mean of the positive part of
-            this kernel is 9 sqrt(3)/(2 pi) = 2.48, which is half the mean of its absolute value.
+        Proof. `weakened_for_linear_maps` has the proof at the center of a ball; here it is used at
+        the centers of balls of radius R/2. In R^4, f_vv is R^-2 times the mean of 6 (4 s^2 - 1) f.
+        The mean of the positive part of this kernel is 9 sqrt(3)/(2 pi) = 2.48, which is half the
+        mean of its absolute value.
         """
         if _is_infinite(self.lower) or _is_infinite(self.upper):
             return None
         half = 0.5 * self.radius
         constant = _SECOND_DERIVATIVE_BOUND_4D if self.dimension == 4 else _SECOND_DERIVATIVE_BOUND
+        # (1.0001 allows for rounding.)
         return 1.0001 * constant * self._span(value) / (half * half), half
 
     def _span(self, value: Real) -> Real:
@@ -340,11 +344,12 @@ class BoundedLaplacian(Promise):
     holds_outside_domain = True
 
     def movement_bounds(self, value: Any, slopes: SlopeRange, length: Any) -> tuple[Any, Any]:
-        """Return the bounds of f(y) - f(p) on the ball: those of f, less f(p)."""
+        """Return a lower and an upper bound of f(y) - f(p) on the ball: the bounds of f, less f(p).
+        They do not depend on the slopes and the length. value: f(p)."""
         return self.lower - value, self.upper - value
 
     def implied_lipschitz(self, value: Real) -> Lipschitz:
-        """Return a Lipschitz constant of f on half the ball.
+        """Return a Lipschitz constant of f on half the ball. It does not depend on the value f(p).
 
         Proof. Let R be the radius. Points within R/2 are centers of balls of radius r = R/2. On
         such a ball f = h - integral of G Laplacian f, where G is the Green function and h is
@@ -354,6 +359,7 @@ class BoundedLaplacian(Promise):
         half = 0.5 * self.radius
         max_laplacian = fmax(dr.abs(self.laplacian_lower), dr.abs(self.laplacian_upper))
         max_slope = 0.75 * (self.upper - self.lower) / half + 0.375 * half * max_laplacian
+        # (1.0001 allows for rounding.)
         return Lipschitz(1.0001 * max_slope, half)
 
     def weakened_for_linear_maps(self, value: Real) -> Promise:
@@ -365,8 +371,8 @@ class BoundedLaplacian(Promise):
 
         stretch: the factor by which A stretches lengths, up to some roundings.
 
-        The Laplacian of f(A x) is that of f times the square of the exact factor. So its range is
-        widened by a few roundings first.
+        The Laplacian of x -> f(A x) is the Laplacian of f times the square of the exact factor. So
+        its range is widened by a few roundings first.
         """
         slack = 5e-6 * (dr.abs(self.laplacian_lower) + dr.abs(self.laplacian_upper))
         lower, upper = self.laplacian_lower - slack, self.laplacian_upper + slack
@@ -390,7 +396,8 @@ class Lipschitz(Promise):
     implies_smooth = False
 
     def movement_bounds(self, value: Any, slopes: SlopeRange, length: Any) -> tuple[Any, Any]:
-        """Return the bounds of f(y) - f(p): constant times length, on both sides."""
+        """Return the bounds of f(y) - f(p): constant times length, to both sides. They do not
+        depend on the value f(p) and the slopes. length: |y - p|."""
         movement = self.constant * length
         return -movement, movement
 
@@ -419,7 +426,11 @@ class TaylorRemainder(Promise):
 
     def movement_bounds(self, value: Any, slopes: SlopeRange, length: Any) -> tuple[Any, Any]:
         """Return the bounds of f(y) - f(p): the slope times the length, and constant length^2/2 to
-        both sides."""
+        both sides.
+
+        value: f(p), not used. slopes: the range of the derivative of f along the direction at p.
+        length: |y - p|.
+        """
         curved = 0.5 * self.constant * length * length
         return slopes.lower * length - curved, slopes.upper * length + curved
 
@@ -430,8 +441,8 @@ class TaylorRemainder(Promise):
         return (self.constant, self.radius) if _is_infinite(self.radius) else None
 
     def taylor_remainder_bound(self, value: Real, length: Real, degree: int = 1) -> Real:
-        """Return the bound of |f(y) - T(y)| that the promise states for the degree 1 or 2 of the
-        Taylor polynomial T; infinite beyond its radius."""
+        """Return the bound of |f(y) - T(y)| for |y - p| <= length that the promise states for the
+        Taylor polynomial T of degree 1 or 2; infinite beyond its radius. value: f(p), not used."""
         if degree == 2 and _is_infinite(self.cubic_constant):
             return dr.inf
         factor = 0.5 * self.constant if degree == 1 else self.cubic_constant * length / 6

@@ -114,8 +114,9 @@ class EnclosureKinds:
     ) -> tuple[Enclosure, ...]:
         """Return the enclosures of f along a direction, one for each promise that a class can use.
 
-        promises, alternative_promises, ray_promises: proved bounds of f near the point, as in
-            `Sample`. Those in `ray_promises` hold along this direction only.
+        promises, alternative_promises: proved bounds of f near the point; the field declares the
+            alternative ones weaker than the others.
+        ray_promises: Lipschitz constants of f that hold along this direction only.
         value, error: f at the point, and a bound of its error.
         slopes: the range of the derivative of f along the direction.
 
@@ -136,7 +137,11 @@ class EnclosureKinds:
     def _enclosure(
         self, promise: Promise, value: Real, error: Real, slopes: SlopeRange
     ) -> Enclosure | None:
-        """Return the enclosure of the first class that can use the promise; None if none can."""
+        """Return the enclosure of the first class that can use the promise; None if none can.
+
+        value, error: f at the point, and a bound of its error.
+        slopes: the range of the derivative of f along the direction.
+        """
         for kind in self.kinds:
             enclosure = kind.from_promise(promise, value, error, slopes)
             if enclosure is not None:
@@ -149,7 +154,9 @@ class EnclosureKinds:
         """Return the text of the error that none of these classes of enclosures can use the field's
         promises. It names the choices of the option `enclosures` that can use them.
 
-        promises, value, error, slopes: as for `from_promises`.
+        promises: all promises of the field at a point.
+        value, error: f at the point, and a bound of its error.
+        slopes: the range of the derivative of f along the direction.
         """
         requested = ", ".join(kind.__name__ for kind in self.kinds)
         if not promises:

@@ -108,7 +108,7 @@ class PointValues:
 
         x: the points, in coordinates in which the field's data have a size of about 1.
         terms: the number of terms that were summed.
-        weight: the sum of the absolute weights of all dipoles.
+        weight: the sum of the absolute weights of all dipoles (the factors of their values).
 
         Two errors matter only far away. First, a term of a derivative is the product of a factor
         that falls like |x|^-5 and one that grows like |x|^2, and the first may underflow. Second,
@@ -148,8 +148,9 @@ class PointValues:
 class BatchedField(Field):
     """A field whose values, derivatives and error bounds can be evaluated at large numbers of
     points at once. Points are either Dr.Jit 3-vectors, one point per lane, or NumPy arrays (n, 3),
-    for which results are NumPy arrays. Many such fields are sums in which a far cluster of sources
-    is approximated as one source. Subclasses define `values_at`."""
+    for which results are NumPy arrays. Many such fields are sums over sources in a tree, in which a
+    far cluster of sources is approximated as one source; this causes a truncation error. Subclasses
+    define `values_at`."""
 
     @abc.abstractmethod
     def values_at(self, x: Vec3, derivatives: int, closer: Real = 1.0) -> PointValues:
@@ -175,7 +176,8 @@ class BatchedField(Field):
         and in forward mode. Its derivative is the gradient of `sharp_values_at`."""
         with dr.suspend_grad():
             at = self.sharp_values_at(dr.detach(p))
-        # A literal 0, the gradient of a closed mesh, would have no derivative in Dr.Jit.
+        # Dr.Jit would drop a gradient that is the literal 0, such as that of a closed mesh, and
+        # with it the dependence on p. A kernel parameter is no literal.
         return dr.replace_grad(
             at.value, dr.dot(as_kernel_parameters(at.gradient), p - dr.detach(p))
         )
@@ -212,8 +214,8 @@ class BatchedField(Field):
         self, points: Any, *, precision: Precision | None = None
     ) -> tuple[FloatArray, FloatArray]:
         """Values (n,) and gradients (n, 3) at points (n, 3), by a single pass over the tree of
-        sources. The gradients may have large errors. So they serve for estimates, and at points
-        where f is steep."""
+        sources. The gradients may have large errors, so they are for estimates only, or for points
+        where f is so steep that the errors do not matter."""
 
         def kernel(backend: Backend, x: Vec3) -> tuple[Any, ...]:
             """The values and gradients at the Dr.Jit points x."""
@@ -245,8 +247,9 @@ class BatchedField(Field):
         proved truncation error and the rounding error. They do not include the change of the
         gradient by rounding the points.
 
-        For a sum over a tree the bound is about a hundred times the error itself, because the
-        accuracy of the sum is chosen by estimates (`sharpened`).
+        For a sum over a tree the bound is about a hundred times the error itself: the sum is made
+        only as accurate as an estimate of the error demands (`sharpened`), and the proved bound is
+        far larger than the estimate.
         """
         return self._choose_at_points(points, precision, 1, lambda at: (at.gradient_error,))[0]
 
@@ -264,8 +267,8 @@ class BatchedField(Field):
         derivatives: int,
         choose: Callable[[PointValues], tuple[Any, ...]],
     ) -> tuple[FloatArray, ...]:
-        """Some of the results of the field at points (n, 3) or (3,), as a tuple of NumPy arrays in
-        the order of the points.
+        """Evaluate the field at points (n, 3) or (3,), and return the results that `choose`
+        selects, as a tuple of NumPy arrays in the order of the points.
 
         precision: "single", "double", or None for that of the points.
         derivatives: the order up to which derivatives are computed, 0 to 2.
@@ -274,8 +277,8 @@ class BatchedField(Field):
         """
 
         def kernel(backend: Backend, x: Vec3) -> tuple[Any, ...]:
-            """What `choose` takes from the field's results at the Dr.Jit points x. Gradients alone
-            are computed more accurately, by `sharp_values_at`."""
+            """The results that `choose` selects, at the Dr.Jit points x. If gradients but no
+            Hessians are asked for, they are computed more accurately, by `sharp_values_at`."""
             del backend
             sharp = derivatives == 1
             return choose(self.sharp_values_at(x) if sharp else self.values_at(x, derivatives))
@@ -338,6 +341,7 @@ def sharpened(at: Callable[[Vec3, Real], PointValues], x: Vec3) -> PointValues:
     gradient, error = gradient + dr.zeros(type(x), dr.width(x)), error + dr.zeros(real, dr.width(x))
     dr.eval(values.value, values.error, gradient, error)
     # The indices of the points whose gradient is to be refined.
+    # (Written with ~, so that NaN counts as not accurate.)
     rows = dr.compress(~(error <= _ACCEPTED_ERROR * dr.norm(gradient)))
     for closer in _DISTANCE_MULTIPLES:
         if not len(rows):
@@ -347,6 +351,7 @@ def sharpened(at: Callable[[Vec3, Real], PointValues], x: Vec3) -> PointValues:
         refined = at(points, dr.opaque(real, closer))
         change = dr.norm(refined.gradient - dr.gather(type(x), gradient, rows))
         length = dr.norm(as_kernel_parameters(refined.gradient))
+        # Accurate enough by the observed change, or by the proved bound.
         is_accurate = (change <= _MAX_CHANGE * length) | (
             refined.gradient_error <= _ACCEPTED_ERROR * length
         )
@@ -374,14 +379,16 @@ Value = TypeVar("Value")
 
 
 class FieldCache(Generic[Value]):
-    """A cache that keeps one value for each field. The value belongs to a key, and is replaced if
-    it is requested for another key. It is dropped when the field is deleted.
+    """A cache that keeps one value for each field, together with the key for which the value was
+    made. If the value is requested for another key, it is made again and replaced. It is dropped
+    when the field is deleted.
 
     A value must not refer to its field, or neither of them would ever be deleted.
     """
 
     def __init__(self) -> None:
-        # By identity: users' fields may be equal to others, or have no hash.
+        # For each field, by its identity (`id`): the key, the field's attributes when the value was
+        # made, and the value. (A user's field may have no hash, or equal another one.)
         self._kept: dict[int, tuple[Any, dict[str, Any], Value]] = {}
 
     def get(self, field: Field, key: Any, make: Callable[[], Value]) -> Value:

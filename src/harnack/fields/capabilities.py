@@ -13,11 +13,11 @@ Accuracy of sums over trees. The smaller the truncation error of a sum over a tr
 cost; and far from the surface a large error does no harm. So `VariableAccuracy.at_accuracy` takes
 any accuracy, from coarse to a direct sum. If the truncation error decides about a step or a hit,
 the tracer samples the point again with higher accuracy, until a hit is within the tolerance minus
-the truncation error. An uncertainty that is due to rounding alone is reported in
-`Hits.uncertainty`. If it is large, for example because grad f is 0 on the surface, `trace` searches
-for the surface around the hit after the march (`doubtful`). The samples of such sums promise a
-bound of the second derivatives of f near the point (`source_sums`). (The ranges of the published
-proof, which add up absolute values to first order, hold only on a fifth of that length.)
+the truncation error. What rounding alone leaves uncertain about the position of a hit is reported
+in `Hits.uncertainty`. If it is large, for example because grad f is 0 on the surface, `trace`
+searches for the surface around the hit after the march (`doubtful`). The samples of such sums
+promise a bound of the second derivatives of f near the point (`source_sums`), which holds on a
+length about five times as long as the ranges of f in the published proof.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class NearestFacet:
     Facets are the pieces of the surface across which f jumps.
 
     sort_key: a number that grows with the distance from x; inf if there is no facet. Facets are
-        ordered by it, and by index if it is equal.
+        ordered by it; those with equal numbers are ordered by index.
     facet: the index of the facet, a Dr.Jit UInt32; NO_FACET if there is none.
     offset: (3,) the vector from x to the closest point of the facet.
     normal: (3,) the unit normal of the facet at that point, to either side; any direction if the
@@ -125,21 +125,22 @@ class JumpSurface:
         `coarsest_accuracy`.
 
         If so, those samples set `Sample.branch_unknown`, and all jumps of f are integers. Besides,
-        `extent` must keep a condition for every set of levels that contains, with each level, the
-        level that differs from it by an integer and is nearest to 0: outside the extent of such a
-        set, no number that differs from a level by an integer lies between f and 0.
+        `extent` has to keep a condition. Consider a set of levels that contains, for each of its
+        levels L, also the number nearest to 0 among L plus all integers. At points outside of the
+        extent of such a set, none of the numbers L plus an integer lies between 0 and f.
         """
         return False
 
     def is_of_sheets_alone(self, levels: tuple[float, ...]) -> bool:
-        """Whether the level set of these levels consists of all facets and of nothing else. Then
-        `with_levels` returns a field that takes the levels at every facet and nowhere else. The
-        default is False."""
+        """Whether the level set of these levels consists of all facets (the sheets of the surface
+        across which f jumps) and of nothing else. Then `with_levels` returns a field that takes the
+        levels at every facet and nowhere else. The default is False."""
         del levels
         return False
 
     only_sheets: bool = False
-    """Whether this field takes its levels at its facets only: see `is_of_sheets_alone`."""
+    """Whether this field takes its levels only where it jumps, at its facets (sheets): see
+    `is_of_sheets_alone`."""
 
     def without_jumps(self) -> Field | None:
         """A field without jumps whose level sets contain all points of this field's level sets,
@@ -154,8 +155,8 @@ class JumpSurface:
         return cast("Field", self).evaluate(p)
 
     def value_if_cheap(self, p: Vec3, rounding: Real, active: Mask) -> Real:
-        """f at p, on active lanes on which it takes less time than `evaluate`. It is NaN on all
-        other lanes, and where p may lie on a facet. It is used only for fields with
+        """f at p, on active lanes on which it takes less time than `evaluate`. The result is NaN on
+        all other lanes, and where p may lie on a facet. It is used only for fields with
         `has_unknown_branch`. The default is NaN everywhere.
 
         rounding: a bound of the rounding errors of the coordinates of p, and of the ray on which p

@@ -48,8 +48,9 @@ _PROOFS = choose_enclosures("curvature")
 def clearance_function(
     field: Field, levels: tuple[float, ...], precision: Precision = "double"
 ) -> Clearance:
-    """A function that takes points (n, 3) and returns their clearances (n,): proved lower bounds of
-    the distance to the nearest of the level sets f = level (`level_distance_lower_bound`).
+    """Make a function that takes points (n, 3) and returns their clearances (n,): proved lower
+    bounds of the distance to the nearest of the level sets f = level
+    (`level_distance_lower_bound`).
 
     levels: the levels.
     precision: of the computation.
@@ -81,20 +82,22 @@ def tight_extent(
 ) -> ConvexHull:
     """A convex polytope of few planes that contains every point of the level sets inside a box.
 
-    The box is cut into cells. A cell is left out if the ball around it is smaller than the
-    clearance of its center (the proved lower bound of the distance to the level sets). The polytope
-    contains the remaining cells. If none remains, it contains the whole box.
+    The box is cut into cells, in several rounds. A cell is left out if its clearance (the proved
+    lower bound of the distance from its center to the level sets) is larger than the radius of the
+    ball around the cell. In each round the edges of the remaining cells are halved. The polytope
+    contains the cells that remain in the end. If none remains, it contains the whole box.
 
     lower, upper: (3,) corners of the box.
     max_cells: the largest number of cells tested in a round.
-    finest: the largest number of rounds; each halves the edges of cells.
+    finest: the largest number of rounds.
     points: (n, 3) points that the polytope must contain in any case. A first polytope is put around
         them. Cells inside of it need no test, so they are not tested.
     """
     clearance = clearance_function(field, levels)
     margin = 1e-4 * float(np.linalg.norm(upper - lower))
     if points is not None:
-        # No cell inside the polytope of the given points needs a test.
+        # Cells inside the polytope of the given points count as free of levels, since that polytope
+        # is part of the result anyway.
         given = kdop_of_points(points, margin)
         cells = nonempty_cells(
             lower, upper, _clearance_outside(given, clearance), max_cells, finest
@@ -107,9 +110,10 @@ def tight_extent(
 
 
 def _clearance_outside(polytope: ConvexHull, clearance: Clearance) -> Clearance:
-    """A function like `clearance`, but for the part of the level sets that lies outside of a
-    polytope. It takes points (n, 3) and returns lengths (n,). For a point inside the polytope the
-    length is the distance to the nearest face. For a point outside it is the result of `clearance`.
+    """A function like `clearance`, but about only that part of the level sets that lies outside of
+    a polytope. It takes points (n, 3) and returns proved lower bounds (n,) of their distances to
+    that part. For a point inside the polytope the bound is the distance to the nearest face, since
+    the part lies beyond the faces. For a point outside it is the result of `clearance`.
 
     clearance: a function that takes points and returns lower bounds of their distances to the level
         sets.
@@ -151,12 +155,13 @@ def level_distance_lower_bound(
 
     Proof. Let v be a unit direction and s the slope of f at p along v. An enclosure (a bound of f
     along a line that follows from a promise) holds f(p + t v) within an interval [L(t, s), U(t,
-    s)]. The length that it proves free of levels ends where this interval first meets a level.
-    Neither L nor U falls as s grows, which every enclosure has to prove (`Enclosure`).
+    s)]. The length that it proves free of levels ends where this interval first meets a level. Both
+    L and U grow with s or stay the same, which every enclosure has to prove (`Enclosure`).
 
-    All slopes at p lie in [-G, G], where G is |grad f(p)| plus its error. So an enclosure for that
-    interval of slopes holds in every direction. The distance to the level above and the distance to
-    the level below are proved separately, each by the promise that proves the larger distance.
+    The slopes at p in all directions lie in [-G, G], where G is |grad f(p)| plus its error. So the
+    interval [L(t, -G), U(t, G)] holds f(p + t v) for every direction v, and a length that it proves
+    free is a lower bound of the distance. The distance to the level above and the distance to the
+    level below are proved separately, each by the promise that proves the larger distance.
 
     As in the tracer, the differences of f to the levels are reduced by the rounding errors of the
     value and of the position, and the result is reduced by the rounding error of p itself. If f
@@ -166,6 +171,8 @@ def level_distance_lower_bound(
     steepest = safe_norm(sample.gradient) + sample.gradient_error
     size = max_norm(p)
     epsilon = backend.machine_epsilon
+    # Eight roundings of the value; and the change of f by four roundings of the point's
+    # coordinates.
     rounding = 8 * epsilon * dr.abs(sample.value) + 4 * epsilon * size * steepest
     gaps = levels.gaps(sample.value).reduced_by(rounding + sample.value_error)
     enclosures = _PROOFS.from_promises(
@@ -179,6 +186,7 @@ def level_distance_lower_bound(
     # An infinite gap stands for no level on that side.
     upward = longest_free_length(enclosures, LevelGaps(inf, gaps.above))
     downward = longest_free_length(enclosures, LevelGaps(gaps.below, inf))
+    # If a gap is 0 or less, the point may lie on a level set.
     distance = dr.select(gaps.nearest > 0, fmin(upward, downward), 0)
     if field.has_jumps:
         distance = fmin(distance, field.distance_to_jumps(p))
@@ -205,9 +213,9 @@ Uploaded = TypeVar("Uploaded", bound=UnitFrame)
 
 class DeviceField(Field, Generic[Uploaded]):
     """A field that is evaluated from data on a backend (a Dr.Jit device and precision), such as a
-    tree of triangles. A prepared field holds its data; a field that is not prepared uploads them
-    when they are needed. There may be two sets of data: one for tracing rays, and one for values at
-    large numbers of points. Subclasses define `_upload`."""
+    tree of triangles. A prepared field (the result of `prepare`) holds its data; a field that is
+    not prepared uploads them whenever it needs them. There may be two sets of data: one for tracing
+    rays, and one for values at large numbers of points. Subclasses define `_upload`."""
 
     def __init__(self) -> None:
         self._device: Uploaded | None = None
@@ -261,7 +269,7 @@ class VariableAccuracyField(DeviceField[Uploaded], BatchedField):
     has_variable_accuracy = True
 
     has_separate_batch_data: ClassVar[bool] = True
-    """Whether the data for values at points differ from those for tracing."""
+    """Whether the data for values at points differ from the data for tracing rays."""
 
     @abc.abstractmethod
     def _sample(self, on: Uploaded, p: Vec3, detail: Real) -> Sample:
@@ -278,14 +286,16 @@ class VariableAccuracyField(DeviceField[Uploaded], BatchedField):
 
     def at_accuracy(self, detail: Real) -> Field:
         on = self._require_data()
+        # The accuracy scale of `values_at` must be at least 1.
         closer = fmax(on.backend.Float(detail), on.backend.Float(1))
         return SumAtDetail(
             lambda p: self._sample(on, p, detail), lambda p: self.values_at(p, 2, closer)
         )
 
     def _batch_data(self, backend: Backend) -> Uploaded:
-        """The data for values at points. They are the data for tracing if the field is prepared for
-        this backend and does not distinguish the two (`has_separate_batch_data`)."""
+        """The data for values at points. If the field is prepared for this backend, and uses the
+        same data for both purposes (`has_separate_batch_data` is False), they are its data for
+        tracing. Otherwise they are uploaded once for each backend and then cached."""
         device = self._device
         if self.has_separate_batch_data or device is None or device.backend is not backend:
             return super()._batch_data(backend)

@@ -61,8 +61,8 @@ class TextFormula:
 
     text: it is made of + - * / ^ (or **), brackets, numbers, x, y, z, pi, e, parameters and the
         functions `_FUNCTIONS`. An equation "left = right" means left - right.
-    tree: the syntax tree of the text. It is never run as Python, so that texts from untrusted
-        sources do no harm.
+    tree: the text's syntax tree, which is evaluated node by node. It is never run as Python, so
+        that texts from untrusted sources do no harm.
     parameters: numbers by their names in the text.
     """
 
@@ -84,6 +84,7 @@ class TextFormula:
         parameters = {name: as_finite(number, name) for name, number in (parameters or {}).items()}
         if len(text) > _MAX_LENGTH:
             raise ValueError(f"a formula has at most {_MAX_LENGTH:,} characters, not {len(text):,}")
+        # A character that no formula has, or a number that is not decimal, such as 0x1F.
         unknown = re.search(r"[^A-Za-z0-9\s.,+*/^()=<>!-]|\b0[xob]", text, re.IGNORECASE)
         if unknown:
             raise _formula_error(text, f"{unknown[0]!r} has no meaning here")
@@ -120,6 +121,8 @@ class TextFormula:
         bare = re.search(rf"\b({'|'.join(_FUNCTIONS)})\s+[A-Za-z0-9]", side)
         if bare:
             raise _formula_error(text, f"the argument of {bare[1]} stands in brackets")
+        # A number or a closing bracket before a name or an opening bracket; or two names with a
+        # space between them.
         missing = re.search(r"(?:[0-9](?<!atan2)|\))\s*[A-Za-z(]|[xyz)]\s+[A-Za-z0-9(]", side)
         hint = f"is a * missing at {missing[0]!r}" if missing else "an operator or bracket is amiss"
         raise _formula_error(text, hint)
@@ -284,7 +287,7 @@ def _evaluate_node(node: ast.expr, names: Mapping[str, Any]) -> Any:
         case ast.Name(name):
             return names[name]
         case ast.Constant(value):
-            # Integers become floats, too.
+            # An int becomes a float, too.
             return float(value)  # pyright: ignore
         case ast.Call(ast.Name(name), arguments):
             return _FUNCTIONS[name](*(_value(argument, names) for argument in arguments))
@@ -293,8 +296,8 @@ def _evaluate_node(node: ast.expr, names: Mapping[str, Any]) -> Any:
 
 
 def _power(base: Any, exponent: Any) -> Any:
-    """base^exponent. An exponent that is a whole number is turned into an integer, because negative
-    numbers have such powers too.
+    """base^exponent. An exponent that is a whole number is turned into an int, because powers with
+    an int as exponent are also defined for negative bases.
 
     Raises:
         OverflowError: both are constants, and the power is not real.
@@ -381,7 +384,8 @@ def expression(
     check_volume(domain, "domain")
     level, is_convex = as_finite(level, "level"), flag(is_convex, "is_convex")
     field = Expression(function, domain, default_level=level, is_convex=is_convex)
-    # Evaluate the formula once at an arbitrary point, which raises the errors above.
+    # Evaluate the formula once at an arbitrary point, as a test: this raises the errors that the
+    # docstring names.
     point = probe_jets()
     check_no_derivatives("an expression", as_jet(field.formula(*point), point[0], "expression"))
     warn_if_slow_to_compile(field)

@@ -85,7 +85,8 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
     """
 
     period: ClassVar[float | None] = None
-    """None if f is real-valued; else f is angle-valued, continuous modulo this number."""
+    """None if f is real-valued. Otherwise f is angle-valued: its values are known up to multiples
+    of this number, and f is continuous if values that differ by a multiple count as equal."""
 
     default_level: float = 0.0
     """The level that is drawn if the user names none."""
@@ -95,8 +96,9 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
     inside is where f > level; else it is where f < level, as for signed distances."""
 
     over_relaxation: float = 1.4
-    """The over-relaxation factor (`TraceOptions.over_relaxation`) that needs the fewest
-    evaluations, by experiment. It is at least 1."""
+    """The over-relaxation factor with which tracing needs the fewest evaluations, by experiment; at
+    least 1. The tracer tries steps longer than the proved length by this factor, and proves the
+    rest afterwards, looking back from the new point."""
 
     domain: Volume | None = None
     """The convex volume in which the field may be evaluated and is drawn; None for all of space.
@@ -126,15 +128,16 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
         return super().__new__(cls)
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
-        """Wrap methods of a new subclass. The wrapped `evaluate` checks its result. The wrapped
-        `hessian` also takes NumPy arrays. Public class methods refuse arguments with derivatives
-        enabled, as the constructor does. `__repr__` becomes that of `Field` unless the subclass
-        defines its own. A subclass that defines `evaluate`, but not `sample_ray`, gets the
-        `sample_ray` of `Field`."""
+        """Replace methods of a new subclass. Its `evaluate` is wrapped so that the result is
+        checked. Its `hessian` is wrapped so that it also takes NumPy arrays. Its public class
+        methods are wrapped so that they refuse arguments with derivatives enabled, as the
+        constructor does. Unless the subclass defines `__repr__`, it gets that of `Field`. If it
+        defines `evaluate` but not `sample_ray`, it gets the `sample_ray` of `Field`, which calls
+        the new `evaluate`."""
         super().__init_subclass__(**kwargs)
         if "__repr__" not in vars(cls):  # a dataclass would write out all numbers
             cls.__repr__ = Field.__repr__
-        # Public class methods are further constructors.
+        # Public class methods are taken as further constructors.
         for name, attribute in list(vars(cls).items()):
             if isinstance(attribute, classmethod) and not name.startswith("_"):
                 checked_maker = no_derivatives(cast("Any", attribute).__func__)
@@ -155,8 +158,8 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Restore a pickled field or a deep copy, and make its arrays read-only again, because
-        NumPy forgets that they were. (Writing to them would not change the results that were
-        computed from them.)"""
+        NumPy does not pickle this. (They are read-only because results were computed from them
+        already: writing to an array would not update these.)"""
         vars(self).update(state)
         make_read_only(state)
 
@@ -239,12 +242,13 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
         return self.domain
 
     def occupied_cells(self, levels: tuple[float, ...]) -> OccupancyGrid | None:
-        """A grid of cells, some of which are marked as occupied: all other cells are proved to
-        contain no point of the level sets of these levels. None if no such grid is known.
+        """A grid of cells, in which some cells are marked as occupied. All other cells are proved
+        to contain no point of the level sets of these levels. None if no such grid is known.
 
         The default is None. Searches for first hits skip the cells that are not occupied. This
-        saves time for fields that are expensive to evaluate. If f jumps across facets, f continued
-        smoothly across the facets takes no level in these cells either.
+        saves time for fields that are expensive to evaluate. If f jumps across facets, there is a
+        second condition: in a cell that is not occupied, f continued smoothly across the facets
+        takes no level either.
         """
         del levels
         return None
@@ -285,8 +289,8 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
 
     @classmethod
     def has_no_parameters(cls) -> bool:
-        """Whether the class does not define `parameters`. Then derivatives with respect to its
-        numbers would be lost."""
+        """Whether the class does not define `parameters`. Then derivatives with respect to the
+        numbers in its fields would be lost."""
         return cls.parameters is Field.parameters
 
     def refuse_hidden_parameters(self) -> None:
@@ -315,8 +319,11 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
         at = dr.detach(p)
         with dr.suspend_grad():
             sample = self.evaluate(at)
-        # A literal 0 would have no derivative in Dr.Jit.
+        # Dr.Jit would drop a gradient that is the literal 0, and with it the dependence on p. A
+        # kernel parameter is no literal.
         gradient = as_kernel_parameters(sample.gradient)
+        # The value of the first argument with the derivative of the second one. `at` is p without
+        # derivatives, so p - at is 0 and has the derivative 1.
         return dr.replace_grad(sample.value, dr.dot(gradient, p - at))
 
     @accepts_dask_arrays("points")
@@ -360,8 +367,8 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
         with dr.suspend_grad():
             p = dr.detach(points)
             gradient, rows = self.evaluate(p).gradient, self.hessian(p)
-        # An expression whose value is the gradient, because `moved` is 0, and whose derivative by
-        # the points is the Hessian.
+        # `p` is the points without derivatives. So `moved` is 0 and has the derivative 1 by the
+        # points: the value of the result is the gradient, and its derivative is the Hessian.
         moved = points - p
         return gradient + type(points)(*(dr.dot(row, moved) for row in rows))
 
@@ -418,7 +425,7 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
 
         path: the ray.
         ahead, back: the lengths of ray in front of and behind the point up to which enclosures are
-            useful. An enclosure that is sharper on a shorter length need not hold on all of it.
+            useful. An enclosure may hold on a shorter length, if it is sharper there.
 
         The default evaluates the field at that point. The enclosures follow from the promises of
         the sample (proved bounds of f near the point) and from the slope of f along the ray. A
@@ -477,8 +484,8 @@ def check_is_field(value: Any) -> None:
 
 
 def suggest_field(value: Any) -> str:
-    """The end of an error message about an object that is not a field: what kind of object it is,
-    and how to make a field of it."""
+    """The end of an error message about an object that is given in place of a field: what kind of
+    object it is, and how to make a field of it."""
     kind, name = type(value).__name__, getattr(value, "__name__", "")
     # An object that holds a field, a list of fields, a class, a mesh, a text, points, or a
     # function.

@@ -45,10 +45,10 @@ if TYPE_CHECKING:
 # Radii of the balls on which a Lipschitz constant is computed, in multiples of |f|/|grad f|; and
 # the largest radius.
 _RADII, _MAX_RADIUS = (0.25, 1.0, 4.0), 1e12
-# At a tie of the formula (see `Formula._with_one_sided_gradient`) the gradient is taken at a point
-# this many roundings of coordinates and value away. The direction to that point is the direction of
-# the middle gradient (a unit vector or 0) plus the vector `_TIE_DIRECTION`, so that it runs along
-# no tie.
+# At a tie (a point at which two branches of the formula are equal, as at x = 0 for max(x, 0)) the
+# gradient is taken at a point this many roundings of coordinates and value away. The direction to
+# that point is the direction of the middle gradient (a unit vector or 0) plus the vector
+# `_TIE_DIRECTION`, so that it runs along no tie.
 _TIE_OFFSET, _TIE_DIRECTION = 64.0, (0.31, 0.19, 0.13)
 # If the error of the gradient is at most this many roundings, there is no tie.
 _TIE_THRESHOLD = 1024.0
@@ -156,6 +156,7 @@ class Formula(Field):
         """
         epsilon = float(dr.epsilon(type(p.x)))
         is_bounded = dr.isfinite(sample.gradient_error + dr.sum(sample.gradient))
+        # An unbounded range has no middle: 0 with an infinite error stands for it.
         middle = dr.select(is_bounded, sample.gradient, 0)
         error = dr.select(is_bounded, sample.gradient_error, dr.inf)
         norm = safe_norm(middle)
@@ -171,6 +172,8 @@ class Formula(Field):
             return sample
         gradient = type(p)(*(0 * p.x + component for component in nearby_value.first_derivatives))
         change = safe_norm(gradient - middle)
+        # Not a tie if the error is mere rounding, or if the second gradient is too far from the
+        # middle: see the docstring. NaN and infinity are no tie either.
         is_tie = (
             (error > _TIE_THRESHOLD * epsilon * norm) & (change <= 2 * error) & dr.isfinite(change)
         )
@@ -188,6 +191,7 @@ class Formula(Field):
     def _sample_of(self, jet: Jet, p: Vec3) -> Sample:
         """The sample at p: value, gradient and their errors are the midpoints and half widths of
         the ranges in `jet`, the jet of f at p."""
+        # Adding it turns a Python number into a Dr.Jit array.
         zero = 0 * p.x
         gradient = type(p)(*(zero + derivative.midpoint for derivative in jet.first_derivatives))
         # The sum of the three half widths is a bound of the error as a length.
@@ -199,8 +203,8 @@ class Formula(Field):
         return Sample(value, gradient, promises, error, gradient_error)
 
     def _local_lipschitz(self, p: Vec3, sample: Sample) -> tuple[Lipschitz, ...]:
-        """Lipschitz constants of f on balls around p, as promises. Each constant is a bound of
-        |grad f| on the box around the ball.
+        """Lipschitz constants of f on three balls around p, as promises (proved bounds of f near
+        p). Each constant is a bound of |grad f| on the box around the ball.
 
         sample: the sample of f at p. The radii are the multiples `_RADII` of |f|/|grad f|, which
             estimates the distance to the level 0 (one step of Newton's method).
@@ -243,7 +247,8 @@ class Formula(Field):
         change of f along the ray) in front of the point, up to the length `ahead`. They follow from
         the ranges of the formula's derivatives along the ray. If the ranges give none, the
         enclosures of `Ray.enclose` are returned, which follow from the sample alone. There are no
-        enclosures behind the point.
+        enclosures behind the point. Slopes and errors include all rounding: f is evaluated with
+        intervals.
 
         path: the ray.
         ahead, back: the lengths in front of and behind the point; `back` is not used.
@@ -257,16 +262,20 @@ class Formula(Field):
         they have no jump.
 
         Proof that no level is passed if f is abrupt (`is_abrupt`), as max(-1, min(1, 1e9 y)) is. At
-        a rounded point f may be -1 with slope 0, although it is 1 at the point of the exact ray. So
-        the slopes at the start, too, are those of all points that round to this point, and they
-        hold for the exact ray. The values on the exact ray differ from f at the rounded point by no
-        more than `tracer.steep.SteepPlace.error`. Together they prove the claim for the exact ray.
-        (Enclosures without such pieces prove the claim for the ray through the rounded point. The
-        error covers the difference, except where a ray passes the end of a surface that is thinner
-        than rounding.)
+        the rounded point p, f may be -1 with slope 0, although f is 1 at the exact point of the
+        ray. So for an abrupt f two things are widened. The range of slopes at the start holds at
+        all points that round to p. And the pieces begin before p, and cover all lines through these
+        points, as above. So both hold for the exact ray. What is left is the value at the start: f
+        at the exact point differs from f(p) by at most `tracer.steep.SteepPlace.error`, which the
+        tracer takes as the error of the value. So the free lengths hold for the exact ray.
+
+        If f is not abrupt, the enclosures hold for the ray through p, and the tracer's error of the
+        value covers the difference to the exact ray. The only exception is a ray that passes the
+        end of a surface thinner than rounding.
         """
         del back
         p = path.point(t)
+        # The jet of f at p. (`_jet` does not use its second argument.)
         jet = self._jet(Jet.at_point(p), p.x)
         sample = self._sample_of(jet, p)
         slope, slope_error = self._slope(p, path.direction)
@@ -289,27 +298,33 @@ class Formula(Field):
         ):
             ahead = dr.select(function.is_continuous(ahead), ahead, 0)
             enclosures = path.proofs.from_restriction(function, slopes, ahead)
+        # How far the next sample should look, as a multiple of the step proved here. It is taken
+        # from the kinds that examine a given length, before the one is added that holds on all
+        # lengths.
         growth = max(entry.reach_growth for entry in enclosures)
         if self.is_convex and ConvexityEnclosure in path.proofs.kinds:
             enclosures = (*enclosures, ConvexityEnclosure(slopes))
+        # A lower bound of |grad f|, from lower bounds of its components. (0 * p.x turns Python
+        # numbers into Dr.Jit arrays.)
         min_norm = safe_norm(type(p)(*(0 * p.x + entry.min_abs for entry in jet.first_derivatives)))
         return RaySample(sample, enclosures, (), slope, growth, slope_error, min_norm)
 
     def _slope(self, p: Vec3, direction: Vec3, *, is_rounded: bool = False) -> tuple[Real, Real]:
-        """The derivative of f at p along a direction, and a bound of its error. On a crease the
-        gradient is a range; for a direction along the crease the derivative is a single number all
-        the same.
+        """The derivative of f at p along a direction, and a bound of its error. It is computed from
+        f along the line, not from the gradient: on a crease of f the gradient is a range, but for a
+        direction along the crease the derivative is a single number.
 
         is_rounded: whether the error also covers all points that round to p.
 
-        The jet that is computed here is the one at the start of the pieces of the ray
-        (`FormulaOnRay`), so that the kernel does no additional work.
+        The jet computed here also occurs at the start of the first piece of the ray
+        (`FormulaOnRay`). Dr.Jit finds equal operations, so that the kernel does them once.
         """
         zero = 0 * p.x
 
         def coordinate(k: int) -> Jet:
             """The jet of coordinate number k along the direction, at p."""
             at = Interval.point(p[k])
+            # The interval of all coordinates that round to p[k].
             at = at.widened(machine_epsilon(p[k])) if is_rounded else at
             return Jet(at, (Interval.point(direction[k]),), (), piece_length=zero)
 
@@ -319,8 +334,9 @@ class Formula(Field):
 
     @property
     def may_jump(self) -> bool:
-        """Whether the formula uses functions that are not continuous everywhere. Also True if it
-        cannot be evaluated with the numbers that count its operations, so that nothing is known."""
+        """Whether the formula uses functions that are not continuous everywhere. Also True if
+        nothing is known, because the formula refuses the special numbers with which its operations
+        are counted (`Tally`)."""
         return self.tally.may_jump
 
     def restrict(self, p: Vec3, direction: Vec3) -> FormulaOnRay:
@@ -339,7 +355,7 @@ class Formula(Field):
         """The jet of f (ranges of its value and derivatives) from the jets of the three
         coordinates.
 
-        like: a number of the backend; not used.
+        like: not used.
         """
         return as_jet(self.formula(*coordinates), coordinates[0], type(self).__name__)
 
@@ -489,7 +505,8 @@ class FormulaOnRay:
         is_exact = isinstance(self.before, float) and self.before == 0.0
         if not is_exact and isinstance(start, float):  # the first piece starts at 0.0
             start = -self.before
-        # If the first piece begins before p, the line is known only up to rounding.
+        # If the first piece begins before p, the jets hold for all lines along d through points
+        # that round to p.
         coordinates = Jet.along_ray(self.p, self.direction, start, end, is_rounded=not is_exact)
         return as_jet(self.field.formula(*coordinates), coordinates[0], type(self.field).__name__)
 

@@ -60,8 +60,9 @@ class PatchBoxes(UnitFrame):
         self, o: Vec3, d: Vec3, after: PatchEntry, start: Real, end: Real, active: Mask
     ) -> PatchEntry:
         """The first box that a ray o + t d enters after the entry `after`, with start <= t <= end,
-        as the `PatchEntry` of the patch in the box. See `PatchUnion.next_patch` for the order of
-        entries."""
+        as a `PatchEntry`: the ray parameters at which the ray enters and leaves the box, and the
+        index of the patch in it (NO_PATCH if there is no further box). Entries are ordered by the
+        parameter of entering, then by the index of the patch."""
         behind = after.enter / self.size, after.patch
         enter, leave, box = self.tree.next_box(
             self.to_unit(o), d, behind, start / self.size, end / self.size, active
@@ -108,8 +109,8 @@ class PatchField(Field, Generic[_Buffers]):
         """Upload the boxes and the data of the patches to a backend."""
 
     def with_levels(self, levels: tuple[float, ...]) -> Self:
-        """This field with boxes that contain the patches of these levels, not yet prepared. Equal
-        levels give the same object."""
+        """This field with boxes that contain the patches of these levels, not yet prepared for a
+        backend. Equal levels give the same object."""
         if levels == self.levels:
             return self
         if levels not in self._for_levels:

@@ -4,10 +4,11 @@ the point, such as a Lipschitz constant on a ball. A ray sample adds enclosures:
 proved to hold the change of f along the ray, in front of the point (forward) and behind it
 (backward).
 
-Rounding is part of the proof. The enclosure in front of a point and the enclosure behind the next
-point may be exact to first order. Then they meet right at a surface, and with rounded arithmetic
-one ray in ten slipped through at tight tolerances. So the difference of f to every level is reduced
-by the rounding error of f, and a tolerance below that error is raised to it.
+Rounding is part of the proof. The length proved in front of a point and the length proved behind
+the next point may both end right at a surface between the two points. Without a margin for
+rounding, they could overlap there by rounding alone, and the ray would pass through the surface. So
+the difference of f to every level is reduced by the rounding error of f, and a tolerance below that
+error is raised to it.
 """
 
 from __future__ import annotations
@@ -40,9 +41,10 @@ class Sample:
     gradient: (3,) the gradient of f at p.
     promises: the proved bounds of f near p, such as a `Lipschitz` constant on a ball about p.
     value_error: a bound of the error of `value`. The whole truncation error is included. Of the
-        rounding error only the part is included that exceeds eight units in the last place, or
-        eight times the smallest normal number. The tracer adds that part, and |gradient| times the
-        rounding error of p. Steps are shortened by the error.
+        rounding error, eight units in the last place of the value (or eight times the smallest
+        normal number, if that is more) are left out, and only the rest is included. The tracer adds
+        what is left out, and |gradient| times the rounding error of p. Steps are shortened by the
+        error.
     gradient_error: a bound of the truncation and rounding error of `gradient`, as a length; 0 if
         the error is only the rounding of a few operations.
     shading_normal: (3,) the unit normal to shade with near a singular point of the surface, where
@@ -52,9 +54,10 @@ class Sample:
         accuracy (`Field.at_accuracy`).
     alternative_promises: proved bounds that are also valid, but gave shorter steps than `promises`
         in every measurement. They are used only if the caller names the enclosures to use.
-    ray_promises: Lipschitz constants of f on a ray through p, in a sample of `Field.sample_ray`.
-    branch_unknown: the lanes on which f is known only modulo 1 (`JumpSurface.has_unknown_branch`);
-        None if there are none.
+    ray_promises: bounds that hold only on one ray through p: Lipschitz constants of f there. Only
+        samples of `Field.sample_ray` have them.
+    branch_unknown: a mask, true on lanes on which `value` may differ from f by an unknown integer
+        (`JumpSurface.has_unknown_branch`); None if there are no such lanes.
     """
 
     value: Real
@@ -199,6 +202,8 @@ def value_error_bound(sample: Sample, gradient_norm: Real, size: Real) -> Real:
     epsilon = 2 * float(dr.epsilon(kind))
     # The rounding of eight units in the last place, which `Sample.value_error` leaves out. Numbers
     # below the smallest normal one may underflow to 0.
+    # The machine epsilon is twice Dr.Jit's epsilon; eight units in the last place are at most 8 of
+    # it.
     smallest = kind(float(dr.smallest(kind)))
     value = 8 * fmax(epsilon * dr.abs(sample.value), smallest)
     # The rounding of p moves it by at most 4 epsilon times size.
@@ -221,8 +226,9 @@ class RaySample:
     slope_error: a bound of the error of `slope` that is smaller than `Sample.gradient_error`; None
         if no such bound is known. (On a crease of f the gradient is a range, but the derivative
         along a ray that runs in the crease may be a single number.)
-    min_gradient_norm: a lower bound of |grad f| that may be larger than |gradient| minus
-        `Sample.gradient_error`, for example on a crease; None if no such bound is known.
+    min_gradient_norm: a lower bound of |grad f|. On a crease, for example, it may be larger than
+        the bound that every sample gives, |gradient| minus `Sample.gradient_error`. None if no
+        other bound is known.
     """
 
     sample: Sample
@@ -270,6 +276,7 @@ class Ray:
         arguments = sample.promises, sample.alternative_promises, sample.value, sample.value_error
         ahead, back = (
             self.proofs.from_promises(*arguments, interval, sample.ray_promises)
+            # Looking back, f is followed along -direction, so the slope has the other sign.
             for interval in (slopes, slopes.negated())
         )
         return RaySample(sample, ahead, back, slope)

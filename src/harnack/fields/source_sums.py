@@ -1,8 +1,8 @@
 """Sums over sources at a point x, and the bounds of f near x that follow from these sums. f is a
-field's function; its sources are edges, dipoles (small triangles), and far nodes of a tree, each of
-which stands for many dipoles. `SourceSums` holds the sums. From them it makes values with error
-bounds, or a `Sample`: value and gradient of f at x with "promises", which are proved bounds of f
-near x.
+field's function. Its sources are of three kinds: edges; dipoles (small triangles); and far nodes of
+a tree, where a far node stands for the many dipoles in it. `SourceSums` holds the sums. From them
+it makes values with error bounds, or a `Sample`: value and gradient of f at x with "promises",
+which are proved bounds of f near x.
 
 Two symbols occur throughout: a is the area of a dipole, and rho is its distance from x.
 """
@@ -24,7 +24,7 @@ from harnack.fields.field import Sample
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
 
-# Radii of the balls about x on which a sum bounds Taylor's remainder (`TaylorRemainder`), as
+# Radii of the balls about x on which second derivatives of f are bounded (`TaylorRemainder`), as
 # fractions of the distance to the nearest singular point. A smaller ball has a smaller bound.
 _TAYLOR_RADII = (0.2, 0.4, 0.6)
 # The largest radius of such a ball, as a fraction of the distance to the dipoles of far nodes.
@@ -35,7 +35,7 @@ SUM_MARGIN = 2e-5
 _NEAR_ROUNDINGS = 256.0
 # The rounding of positions and of terms changes the gradient by at most the first number times s4
 # times the rounding of a coordinate, and second derivatives by at most the second number times s5
-# times that rounding.
+# times that rounding. (s4 and s5 are sums over the sources: see `SourceSums`.)
 SLOPE_ROUNDINGS, SECOND_ROUNDINGS = 16.0, 320.0
 
 
@@ -82,9 +82,10 @@ def dipole_rounding(area: Real, inverse: Real, unit: Real) -> Real:
     inverse: 1/rho.
     unit: a bound of the rounding error of a coordinate, at least the machine epsilon.
 
-    The rounding of one coordinate changes the value by at most 2 unit area/rho^3. A difference of
-    two coordinates has this error twice. The four rounded operations of the term itself change it
-    by at most 4 epsilon area/rho^2.
+    The rounding of one coordinate changes the value by at most 2 unit area/rho^3. The vector from x
+    to the dipole is a difference of two coordinates, so it has this error twice. The four rounded
+    operations with which the value is computed change it by at most 4 epsilon area/rho^2, and
+    epsilon is at most `unit`.
     """
     square = inverse * inverse
     return (unit * area) * dr.fma(4 * inverse, square, 4 * square)
@@ -95,7 +96,8 @@ class SourceTerm:
     """The contribution of a single source (a dipole, an edge or a far node) to f and to its
     derivatives.
 
-    value: its part of f; None for an edge, whose angle is added later.
+    value: its part of f; None for an edge, whose part of f (an angle) is added to the sum
+        elsewhere.
     gradient: (3,) its part of the gradient; None if gradients were not requested.
     hessian: its part of the second derivatives; None if they were not requested.
     """
@@ -111,7 +113,7 @@ class SourceSums:
     each lane: f, its derivatives, error bounds, and the numbers from which bounds of f near x
     follow.
 
-    total: the plain sum of the values. The property `value` adds `compensation` to it.
+    total: the sum of the values as it was rounded. The property `value` adds `compensation` to it.
     gradient: (3,) of f; None if it was not requested.
     hessian: of f; None if it was not requested.
     truncation, gradient_truncation: bounds of the truncation errors of the value and of the
@@ -124,7 +126,8 @@ class SourceSums:
         center, if that is smaller.
     s4, s5: the sums of a/rho^4 and of a/rho^5 over all sources. For a dipole at the distance rho, a
         is its area. For a far node, rho is the distance of its center, and a is A + K/rho^2 with
-        the numbers A and K of `multipole.remainder_constants`. For edges see `LiftedEdge.bounds`.
+        the numbers A and K of `multipole.remainder_constants`. What edges add to them is derived in
+        `LiftedEdge.bounds`.
     compensation: the sum of the rounding errors of the additions to `total`; see `add_term`.
     """
 
@@ -173,7 +176,8 @@ class SourceSums:
     def to_state(self) -> tuple[Any, ...]:
         """The attributes in the order of the constructor, as a tuple for the state of a recorded
         loop. The Hessian becomes a tuple of its six entries. Sums that were not requested are None,
-        because Dr.Jit would record the loop a second time for numbers that never change."""
+        and not arrays of zeros: Dr.Jit records a loop a second time if an array of its state never
+        changes."""
         hessian = None if self.hessian is None else self.hessian.components()
         bounds = self.truncation, self.gradient_truncation, self.hessian_truncation, self.rounding
         ends = self.singularity_distance, self.s4, self.s5, self.compensation
@@ -215,8 +219,8 @@ class SourceSums:
         if terms.value is not None:
             term = dr.select(active, terms.value, 0)
             total = self.total + term
-            # In the docstring's words: total is s, added is c, and the next line adds the error of
-            # s.
+            # In the docstring's words: self.total is a, term is b, total is s, added is c. The next
+            # line adds the error of s.
             added = total - self.total
             compensation = compensation + ((self.total - (total - added)) + (term - added))
             # Dr.Jit's epsilon is u.
@@ -238,11 +242,11 @@ class SourceSums:
 
         terms: the node's parts of f and of its derivatives.
         far: the lanes on which the node is far.
-        inverse: 1 / the distance from x to the node's center; 0 on the other lanes.
+        inverse: 1 / the distance from x to the node's center; 0 on lanes where the node is not far.
         size: the node's number a, which is A + K/r^2 (`multipole.remainder_constants`, with r the
             distance of the center).
-        left_out: bounds of the truncation errors of value, gradient and second derivatives; 0 on
-            the other lanes.
+        left_out: bounds of the truncation errors that the node causes: of the value, of the
+            gradient and of second derivatives; 0 on lanes where the node is not far.
         free: a distance from x within which none of the node's dipoles lies.
         unit: a bound of the rounding error of a coordinate.
         """
@@ -264,15 +268,15 @@ class SourceSums:
         )
 
     def values(self, share: float, unit: Real, rounding: Real, outside: float = 0.0) -> PointValues:
-        """The value of `share` times f at x and its derivatives, as far as they were summed, with
+        """The value of `share` times f at x, and those of its derivatives that were summed, with
         error bounds.
 
         share: the factor.
         unit: a bound of the rounding error of a coordinate, at least epsilon.
         rounding: a bound of the part of the value's rounding error that these sums do not count.
-        outside: a number of further roundings of the gradient, for points far from all sources.
-            There, distances are as long as coordinates, and powers of distances and sums of moments
-            are rounded too.
+        outside: a number of further roundings of the gradient that are counted at points far from
+            all sources. There, distances from sources are as long as coordinates, and also the
+            rounding of powers of distances and of sums of moments matters.
         """
         # `rounding` is a bound in units of the result, so it is not multiplied.
         value, error = share * self.value, dr.fma(share, self.truncation + self.rounding, rounding)
@@ -336,12 +340,14 @@ class SourceSums:
         """
         g = share * self.gradient
         slope_error = share * dr.fma(SLOPE_ROUNDINGS * unit, self.s4, self.gradient_truncation)
+        # The distance to the nearest singular point, reduced for rounding.
         distance = self.singularity_distance * (1 - SUM_MARGIN) - 4 * unit
         # A TaylorRemainder bounds the second derivative, so its constant is twice that of t^2.
         scale, radii = (2 + 2 * SUM_MARGIN) * share, [(b, b * distance) for b in _TAYLOR_RADII]
         taylor = [TaylorRemainder(scale * self.remainder(b, r), r) for b, r in radii]
         slope, largest = dr.norm(g) + slope_error, taylor[-1]
         r = largest.radius
+        # By how much f changes at most on the largest ball: slope R + constant R^2/2.
         variation = (1 + SUM_MARGIN) * r * dr.fma(0.5 * r, largest.constant, slope)
         value = share * self.value
         ball = HarmonicBall(r, value - variation, value + variation)
@@ -377,9 +383,10 @@ class SourceSums:
         self, v: Vec3, unit: Real, lengths: tuple[Real, ...], rates: tuple[Real, ...], active: Mask
     ) -> tuple[Real, ...]:
         """For each of several lengths, a rate K with |f(x + s v) - f(x)| <= K |s| for |s| up to
-        that length. These sums contribute to K what their sources change; the given rates
-        contribute what some edges change, which are not in these sums. A rate is infinite on lanes
-        that are not active, and for lengths above the radius R of the proof.
+        that length. f is the sum over the sources of these sums and over some further edges. K is
+        the sum of two rates: one that is computed here from these sums, and the given rate of those
+        edges. K is infinite on lanes that are not active, and for lengths above the radius R of the
+        proof.
 
         v: (3,) unit directions of the lines through x.
         unit: a bound of the rounding error of a coordinate of x.
@@ -395,7 +402,7 @@ class SourceSums:
         slope = dr.fma(SLOPE_ROUNDINGS * unit, self.s4, slope)
         fraction = _TAYLOR_RADII[-1]
         radius = fraction * (self.singularity_distance * (1 - SUM_MARGIN) - 4 * unit)
-        # Without sources R may be infinite; then R s5 would be NaN.
+        # Without sources s5 is 0 and R may be infinite; then R s5 would be NaN.
         remainder = self.remainder(fraction, dr.select(self.s5 > 0, radius, 0))
         pairs = zip(lengths, rates, strict=True)
         sums = (

@@ -33,7 +33,8 @@ class FileFormatError(ValueError):
 
 @dataclass(frozen=True)
 class FileLocation:
-    """A location in a file, which prints as 'model.obj, line 12'."""
+    """A location in a file, which prints as 'model.obj, line 12'. position: where in the file, such
+    as "line 12"; "" for the whole file."""
 
     path: Path
     position: str = ""
@@ -44,7 +45,7 @@ class FileLocation:
         return f"{name}, {self.position}" if self.position else name
 
     def error(self, message: str) -> FileFormatError:
-        """An error whose message begins with this location."""
+        """Return an error whose message begins with this location."""
         return FileFormatError(f"{self}: {message}")
 
 
@@ -53,8 +54,9 @@ class FileLocations:
     """The locations in a file of all members of a list, such as of all vertices. Index k gives the
     `FileLocation` of member k.
 
-    noun: what the members are called in messages, such as "line".
-    numbers: for each member, the number of its line, or its position in the file."""
+    noun: the word before the number in messages, such as "line" in "line 12".
+    numbers: for each member, the number of its line, or its position in the file.
+    """
 
     path: Path
     noun: str
@@ -70,7 +72,8 @@ class PolygonList:
 
     corners: the vertex indices of all polygons, one polygon after the other.
     sizes: (m,) the number of corners of each polygon.
-    locations: (m,) the location of each polygon in the file."""
+    locations: (m,) the location of each polygon in the file.
+    """
 
     corners: IntArray
     sizes: IntArray
@@ -80,7 +83,7 @@ class PolygonList:
         return len(self.sizes)
 
     def location_of_corner(self, k: int | np.integer[Any]) -> FileLocation:
-        """The location in the file of the polygon that contains `corners[k]`."""
+        """Return the location in the file of the polygon that contains `corners[k]`."""
         return self.locations[int(np.searchsorted(np.cumsum(self.sizes), k, side="right"))]
 
     def __iter__(self) -> Iterator[tuple[IntArray, FileLocation]]:
@@ -101,10 +104,11 @@ class FileGeometry:
     path: of the file.
     vertices: (n, 3), finite.
     normals: (n, 3) normals of the vertices, or None.
-    faces: closed polygons; the last corner is joined to the first.
-    polylines: closed only if the last index equals the first.
+    faces: closed polygons; the last corner of each is joined to the first.
+    polylines: chains of edges, each closed only if its last index equals its first.
 
-    All indices lie in [0, n)."""
+    All indices lie in [0, n).
+    """
 
     path: Path
     vertices: FloatArray
@@ -114,22 +118,22 @@ class FileGeometry:
 
 
 def ranks_in_lists(sizes: IntArray) -> IntArray:
-    """For lists that are stored one after the other in one array, the position of each entry within
-    its own list: 0, 1, ..., size - 1 for each list. sizes: (m,) the lengths of the lists."""
+    """Return the position of each entry within its own list (0, 1, ..., size - 1), for lists that
+    are stored one after the other in one array. sizes: (m,) the lengths of the lists."""
     ranks = np.arange(int(sizes.sum()), dtype=np.int64)
     ranks -= np.repeat(np.cumsum(sizes) - sizes, sizes)
     return ranks
 
 
 def triangles_as_polygons(path: Path, corners: IntArray) -> PolygonList:
-    """Triangles as a `PolygonList`. corners: (m, 3) their vertex indices, which were read from the
-    file `path`."""
+    """Return triangles as a `PolygonList`. corners: (m, 3) their vertex indices, which were read
+    from the file `path`."""
     sizes = np.full(len(corners), 3, dtype=np.int64)
     return PolygonList(corners.ravel(), sizes, FileLocations(path, "triangle", range(len(corners))))
 
 
 def check_finite(coordinates: FloatArray, places: FileLocations) -> None:
-    """Raise a FileFormatError if some number in the rows of `coordinates` (n, k) is not finite. The
+    """Raise a FileFormatError if a number in an array `coordinates` (n, k) is not finite. The
     message names the location of the first such row. places: the locations of the rows."""
     wrong = np.flatnonzero(~np.isfinite(coordinates).all(axis=1))
     if wrong.size:
@@ -141,7 +145,8 @@ def check_indices(polygons: PolygonList, count: int, *, first: int = 0) -> None:
     message names the first such index and its location.
 
     count: the number of vertices.
-    first: the index that the file's format gives to the first vertex (0 or 1), for the message."""
+    first: the index that the file's format gives to the first vertex (0 or 1), for the message.
+    """
     corners = polygons.corners
     wrong = np.flatnonzero((corners < 0) | (corners >= count))
     if wrong.size:
@@ -151,7 +156,7 @@ def check_indices(polygons: PolygonList, count: int, *, first: int = 0) -> None:
 
 
 def read_bytes(path: Path) -> bytes:
-    """All bytes of a file.
+    """Return all bytes of a file.
 
     Raises:
         FileFormatError: the file is missing, a directory or a device, unreadable, empty, or larger
@@ -181,9 +186,9 @@ def read_bytes(path: Path) -> bytes:
 
 
 def check_element_count(place: FileLocation, count: int) -> None:
-    """Raise a FileFormatError if a file has more than MAX_ELEMENTS elements, which would be read
-    one by one. place: the location that the message names. count: the number of vertices, faces and
-    lines that the file declares."""
+    """Raise a FileFormatError if a file has more than MAX_ELEMENTS elements. It is called for files
+    whose elements are read one by one, which takes long. place: the location that the message
+    names. count: the number of vertices, faces and lines that the file declares."""
     if count > MAX_ELEMENTS:
         raise place.error(
             f"{count:,} elements are too many in a file whose faces differ in size: at most "
@@ -192,9 +197,10 @@ def check_element_count(place: FileLocation, count: int) -> None:
 
 
 def have_mixed_sizes(polygons: PolygonList) -> bool:
-    """Whether polygons have different numbers of corners, or fewer than three. Such polygons are
-    read one by one, which takes long."""
+    """Return whether polygons have different numbers of corners, or fewer than three. Such polygons
+    are read one by one, which takes long."""
     sizes = polygons.sizes
+    # All sizes must be that of the first polygon, and at least 3.
     return bool(len(sizes)) and bool((sizes != max(3, int(sizes[0]))).any())
 
 
@@ -227,7 +233,7 @@ def write_atomically(path: str | os.PathLike[str]) -> Generator[Path, None, None
     finally:
         try:
             _remove(partial)
-        except KeyboardInterrupt:
+        except KeyboardInterrupt:  # it may have come before the file was removed
             _remove(partial)
             raise
 
@@ -244,8 +250,8 @@ def check_writable(path: str | os.PathLike[str]) -> None:
 
 
 def _writable_target(path: str | os.PathLike[str]) -> Path:
-    """The file to which `path` leads if symbolic links are followed. Raises an OSError if a file
-    cannot be written there."""
+    """Return the file to which `path` leads if symbolic links are followed. Raises an OSError if a
+    file cannot be written there."""
     cannot = f"cannot write {_printable_path(path)}"
     try:
         target = Path(os.path.realpath(path))
@@ -273,9 +279,9 @@ def _remove(partial: Path) -> None:
 
 
 def _partial_name(target: Path) -> Path:
-    """A random name, in the folder of `target`, for the file that is written first and then renamed
-    to `target`. If the target's name is long, this name is not longer, so that the file system
-    accepts it as well."""
+    """Return a random name, in the folder of `target`, for the file that is written first and then
+    renamed to `target`. If the target's name is long, this name is not longer, so that the file
+    system accepts it as well."""
     token = f".{secrets.token_hex(4)}.partial"
     stem = os.fsencode(target.stem)
     prefix = os.fsdecode(stem[: max(0, len(stem) - len(token) - 1)])
@@ -294,13 +300,13 @@ _WRITE_ADVICE = {
 
 
 def _printable_path(path: str | os.PathLike[str]) -> str:
-    """The path for messages, with unprintable characters escaped."""
+    """Return the path for messages, with unprintable characters escaped."""
     return str(FileLocation(Path(path)))
 
 
 def _write_error(path: str | os.PathLike[str], error: OSError) -> OSError:
-    """An error of the same type as `error`, whose message says that the file `path` could not be
-    written, why, and what to do."""
+    """Return an error of the same type as `error`, whose message says that the file `path` could
+    not be written, why, and what to do."""
     number = error.errno
     reason = _WRITE_ADVICE.get(number or 0) or f"{error.strerror or error}; name a file elsewhere"
     write_error = type(error)(f"cannot write {_printable_path(path)}: {reason}")

@@ -1,7 +1,8 @@
 """Readers of files with meshes, point clouds, closed curves, blobs or molecules. The extension of
-the file's name decides its format; its contents decide what it is read as, unless the caller says
-so (`read_as`). `contents` is the geometry that was found in a file: vertices, faces, polylines.
-Results contain a summary: a text about the contents of the file, and why they are read like that.
+the file's name decides its format. Its contents decide as what it is read (a mesh, a cloud or
+curves), unless the caller decides that by `read_as`. `contents` is the geometry that was found in a
+file: vertices, faces, polylines. Results contain a summary: a text about the contents of the file,
+and why they are read like that.
 """
 
 from __future__ import annotations
@@ -69,7 +70,7 @@ _LOOP_READERS: dict[str, Callable[[Path, bytes], FileGeometry]] = {
 
 
 def read_loops(path: str | os.PathLike[str], *, boundary: bool = False) -> list[FloatArray]:
-    """The closed curves in an .obj, .ply or .loops file, as arrays (n, 3).
+    """Return the closed curves in an .obj, .ply or .loops file, as arrays (n, 3).
 
     .obj: every `f` face is a loop, every `l` polyline that ends at its first vertex is a loop, and
     all other `l` polylines are joined end to end. .ply: every face is a loop, edges are joined; a
@@ -77,12 +78,13 @@ def read_loops(path: str | os.PathLike[str], *, boundary: bool = False) -> list[
     Where edges are joined, equal positions count as the same vertex.
 
     boundary: whether to return, in place of the faces, the boundary of the surface they form: the
-        edges that do not cancel between neighboring faces, where equal positions count as the same
+        edges that do not cancel between neighboring faces. Equal positions count as the same
         vertex.
 
     Raises:
-        FileFormatError: unreadable, malformed or hostile; open polylines; a loop that
-            `validate_loops` rejects; a closed surface, which has no boundary.
+        FileFormatError: the file is unreadable, malformed or hostile; polylines are open;
+            `validate_loops` rejects a loop; or the boundary of a closed surface is requested, which
+            has none.
     """
     path = Path(path)
     kind = path.suffix.lower()
@@ -97,11 +99,12 @@ def read_loops(path: str | os.PathLike[str], *, boundary: bool = False) -> list[
 
 
 def closed_curves_of(contents: FileGeometry, *, boundary: bool = False) -> list[FloatArray]:
-    """The closed curves, arrays (n, 3), in the contents of an .obj or .ply file, by the rules of
-    `read_loops`.
+    """Return the closed curves, arrays (n, 3), in the contents of an .obj or .ply file, by the
+    rules of `read_loops`.
 
     contents: what was read from the file.
-    boundary: whether to return the boundary of the surface that the faces form, not the faces."""
+    boundary: whether to return the boundary of the surface that the faces form, not the faces.
+    """
     placed = _boundary_loops(contents) if boundary else _all_loops(contents)
     return [_validated(loop, place) for loop, place in placed]
 
@@ -116,9 +119,9 @@ def _validated(loop: FloatArray, place: FileLocation) -> FloatArray:
 
 
 def _all_loops(contents: FileGeometry) -> list[LocatedLoop]:
-    """The closed curves (n, 3) in the contents of a file, each with its place in the file. These
-    are its faces and its polylines, joined end to end. If a .ply file has neither, its vertices are
-    a single curve.
+    """Return the closed curves (n, 3) in the contents of a file, each with its place in the file.
+    These are its faces and its polylines, joined end to end. If a .ply file has neither, its
+    vertices are a single curve.
 
     Raises:
         FileFormatError: there are none, or polylines are open.
@@ -135,8 +138,9 @@ def _all_loops(contents: FileGeometry) -> list[LocatedLoop]:
 
 
 def _joined_polylines(contents: FileGeometry) -> list[LocatedLoop]:
-    """The closed curves (n, 3) that the polylines of a file form, each with its place in the file.
-    A polyline that is closed is a curve; the edges of all other polylines are joined to curves.
+    """Return the closed curves (n, 3) that the polylines of a file form, each with its place in the
+    file. A polyline that is closed is a curve; the edges of all other polylines are joined to
+    curves.
 
     Raises:
         FileFormatError: an edge of length zero, or edges that do not form closed curves.
@@ -146,8 +150,9 @@ def _joined_polylines(contents: FileGeometry) -> list[LocatedLoop]:
     open_edges: list[Edge] = []
     places: dict[int, FileLocation] = {}
     for corners, place in contents.polylines:
-        # A vertex is known by the number that all vertices at the same position have.
+        # All vertices at the same position have the same number here.
         ids: list[int] = welded[corners].tolist()
+        # Closed, with at least three vertices.
         if ids[0] == ids[-1] and len(ids) > 3:
             loops.append((x[ids[:-1]], place))
             continue
@@ -164,8 +169,8 @@ def _joined_polylines(contents: FileGeometry) -> list[LocatedLoop]:
 
 
 def _open_message(error: OpenChainError, position: FloatArray) -> str:
-    """The message of an error about edges that cannot be joined to closed curves, because at the
-    vertex at `position` (3,) an edge ends, or more than two meet."""
+    """Return the message of an error about edges that cannot be joined to closed curves, because at
+    the vertex at `position` (3,) an edge ends, or more than two meet."""
     point = position.tolist()
     if error.count == 1:
         return (
@@ -179,8 +184,8 @@ def _open_message(error: OpenChainError, position: FloatArray) -> str:
 
 
 def _boundary_loops(contents: FileGeometry) -> list[LocatedLoop]:
-    """The closed curves (n, 3) that form the boundary of the surface of a file's faces, each with
-    its place in the file.
+    """Return the closed curves (n, 3) that form the boundary of the surface of a file's faces, each
+    with its place in the file.
 
     Raises:
         FileFormatError: there are no faces, or their surface is closed.
@@ -216,8 +221,8 @@ class LoadedMesh:
     """Triangles from a file, as `validate_mesh` returns them.
 
     summary: the contents of the file, and why they are read as a mesh.
-    zero_area_faces: (k, 3) faces of zero area, left out of `faces`; they may close gaps without a
-        width.
+    zero_area_faces: (k, 3) the faces of zero area, which are not among `faces`. They may close gaps
+        that have no width.
     rounded: the number of corners that were joined with others from which rounding separated them.
     """
 
@@ -255,7 +260,8 @@ class LoadedPolygons:
     """Polygons from a file, not triangulated: vertices (n, 3), and for each face the indices (k,)
     of its corners.
 
-    summary: the contents of the file."""
+    summary: the contents of the file.
+    """
 
     vertices: FloatArray
     faces: list[IntArray]
@@ -271,20 +277,20 @@ def read_geometry(path: str | os.PathLike[str], read_as: ReadAs | None = None) -
     """Read the surface, cloud, curves, blobs or molecule in a file: .obj, .ply, .stl, .off, .glb,
     .gltf, .3mf, .xyz, .loops, .blobs; molecules .pdb, .ent, .cif, .mmcif.
 
-    Faces make a mesh, except polygons of an .obj or .ply file if a polygon has more than four
-    corners and no two share an edge: these are curves, as are polylines without faces. Points alone
-    make a cloud, with normals from nx ny nz (.ply), from the same number of `vn` as of `v` (.obj)
-    or from columns 4 to 6 (.xyz). Polygons are triangulated, the nodes of a scene are transformed
-    to their positions, and faces of zero area are left out.
+    Faces make a mesh. But the polygons of an .obj or .ply file are curves if one of them has more
+    than four corners and no two share an edge; polylines without faces are curves, too. Points
+    alone make a cloud, with normals from nx ny nz (.ply), from the same number of `vn` as of `v`
+    (.obj) or from columns 4 to 6 (.xyz). Polygons are triangulated, the nodes of a scene are
+    transformed to their positions, and faces of zero area are left out.
 
     read_as: what to make of the contents. "winding": the faces, as a mesh. "dipole": the points; of
         a mesh the centers of its triangles, with their normals and areas. "loops": the result of
-        `read_loops`; of a mesh its boundary, the singular edges joined. "polygons": the faces, not
-        triangulated. None decides as above.
+        `read_loops`; of a mesh its boundary: the edges at which its faces do not cancel, joined to
+        curves. "polygons": the faces, not triangulated. None decides as above.
 
     Raises:
-        FileFormatError: unreadable, malformed, truncated or hostile; of another format; it contains
-            nothing that can be read in this way.
+        FileFormatError: the file is unreadable, malformed, truncated or hostile, has another
+            format, or contains nothing that can be read in this way.
     """
     path = Path(path)
     kind = path.suffix.lower()
@@ -377,7 +383,7 @@ def _interpret_faces(
 
 
 def _polygons(contents: FileGeometry) -> LoadedPolygons:
-    """The polygons of a file that have three corners or more, not triangulated."""
+    """Return the polygons of a file that have three corners or more, not triangulated."""
     sizes = contents.faces.sizes
     ends, indices = np.cumsum(sizes), np.flatnonzero(sizes >= 3)
     polygons = [contents.faces.corners[ends[k] - sizes[k] : ends[k]] for k in indices]
@@ -390,8 +396,8 @@ def _polygons(contents: FileGeometry) -> LoadedPolygons:
 
 
 def _looks_like_curves(contents: FileGeometry) -> bool:
-    """Whether the polygons of a file are probably meant as curves and not as the faces of a mesh:
-    some polygon has more than four corners, and no two polygons share an edge."""
+    """Return whether the polygons of a file are probably meant as curves and not as the faces of a
+    mesh: some polygon has more than four corners, and no two polygons share an edge."""
     faces = contents.faces
     if faces.sizes.max() <= 4:
         return False
@@ -404,6 +410,7 @@ def _looks_like_curves(contents: FileGeometry) -> bool:
     end = begin[next_corner]
     # A number for each edge, the same in both directions.
     keys = np.minimum(begin, end) * len(welded) + np.maximum(begin, end)
+    # Polygons with fewer than three corners do not count.
     keys = keys[np.repeat(faces.sizes, faces.sizes) >= 3]
     return len(np.unique(keys)) == len(keys)
 
@@ -418,6 +425,8 @@ def _mesh(contents: FileGeometry) -> LoadedMesh:
     vertices, faces = without_zero_area_faces(contents.vertices, triangles)
     zero_area = triangles[zero_area_faces(vertices, triangles)]
     welded = Welded.of(vertices, faces)
+    # The net faces are what remains if equal faces are added and opposite ones cancel. Singular
+    # edges are those at which faces do not cancel.
     net_faces, singular = welded.net, welded.edges
     if not len(net_faces.faces):
         raise MeshError(f"its {len(faces):,} faces cancel each other: there is no surface")
@@ -435,6 +444,7 @@ def _mesh(contents: FileGeometry) -> LoadedMesh:
             f"{count}, {len(singular):,} singular edges: a mesh with holes or faces turned round"
         )
     if welded.rounded:
+        # Each vertex gets the position of the vertex that it was joined with.
         vertices = vertices[welded.index]
         summary += f"; {welded.rounded:,} corners joined with others that were apart by rounding"
     if len(triangles) > len(faces):
@@ -447,8 +457,8 @@ def _mesh(contents: FileGeometry) -> LoadedMesh:
 
 
 def _mesh_to_cloud(mesh: LoadedMesh) -> LoadedCloud:
-    """A cloud of points that stands for the triangles of a mesh: their centers, with their normals
-    and areas."""
+    """Return a cloud of points that stands for the triangles of a mesh: their centers, with their
+    normals and areas."""
     corners = mesh.vertices[mesh.faces]
     area_normal = 0.5 * np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = np.linalg.norm(area_normal, axis=1)
@@ -457,11 +467,12 @@ def _mesh_to_cloud(mesh: LoadedMesh) -> LoadedCloud:
 
 
 def _mesh_to_boundary(path: Path, mesh: LoadedMesh) -> LoadedCurves:
-    """The boundary of a mesh's faces as closed curves. path: of the file, for errors.
+    """Return the boundary of a mesh's faces as closed curves. path: of the file, for errors.
 
     Raises:
         FileFormatError: the faces have no boundary, or it is not a valid curve.
     """
+    # The weight of an edge: how often it remains after opposite edges of faces have canceled.
     edges, weights = singular_edges(weld_vertices(mesh.vertices)[mesh.faces])
     if not len(edges):
         raise FileLocation(path).error(

@@ -138,7 +138,8 @@ def _check_header(place: FileLocation, header: dict[str, Any], size: int) -> Non
     """Raise a FileFormatError if a header needs extensions or features that are not supported, or
     asks for more data than the file has. A malformed header may raise an error of any type.
 
-    size: the number of bytes of the file and its buffers."""
+    size: the number of bytes of the file and its buffers.
+    """
     for name in header.get("extensionsRequired", []):
         if not str(name).startswith(_IGNORED_EXTENSIONS):
             raise place.error(f"it needs the extension {name}, which is not read: save it without")
@@ -157,6 +158,7 @@ def _check_header(place: FileLocation, header: dict[str, Any], size: int) -> Non
         element_bytes = _COMPONENT_BYTES[accessor["componentType"]] * _COMPONENTS[accessor["type"]]
         total += _count(accessor, "count") * element_bytes
         _count(accessor, "byteOffset", 0)
+    # Of small files, 64 KiB count as their size.
     if total > 8 * max(size, 1 << 16):
         raise place.error(
             f"its header asks for {total:,} bytes of data, many times those of the file ({size:,})"
@@ -185,7 +187,7 @@ def _check_supported(place: FileLocation, header: dict[str, Any]) -> None:
 
 
 def _corner_counts(place: FileLocation, header: dict[str, Any], accessors: list[Any]) -> list[int]:
-    """For each mesh in the header of a scene, the number of triangle corners that it lists.
+    """Return the number of triangle corners that each mesh in the header of a scene lists.
     accessors: the header's descriptions of arrays, which contain their lengths.
 
     Raises:
@@ -208,10 +210,11 @@ def _corner_counts(place: FileLocation, header: dict[str, Any], accessors: list[
 
 
 def _check_nodes(place: FileLocation, header: dict[str, Any], corner_counts: list[int]) -> None:
-    """Raise a FileFormatError if the nodes of a scene do not form trees, or trees that are too
-    deep; or if the meshes at all nodes together have too many corners.
+    """Raise a FileFormatError if the nodes of a scene do not form trees, if the trees are too deep,
+    or if the meshes at all nodes together have too many corners.
 
-    corner_counts: the number of corners of each mesh."""
+    corner_counts: the number of corners of each mesh.
+    """
     nodes: list[Any] = header.get("nodes", [])
     children = {k: node.get("children", []) for k, node in enumerate(nodes)}
     descendants = [child for child_list in children.values() for child in child_list]
@@ -226,13 +229,14 @@ def _check_nodes(place: FileLocation, header: dict[str, Any], corner_counts: lis
             raise place.error(f"its scene is nested more than {_MAX_NODE_DEPTH} nodes deep")
     mesh_ids: list[int] = [node["mesh"] for node in nodes if "mesh" in node]
     total = sum(corner_counts[mesh] for mesh in mesh_ids)
+    # The limit for bytes serves as a limit for corners.
     if total > MAX_BYTES:
         raise place.error(f"its scene draws {total:,} corners: at most {MAX_BYTES:,} are read")
 
 
 def _count(entry: dict[str, Any], key: str, default: int | None = None) -> int:
-    """The nonnegative integer entry[key] of a header, or `default` if the key is missing. Raises a
-    ValueError if it is not a nonnegative integer."""
+    """Return the nonnegative integer entry[key] of a header, or `default` if the key is missing.
+    Raises a ValueError if it is not a nonnegative integer."""
     value = entry.get(key, default)
     if not isinstance(value, int) or isinstance(value, bool) or value < 0:
         raise ValueError(f"{key} is {value!r}")
@@ -240,7 +244,7 @@ def _count(entry: dict[str, Any], key: str, default: int | None = None) -> int:
 
 
 def _contents(place: FileLocation, scene: Any) -> FileGeometry:
-    """The triangles of a trimesh scene in world coordinates; if there are none, its points.
+    """Return the triangles of a trimesh scene in world coordinates; if there are none, its points.
 
     Raises:
         FileFormatError: an index out of range; neither triangles nor points.
@@ -279,8 +283,8 @@ def _contents(place: FileLocation, scene: Any) -> FileGeometry:
 def _transformed(
     place: FileLocation, vertices: FloatArray, world_from_node: FloatArray
 ) -> FloatArray:
-    """The vertices (n, 3) moved by the transform `world_from_node` (4, 4). Raises a FileFormatError
-    for coordinates that are not finite."""
+    """Return the vertices (n, 3) moved by the transform `world_from_node` (4, 4). Raises a
+    FileFormatError for coordinates that are not finite."""
     x = vertices.astype(np.float64) @ world_from_node[:3, :3].T + world_from_node[:3, 3]
     if not math.isfinite(float(np.abs(x).max(initial=0.0))):
         raise place.error("coordinates must be finite")

@@ -29,7 +29,8 @@ class Atoms:
     """Atoms of a molecule from a file: positions (n, 3) and van der Waals radii (n,) in angstrom,
     and the names of the elements (n,).
 
-    summary: the contents of the file, and which of its atoms were left out."""
+    summary: the contents of the file, and which of its atoms were left out.
+    """
 
     positions: FloatArray
     radii: FloatArray
@@ -107,9 +108,9 @@ def parse_molecule(path: Path, data: bytes) -> Atoms:
 
 
 def _text(data: bytes, *, is_cif: bool) -> str:
-    r"""Decode the bytes of a molecule's file to text, without byte order mark, and in a .pdb file
-    with "\n" as line end. There each non-ASCII letter is replaced by a single byte: the format is
-    given by columns, which gemmi counts in bytes."""
+    r"""Decode the bytes of a molecule's file to text, without byte order mark. In the text of a
+    .pdb file, lines end with "\n", and each non-ASCII letter is replaced by a single byte: the
+    format is given by columns, which gemmi counts in bytes."""
     data = data.removeprefix(b"\xef\xbb\xbf")
     if is_cif:
         return data.decode("utf-8", "replace")
@@ -122,10 +123,14 @@ def _text(data: bytes, *, is_cif: bool) -> str:
 
 
 def _drop_alternate_locations(model: Any) -> list[Any]:
-    """The atoms of a model of a molecule, without alternatives. Of several residues at the same
-    position only the first is kept; in a residue, of several atoms with the same name that are
-    marked by different letters as alternatives, only the first. A line TER in the file ends a
-    chain; the same residue number after it stands for another position."""
+    """Return the atoms of a model of a molecule, without alternatives. Only atoms that the file
+    marks by a letter can be alternatives.
+
+    Of marked atoms with the same name in a residue, only those with the letter that comes first are
+    kept. If residues with different names are at the same position, marked atoms of the later ones
+    are dropped unless their letter is that of the first. A line TER in the file ends a chain; the
+    same residue number after it stands for another position.
+    """
     # The first marked residue at each position (its name and its letter); and the first letter of
     # each marked atom.
     residues: dict[tuple[int, str], tuple[str, str]] = {}
@@ -147,7 +152,7 @@ def _drop_alternate_locations(model: Any) -> list[Any]:
 
 
 def _count_atom_lines(text: str) -> int:
-    """The number of lines of a .pdb file that describe an atom."""
+    """Return the number of lines of a .pdb file that describe an atom."""
     return sum(line[:4].upper() in _ATOM_LINES for line in text.split("\n"))
 
 
@@ -186,11 +191,13 @@ def _check_coordinates(path: Path, text: str) -> None:
 
 
 def _summarize(elements: tuple[str, ...], left_out: dict[str, int], model_count: int) -> str:
-    """The summary of a molecule as a text: the number of atoms, the commonest elements, and how
-    many atoms were left out.
+    """Return the summary of a molecule as a text: the number of atoms, the commonest elements, and
+    how many atoms were left out.
 
-    elements: the name of each atom's element. left_out: the number of atoms that were left out, by
-        reason. model_count: the number of models in the file."""
+    elements: the name of each atom's element.
+    left_out: the number of atoms that were left out, by reason.
+    model_count: the number of models in the file.
+    """
     common = Counter(elements).most_common(_MAX_LISTED_ELEMENTS)
     names = ", ".join(f"{count:,} {name}" for name, count in common)
     summary = (

@@ -2,9 +2,6 @@
 regular polygons. An outline is a list of closed polygons ("loops", arrays (n, 2)) that do not cross
 and have the region on their left, as `harnack.geometry.make_outline` returns them. Curves of
 letters and SVG paths are replaced by polylines within a stated tolerance.
-
-Curves are flattened to a stated tolerance. The results are loops that do not cross, with the region
-on their left, as `harnack.geometry.make_outline` returns them.
 """
 
 from __future__ import annotations
@@ -38,8 +35,8 @@ _MAX_SIDES = 100_000
 
 
 def regular_polygon(sides: int, radius: float) -> Outline:
-    """The regular polygon with this number of sides, at least 3. Its corners have the distance
-    `radius` from the origin, and the first one is on the x axis. For example,
+    """Return the regular polygon with this number of sides, at least 3. Its corners have the
+    distance `radius` from the origin, and the first one is on the x axis. For example,
     `Extrusion(regular_polygon(6, 5.0), height)` is a hexagonal prism.
 
     Raises:
@@ -74,7 +71,8 @@ def text(
     align: Literal["left", "center", "right"] = "left",
     tolerance: float | None = None,
 ) -> Outline:
-    """The outline of text. Its first line starts at the origin and runs along x, with y upwards.
+    """Return the outline of text. Its first line starts at the origin and runs along x, with y
+    upwards.
 
     words: one or more lines, set by matplotlib (`pip install harnack[outlines]`).
     size: of the font, in units of length: about the height from the lowest to the highest point of
@@ -113,7 +111,7 @@ def text(
 
 
 def _text_line_loops(line: str, font: Any, size: float, max_error: float) -> list[FloatArray]:
-    """The closed polygons (n, 2) that outline the letters of a line of text.
+    """Return the closed polygons (n, 2) that outline the letters of a line of text.
 
     font: the name of a font file (.ttf, .otf) or of an installed family; None for the default.
     size: the size of the font, in units of length.
@@ -158,11 +156,13 @@ _POINTS_OF_CODE = {2: 1, 3: 2, 4: 3}
 
 
 def _path_to_loops(points: FloatArray, codes: list[int], max_error: float) -> list[FloatArray]:
-    """The closed polygons (n, 2) of a path of matplotlib, with its curves replaced by polylines.
+    """Return the closed polygons (n, 2) of a path of matplotlib, with its curves replaced by
+    polylines.
 
     points, codes: (k, 2), (k,) the path's points, and matplotlib's code for the role of each: the
         start of a polygon, its end, or a point of a line or of a curve.
-    max_error: the largest distance of a polyline from its curve, a length."""
+    max_error: the largest distance of a polyline from its curve, a length.
+    """
     loop_pieces: list[list[FloatArray]] = []
     k = 0
     while k < len(codes):
@@ -183,8 +183,8 @@ def _path_to_loops(points: FloatArray, codes: list[int], max_error: float) -> li
 
 
 def _drop_degenerate_loops(loops: list[FloatArray]) -> list[FloatArray]:
-    """The loops (n, 2) that have at least three different points. Loops with fewer points enclose
-    no area."""
+    """Return the loops (n, 2) that have at least three different points. Loops with fewer points
+    enclose no area."""
     return [loop for loop in loops if len(np.unique(loop, axis=0)) > 2]
 
 
@@ -206,8 +206,8 @@ _FILL_CHANGING_RULES = re.compile(r"none|evenodd|transform|hidden|@import|clip|m
 def svg(
     path: str | os.PathLike[str], *, scale: float = 1.0, tolerance: float | None = None
 ) -> Outline:
-    """The outline of the filled shapes of an SVG file, with y upwards. It is read by svgpathtools
-    (`pip install harnack[outlines]`).
+    """Return the outline of the filled shapes of an SVG file, with y upwards. It is read by
+    svgpathtools (`pip install harnack[outlines]`).
 
     path: of a file with paths, rectangles, circles, ellipses and polygons, in groups and with
         transforms. The outline is that of the union of all filled shapes. Strokes have no outline
@@ -226,6 +226,7 @@ def svg(
     """
     scale = as_positive(scale, "the scale of an SVG file")
     if tolerance is not None:
+        # In the unit of the file.
         tolerance = as_positive(tolerance, "the tolerance") / scale
     source = Path(path)
     if source.stat().st_size > _MAX_SVG_BYTES:
@@ -298,6 +299,7 @@ def _filled_shapes(
     if tag == "style" and _FILL_CHANGING_RULES.search("".join(element.itertext())):
         raise ValueError("its style sheet may change what is filled: save it with plain attributes")
     if tag in _HIDDEN:
+        # (A generator that yields nothing.)
         yield from ()
         return
     styles = {**inherited, **_styles(element)}
@@ -337,9 +339,9 @@ _CUTTING = ("clip-path", "mask")
 
 
 def _styles(element: Element) -> dict[str, str]:
-    """The style properties of an SVG element, by name, as far as they matter for what is filled.
-    They are given by its attributes and by its attribute `style`, which overrides the others. A
-    transform is included only if it is in `style`."""
+    """Return the style properties of an SVG element, by name, as far as they matter for what is
+    filled. They are given by its attributes and by its attribute `style`, which overrides the
+    others. A transform is included only if it is in `style`."""
     names = (*_INHERITED, *_CUTTING, "transform-origin")
     styles = {name: element.attrib[name].strip() for name in names if name in element.attrib}
     names = (*names, "transform")
@@ -354,7 +356,7 @@ _LENGTHS = {"x", "y", "cx", "cy", "width", "height", "r", "rx", "ry"}
 
 
 def _path_data(element: Element) -> str:
-    """The path data (the text of SVG's attribute d) of a shape.
+    """Return the path data (the text of SVG's attribute d) of a shape.
 
     Raises:
         ValueError: a length with a unit, or a size that is negative or not finite.
@@ -364,6 +366,7 @@ def _path_data(element: Element) -> str:
     if tag == "path":
         return attrib.get("d", "")
     for name in _LENGTHS & attrib.keys():
+        # Letters other than e, which belongs to exponents, are units.
         if re.search(r"[%a-df-z]", attrib[name], re.IGNORECASE):
             raise ValueError(
                 f'{name}="{attrib[name]:.20}" of a <{tag}> has a unit: save the file with plain '
@@ -388,7 +391,7 @@ def _path_data(element: Element) -> str:
 def _outline_of(
     shapes: list[tuple[str, FloatArray, FillingRule]], scale: float, tolerance: float | None
 ) -> Outline:
-    """The outline of the union of filled shapes, with y upwards.
+    """Return the outline of the union of filled shapes, with y upwards.
 
     shapes: for each shape its path data, its transform (3, 3), and its fill rule.
     scale: the length of the file's unit.
@@ -424,7 +427,8 @@ def _outline_of(
 
 
 def _segments(data: str) -> list[Any]:
-    """The segments (lines, Bezier curves and arcs, objects of svgpathtools) of SVG path data.
+    """Return the segments (lines, Bezier curves and arcs, objects of svgpathtools) of SVG path
+    data.
 
     Raises:
         ValueError: malformed data, or a number that is not finite.
@@ -447,9 +451,9 @@ def _segments(data: str) -> list[Any]:
 
 
 def _loops(segments: list[Any], matrix: FloatArray, tolerance: float) -> list[FloatArray]:
-    """The closed polygons (n, 2) that the segments of an SVG path form, moved by the transform
-    `matrix` (3, 3). A polygon is made of successive segments, each of which begins where the one
-    before ends. Curves are replaced by polylines within the distance `tolerance`."""
+    """Return the closed polygons (n, 2) that the segments of an SVG path form, moved by the
+    transform `matrix` (3, 3). A polygon is made of successive segments, each of which begins where
+    the one before ends. Curves are replaced by polylines within the distance `tolerance`."""
     loop_pieces: list[list[FloatArray]] = []
     end_point: complex | None = None
     for segment in segments:
@@ -471,8 +475,8 @@ def _loops(segments: list[Any], matrix: FloatArray, tolerance: float) -> list[Fl
 
 
 def _arc(arc: Any, matrix: FloatArray, tolerance: float) -> FloatArray:
-    """A polyline within `tolerance` of an elliptic arc, moved by the transform `matrix` (3, 3).
-    Returns its points (n, 2) without the first one.
+    """Approximate an elliptic arc, moved by the transform `matrix` (3, 3), by a polyline within
+    `tolerance`. Returns the points (n, 2) of the polyline without the first one.
 
     The number of chords, at least 2, follows from a bound of their error: if an arc of the angle a
     and the larger radius r is divided into n chords, they are within r (a/n)^2/8 of it. The
@@ -493,10 +497,11 @@ def _arc(arc: Any, matrix: FloatArray, tolerance: float) -> FloatArray:
 
 
 def _transform_points(matrix: FloatArray, points: list[complex]) -> FloatArray:
-    """(n, 2) points, given as complex numbers x + i y, moved by the transform `matrix` (3, 3)."""
+    """Return points, given as complex numbers x + i y, after the transform `matrix` (3, 3), as an
+    array (n, 2)."""
     return np.array([_xy(point) for point in points]) @ matrix[:2, :2].T + matrix[:2, 2]
 
 
 def _xy(z: complex) -> FloatArray:
-    """The vector (x, y) of the complex number z = x + i y."""
+    """Return the vector (x, y) of the complex number z = x + i y."""
     return np.array([z.real, z.imag])

@@ -5,10 +5,6 @@ number of its rows; its "properties" are the numbers, or lists of numbers, in ea
 Each property is read in all rows of an element at once. A "position" says where a number is in the
 file: in bytes for a binary file, in words (entries between blanks) for a text file. The position of
 a property in a row follows from the properties before it, and the lengths of the lists among these.
-
-A file is a header and rows of elements, such as one row for each vertex. Properties of a row are
-numbers or lists. Each property is read in all rows of an element at once; its position in a row
-follows from the properties before it, and the lengths of the lists among these.
 """
 
 from __future__ import annotations
@@ -67,7 +63,8 @@ class Property:
     row of an element.
 
     code: the type of the numbers, as a format character of the module `struct`.
-    length_code: for a list, the type of its length; None for a single number."""
+    length_code: for a list, the type of its length; None for a single number.
+    """
 
     name: str
     code: str
@@ -89,7 +86,8 @@ class PlyHeader:
     """The header of a .ply file.
 
     byte_order: "<" or ">" for a binary file, "" for text.
-    size, lines: the number of bytes and the number of lines before the first row."""
+    size, lines: the number of bytes and the number of lines before the first row.
+    """
 
     byte_order: str
     elements: tuple[PlyElement, ...]
@@ -97,9 +95,9 @@ class PlyHeader:
     lines: int
 
     def declared_rows(self, size: int) -> int:
-        """The number of rows that the header declares for all elements together. The number for a
-        single element counts as at most `size`, the file's size in bytes, as a file cannot hold
-        more."""
+        """Return the number of rows that the header declares for all elements together. The number
+        for a single element counts as at most `size`, the file's size in bytes, as a file cannot
+        hold more."""
         return sum(min(section.count, size) for section in self.elements)
 
 
@@ -112,11 +110,13 @@ class BinaryValues:
         self.byte_order = byte_order
 
     def read(self, where: IntArray, code: str) -> npt.NDArray[Any]:
-        """The numbers that are stored at the byte positions `where` (n,). code: their type, a
-        format character of the module `struct`.
+        """Return the numbers that are stored at the byte positions `where` (n,).
+
+        code: the type of the numbers, a format character of the module `struct`.
 
         A position outside of the file gives an arbitrary number. Callers detect such positions,
-        since the rows that contain them end after the file's end."""
+        since the rows that contain them end after the file's end.
+        """
         kind = np.dtype(self.byte_order + code)
         last_position = self.size - kind.itemsize  # the header alone is longer than a number
         # A view of the data as the numbers that begin at each byte, so that one index reads them
@@ -125,14 +125,17 @@ class BinaryValues:
         return all_numbers[np.clip(where, 0, last_position)].astype(kind.newbyteorder("="))
 
     def width(self, code: str) -> int:
-        """The number of bytes of a number of the type `code`, a format character of `struct`."""
+        """Return the number of bytes of a number of the type `code`, a format character of
+        `struct`."""
         return struct.calcsize("=" + code)
 
 
 class TextValues:
     """The numbers of all rows of an element in a text file, read at positions. A position is
-    counted in words (entries between blanks) from the first row. counts: (n,) the number of words
-    of each row."""
+    counted in words (entries between blanks) from the first row.
+
+    counts: (n,) the number of words of each row.
+    """
 
     def __init__(self, rows: TextLines) -> None:
         numbers, self.counts = read_floats(rows, convert=_any_number)
@@ -140,9 +143,9 @@ class TextValues:
         self.size = len(numbers)
 
     def read(self, where: IntArray, code: str) -> npt.NDArray[Any]:
-        """The numbers at the word positions `where` (n,). They are returned as integers if `code`
-        (a format character of `struct`) is an integer type and all of them are whole. A position
-        outside of the rows gives an arbitrary number."""
+        """Return the numbers at the word positions `where` (n,). They are returned as integers if
+        `code` (a format character of `struct`) is an integer type and all of them are whole. A
+        position outside of the rows gives an arbitrary number."""
         values = self._numbers[np.clip(where, 0, self.size)]
         if code in "fd" or (values != np.rint(values)).any():
             return values
@@ -150,9 +153,9 @@ class TextValues:
         return np.clip(values, -(2.0**53), 2.0**53).astype(np.int64)
 
     def width(self, code: str) -> int:
-        """How many positions a number takes: always 1, as positions in a text file are counted in
-        words. (The same method of `BinaryValues` returns the number of bytes of the type `code`.)
-        """
+        """Return how many positions a number takes: always 1, as positions in a text file are
+        counted in words. (The same method of `BinaryValues` returns the number of bytes of the type
+        `code`.)"""
         return 1
 
 
@@ -160,8 +163,8 @@ Values: TypeAlias = BinaryValues | TextValues
 
 
 def _any_number(word: bytes, place: FileLocation) -> float:
-    """The number that a word stands for, also NaN or infinite. Raises a FileFormatError that names
-    its `place` if it stands for none."""
+    """Return the number that a word stands for, also NaN or infinite. Raises a FileFormatError that
+    names its `place` if it stands for none."""
     try:
         return float(word)
     except ValueError as error:
@@ -174,7 +177,8 @@ class PropertyColumn:
 
     code: the type of the numbers, as a format character of the module `struct`.
     positions: (n,) in bytes for a binary file, in words for a text file.
-    list_lengths: (n,) the lengths of the lists; None for a property that is a single number."""
+    list_lengths: (n,) the lengths of the lists; None for a property that is a single number.
+    """
 
     code: str
     positions: IntArray
@@ -185,30 +189,31 @@ class PropertyColumn:
 @dataclass(frozen=True, eq=False)
 class ElementTable:
     """All rows of an element of a .ply file: its properties as columns by name, and the location of
-    each row in the file."""
+    each row in the file (`places`). `values` reads the numbers."""
 
     values: Values
     columns: dict[str, PropertyColumn]
     places: FileLocations
 
     def has_scalars(self, *names: str) -> bool:
-        """Whether there are columns with all of these names that hold single numbers, not lists."""
+        """Return whether there are columns with all of these names that hold single numbers, not
+        lists."""
         return all(
             name in self.columns and self.columns[name].list_lengths is None for name in names
         )
 
     def scalar_column(self, name: str) -> npt.NDArray[Any]:
-        """The numbers (n,) of a column of single numbers. Raises a FileFormatError if there is no
-        such column, or if it holds lists."""
+        """Return the numbers (n,) of a column of single numbers. Raises a FileFormatError if there
+        is no such column, or if it holds lists."""
         column = self._column(name)
         if column.list_lengths is not None:
             raise self._wrong_kind_error()
         return self.values.read(column.positions + column.offset, column.code)
 
     def list_column(self, name: str) -> tuple[npt.NDArray[Any], IntArray]:
-        """The numbers of a column of lists: all lists in one array, one list after the other; and
-        the length (n,) of each list. Raises a FileFormatError if there is no such column, or if it
-        holds single numbers."""
+        """Return the numbers of a column of lists: all lists in one array, one list after the
+        other; and the length (n,) of each list. Raises a FileFormatError if there is no such
+        column, or if it holds single numbers."""
         column = self._column(name)
         if column.list_lengths is None:
             raise self._wrong_kind_error()
@@ -218,13 +223,13 @@ class ElementTable:
         return self.values.read(where, column.code), column.list_lengths
 
     def _column(self, name: str) -> PropertyColumn:
-        """The column with this name. Raises a FileFormatError if there is none."""
+        """Return the column with this name. Raises a FileFormatError if there is none."""
         if name not in self.columns:
             raise self.places[0].error(f"this element needs a property {name!r}")
         return self.columns[name]
 
     def _wrong_kind_error(self) -> FileFormatError:
-        """The error for a column that holds lists where single numbers are expected, or the
+        """Return the error for a column that holds lists where single numbers are expected, or the
         reverse."""
         return self.places[0].error("a list where one number is expected, or the reverse")
 
@@ -258,7 +263,7 @@ def read_ply(path: Path, data: bytes) -> FileGeometry:
     if table and (table.has_scalars("vertex1", "vertex2") or not tables.get("face")):
         ends = np.stack([table.scalar_column("vertex1"), table.scalar_column("vertex2")], axis=1)
         edges = _polygons(table, ends.ravel(), np.full(len(ends), 2), len(vertices))
-    # Such faces are handled one by one, which takes long.
+    # Faces of different sizes are handled one by one, which takes long.
     if have_mixed_sizes(faces):
         check_element_count(FileLocation(path), header.declared_rows(len(data)))
     return FileGeometry(path, vertices, normals, faces, edges)
@@ -289,14 +294,16 @@ def _check_end(path: Path, remainder: bytes) -> None:
 def _polygons(
     table: ElementTable, corners: npt.NDArray[Any], sizes: IntArray, count: int
 ) -> PolygonList:
-    """The polygons (or edges) that the rows of an element list. Raises a FileFormatError if an
-    index is not an integer in [0, count).
+    """Return the polygons (or edges) that are listed in the rows of an element. Raises a
+    FileFormatError if an index is not an integer in [0, count).
 
     table: the rows of the element, for their locations in the file.
-    corners: the vertex indices, one polygon after the other. sizes: (m,) the number of corners of
-        each polygon.
-    count: the number of vertices."""
+    corners: the vertex indices, one polygon after the other.
+    sizes: (m,) the number of corners of each polygon.
+    count: the number of vertices.
+    """
     polygons = PolygonList(corners.astype(np.int64), sizes, table.places)
+    # Indices are read as floats only if one of them is not whole.
     if corners.dtype.kind == "f" and corners.size:
         k = int(np.argmax(corners != np.rint(corners)))
         raise polygons.location_of_corner(k).error(
@@ -309,13 +316,15 @@ def _polygons(
 def _columns(
     section: PlyElement, values: Values, begins: IntArray, places: FileLocations
 ) -> tuple[dict[str, PropertyColumn], IntArray]:
-    """The properties of the element `section` in all its rows, as columns by name; and the position
-    (n,) at which each row ends.
+    """Find where the properties of the element `section` are in all its rows. Returns them as
+    columns by name, and the position (n,) at which each row ends.
 
-    values: the numbers of the file. begins: (n,) the position at which each row begins.
+    values: the numbers of the file.
+    begins: (n,) the position at which each row begins.
     places: the locations of the rows, for errors.
 
-    A row whose list has an invalid length ends after the end of the file; callers test for that."""
+    A row whose list has an invalid length ends after the end of the file; callers test for that.
+    """
     columns: dict[str, PropertyColumn] = {}
     positions, offset = begins, 0
     for prop in section.properties:
@@ -325,10 +334,12 @@ def _columns(
             continue
         # What follows a list begins at another place in each row: positions are counted from there.
         lengths = values.read(positions + offset, prop.length_code)
+        # Lengths are read as floats only if one of them is not whole.
         if lengths.dtype.kind == "f":
             k = int(np.argmax(lengths != np.rint(lengths)))
             raise places[k].error(f"the length of a list is no integer, but {lengths[k]}")
-        # Lists of invalid length get one that ends after the end of the file.
+        # A list with a negative or too large length gets a length that ends after the end of the
+        # file.
         sizes = np.where(lengths < 0, values.size + 1, lengths).astype(np.int64)
         sizes = np.minimum(sizes, values.size + 1)
         offset += values.width(prop.length_code)
@@ -338,8 +349,8 @@ def _columns(
 
 
 def _text_tables(path: Path, data: bytes, header: PlyHeader) -> dict[str, ElementTable]:
-    """The rows of each element of a text file, as a table by the element's name. Elements without
-    rows are left out.
+    """Return the rows of each element of a text file, as a table by the element's name. Elements
+    without rows are left out.
 
     Raises:
         FileFormatError: fewer or more rows than the header declares, or a row of wrong length.
@@ -367,8 +378,8 @@ def _text_tables(path: Path, data: bytes, header: PlyHeader) -> dict[str, Elemen
 
 
 def _binary_tables(path: Path, data: bytes, header: PlyHeader) -> dict[str, ElementTable]:
-    """The rows of each element of a binary file, as a table by the element's name. Elements without
-    rows are left out.
+    """Return the rows of each element of a binary file, as a table by the element's name. Elements
+    without rows are left out.
 
     Rows are first read as if all were as long as the first row, which is fast. If their ends show
     that they are not, the end of each row is found one by one.
@@ -390,6 +401,8 @@ def _binary_tables(path: Path, data: bytes, header: PlyHeader) -> dict[str, Elem
             # In most files the lists of all rows are as long as those of the first row, and not
             # empty.
             stride = next(_row_ends(section, values, begin)) - begin
+            # Then all lists of the first row are empty. Rows without data could be declared in any
+            # number, so their number is checked.
             if stride == min_stride and any(p.length_code for p in section.properties):
                 check_element_count(FileLocation(path), header.declared_rows(len(data)))
             begins = begin + stride * np.arange(section.count, dtype=np.int64)
@@ -410,9 +423,11 @@ def _row_ends(section: PlyElement, values: BinaryValues, begin: int) -> Iterator
     """Yield the position at which each row of the element `section` ends, one row after the other.
     This is for elements whose rows have different lengths because they contain lists.
 
-    values: the bytes of the file. begin: the position at which the first row begins.
+    values: the bytes of the file.
+    begin: the position at which the first row begins.
 
-    Raises struct.error if a row ends after the end of the file, or a list has a negative length."""
+    Raises struct.error if a row ends after the end of the file, or a list has a negative length.
+    """
     # For each list: the bytes since the list before, how its length is stored, and the bytes of
     # each of its numbers. At the end `fixed_bytes` is what follows the last list.
     fixed_bytes = 0
@@ -438,7 +453,7 @@ def _row_ends(section: PlyElement, values: BinaryValues, begin: int) -> Iterator
 
 
 def _too_short(path: Path, section: PlyElement) -> FileFormatError:
-    """The error for a file that ends before all rows of the element `section`."""
+    """Return the error for a file that ends before all rows of the element `section`."""
     return FileLocation(path).error(
         f"the file ends before the {section.count:,} rows of element {section.name!r} that its "
         "header declares"
@@ -487,16 +502,16 @@ def _header(path: Path, data: bytes) -> PlyHeader:
 
 
 def _parse_count(word: bytes, place: FileLocation) -> int:
-    """The number of rows of an element, from its digits in the header. Raises a FileFormatError if
-    it has more than 18."""
+    """Return the number of rows of an element, from its digits in the header. Raises a
+    FileFormatError if it has more than 18."""
     if len(word) > 18:
         raise place.error(f"{excerpt(word)} is too large a count")
     return int(word)
 
 
 def _parse_property(words: list[bytes], section: PlyElement, place: FileLocation) -> Property:
-    """The property that a line of the header declares for the element `section`. words: the words
-    of the line.
+    """Return the property that a line of the header declares for the element `section`. words: the
+    words of the line.
 
     Raises:
         FileFormatError: a malformed line, a name that occurs twice, or a list whose length is no

@@ -107,7 +107,8 @@ class Metaballs:
     """The n blobs (metaballs) of a file: their centers (n, 3), radii (n,) and weights (n,); and the
     number of the group of each blob (n,), or None if the file names no groups.
 
-    summary: a text about the contents of the file."""
+    summary: a text about the contents of the file.
+    """
 
     centers: FloatArray
     radii: FloatArray
@@ -117,8 +118,8 @@ class Metaballs:
 
 
 def read_metaballs(path: Path, data: bytes) -> Metaballs:
-    """The blobs of a .blobs file: text that a person can write, with a blob on each line. `#`
-    begins a comment.
+    """Read the blobs of a .blobs file, a text with a blob on each line. Returns the `Metaballs`.
+    `#` begins a comment.
 
         # x y z radius [weight [group]]
         0.0  0.0  0.0  1.0
@@ -130,9 +131,9 @@ def read_metaballs(path: Path, data: bytes) -> Metaballs:
     Lines may have different numbers of columns. Either all lines name a group or none does.
 
     Raises:
-        FileFormatError: an empty file; words, numbers that are not finite, fewer than four or more
-            than six columns, a radius that is not positive, a group that is no integer, groups on
-            some lines only.
+        FileFormatError: the file is empty; an entry is not a finite number; a line has fewer than
+            four or more than six columns; a radius is not positive; a group is no integer; or only
+            some lines name a group.
     """
     lines = split_content_lines(path, data)
     if not len(lines):
@@ -143,7 +144,7 @@ def read_metaballs(path: Path, data: bytes) -> Metaballs:
         raise lines.locations[invalid[0]].error(
             f"a blob has four to six numbers, {_COLUMNS}, not {counts[invalid[0]]}"
         )
-    # Columns that a line lacks (weight and group) are 1.
+    # Columns that a line lacks (weight and group) are 1. The others are filled row by row.
     table = np.ones((len(counts), 6))
     table[np.arange(6) < counts[:, None]] = numbers
     radii, groups = table[:, 3], table[:, 5]
@@ -203,6 +204,7 @@ def read_obj(path: Path, data: bytes) -> FileGeometry:
         if statement := statements.get(keyword):
             statement[0].append(line[len(keyword) :])
             statement[1].append(number)
+        # Known keywords in capital letters are refused, too.
         elif keyword in _UNSUPPORTED_OBJ_STATEMENTS or keyword.lower() in statements:
             raise FileLocation(path, f"line {number}").error(
                 f"the statement {excerpt(keyword)} is not read: save the surface as 'v' and 'f'"
@@ -218,7 +220,7 @@ def read_obj(path: Path, data: bytes) -> FileGeometry:
     vertices = read_table(rows[b"v"], 3, too_few_message="a vertex needs three coordinates, not {}")
     faces = _parse_obj_polygons(rows[b"f"], "'f' needs at least 3 vertices", 3, rows[b"v"])
     polylines = _parse_obj_polygons(rows[b"l"], "'l' needs at least 2 vertices", 2, rows[b"v"])
-    # Such faces are handled one by one, which takes long.
+    # Faces of different sizes are handled one by one, which takes long.
     if have_mixed_sizes(faces):
         check_element_count(FileLocation(path), len(lines))
     if len(faces) or len(polylines):
@@ -234,10 +236,11 @@ def read_obj(path: Path, data: bytes) -> FileGeometry:
 def _parse_obj_points(
     path: Path, vertices: FloatArray, normals: FloatArray | None, rows: dict[bytes, TextLines]
 ) -> FileGeometry:
-    """The vertices that the statements `p` of an .obj file name, as a point cloud, with their
-    normals if all of these statements name one.
+    """Return the vertices that the statements `p` of an .obj file name, as a point cloud, with
+    their normals if all of these statements name one.
 
-    vertices: (n, 3) all vertices of the file. normals: (k, 3) all its normals, or None.
+    vertices: (n, 3) all vertices of the file.
+    normals: (k, 3) all its normals, or None.
     rows: the lines of the statements, by their keyword.
 
     Raises:
@@ -260,8 +263,8 @@ def _parse_obj_points(
 
 
 def _join_continued_lines(lines: TextLines) -> TextLines:
-    """The same lines, except that a line that ends with a backslash is joined with the next one to
-    a single line, which has the number of its first line."""
+    """Return the same lines, except that a line that ends with a backslash is joined with the next
+    one to a single line, which has the number of its first line."""
     pieces: list[list[bytes]] = []
     numbers: list[int] = []
     continued = 0  # the number of the line that continues the last
@@ -281,8 +284,8 @@ def _join_continued_lines(lines: TextLines) -> TextLines:
 def _parse_obj_polygons(
     lines: TextLines, too_few: str, min_corners: int, vertices: TextLines
 ) -> PolygonList:
-    """The faces, polylines or points that statements of an .obj file define, with vertex indices
-    from 0.
+    """Return the faces, polylines or points that statements of an .obj file define, with vertex
+    indices from 0.
 
     lines: the lines of the statements `f`, `l` or `p`, without the keyword.
     too_few: the error message for a statement with fewer corners than `min_corners`.
@@ -311,6 +314,7 @@ def _parse_obj_polygons(
         raise statements.location_of_corner(low[0]).error(
             f"vertex {corners[low[0]]} is out of range: {preceding[low[0]]} vertices precede it"
         )
+    # All indices are counted from 0 from here on.
     corners = np.where(corners > 0, corners - 1, corners + preceding)
     polygons = PolygonList(corners, sizes, lines.locations)
     check_indices(polygons, len(vertices), first=1)
@@ -346,7 +350,7 @@ def read_off(path: Path, data: bytes) -> FileGeometry:
     # Colors may follow the corners; these need not be integers, and not even numbers.
     numbers, word_counts = read_floats(rows, convert=_number_or_nan)
     begins = np.cumsum(word_counts) - word_counts
-    # The first word of a face's line is the number of its corners.
+    # The first word of a face's line (word 0) is the number of its corners.
     sizes = _integers(rows, numbers[begins], np.arange(len(rows)), np.zeros_like(begins))
     if (wrong := np.flatnonzero((sizes < 1) | (sizes >= word_counts))).size:
         k = wrong[0]
@@ -362,7 +366,7 @@ def read_off(path: Path, data: bytes) -> FileGeometry:
 
 
 def _number_or_nan(word: bytes, _: FileLocation) -> float:
-    """The number that a word of a text file stands for; NaN if it is not a number."""
+    """Return the number that a word of a text file stands for; NaN if it is not a number."""
     try:
         return float(word)
     except ValueError:
@@ -374,8 +378,9 @@ def _integers(
 ) -> IntArray:
     """Convert numbers (k,), which were read from words of lines, to integers.
 
-    rows: the lines. row_of, word_of: (k,) for each number, the index of its line, and its position
-        among the words of that line, for messages.
+    rows: the lines.
+    row_of, word_of: (k,) for each number, the index of its line, and its position among the words
+        of that line, for messages.
 
     Raises:
         FileFormatError: a number is no integer.
@@ -389,8 +394,8 @@ def _integers(
 
 
 def _parse_off_header(path: Path, lines: TextLines) -> tuple[int, int, TextLines]:
-    """The numbers of vertices and of faces that the header of an .off file declares, and the lines
-    after the header.
+    """Return the number of vertices and the number of faces that the header of an .off file
+    declares, and the lines after the header.
 
     Raises:
         FileFormatError: it is malformed, or not supported.
@@ -448,8 +453,8 @@ def read_stl(path: Path, data: bytes) -> FileGeometry:
 
 
 def _is_binary(data: bytes) -> bool:
-    """Whether an .stl file with the bytes `data` is binary. Many binary files begin with the word
-    "solid" like text files. So the length is tested first: a binary file has the length that
+    """Return whether an .stl file with the bytes `data` is binary. Many binary files begin with the
+    word "solid" like text files. So the length is tested first: a binary file has the length that
     follows from the number of triangles in its header."""
     if (
         len(data) >= _STL_HEADER_BYTES
@@ -460,13 +465,14 @@ def _is_binary(data: bytes) -> bool:
 
 
 def _stl_facet_count(data: bytes) -> int:
-    """The number of triangles that the header of a binary .stl file states."""
+    """Return the number of triangles that the header of a binary .stl file states."""
     return int.from_bytes(data[_STL_HEADER_BYTES - 4 : _STL_HEADER_BYTES], "little")
 
 
 def _parse_binary_stl(path: Path, data: bytes) -> FloatArray:
-    """The corners (3 m, 3) of the m triangles of a binary .stl file. Raises a FileFormatError if
-    the file's length does not follow from the number of triangles in its header."""
+    """Return the corners (3 m, 3) of the m triangles of a binary .stl file. Raises a
+    FileFormatError if the file's length does not follow from the number of triangles in its
+    header."""
     if len(data) < _STL_HEADER_BYTES:
         raise FileLocation(path).error(
             f"{len(data)} bytes are too few for an .stl file: it begins with 'solid' or with a "
@@ -488,7 +494,7 @@ def _parse_binary_stl(path: Path, data: bytes) -> FloatArray:
 
 
 def _parse_text_stl(path: Path, data: bytes) -> FloatArray:
-    """The corners (3 m, 3) of the m triangles of a text .stl file.
+    """Return the corners (3 m, 3) of the m triangles of a text .stl file.
 
     Raises:
         FileFormatError: an unknown statement, a truncated file, or a facet without three vertices.

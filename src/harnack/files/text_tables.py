@@ -56,9 +56,10 @@ class TextLines:
 def split_content_lines(
     path: Path, data: bytes, *, comment: bytes | None = b"#", first: int = 1
 ) -> TextLines:
-    """The lines of a text file that are not blank, without comments and byte order mark.
+    """Return the lines of a text file that are not blank, without comments and byte order mark.
 
-    data: the bytes of the file. comment: what begins a comment; None if there are no comments.
+    data: the bytes of the file.
+    comment: what begins a comment; None if there are no comments.
     first: number of the first line, for messages.
 
     Raises:
@@ -87,8 +88,8 @@ def split_content_lines(
 
 
 def parse_finite(word: bytes, place: FileLocation) -> float:
-    """The finite number that a word of a text file stands for. place: the word's location, for the
-    error.
+    """Return the finite number that a word of a text file stands for. place: the word's location,
+    for the error.
 
     Raises:
         FileFormatError: the word is not a finite number.
@@ -103,8 +104,8 @@ def parse_finite(word: bytes, place: FileLocation) -> float:
 
 
 def parse_vertex_index(word: bytes, place: FileLocation) -> int:
-    """The integer that a word of a text file stands for, small enough for the index of a vertex.
-    place: the word's location, for the error.
+    """Return the integer that a word of a text file stands for, small enough for the index of a
+    vertex. place: the word's location, for the error.
 
     Raises:
         FileFormatError: the word is not such an integer.
@@ -122,7 +123,8 @@ def parse_vertex_index(word: bytes, place: FileLocation) -> int:
 
 
 def _is_integral(word: bytes) -> bool:
-    """Whether a word of a text file is a number whose value is an integer, such as 3.000e+00."""
+    """Return whether a word of a text file is a number whose value is an integer, such as
+    3.000e+00."""
     try:
         return b"_" not in word and float(word).is_integer()
     except ValueError:
@@ -130,8 +132,8 @@ def _is_integral(word: bytes) -> bool:
 
 
 def excerpt(word: bytes) -> str:
-    """A word from a file in quotes, as it is shown in messages: shortened if it is long, and with
-    unprintable characters escaped."""
+    """Return a word from a file in quotes, as it is shown in messages: shortened if it is long, and
+    with unprintable characters escaped."""
     shown = word[:32].decode("ascii", "backslashreplace")
     return repr(shown + ("..." if len(word) > 32 else ""))
 
@@ -167,8 +169,8 @@ def read_table(
 def read_floats(
     lines: TextLines, *, convert: Callable[[bytes, FileLocation], float] = parse_finite
 ) -> tuple[FloatArray, IntArray]:
-    """The numbers in all words of n lines, as one array, line after line; and the number (n,) of
-    words of each line.
+    """Return the numbers in all words of n lines, as one array, line after line; and the number
+    (n,) of words of each line.
 
     convert: a function that converts a word to a number or raises an error. It is called only if
         not all words are finite numbers.
@@ -183,8 +185,8 @@ def read_floats(
 
 
 def read_integers(lines: TextLines) -> tuple[IntArray, IntArray]:
-    """The integers in all words of n lines, as one array, line after line; and the number (n,) of
-    words of each line.
+    """Return the integers in all words of n lines, as one array, line after line; and the number
+    (n,) of words of each line.
 
     Raises:
         FileFormatError: some word is not an integer; the message names the line of the first one.
@@ -197,11 +199,12 @@ def read_integers(lines: TextLines) -> tuple[IntArray, IntArray]:
 
 
 def _parse_with_numpy(lines: TextLines, columns: Sequence[int] | None = None) -> FloatArray | None:
-    """The numbers of n lines with k words each as a table (n, k), parsed by NumPy, which is fast.
-    None if that fails, because some word is not a number, or because lines have different numbers
-    of words.
+    """Return the numbers of n lines with k words each as a table (n, k), parsed by NumPy, which is
+    fast. None if that fails, because some word is not a number, or because lines have different
+    numbers of words.
 
-    columns: the columns to read; None for all."""
+    columns: the columns to read; None for all.
+    """
     # NumPy would read 1_0 as 10.
     if not len(lines) or b"_" in b"\n".join(lines.text):
         return None
@@ -217,8 +220,8 @@ def _parse_with_numpy(lines: TextLines, columns: Sequence[int] | None = None) ->
 
 
 def _row_lengths(table: FloatArray) -> IntArray:
-    """How many words each line has, for lines that were read as a rectangular table (n, k): an
-    array (n,) filled with k. `read_floats` and `read_integers` return such an array for lines of
+    """Return how many words each line has, for lines that were read as a rectangular table (n, k):
+    an array (n,) filled with k. `read_floats` and `read_integers` return such an array for lines of
     any lengths."""
     return np.full(len(table), table.shape[1], dtype=np.int64)
 

@@ -71,7 +71,8 @@ def read_3mf(path: Path, data: bytes) -> FileGeometry:
 
 
 def _contents(place: FileLocation, scene: Any) -> FileGeometry:
-    """The triangles of all nodes of a trimesh scene, in one coordinate system and in millimeters.
+    """Return the triangles of all nodes of a trimesh scene, in one coordinate system and in
+    millimeters.
 
     Raises:
         FileFormatError: an unknown unit, an index out of range, numbers that are not finite, or no

@@ -32,22 +32,22 @@ from harnack.tracer import Surface
 
 
 def _curve(loops: Any, level: Any = None, **settings: Any) -> list[Surface]:
-    """A surface that spans closed curves: a level set of their solid angle. loops: the vertices (n,
-    3) of a curve, or a list of such arrays. level: the level; None for the default. settings:
-    keywords of `Surface`."""
+    """Return a surface that spans closed curves: a level set of their solid angle. loops: the
+    vertices (n, 3) of a curve, or a list of such arrays. level: the level; None for the default.
+    settings: keywords of `Surface`."""
     return [Surface(SolidAngle(loops), level, **settings)]
 
 
 def _levels() -> list[Surface]:
-    """Five level sets of the solid angle of one polygon, cut by a half-space."""
+    """Return five level sets of the solid angle of one polygon, cut by a half-space."""
     cut = HalfSpace((0.5, -0.9, 0.0), 0.0)
     levels = [k * math.pi for k in (1.0, 1.5, 2.0, 2.5, 3.0)]
     return _curve(example_curves.wavy_polygon(48), levels, clip=cut)
 
 
 def _holes() -> list[Surface]:
-    """A surface spanned by a square with three holes. The curves are bent like a sheet in the wind,
-    so that no plane contains them."""
+    """Return a surface spanned by a square with three holes. The curves are bent like a sheet in
+    the wind, so that no plane contains them."""
     edge, *holes = example_curves.square_with_holes(24)
     s = np.linspace(0, 1, 10, endpoint=False)[:, None]
     # Ten points on each side of the square, so that it can be bent.
@@ -56,27 +56,29 @@ def _holes() -> list[Surface]:
 
 
 def _on_wave(loop: FloatArray) -> FloatArray:
-    """The points (n, 3) of a loop moved vertically onto a wavy surface."""
+    """Return the points (n, 3) of a loop moved vertically onto a wavy surface."""
     x, y, _ = loop.T
     return np.column_stack([x, y, 0.25 * np.sin(2.2 * x) + 0.2 * np.cos(2.0 * y)])
 
 
 def _periodic(kind: Any, half_wall: float, *, box: bool = False) -> list[Surface]:
-    """A wall: the solid between the levels -half_wall and half_wall of a periodic function.
+    """Return a wall: the solid between the levels -half_wall and half_wall of a periodic function.
 
-    kind: the class of the function. box: whether it is cut to a box; otherwise to a ball."""
+    kind: the class of the function.
+    box: whether it is cut to a box; otherwise to a ball.
+    """
     domain = Box((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0)) if box else Ball(radius=1.0)
     return [Surface(kind(1.0, domain=domain), (-half_wall, half_wall), side="between")]
 
 
 def _golden_gyroid() -> list[Surface]:
-    """The half of space in which the gyroid's function is negative, cut to a box."""
+    """Return the half of space in which the gyroid's function is negative, cut to a box."""
     domain = Box((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
     return [Surface(Gyroid(1.0, domain=domain), 0.0, side="below")]
 
 
 def _eigenfunctions() -> list[Surface]:
-    """The solid in which a sum of two Laplacian eigenfunctions is at least 1/2 (Fig. 21 of
+    """Return the solid in which a sum of two Laplacian eigenfunctions is at least 1/2 (Fig. 21 of
     Gillespie et al. 2024)."""
     terms = [
         WaveProduct(1.0, x=sine_factor(k), y=sine_factor(k), z=sine_factor(k)) for k in (6.0, 2.0)
@@ -87,47 +89,49 @@ def _eigenfunctions() -> list[Surface]:
 
 
 def _harmonic(field: Field) -> list[Surface]:
-    """A scene of one surface: the field's default level set."""
+    """Return a scene of one surface: the field's default level set."""
     return [Surface(field)]
 
 
 def _on_the_sphere(field: HypersphericalHarmonic, level: float) -> list[Surface]:
-    """The level sets -level and level of a function on the sphere S^3, projected to space. Both are
-    bounded, so that nothing is clipped."""
+    """Return the level sets -level and level of a function on the sphere S^3, projected to space.
+    Both are bounded, so that nothing is clipped."""
     return [Surface(field, [-level, level])]
 
 
 def _lobes() -> list[Surface]:
-    """The lobes of the spherical harmonic with l = 3, m = 2 as two solids: the lobes on which it is
-    positive, and the lobes on which it is negative."""
+    """Return the lobes of the spherical harmonic with l = 3, m = 2 as two solids: the lobes on
+    which it is positive, and the lobes on which it is negative."""
     lobes = Lobes(3, 2)
     return [Surface(part, 0.0, side="below") for part in (lobes.positive, lobes.negative)]
 
 
 def _quartic() -> list[Surface]:
-    """Level sets of x^3 y + x y^3 - 3 x y (w^2 + z^2) on the sphere S^3 (Gillespie et al. 2024,
-    Appendix E.2). On the sphere it equals x y (4 (x^2 + y^2) - 3), hence is at most 1/2."""
+    """Return level sets of x^3 y + x y^3 - 3 x y (w^2 + z^2) on the sphere S^3 (Gillespie et al.
+    2024, Appendix E.2). On the sphere it equals x y (4 (x^2 + y^2) - 3), hence is at most 1/2."""
     terms = {(3, 1, 0, 0): 1.0, (1, 3, 0, 0): 1.0, (1, 1, 0, 2): -3.0, (1, 1, 2, 0): -3.0}
     return _on_the_sphere(HypersphericalHarmonic.from_polynomial(terms), 0.15)
 
 
 def _fitted_knot() -> list[Surface]:
-    """A solid around a trefoil knot. Its field is a sum of Gaussians along the knot, approximated
-    by a series of 16 x 16 x 9 cosines."""
+    """Return a solid around a trefoil knot. Its field is a sum of Gaussians along the knot,
+    approximated by a series of 16 x 16 x 9 cosines."""
     curve = example_curves.torus_knot(2, 3, 150)
     step = np.linalg.norm(np.roll(curve, -1, axis=0) - curve, axis=1)
     # The Gaussians' width, and the lengths of the curve's edges as weights of the sum.
     width = 0.15 * float(np.ptp(curve, axis=0).max()) / 2
 
     def density(x: FloatArray) -> FloatArray:
-        """(n,) the sum of Gaussians at points x (n, 3): the integral along the curve, divided by
-        its value for a straight line."""
+        """Return the sum of Gaussians (n,) at points x (n, 3): the integral along the curve,
+        divided by its value for a straight line."""
+        # In batches, as the array of all distances would take much memory.
         sums = [
             np.exp(-((batch[:, None] - curve) ** 2).sum(axis=2) / width**2) @ step
             for batch in np.array_split(x, len(x) // 4000 + 1)
         ]
         return np.concatenate(sums) / (width * math.sqrt(math.pi))
 
+    # Beyond 2.6 widths a Gaussian is below 0.002.
     low, high = curve.min(axis=0) - 2.6 * width, curve.max(axis=0) + 2.6 * width
     box = low.tolist(), high.tolist()
     series = FourierSeries.fit(density, box, (16, 16, 9), samples=(48, 48, 28))
@@ -273,33 +277,33 @@ SOLIDS = (
 
 
 def _surface(function: Any, part: str = "imag", **settings: Any) -> list[Surface]:
-    """The Riemann surface of a function. function: its name, such as "log". part: "real" or "imag",
-    the part of the function that is the height. settings: options of `RiemannSurface`."""
+    """Return the Riemann surface of a function. function: its name, such as "log". part: "real" or
+    "imag", the part of the function that is the height. settings: options of `RiemannSurface`."""
     return [Surface(RiemannSurface(function, part, **settings))]
 
 
 def _elliptic(domain: Volume) -> list[Surface]:
-    """The Riemann surface of sqrt(z^3 - z), cut to `domain`: a torus without its points at
+    """Return the Riemann surface of sqrt(z^3 - z), cut to `domain`: a torus without its points at
     infinity."""
     return _surface("sqrt", argument={0: 1, 1: 1, -1: 1}, height=0.6, domain=domain)
 
 
 def _lemniscates() -> list[Surface]:
-    """Level curves of the potential of three line charges, as vertical walls."""
+    """Return level curves of the potential of three line charges, as vertical walls."""
     triangle = {complex(math.cos(a), math.sin(a)): 1 for a in (0.5 * math.pi, 3.7, 5.8)}
     field = LevelCurves("log", argument=triangle, domain=Box((-2.2, -2.2, -0.2), (2.2, 2.2, 0.2)))
     return [Surface(field, [-1.2, -0.6, 0.0, 0.6, 1.2, 1.8])]
 
 
 def _field_lines() -> list[Surface]:
-    """Field lines of two opposite line charges, as vertical walls: the level curves of the
+    """Return field lines of two opposite line charges, as vertical walls: the level curves of the
     conjugate of the potential."""
     field = LevelCurves("log", "imag", argument={1: 1, -1: -1})
     return [Surface(field, [k * math.pi / 6 for k in range(12)])]
 
 
 def _ripples() -> list[Surface]:
-    """The graph of a function of x and y that looks like ripples on water."""
+    """Return the graph of a function of x and y that looks like ripples on water."""
     field = HeightField(
         lambda x, y: exp(-(x**2 + y**2) * 1.5) * sin(x * 5 + cos(y * 4)) * 0.6,
         domain=Box((-1.5, -1.5, -1.0), (1.5, 1.5, 1.0)),

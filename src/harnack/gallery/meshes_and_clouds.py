@@ -21,7 +21,7 @@ _GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
 
 
 def _cut_mesh() -> list[Surface]:
-    """A bumpy sphere with 14 round holes, closed by the level set of its winding number."""
+    """Return a bumpy sphere with 14 round holes, closed by the level set of its winding number."""
     vertices, faces = example_meshes.bumpy_sphere(6)
     directions = vertices[faces].mean(axis=1)
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
@@ -31,7 +31,7 @@ def _cut_mesh() -> list[Surface]:
 
 
 def _spiral_directions(n: int) -> FloatArray:
-    """n unit vectors (n, 3), spread evenly over the sphere along a spiral."""
+    """Return n unit vectors (n, 3), spread evenly over the sphere along a spiral."""
     k = np.arange(n)
     z, angle = 1.0 - (2.0 * k + 1.0) / n, 2.0 * math.pi * _GOLDEN * k
     radius = np.sqrt(1.0 - z * z)
@@ -39,8 +39,8 @@ def _spiral_directions(n: int) -> FloatArray:
 
 
 def _soup() -> list[Surface]:
-    """The level set of the winding number of loose triangles: a torus whose triangles are shrunk
-    about their centers, with a tenth of them missing."""
+    """Return the level set of the winding number of loose triangles: a torus whose triangles are
+    shrunk about their centers, with a tenth of them missing."""
     vertices, faces = example_meshes.torus_mesh(1.0, 0.42, 20, 9)
     faces = example_meshes.remove_faces(faces, 0.1, seed=1)
     corners = vertices[faces]
@@ -51,32 +51,35 @@ def _soup() -> list[Surface]:
 
 
 def _cloud() -> list[Surface]:
-    """A surface through random points of a quartic with five handles; the normals are the quartic's
-    gradients. Newton's steps move random points onto the quartic."""
+    """Return a surface through random points of a quartic with five handles; the normals are the
+    quartic's gradients. Newton's steps move random points onto the quartic."""
     points = np.random.default_rng(2).uniform(-2.5, 2.5, (12000, 3))
     for _ in range(40):
         value, gradient = _tangle(points)
+        # Damped steps of Newton's method.
         points = points - 0.7 * (value / (gradient**2).sum(axis=1))[:, None] * gradient
     value, gradient = _tangle(points)
+    # Points at which Newton's method did not converge are left out.
     is_on_quartic = (np.abs(value) < 1e-9) & (np.abs(points) < 2.6).all(axis=1)
     return [Surface(DipolePotential(points[is_on_quartic], gradient[is_on_quartic]))]
 
 
 def _tangle(points: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The function f = x^4 - 5 x^2 + y^4 - 5 y^2 + z^4 - 5 z^2 + 11.8 at points (n, 3): its values
-    (n,) and its gradients (n, 3). Its zero set is a surface with five handles."""
+    """Return the function f = x^4 - 5 x^2 + y^4 - 5 y^2 + z^4 - 5 z^2 + 11.8 at points (n, 3): its
+    values (n,) and its gradients (n, 3). Its zero set is a surface with five handles."""
     value = (points**4 - 5.0 * points**2).sum(axis=1) + 11.8
     return value, 4.0 * points**3 - 10.0 * points
 
 
 def _knot_cloud() -> list[Surface]:
-    """A surface through points on a tube around a trefoil knot. The points are arranged like the
-    seeds of a sunflower."""
+    """Return a surface through points on a tube around a trefoil knot. The points are arranged like
+    the seeds of a sunflower."""
     n, count = 1200, 8000
     curve = example_curves.torus_knot(2, 3, n)
     tangents = np.roll(curve, -1, axis=0) - np.roll(curve, 1, axis=0)
     tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
     k = np.arange(count)
+    # The point of the curve around which point k of the cloud lies.
     index = k * n // count
     angle = (2 * math.pi * _GOLDEN * k)[:, None]
     # Two vectors across the knot at each point, and the normal at an angle between them.

@@ -50,7 +50,7 @@ _WORD: tuple[tuple[int, ...], ...] = (
 
 
 def _nameplate() -> list[Surface]:
-    """A plate with round ends and a hole, and a word in raised letters on it."""
+    """Return a plate with round ends and a hole, and a word in raised letters on it."""
     angle = np.linspace(-0.5 * math.pi, 0.5 * math.pi, 90)
     right = np.column_stack([4.2 + 0.75 * np.cos(angle), 0.75 * np.sin(angle)])
     left = np.column_stack([-0.6 - 0.75 * np.cos(angle), -0.75 * np.sin(angle)])
@@ -64,7 +64,7 @@ def _nameplate() -> list[Surface]:
 
 
 def _bolt() -> list[Surface]:
-    """An M8 bolt and a nut beside it, in millimeters."""
+    """Return an M8 bolt and a nut beside it, in millimeters."""
     hexagon = outline.regular_polygon(6, 13.0 / math.sqrt(3.0))
     bolt = metric_thread("M8", 22.0) | Extrusion(hexagon, 5.3).translated((0.0, 0.0, -5.3))
     nut = Extrusion(hexagon, 6.5) - metric_thread("M8", 8.0, internal=True, clearance=0.05)

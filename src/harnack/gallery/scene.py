@@ -24,7 +24,8 @@ class Scene:
     materials: the name of each surface's material, or a single name for all surfaces.
     camera, show, options: options of `render` by these names.
     demo_spp: samples per pixel in `make demo`, few enough for the demo to take a few minutes; 0
-        leaves the scene out of the demo."""
+        leaves the scene out of the demo.
+    """
 
     name: str
     title: str
@@ -42,8 +43,8 @@ class Scene:
         return render(surfaces, path, **{**self.settings(len(surfaces)), **options})
 
     def settings(self, count: int) -> dict[str, Any]:
-        """The options of `render` with which the scene is drawn, by name. count: the number of its
-        surfaces, which are needed to repeat a single material."""
+        """Return the options of `render` with which the scene is drawn, by name. count: the number
+        of its surfaces, which are needed to repeat a single material."""
         names = self.materials * count if len(self.materials) == 1 else self.materials
         return {
             "material": list(names), "camera": self.camera, "show": self.show,

@@ -28,7 +28,7 @@ _PATCH_OPTIONS = TraceOptions(tolerance=1e-5)
 
 
 def _exoskeleton() -> list[Surface]:
-    """A wavy torus of some 150 nonplanar polygons, and tubes around their edges."""
+    """Return a wavy torus of some 150 nonplanar polygons, and tubes around their edges."""
     vertices, faces = example_meshes.torus_mesh(1.0, 0.45, 240, 108)
     angle = np.arctan2(vertices[:, 1], vertices[:, 0])
     # The center line of the torus goes up and down three times, and its tube is thicker and
@@ -42,7 +42,7 @@ def _exoskeleton() -> list[Surface]:
 
 
 def _patches() -> list[Surface]:
-    """A bumpy sphere of 5,200 nonplanar polygons with some eleven corners each."""
+    """Return a bumpy sphere of 5,200 nonplanar polygons with some eleven corners each."""
     vertices, faces = example_meshes.bumpy_sphere(6)
     mesh = PolygonMesh(*cluster_into_polygons(vertices, faces, 5200))
     return [Surface(mesh)]
@@ -90,7 +90,8 @@ class GridShell:
     holes: (x, y, radius) of each hole.
     angle: a in radians, twice the angle at which the shell leaves the ground.
     spacing: the distance of the beams along the outline and the holes, a length.
-    thickness: the radius of the beams, a length."""
+    thickness: the radius of the beams, a length.
+    """
 
     outline: FloatArray
     holes: tuple[tuple[float, float, float], ...]
@@ -99,8 +100,8 @@ class GridShell:
     thickness: float
 
     def field(self) -> SolidAngle:
-        """The solid angle of the outline and the holes, a function of space. The shell is its level
-        set at `level`."""
+        """Return the solid angle of the outline and the holes, a function of space. The shell is
+        its level set at `level`."""
         corners = np.column_stack([self.outline, np.zeros(len(self.outline))])
         return SolidAngle([corners, *(Circle(r, (x, y, 0), (0, 0, -1)) for x, y, r in self.holes)])
 
@@ -110,19 +111,21 @@ class GridShell:
         return -2 * math.pi + self.angle
 
     def beams(self, field: SolidAngle) -> list[FloatArray]:
-        """The center lines of all beams, each (k, 3): "ribs", lines of curvature from the outline
-        and the holes across the shell; lines of the other family, which cross them; and the outline
-        and the holes themselves.
+        """Find the center lines of all beams, each (k, 3). Returns the "ribs", which are lines of
+        curvature from the outline and the holes across the shell; then lines of the other family,
+        which cross the ribs; then the outline and the holes themselves.
 
-        field: the solid angle."""
+        field: the solid angle.
+        """
         above_ground = HalfSpace((0, 0, -1), 0.0)
         points, inward = self._boundary_points_and_normals()
+        # The shell leaves the ground at half of `angle`.
         slope = 0.5 * self.angle
         upward = np.column_stack([math.cos(slope) * inward, np.full(len(points), math.sin(slope))])
         boundary_points = np.column_stack([points, np.zeros(len(points))])
 
         def lines(seeds: FloatArray) -> tuple[list[FloatArray], list[FloatArray]]:
-            """The lines of curvature through the points `seeds` (n, 3). Returns two lists with a
+            """Return the lines of curvature through the points `seeds` (n, 3), as two lists with a
             line for each seed: the lines along the largest curvature, and the lines along the
             smallest."""
             step = 0.25 * self.spacing
@@ -134,18 +137,19 @@ class GridShell:
             return maximum_lines, minimum_lines
 
         offset = 0.3 * self.spacing
-        # Of the two lines of curvature through each seed near the boundary, the one that rises from
-        # it; the other runs along it.
+        # Through each seed near the boundary there are two lines of curvature. The one that rises
+        # from the boundary is chosen; the other runs along it.
         candidates = [
             max(both_families, key=lambda line: _relative_height(line, offset))
             for both_families in zip(*lines(boundary_points + offset * upward), strict=True)
         ]
         ribs = _drop_parallel_lines(candidates, 0.55 * self.spacing)
-        # Seeds of the other family lie along a subset of these lines.
+        # Seeds of the other family lie along about six of the ribs.
         spines = ribs[:: max(1, len(ribs) // 6)]
+        # Every second point, and none near the ends.
         seeds = np.concatenate([spine[2:-2:2] for spine in spines])
-        # Of the two lines through each seed, the one that crosses the ribs more nearly at a right
-        # angle.
+        # Of the two lines through each seed, the one is chosen that crosses a rib more nearly at a
+        # right angle.
         crossing_lines = [
             min(
                 both_families,
@@ -156,8 +160,9 @@ class GridShell:
         return [*ribs, *_drop_parallel_lines(crossing_lines, 0.55 * self.spacing), *self._edges()]
 
     def _boundary_points_and_normals(self) -> tuple[FloatArray, FloatArray]:
-        """Points (n, 2) on the outline and the holes, spaced by about `spacing`, and the unit
-        normals (n, 2) there that point into the region. Both are in the plane of the ground."""
+        """Return points (n, 2) on the outline and the holes, spaced by about `spacing`, and the
+        unit normals (n, 2) there that point into the region. Both are in the plane of the
+        ground."""
         points: list[FloatArray] = []
         inward: list[FloatArray] = []
         for a, b in zip(self.outline, np.roll(self.outline, -1, axis=0), strict=True):
@@ -177,7 +182,7 @@ class GridShell:
         return np.concatenate(points), np.concatenate(inward)
 
     def _edges(self) -> list[FloatArray]:
-        """The outline and the holes as closed lines (k, 3) on the ground."""
+        """Return the outline and the holes as closed lines (k, 3) on the ground."""
         closed = np.concatenate([self.outline, self.outline[:1]])
         edges = [np.column_stack([closed, np.zeros(len(closed))])]
         for x, y, r in self.holes:
@@ -187,27 +192,31 @@ class GridShell:
 
 
 def _relative_height(line: FloatArray, reach: float) -> float:
-    """The difference of the largest and smallest height of a line (k, 3), divided by the length
-    `reach`; -1 for a line without points. It is small for a line that runs along the boundary."""
+    """Return the difference of the largest and smallest height of a line (k, 3), divided by the
+    length `reach`; -1 for a line without points. The result is small for a line that runs along the
+    boundary."""
     return float(line[:, 2].max() - line[:, 2].min()) / reach if len(line) else -1.0
 
 
 def _crossing_cosine(line: FloatArray, other: FloatArray) -> float:
-    """cos| of the angle between two lines (k, 3) at their points that are nearest to each
-    other; 2 if `line` has fewer than three points."""
+    """Return the absolute value of the cosine of the angle between two lines (k, 3), at their
+    points that are nearest to each other: 0 for a right angle; 2 if `line` has fewer than three
+    points."""
     if len(line) < 3:
         return 2.0
     distance = np.linalg.norm(line[:, None] - other[None], axis=2)
     i, j = np.unravel_index(int(distance.argmin()), distance.shape)
+    # The tangents are taken from the points before and after; the ends have only one neighbor.
     i, j = min(max(int(i), 1), len(line) - 2), min(max(int(j), 1), len(other) - 2)
     a, b = line[i + 1] - line[i - 1], other[j + 1] - other[j - 1]
     return float(abs(a @ b) / (np.linalg.norm(a) * np.linalg.norm(b)))
 
 
 def _drop_parallel_lines(lines: Sequence[FloatArray], gap: float) -> list[FloatArray]:
-    """The lines (k, 3), longest first, without each line that lies within the distance `gap` of
-    longer lines for more than 60 % of its points. Of each line every second point is returned, and
-    its last."""
+    """Return the lines (k, 3) that do not run along longer ones, longest first. A line is dropped
+    if more than 60 % of its points are within the distance `gap` of the lines that are kept before
+    it, or if it has fewer than three points. Of each line, every second point is returned, and its
+    last."""
     kept: list[FloatArray] = []
     for line in sorted(lines, key=len, reverse=True):
         if len(line) < 3:
@@ -222,7 +231,7 @@ def _drop_parallel_lines(lines: Sequence[FloatArray], gap: float) -> list[FloatA
 
 
 def _grid_shell_surfaces(shell: GridShell) -> list[Surface]:
-    """A grid shell as two surfaces: the shell above the ground, and its beams as a solid."""
+    """Return a grid shell as two surfaces: the shell above the ground, and its beams as a solid."""
     field = shell.field()
     ground = HalfSpace((0, 0, -1), 0.0)
     beams = Tube.from_polylines(shell.beams(field), shell.thickness)
@@ -233,7 +242,7 @@ def _grid_shell_surfaces(shell: GridShell) -> list[Surface]:
 
 
 def _regular(sides: int) -> FloatArray:
-    """The corners (sides, 2) of a regular polygon in the unit circle."""
+    """Return the corners (sides, 2) of a regular polygon in the unit circle."""
     angle = 2 * math.pi * (np.arange(sides) + 0.5) / sides
     return np.column_stack([np.cos(angle), np.sin(angle)])
 

@@ -4,9 +4,6 @@ normals, and a molecule.
 
 Solids are distance surfaces (level sets of distances), Boolean combinations of them, noise, and
 transparent blobs.
-
-Blobs are metaballs, a surface through points with normals, and molecules. Solids are distance
-surfaces (level sets of distances), Boolean combinations of them, noise, and transparent blobs.
 """
 
 from __future__ import annotations
@@ -39,14 +36,14 @@ _VAN_DER_WAALS = {"H": 1.2, "C": 1.7, "N": 1.55, "O": 1.52}
 
 
 def _solid(field: Field, level: float) -> list[Surface]:
-    """The solid of the points at which the field is at least `level`, as the only surface of a
-    scene."""
+    """Return the solid of the points at which the field is at least `level`, as the only surface of
+    a scene."""
     return [Surface(field, level, side="above")]
 
 
 def _metaballs() -> list[Surface]:
-    """Metaballs: drops around a large ball, and a blob of negative weight that carves a bite out of
-    it."""
+    """Return metaballs: drops around a large ball, and a blob of negative weight that carves a bite
+    out of it."""
     angle = np.linspace(0, 2 * math.pi, 9, endpoint=False)
     ring = np.column_stack([np.cos(angle), np.sin(angle), 0.35 * np.sin(3 * angle)])
     centers = np.concatenate([[[0.0, 0.0, 0.0]], 1.15 * ring, [[0.35, -0.55, 0.5]]])
@@ -56,8 +53,8 @@ def _metaballs() -> list[Surface]:
 
 
 def _groups() -> list[Surface]:
-    """Two groups of blobs, each a ring. Blobs of one ring blend with each other; the two rings meet
-    in creases."""
+    """Return two groups of blobs, each a ring. Blobs of one ring blend with each other; the two
+    rings meet in creases."""
     angle = np.linspace(0, 2 * math.pi, 12, endpoint=False)
     flat = np.column_stack([np.cos(angle) - 0.5, np.sin(angle), 0 * angle])
     upright = np.column_stack([np.cos(angle) + 0.5, 0 * angle, np.sin(angle)])
@@ -66,7 +63,7 @@ def _groups() -> list[Surface]:
 
 
 def _through_points() -> list[Surface]:
-    """A surface through 18 points on a torus, with the torus's normals."""
+    """Return a surface through 18 points on a torus, with the torus's normals."""
     points, normals = [], []
     for j in range(6):
         for k in range(3):
@@ -79,8 +76,8 @@ def _through_points() -> list[Surface]:
 
 
 def _helix() -> Atoms:
-    """The backbone of an alpha helix of 14 residues, with 3.6 residues per turn and a rise of 1.5
-    angstrom per residue. The cylindrical coordinates of its atoms (radius, angle in degrees,
+    """Return the backbone of an alpha helix of 14 residues, with 3.6 residues per turn and a rise
+    of 1.5 angstrom per residue. The cylindrical coordinates of its atoms (radius, angle in degrees,
     height) give bond lengths that are right within 0.05 angstrom."""
     backbone = (
         ("N", 1.55, -28.3, -0.89), ("C", 2.28, 0.0, 0.0), ("C", 1.68, 26.3, 1.13),
@@ -90,6 +87,7 @@ def _helix() -> Atoms:
     positions: list[tuple[float, float, float]] = []
     for residue in range(14):
         for element, radius, degrees, height in backbone:
+            # 100 degrees a residue: 3.6 residues a turn.
             angle = math.radians(degrees + 100.0 * residue)
             elements.append(element)
             positions.append(
@@ -140,19 +138,19 @@ BLOBS = (
 
 
 def _drawn(*solids: Solid) -> list[Surface]:
-    """Each of the solids as a surface of a scene."""
+    """Return each of the solids as a surface of a scene."""
     return [Surface(solid) for solid in solids]
 
 
 def _carved() -> list[Surface]:
-    """A ball with a torus cut out, twisted, and a ring blended to it."""
+    """Return a ball with a torus cut out, twisted, and a ring blended to it."""
     ball = (Sphere(1.0) - Torus(0.85, 0.28)).twisted(86.0, "x")
     return _drawn(ball.blended(Torus(1.15, 0.12), 0.15))
 
 
 def _tori() -> list[Surface]:
-    """Three pairs of linked tori of radii 1 and 0.1, blended by superellipses of different power p
-    and blend radius r: (p, r) = (2, 0.5), (8, 0.5) and (8, 0.2)."""
+    """Return three pairs of linked tori of radii 1 and 0.1, blended by superellipses of different
+    power p and blend radius r: (p, r) = (2, 0.5), (8, 0.5) and (8, 0.2)."""
     link = Torus(1.0, 0.1).rotated(90, "x")
     pairs = [Torus(1.0, 0.1).blended(link, r, power=p) for p, r in ((2, 0.5), (8, 0.5), (8, 0.2))]
     return _drawn(*(pair.translated((0.0, 2.4 * k, 0.0)) for k, pair in enumerate(pairs)))
@@ -176,7 +174,7 @@ _LETTERS: tuple[tuple[float, tuple[tuple[float, ...], ...]], ...] = (
 
 
 def _letters() -> list[Surface]:
-    """A word of tubes around 19 cubic Bezier curves."""
+    """Return a word of tubes around 19 cubic Bezier curves."""
     tubes: list[Solid] = []
     for start, curves in _LETTERS:
         for curve in curves:
@@ -187,25 +185,25 @@ def _letters() -> list[Surface]:
 
 
 def _lava() -> list[Surface]:
-    """A ball displaced by fractal noise."""
+    """Return a ball displaced by fractal noise."""
     noise = FractalNoise(6, beta=1.0, frequency=1.6, amplitude=0.55, seed=4)
     return _drawn(DisplacedSolid(Sphere(1.0), noise))
 
 
 def _lattice() -> list[Surface]:
-    """A gyroid wall, intersected with a torus."""
+    """Return a gyroid wall, intersected with a torus."""
     return _drawn(solid(Gyroid(0.5), between=(-0.4, 0.4)) & Torus(0.8, 0.4))
 
 
 def _knot() -> list[Surface]:
-    """A thick Seifert surface of the trefoil knot, and a tube around the knot itself."""
+    """Return a thick Seifert surface of the trefoil knot, and a tube around the knot itself."""
     curve: FloatArray = example_curves.torus_knot(2, 3, 120)
     surface = solid(SolidAngle(curve), around=(2 * math.pi, 0.12))
     return _drawn(surface, Tube(np.concatenate([curve, curve[:1]]), 0.09))
 
 
 def _jelly() -> list[Surface]:
-    """A cluster of random blobs, to be drawn transparent."""
+    """Return a cluster of random blobs, to be drawn transparent."""
     rng = np.random.default_rng(8)
     blobs: Any = Blobs(rng.normal(size=(14, 3)) * 0.55, 0.55, kernel=CompactKernel(1.7))
     return [Surface(blobs, 1.0, side="above")]

@@ -208,8 +208,9 @@ class Polytope(Volume):
         slacks = self._slacks(table, o, d)
 
         def step(state: tuple[Real, Real], n: Vec3, h: Real) -> tuple[Real, Real]:
-            """Cut the interval [t0, t1] to the half-space n.x <= h. In the terms of the class,
-            `room` is N and `speed` is D, both with their bounds of rounding errors."""
+            """Cut the interval [t0, t1] to the half-space n.x <= h, which is the condition room - t
+            speed >= 0 with room = h - n.o and speed = n.d. Bounds of their rounding errors are
+            added to room and subtracted from speed, so that no point is lost."""
             t0, t1 = state
             room_slack, speed_slack = slacks(n, h)
             room = h - dr.dot(n, o) + room_slack
@@ -260,7 +261,8 @@ class Polytope(Volume):
         backend = backend_of(p)
 
         def step(state: tuple[Real, Vec3], n: Vec3, h: Real) -> tuple[Real, Vec3]:
-            """Keep the larger of two signed distances, and its normal."""
+            """Keep the larger one of the signed distance so far and the signed distance from the
+            plane n.x = h, with the normal of its plane."""
             distance = dr.dot(n, p) - h
             is_larger = distance > state[0]
             return dr.select(is_larger, distance, state[0]), dr.select(is_larger, n, state[1])

@@ -424,6 +424,7 @@ def _fit_tangent_planes(x: FloatArray, tree: Any, neighbors: int) -> _TangentPla
     def fit_slice(rows: slice) -> None:
         """Fit the planes of a slice of the points. Offsets are relative to the point, in units of
         the distance of the farthest neighbor."""
+        # The farthest neighbor is at a distance above 0, as all points of the tree are different.
         index, distance = nearest_neighbors(tree, x[rows], neighbors)
         nearest[rows] = index
         offsets = (x[index] - x[rows, None]) / distance[:, -1, None, None]

@@ -39,8 +39,9 @@ MIN_ANGLE = 1e-6  # so do edges that fold back at a smaller angle (radians)
 
 
 def is_convex_position(loops: tuple[FloatArray, ...]) -> bool:
-    """Whether it is proved that a curve is in convex position, so that the theorems of the module
-    apply to it.
+    """Whether it is proved that a curve is in convex position. Then the 2 pi level of its solid
+    angle lies in the hull of the curve, and a segment crosses that level at most once (theorems
+    that the module cites).
 
     loops: the validated loops (n, 3) of the curve.
 
@@ -328,7 +329,8 @@ def _hull_normals(x: FloatArray) -> tuple[FloatArray, bool]:
     outward normals (m, 3) of half-spaces whose intersection, with suitable offsets, is the hull;
     and whether the points are flat or on a line. For flat points the normals are those of the sides
     of the slab, and of the edges of the outline; for points on a line, those of a rod (a box)."""
-    # The axes along which the points vary most, less and least.
+    # The axes along which the points vary most, less and least. For fewer than three points the
+    # missing axes are added (`full_matrices`).
     axes: FloatArray = np.linalg.svd(x - x.mean(axis=0), full_matrices=len(x) < 3)[2]
     coordinates: FloatArray = np.einsum("ij,kj->ik", x, axes)
     thickness: FloatArray = np.ptp(coordinates, axis=0)

@@ -330,15 +330,16 @@ def _move_along_normals(
         """Move the points of a slice."""
         n, index = own_normals[rows], neighbors[rows]
         neighbor_normals, offsets = normals[index], points[index] - start[rows, None]
+        # n . (p_j - x), the height of each neighbor above the point.
         height = np.einsum("mi,mki->mk", n, offsets)
         cosine = np.einsum("mi,mki->mk", n, neighbor_normals)
         weight = _weights(_squared_tangential(offsets, height), cosine, normal_scale)
-        # The mean of n_j . (p_j - x) and n . (p_j - x); both are linear where x moves along n.
-        heights = 0.5 * (np.einsum("mki,mki->mk", neighbor_normals, offsets) + height)
+        # t_j, the mean of n_j . (p_j - x) and n . (p_j - x); both are linear where x moves along n.
+        predicted = 0.5 * (np.einsum("mki,mki->mk", neighbor_normals, offsets) + height)
         # The rate at which the mean of t_j falls as x moves along n.
         slope = 0.5 * (weight * (cosine + 1)).sum(axis=1)
         # A point with a smaller slope stays.
-        mean = np.where(slope > _MIN_SLOPE, (weight * heights).sum(axis=1), 0.0)
+        mean = np.where(slope > _MIN_SLOPE, (weight * predicted).sum(axis=1), 0.0)
         moved[rows] = start[rows] + (mean / np.maximum(slope, _MIN_SLOPE))[:, None] * n
 
     parallel_over_slices(move_slice, len(start))
@@ -366,7 +367,7 @@ def _agreeing_weight(
     """
     fraction = np.empty(len(start))
 
-    def add_slice(rows: slice) -> None:
+    def compute_slice(rows: slice) -> None:
         """Compute the fractions for a slice of the points."""
         n, index = own_normals[rows], neighbors[rows]
         offsets = points[index] - start[rows, None]
@@ -380,7 +381,7 @@ def _agreeing_weight(
             axis=1
         )
 
-    parallel_over_slices(add_slice, len(start))
+    parallel_over_slices(compute_slice, len(start))
     return fraction
 
 

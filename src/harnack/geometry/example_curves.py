@@ -105,7 +105,7 @@ def coil(
         raise ValueError(f"a coil needs at least one turn, not {turns}")
     return_x = {"outside": 1.5 * radius, "axis": 0.0}
     if return_path not in return_x:
-        raise ValueError(f'the route of a coil is "outside" or "axis", not {return_path!r}')
+        raise ValueError(f'return_path of a coil is "outside" or "axis", not {return_path!r}')
     if n < 3 * turns + 3:
         raise ValueError(f"a coil of {turns} turns needs at least {3 * turns + 3} vertices")
     s = np.linspace(0.0, 1.0, n - 2)

@@ -231,8 +231,9 @@ def _resolve_crossings(loops: list[FloatArray], rule: FillingRule) -> Outline:
     fill = FillRule.EvenOdd if rule == "even-odd" else FillRule.NonZero
     points = np.concatenate(loops)
     lower, upper = points.min(axis=0), points.max(axis=0)
+    # A power of two, about a thousandth of the outline's size. The center is rounded to a multiple
+    # of it, so that loops that were rounded before still have the same center.
     grid = 2.0 ** (math.frexp(float((upper - lower).max()))[1] - 10)
-    # A multiple of the grid width, so that the rounded loops have the same center.
     center: FloatArray = np.rint(0.5 * (lower + upper) / grid) * grid
     scaled, scale = scale_for_clipper([loop - center for loop in loops])
     polygons = cast("list[FloatArray]", CrossSection(scaled, fill).to_polygons())

@@ -371,7 +371,10 @@ def cluster_into_polygons(
         ValueError: fewer than two clusters, or more than triangles.
     """
     if not 2 <= count <= len(faces):
-        raise ValueError(f"a mesh of {len(faces):,} faces has 2 to as many patches, not {count}")
+        raise ValueError(
+            f"the number of clusters must be from 2 to {len(faces):,}, the number of faces of the "
+            f"mesh, not {count}"
+        )
     cluster_of = _clusters(vertices, faces, count, iterations, seed)
     order = np.argsort(cluster_of, kind="stable")
     parts = np.split(faces[order], np.flatnonzero(np.diff(cluster_of[order])) + 1)

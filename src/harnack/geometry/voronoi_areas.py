@@ -135,9 +135,9 @@ class TangentVoronoi:
             return _line_in_disc(backend, q, 0.5 * dr.squared_norm(offset))
 
         def add_lines(j: Any, *state: Any) -> tuple[Any, ...]:
-            """Add the triangles at the lines j, j + 1, ... to the area and their angles to the sum
-            of angles; and note whether one of them has no neighbor to its left. The state is (area,
-            angle, is_one_sided)."""
+            """Add the triangles at the lines j, j + 1, ... to the area, and the angles of these
+            triangles to the sum of angles. Note whether there is a line whose neighbor has no other
+            neighbor to the left. The state is (area, angle, is_one_sided)."""
             numbers = [j + t for t in range(_LINES_PER_ITERATION)]
             own_lines = [bisector(number, number < line_count) for number in numbers]
             area, angle, is_one_sided = state
@@ -201,8 +201,10 @@ def _clip_bisectors(
 ) -> list[tuple[Real, Real, Mask]]:
     """Find the edges of a cell on the lines `own_lines`. Returns for each of them: the interval
     (lower, upper) of positions along it that lie in the cell, that is in the unit disc and not
-    beyond another line (empty if lower >= upper); and whether some other neighbor lies to the left
-    of the line's neighbor.
+    beyond another line (empty if lower >= upper); and whether some neighbor lies to the left of the
+    line's own neighbor: the direction to it, projected to the tangent plane, is less than 180
+    degrees counter-clockwise of the direction to the line's own neighbor. If no neighbor does, all
+    lie on one side.
 
     indices: the index of each of `own_lines` among all lines.
     bisector: bisector(i, mask) returns line i, in lanes of the mask.
@@ -215,8 +217,9 @@ def _clip_bisectors(
         initial += [-half_chord, half_chord, half_chord > dr.inf]
 
     def clip_by_line(i: Any, *state: Any) -> tuple[Any, ...]:
-        """Clip the intervals of all own lines by line i; and note whether its neighbor is to the
-        left. The state has three entries for each own line: lower, upper, has_left."""
+        """Clip the intervals of all own lines by line i. Note for each own line whether the
+        neighbor of line i is to the left of the own line's neighbor. The state has three entries
+        for each own line: lower, upper, has_left."""
         other, clipped = bisector(i, i < line_count), list[Any]()
         for t, (index, own_line) in enumerate(zip(indices, own_lines, strict=True)):
             lower, upper, has_left = state[3 * t : 3 * t + 3]

@@ -73,8 +73,8 @@ class Welded:
         count = int((joined != np.arange(len(vertices))).sum())
         if not count:
             return welded
-        closer = cls._from_index(joined[welded.index], vertices, faces, count)
-        return closer if closer.weights.sum() < welded.weights.sum() else welded
+        rounded = cls._from_index(joined[welded.index], vertices, faces, count)
+        return rounded if rounded.weights.sum() < welded.weights.sum() else welded
 
     @classmethod
     def _from_index(

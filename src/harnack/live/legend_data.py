@@ -65,8 +65,14 @@ def legends() -> dict[str, Any]:
         "normal": {
             "title": "normal: x, y, z as red, green, blue",
             "swatches": [
-                *([f"+{axis}", css_color(0.5 + 0.5 * np.eye(3)[k])] for k, axis in enumerate("xyz")),
-                *([f"-{axis}", css_color(0.5 - 0.5 * np.eye(3)[k])] for k, axis in enumerate("xyz")),
+                *(
+                    [f"+{axis}", css_color(0.5 + 0.5 * np.eye(3)[k])]
+                    for k, axis in enumerate("xyz")
+                ),
+                *(
+                    [f"-{axis}", css_color(0.5 - 0.5 * np.eye(3)[k])]
+                    for k, axis in enumerate("xyz")
+                ),
                 out_of_steps_swatch,
             ],
         },

@@ -92,6 +92,7 @@ def _orbit(camera: Camera, placement: Placement, points: FloatArray) -> dict[str
     forward = pose.target - pose.origin
     forward = forward / np.linalg.norm(forward)
     middle = 0.5 * (on_stage.min(axis=0) + on_stage.max(axis=0))
+    # The middle may lie beside or behind the camera.
     distance = max(float((middle - pose.origin) @ forward), 1e-3)
     elevation = np.degrees(np.arcsin(np.clip(-forward[2], -1, 1)))
     # A vertical line of sight has no azimuth of its own.

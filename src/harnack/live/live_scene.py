@@ -302,6 +302,8 @@ class LiveScene:
         objects = self.surfaces_at(controls)
         with slider_values_in_errors(controls.values):
             placed = [self.place(body) for body in objects]
+        # A state may have more surfaces than the start, whose test rays are used: further surfaces
+        # take those of the last one.
         surfaces = [
             _kernel_data(body, placed_surface, *self.rays[min(k, len(self.rays) - 1)])
             for k, (body, placed_surface) in enumerate(zip(objects, placed, strict=True))
@@ -587,6 +589,7 @@ def _kernel_data(
     # The test rays and Dr.Jit's results for them, as words in the order of the shader.
     inputs = dict(labeled_leaves("lane", lanes))
     results = {name: kernel.results.get(f"result {name}") for name in _RESULTS}
+    # All results but the last, the color, must differ between rays.
     if any(results[name] is None for name in _RESULTS[:-1]):
         raise ValueError("what rays meet is the same for all of them: there is nothing to draw")
     # Results that are the same constant for all rays are 0 here; of these only the color may be
@@ -668,6 +671,7 @@ def surface_colors(body: StudioObject) -> list[JsonDict]:
     is_solid = surface.solid_range is not None
     front, back, glossy = _reflectances(body.material.bsdf(solid=is_solid, traced_light=False))
     is_open = mi.Bool(not is_solid and not isinstance(surface.field, Solid))
+    # If an open surface has one color, its side of larger values is drawn darker.
     sides = two_sided_color(front, back, is_open), back
     fillings = [hole_filling_tint(side, mi.Bool(True)) for side in sides]
     paints = [_paint(sides[0], sides[1], glossy), _paint(fillings[0], fillings[1], glossy)]

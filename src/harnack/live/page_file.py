@@ -40,12 +40,15 @@ if TYPE_CHECKING:
 __all__ = ["MODULES", "check_title", "document", "page", "resource", "script", "still_png"]
 
 _STILL_SIZE = (640, 480)
-# Places of a slider without a step, at most; choices of places of several; and of all.
+# The largest number of values of a slider without a step; the number of combinations of values of
+# all sliders that is aimed at if none has a step; and the largest number of combinations.
 _MAX_SLIDER_VALUES, _CHOICES, _MOST_CHOICES = 33, 300, 1000
-# Choices up to which all are framed; of more, every other place of each slider, and its ends.
+# Up to this number of combinations, the camera frames all of them; of more, every other value of
+# each slider, and its ends.
 _FRAMED = 100
-# Bytes that all frames together have at most, where sliders have no step, and the fewest places of
-# one slider and of each of several; bytes of a page that are many.
+# If the states take more than the first number of bytes, sliders without steps get fewer values,
+# but at least 9 if there is one slider, and 5 each of several; and the bytes of a page above which
+# a warning is given.
 _TARGET_BYTES, _FEWEST, _MANY_BYTES = 4e6, (9, 5), 8e6
 MODULES = (
     "camera.js", "channels.js", "curve_editor.js", "device_check.js", "dom.js", "floor_light.js",
@@ -152,6 +155,7 @@ def _places(live: LiveScene) -> dict[str, list[float]]:
         ValueError: there are more than `_MOST_CHOICES` combinations of slider values.
     """
     sliders = live.content.sliders
+    # n sliders with `count` values each have count^n combinations.
     count = max(2, min(_MAX_SLIDER_VALUES, int(_CHOICES ** (1 / max(1, len(sliders))))))
     values_by_name = {name: slider.values(count) for name, slider in sliders.items()}
     total = math.prod(map(len, values_by_name.values()))
@@ -169,11 +173,13 @@ def _places(live: LiveScene) -> dict[str, list[float]]:
     largest_bytes = max(
         len(json.dumps(_slider_state(live, slider_values))) for slider_values in ends
     )
+    # The index is False (0) for one slider and True (1) for several.
     fewest = min(count, _FEWEST[len(sliders) > 1])
     while (
         count > fewest
         and largest_bytes * math.prod(map(len, values_by_name.values())) > _TARGET_BYTES
     ):
+        # Half as many intervals.
         count = max(fewest, (count + 1) // 2)
         values_by_name = {name: slider.values(count) for name, slider in sliders.items()}
     return values_by_name

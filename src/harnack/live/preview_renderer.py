@@ -132,6 +132,7 @@ class PreviewRenderer:
         # would then be evaluated separately.
         if has_floor and (is_idle or self.floor is None):
             self.floor = FloorShadow.of(_Casting(mi, painted), light)
+        # The width of a pixel at the hit, by its distance in the direction of view.
         width = hits["t"] * eye.pixel * dr.dot(hits["d"], _vector(mi, eye.forward))
         sky = ambient_visibility(mi, hits["position"], hits["normal"], width, size)
         reflectance = reflectance_of(ground)
@@ -152,9 +153,7 @@ class PreviewRenderer:
         # The wall has the color of the floor far away, and is darker higher up.
         wall = light.shade(floor_color, z, z, mi.Bool(False), mi.Float(1))
         wall = wall * wall_brightness(dr.clip(hits["d"].z, 0, 1))
-        linear = dr.select(
-            hits["met"], compress_highlights(light_at_hits, dr.select, dr.exp), wall
-        )
+        linear = dr.select(hits["met"], compress_highlights(light_at_hits, dr.select, dr.exp), wall)
         linear = dr.clip(dr.select(hits["lost"], mi.Color3f(OUT_OF_STEPS_COLOR), linear), 0, 1)
         srgb = linear_to_srgb(linear, dr.select)
         red, green, blue = (mi.UInt32(255 * part + 0.5) for part in srgb)
@@ -178,7 +177,7 @@ class PreviewRenderer:
           floor.
         - "evaluations": the number of evaluations of all surfaces' fields.
         """
-        columns, rows = (dr.opaque(mi.UInt32, surface_normal) for surface_normal in size)
+        columns, rows = (dr.opaque(mi.UInt32, side) for side in size)
         index = dr.arange(mi.UInt32, size[0] * size[1])
         pixel = dr.opaque(mi.Float, eye.pixel)
         x = (mi.Float(index % columns) + 0.5 - 0.5 * mi.Float(columns)) * pixel
@@ -189,9 +188,11 @@ class PreviewRenderer:
         origin = _vector(mi, eye.origin)
         vector = mitsuba_backend(mi).Array3f
         o = vector(origin) + dr.zeros(vector, dr.width(d))
+        # The nearest hit so far: the floor, if the ray goes down to it.
         t, normal, color = mi.Float(dr.inf), mi.Vector3f(0, 0, 1), mi.Color3f(0)
         glossy, lost, ground = mi.Bool(False), mi.Bool(False), mi.Bool(False)
         if has_floor:
+            # Rays that do not go down are left out by `ground`; for them, the divisor is not 0.
             t_floor = (FLOOR_HEIGHT - origin.z) / dr.minimum(d.z, -1e-9)
             ground = (d.z < 0) & (dr.norm(origin + t_floor * d) < FLOOR_RADIUS)
             t = dr.select(ground, t_floor, t)
@@ -212,6 +213,7 @@ class PreviewRenderer:
             color = dr.select(nearer, paint_color, color)
             glossy = dr.select(nearer, paint_is_glossy, glossy)
             ground &= ~nearer
+        # From here on, `met` is the mask of rays that hit something.
         met = dr.isfinite(t) & ~lost
         return {
             "t": t, "d": d, "normal": dr.mulsign(normal, -dr.dot(normal, d)),

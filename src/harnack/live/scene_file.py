@@ -361,6 +361,7 @@ def _field_to_json(field: Field, sources: FieldSources) -> Plain:
         }
         params = inspect.signature(expression).parameters
         data |= {k: _to_json_value(v) for k, v in keywords.items() if v != params[k].default}
+        # A formula without parameters has no such entry.
         return {name: value for name, value in data.items() if value != {}}
     if type(field) is SolidAngle and not field.circles:
         values = {"lift_bound": field.lift_bound_option, "cells": field.cells}

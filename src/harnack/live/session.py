@@ -256,8 +256,8 @@ class Session:
     def _delta_response(
         self, question: Mapping[str, Any], controls: ControlState, report: Progress
     ) -> JsonDict:
-        """Answer "change": return the state for the controls as its difference from the initial
-        state, in JSON data."""
+        """Answer "change": compute the data of all surfaces for the controls. Returns how it
+        differs from the data at the start, as JSON data."""
         state = self.live.state(controls)
         checks = question.get("checks") is True
         return encode_arrays(state_delta(self.live.initial_state, state, checks=checks))
@@ -284,6 +284,7 @@ class Session:
         nearest = min(range(len(results)), key=lambda k: float(results[k].t[0]))
         hits, surface = results[nearest], surfaces[nearest]
         # A ray with a limit of `count` evaluations ends where its step of that number ends.
+        # Only steps that lead farther are listed.
         steps = [0.0]
         for count in range(1, min(int(hits.evaluations[0]), _MOST_STEPS)):
             options = surface.options.replace(max_steps=count)
@@ -303,8 +304,8 @@ class Session:
             "position": point[0].tolist(),
             "normal": hits.normal[0].tolist(),
         }
-        # A hit on a triangle, across which f jumps: there are no derivatives.
-        if hits.primitive_index[0] >= 0:  # f jumps there, and has no derivatives
+        # At a hit on a triangle the field jumps, and has no derivatives.
+        if hits.primitive_index[0] >= 0:
             return answer | {"triangle": int(hits.primitive_index[0])}
         value, period = float(surface.field.value(point)[0]), surface.field.period
         if period is not None and len(surface.level_values):
@@ -359,6 +360,7 @@ class Session:
         rays were traced that building cells takes less time than it saves. Cells hold local
         expansions of the field, which make each ray faster.
         """
+        # Arrays are compared by their bytes.
         loops = None if controls.curves is None else [loop.tobytes() for loop in controls.curves]
         key = controls.values, loops, controls.cut_volume, controls.settings
         state = self._painted

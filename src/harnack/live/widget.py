@@ -1,5 +1,6 @@
 """The live view as a notebook widget, by the package anywidget. The widget sends a page into the
-notebook, and answers the page's questions, messages about changes of the scene."""
+notebook. When a person changes something there, the page sends a question, and the widget answers
+it."""
 
 from __future__ import annotations
 

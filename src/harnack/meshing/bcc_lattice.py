@@ -115,7 +115,7 @@ class BccLattice:
         if (min_cells := float(np.prod(np.sort(self.counts)[:2].astype(float)))) > max_cells:
             raise triangle_limit_error(min_cells, max_cells)
         # Blocks have up to 8 cells along each axis, but each axis has at least two blocks. Blocks
-        # are larger if there are too many of them.
+        # are larger, up to 2^12 cells, if there are too many of them.
         halvings = 0
         while halvings < 3 and (self.counts >= 2 ** (halvings + 2)).all():
             halvings += 1
@@ -268,10 +268,10 @@ class BccLattice:
         else:
             center_below, center_above, *ring = (np.searchsorted(used, column) for column in keys)
         # A tetrahedron for each edge of the face: from corner k - 1 to corner k of the ring.
-        corners = [
+        corners_of_tetrahedra = [
             np.stack([center_below, center_above, ring[k - 1], ring[k]], axis=1) for k in range(4)
         ]
-        return _lattice_coordinates(used, shape), np.concatenate(corners)
+        return _lattice_coordinates(used, shape), np.concatenate(corners_of_tetrahedra)
 
 
 def distinct_rows(rows: IntArray) -> IntArray:

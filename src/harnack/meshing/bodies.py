@@ -1,10 +1,10 @@
 """Closed components of meshes: the faces that form them, which components lie in which, and the
 boundary of the solid that they describe together. A component is a connected group of faces, and it
 is closed if its faces run every edge as often in one direction as in the other. It winds around a
-point k times: k is its winding number there, 1 inside of a component whose faces look outwards (it
-winds counter-clockwise), -1 inside of a component that is inside out (it winds clockwise), and 0
-outside. Lengths named relative to the size are fractions of the longest side of the bounding
-box."""
+point k times: k is its winding number there. If the component does not cross itself, k is 0
+outside; inside it is 1 if the faces look outwards ("counter-clockwise", as for curves in the
+plane), and -1 if the component is inside out ("clockwise"). The size is the longest side of the
+bounding box; a relative length is a fraction of the size."""
 
 from __future__ import annotations
 

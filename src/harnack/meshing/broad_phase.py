@@ -133,10 +133,10 @@ class _FaceBoxTree:
         """
         backend = self.tree.backend
         real, vector, integer = backend.Float, backend.Array3f, backend.UInt32
-        columns = [real(np.ascontiguousarray(own_faces)) for own_faces in self.records[rows].T]
+        columns = [real(np.ascontiguousarray(column)) for column in self.records[rows].T]
         low, high, own_index = vector(*columns[:3]), vector(*columns[3:6]), columns[_FACE_INDEX]
         pair_count, max_count = dr.zeros(integer, 1), dr.opaque(integer, room)
-        # The pairs found so far: face column[i] with face partners[i], for i < pair_count.
+        # The pairs found so far: face own_faces[i] with face partners[i], for i < pair_count.
         own_faces, partners = dr.zeros(integer, room), dr.zeros(integer, room)
 
         def overlap(row: Any) -> Mask:
@@ -201,15 +201,17 @@ class _PairTests:
             pairs.
         """
         backend = self.points.backend
+        # For both faces of each pair, the indices of the three corners, and their positions.
         vertex_ids = [
-            [dr.gather(backend.UInt32, k, i) for k in self.corners] for i in (first, second)
+            [dr.gather(backend.UInt32, column, face) for column in self.corners]
+            for face in (first, second)
         ]
         triangles = [
-            tuple(backend.Array3f(*self.points.read_record(name)[:3]) for name in ids)
+            tuple(backend.Array3f(*self.points.read_record(vertex)[:3]) for vertex in ids)
             for ids in vertex_ids
         ]
         # shared[i][k]: whether corner i of the first face is corner k of the second.
-        shared = [[name == another for another in vertex_ids[1]] for name in vertex_ids[0]]
+        shared = [[vertex == another for another in vertex_ids[1]] for vertex in vertex_ids[0]]
         a, b = cast("tuple[Corners, Corners]", triangles)
         rows = dr.compress(~_are_apart(a, b, shared))
         pairs = [to_numpy(dr.gather(backend.UInt32, i, rows)) for i in (first, second)]
@@ -241,7 +243,9 @@ def _are_apart(a: Corners, b: Corners, shared: list[list[Mask]]) -> Mask:
     is_shared_a = [shared[i][0] | shared[i][1] | shared[i][2] for i in range(3)]
     is_shared_b = [shared[0][k] | shared[1][k] | shared[2][k] for k in range(3)]
     real = cast("Any", type(a[0].x))
-    shared_count: Real = sum((dr.select(first, real(1), real(0)) for first in is_shared_a), real(0))
+    shared_count: Real = sum(
+        (dr.select(is_shared, real(1), real(0)) for is_shared in is_shared_a), real(0)
+    )
     sides_of_b, sides_of_a = _sides(a, b), _sides(b, a)
     by_plane = _on_one_side(sides_of_b, is_shared_b) | _on_one_side(sides_of_a, is_shared_a)
     # Three shared corners: the same triangle twice. (Counts are floats.)

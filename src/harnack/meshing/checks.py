@@ -280,7 +280,8 @@ def touching_pairs(vertices: FloatArray, faces: IntArray) -> tuple[IntArray, Flo
                 rows = np.flatnonzero((shared_count == 0) & (sides[:, i] == 0) & (sides[:, j] == 0))
                 p, q = (vertices[faces[other[rows], k]] for k in (i, j))
                 add(pairs[rows], _segments_meet(vertices[faces[base[rows]]], p, q), p, q)
-            # for each corner of `other`, whether it is shared
+            # For each corner of `other`, whether it is shared: `other` is the second face if order
+            # is 0, and the first face if order is 1.
             is_common = is_same.any(axis=1 + order)
             for i in range(3):
                 rows = np.flatnonzero((shared_count == 1) & ~is_common[:, i] & (sides[:, i] == 0))
@@ -346,7 +347,7 @@ def _near_pairs(corner: FloatArray, among: BoolArray | None) -> IntArray:
     radius = 0.5 * row_norms(upper - lower)
     log2_radius = np.floor(np.log2(np.maximum(radius, 1e-300)))
     groups = [
-        np.flatnonzero(near & (log2_radius == first)) for first in np.unique(log2_radius[near])
+        np.flatnonzero(near & (log2_radius == value)) for value in np.unique(log2_radius[near])
     ]
     trees = [searching.cKDTree(center[rows]) for rows in groups]
     batches: list[IntArray] = []
@@ -366,7 +367,7 @@ def _near_pairs(corner: FloatArray, among: BoolArray | None) -> IntArray:
             table = trees[i].query_pairs(max_distance, output_type="ndarray")
             add_if_overlapping(*groups[i][table.T])
             continue
-        step = max(1, _PAIRS_AT_ONCE // 64)
+        step = max(1, _PAIRS_AT_ONCE // 64)  # for about 64 pairs of each triangle
         for start in range(0, len(queries), step):
             rows = queries[start : start + step]
             query_tree = searching.cKDTree(center[rows])
@@ -483,15 +484,15 @@ def _segments_meet(triangle: FloatArray, p: FloatArray, q: FloatArray) -> BoolAr
     # The two coordinates that a projection along the nearest axis keeps.
     axes = np.array([[1, 2], [2, 0], [0, 1]])[normal.argmax(axis=1)]
     a = np.take_along_axis(triangle, axes[:, None].repeat(3, axis=1), axis=2)
-    p, q = (np.take_along_axis(corner, axes, axis=1) for corner in (p, q))
-    sign = orient2d(a[:, 0], a[:, 1], a[:, 2])
+    p, q = (np.take_along_axis(end, axes, axis=1) for end in (p, q))
     # 1 if the projected triangle runs counter-clockwise; then its inside is left of its edges.
+    sign = orient2d(a[:, 0], a[:, 1], a[:, 2])
     is_on = sign != 0
     for i, j in _EDGES:
-        side = [sign * orient2d(a[:, i], a[:, j], corner) for corner in (p, q)]
-        is_on &= (np.stack(side) >= 0).any(axis=0)
-    side = np.stack([orient2d(p, q, a[:, k]) for k in range(3)])
-    return is_on & ~((side > 0).all(axis=0) | (side < 0).all(axis=0))
+        sides_of_ends = [sign * orient2d(a[:, i], a[:, j], end) for end in (p, q)]
+        is_on &= (np.stack(sides_of_ends) >= 0).any(axis=0)
+    sides_of_corners = np.stack([orient2d(p, q, a[:, k]) for k in range(3)])
+    return is_on & ~((sides_of_corners > 0).all(axis=0) | (sides_of_corners < 0).all(axis=0))
 
 
 def _is_in_angle(triangle: FloatArray, p: FloatArray) -> BoolArray:
@@ -768,7 +769,7 @@ def points_off_level(
     directions /= np.maximum(row_norms(directions), 1e-300)[:, None]
     # Not `>`: a distance that is not a number fails too.
     rows = np.flatnonzero(~(function.sample(points).distance <= tolerance))
-    # Nearer points are tried as well: behind a cap there may be little of a solid.
+    # Nearer points are tried as well: where the solid is thin, the farther ones may lie beyond it.
     for fraction, line in itertools.product((1.0, 0.25, 0.0625), (None, *_askew_lines())):
         if not len(rows):
             break

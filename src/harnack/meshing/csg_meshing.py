@@ -339,6 +339,7 @@ class CsgMesher:
             if not (lower < upper).all():
                 return TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64)), is_whole
         size = float((upper - lower).max())
+        # At least eight cells along the longest side.
         spacing = min(self.spacing, size / 8)
         if self.per_wave is not None and field.min_wavelength is not None:
             spacing = min(spacing, field.min_wavelength / self.per_wave)
@@ -882,7 +883,7 @@ def _bounds(solid: Solid, level: float, volume: Volume | None) -> tuple[FloatArr
     if not (np.isfinite(lower).all() and np.isfinite(upper).all()):
         raise MeshingError(
             f"{type(solid).__name__} does not say where it ends (a solid does not end at the "
-            "domain of the field it is made of): give a clip, such as a box"
+            "domain of the field it is made of): give a clip, such as a box (harnack.Box)"
         )
     if not (lower < upper).all():
         raise MeshingError("the solid is empty: it lies outside of the clip")

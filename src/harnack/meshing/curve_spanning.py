@@ -125,7 +125,7 @@ def _push_inward(
     vertices, faces: (n, 3), (m, 3) the mesh.
     inner: (k,) indices of the extra points.
     edge: (k,) for each extra point, the index of its edge.
-    ends: (m, 2) the two vertices at the ends of each edge.
+    ends: (e, 2) the two vertices at the ends of each edge.
     height: the largest distance from the edge, a length.
     """
     points = vertices[inner]

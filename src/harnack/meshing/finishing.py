@@ -253,8 +253,8 @@ def simplify_mesh(
     """
     facts = {"triangles_before_simplification": len(surface.faces)}
     solid = to_manifold(surface)
-    for part in _SIMPLIFIED_WITHIN:
-        simpler = from_manifold(without_short_edges(solid, part * tolerance))
+    for fraction in _SIMPLIFIED_WITHIN:
+        simpler = from_manifold(without_short_edges(solid, fraction * tolerance))
         if not 0 < len(simpler.faces) < len(surface.faces):
             continue
         try:

@@ -370,7 +370,7 @@ def _min_area_triangulation(
     is found from the shorter parts, by trying every third corner m of the triangle at the diagonal
     from i to k.
 
-    x: (m, 3) all vertices.
+    x: (v, 3) all vertices.
     polygon: (n,) indices of vertices.
     third: unused; the parameters are those of `_min_dihedral_triangulation`.
     used_edges: existing edges, the lower index first; they are no diagonals.
@@ -431,7 +431,7 @@ def _min_dihedral_triangulation(
     its area; beside[i, k] is the normal of its triangle at the diagonal or, for an edge of the
     polygon, the normal of the face outside.
 
-    x: (m, 3) all vertices.
+    x: (v, 3) all vertices.
     polygon: (n,) indices of vertices.
     third: from directed edges around the polygon to the third corners of their faces
         (`_opposite_corners`).
@@ -442,12 +442,12 @@ def _min_dihedral_triangulation(
         return polygon[None]
     barred = _forbidden_diagonals(polygon, used_edges)
     beside = np.zeros((n, n, 3))  # 0: no neighbor, or not yet
-    for k in range(n):
+    for position in range(n):
         # The face outside runs the polygon's edge from b to a.
-        a, b = int(polygon[k]), int(polygon[(k + 1) % n])
+        a, b = int(polygon[position]), int(polygon[(position + 1) % n])
         if (b, a) in third:
             face = np.array([[b, a, third[b, a]]])
-            beside[k, (k + 1) % n] = _normalized(area_normals(x[face]))[0]
+            beside[position, (position + 1) % n] = _normalized(area_normals(x[face]))[0]
     turn, area = np.full((n, n), -1.0), np.zeros((n, n))
     apex = np.zeros((n, n), np.int64)
     for d in range(2, n):
@@ -460,11 +460,14 @@ def _min_dihedral_triangulation(
         # The last diagonal is an edge of the polygon, with a face outside.
         if d == n - 1:
             sides.append(np.broadcast_to(beside[k, i], normals.shape))
-        turns = [-np.einsum("imk,imk->im", normals, side) for side in sides]
+        turns_at_sides = [-np.einsum("imk,imk->im", normals, side) for side in sides]
         # No neighbor, no angle.
-        turns = [np.where(side.any(axis=2), t, -1.0) for side, t in zip(sides, turns, strict=True)]
+        turns_at_sides = [
+            np.where(side.any(axis=2), t, -1.0)
+            for side, t in zip(sides, turns_at_sides, strict=True)
+        ]
         # For each m, the largest turn of the part that is divided at m, and twice its area.
-        worst = np.maximum.reduce([*turns, turn[i, m], turn[m, k]])
+        worst = np.maximum.reduce([*turns_at_sides, turn[i, m], turn[m, k]])
         size = area[i, m] + area[m, k] + np.sqrt((cross**2).sum(axis=2))
         smallest = worst.min(axis=1, keepdims=True)
         best = np.where(worst <= smallest + _EQUAL_COSINES, size, np.inf).argmin(axis=1)
@@ -625,8 +628,9 @@ def _fair_patches(x: FloatArray, faces: IntArray, new: IntArray, input_count: in
     for k in range(3):  # the edge from corner k to k + 1 is opposite to corner k + 2
         u, w = (corner[:, j] - corner[:, k - 1] for j in (k, (k + 1) % 3))
         cotangent = np.clip(row_dots(u, w) / twice_area, -_MAX_COTANGENT, _MAX_COTANGENT)
-        m = len(triangles)
-        np.add.at(weight, edges.edge_of_pair[k * m : (k + 1) * m], 0.5 * cotangent)
+        # `half_edges` lists the first edges of all triangles, then the second, then the third.
+        count = len(triangles)
+        np.add.at(weight, edges.edge_of_pair[k * count : (k + 1) * count], 0.5 * cotangent)
         # A vertex gets a third of the area of each of its triangles.
         np.add.at(area, triangles[:, k], twice_area / 6)
     weight = np.maximum(weight, _MIN_WEIGHT)
@@ -722,8 +726,8 @@ def _loop_of_faces(new: IntArray, loops: list[IntArray], count: int) -> IntArray
     face_at[edges.edge_of_pair] = np.arange(3 * len(new)) % len(new)
     # The first edges of the loops, looked up among the edges of patches. Loops without a patch have
     # none.
-    firsts = edge_keys(np.array([loop[:2] for loop in loops]), count)
-    positions = np.minimum(np.searchsorted(keys, firsts), len(keys) - 1)
-    matched = np.flatnonzero(keys[positions] == firsts)
+    first_edge_keys = edge_keys(np.array([loop[:2] for loop in loops]), count)
+    positions = np.minimum(np.searchsorted(keys, first_edge_keys), len(keys) - 1)
+    matched = np.flatnonzero(keys[positions] == first_edge_keys)
     loop_at[part[face_at[positions[matched]]]] = matched
     return loop_at[part]

@@ -215,7 +215,10 @@ def _linear_gradients(
 
     function: f.
     corners, index: (m, 4, 3), (m, 4) the corners of the tetrahedra and the indices of these points.
-    faces: (j, 3) of the mesh.
+    faces: (j, 3) the triangles of the mesh. In them a corner of a tetrahedron has the same index as
+        in `index`; the mesh's other vertices have larger indices.
+
+    Where F is not 0, the result is grad F. Where it was changed, only the direction is right.
     """
     edges = corners[:, 1:] - corners[:, :1]
     size = np.linalg.norm(edges, axis=2).max(axis=1)
@@ -227,8 +230,10 @@ def _linear_gradients(
     rise = values[rows, 1:] - values[rows, :1]
     slope: FloatArray = np.linalg.solve(edges[rows], rise[..., None])[..., 0].astype(np.float64)
     owners, slopes = [rows], [slope]
+    # From here on, the tetrahedra whose four corners are on the level set.
     rows = np.flatnonzero(has_volume & on_level)
     point_count = int(index.max(initial=0)) + 1
+    # Only triangles of the mesh whose vertices are all corners of tetrahedra can be their faces.
     mesh_keys = _triple_keys(faces[(faces < point_count).all(axis=1)], point_count)
     faces_of_tetrahedron = np.array([np.delete(np.arange(4), k) for k in range(4)])
     in_mesh = np.stack(
@@ -238,7 +243,8 @@ def _linear_gradients(
         ],
         axis=1,
     )
-    # The side of the level set to which all of T is given: the sign of f at the center.
+    # `marching_tetrahedra` assigns the inside of such a tetrahedron to one side of the level set:
+    # to the side f > 0 if f is positive at the center.
     sign = np.sign(function.values(corners[rows].mean(axis=1)))
     has_two = in_mesh.sum(axis=1) == 2
     for k, face in enumerate(faces_of_tetrahedron):
@@ -286,23 +292,24 @@ def _proved_by_stars(
     vertices = np.unique(index[rows])
     vertex_number = np.full(int(index.max(initial=0)) + 1, -1, np.int64)
     vertex_number[vertices] = np.arange(len(vertices))
-    # Pairs of a tetrahedron and a corner of it among `vertices`; then pairs of a gradient and such
-    # a corner of its tetrahedron.
-    tet, corner = np.nonzero(vertex_number[index] >= 0)
-    vertex_of_pair = vertex_number[index[tet, corner]]
-    entry, corner_of_entry = np.nonzero(vertex_number[index[slopes.owner]] >= 0)
-    vertex = vertex_number[index[slopes.owner[entry], corner_of_entry]]
+    # Pairs of a tetrahedron and the column, 0 to 3, of a corner of it among `vertices`; then pairs
+    # ("entries") of a gradient and such a column of its tetrahedron.
+    tet, column = np.nonzero(vertex_number[index] >= 0)
+    vertex_of_pair = vertex_number[index[tet, column]]
+    entry, column_of_entry = np.nonzero(vertex_number[index[slopes.owner]] >= 0)
+    vertex_of_entry = vertex_number[index[slopes.owner[entry], column_of_entry]]
     units = slopes.slope[entry]
     units = units / np.maximum(np.linalg.norm(units, axis=1), 1e-300)[:, None]
     normal = np.zeros((len(vertices), 3))
-    np.add.at(normal, vertex, units)
+    np.add.at(normal, vertex_of_entry, units)
     for _ in range(_MAX_PERCEPTRON_ROUNDS):
-        is_short = (normal[vertex] * units).sum(axis=1) <= 0
+        is_short = (normal[vertex_of_entry] * units).sum(axis=1) <= 0
         if not is_short.any():
             break
-        np.add.at(normal, vertex[is_short], units[is_short])
+        np.add.at(normal, vertex_of_entry[is_short], units[is_short])
+    # n . grad F > 0, by more than rounding.
     is_proved = np.ones(len(vertices), np.bool_)
-    is_proved[vertex[(normal[vertex] * units).sum(axis=1) <= 1e-9]] = False
+    is_proved[vertex_of_entry[(normal[vertex_of_entry] * units).sum(axis=1) <= 1e-9]] = False
     has_slope = np.bincount(slopes.owner, minlength=len(index)) > 0
     # A tetrahedron without a gradient proves nothing at its corners.
     is_proved[vertex_of_pair[~has_slope[tet]]] = False
@@ -376,8 +383,9 @@ def _proved_regular(
         gradient_length = np.linalg.norm(samples.gradient, axis=1)
         moved = (gradient_length + change) * radius
         product = (samples.gradient * projected).sum(axis=1)
-        # (b), with D = `change`; then (a), for f by its bound and for F by its values at the
-        # corners.
+        # (b): grad f . grad F exceeds `change` |grad F| at the center, where `change` bounds how
+        # much grad f changes in the ball. Then (a): f by its bound in the ball, and F by its values
+        # at the corners.
         is_regular = product > change * np.linalg.norm(projected, axis=1) * (1 + 1e-9)
         is_within_half_period = np.abs(samples.value) + moved < half_period
         linear = start[owner, None] + ((pieces - first[owner, None]) * slope[owner, None]).sum(2)

@@ -4,10 +4,6 @@ of the mesh are cut along each other into triangles, called "pieces". The windin
 sides of a piece tell whether it bounds the solid, and the pieces that do are joined. A "half edge"
 is an edge of a face with a direction.
 
-The solid is the set of points around which the mesh winds at least once. The faces of the mesh are
-cut along each other. The winding numbers on both sides of a piece tell whether it bounds the solid,
-and the pieces that do are joined.
-
 Where two faces meet, the vertices of pieces of one face differ by rounding from those of the other
 face, and a piece may have vertices in the middle of an edge of another piece. So vertices are
 merged first, and then edges are split at the vertices on them.
@@ -247,22 +243,24 @@ def _corners_on(x: FloatArray, edges: IntArray) -> tuple[IntArray, BoolArray]:
     nearby = searching.cKDTree(x[corners]).query_ball_point(0.5 * (p + q), half_length)
     count = np.array([len(group) for group in nearby])
     edge_row = np.repeat(np.arange(len(edges)), count)
-    corner = corners[np.fromiter(itertools.chain.from_iterable(nearby), np.int64, int(count.sum()))]
+    candidate = corners[
+        np.fromiter(itertools.chain.from_iterable(nearby), np.int64, int(count.sum()))
+    ]
     direction = (q - p)[edge_row] / np.maximum(2 * half_length[edge_row], 1e-300)[:, None]
-    relative = x[corner] - p[edge_row]
+    relative = x[candidate] - p[edge_row]
     position = row_dots(relative, direction)
     is_on = row_norms(relative - position[:, None] * direction) <= _SAME
-    is_on &= (corner != edges[edge_row, 0]) & (corner != edges[edge_row, 1])
+    is_on &= (candidate != edges[edge_row, 0]) & (candidate != edges[edge_row, 1])
     is_on &= (position > 0) & (position < 2 * half_length[edge_row])
-    edge_row, corner, distance = (
+    edge_row, candidate, distance = (
         edge_row[is_on],
-        corner[is_on],
+        candidate[is_on],
         np.abs(position - half_length[edge_row])[is_on],
     )
     order = np.lexsort((distance, edge_row))
     edge_row, first = np.unique(edge_row[order], return_index=True)
     vertex_on_edge, is_cut = np.zeros(len(edges), np.int64), np.zeros(len(edges), np.bool_)
-    vertex_on_edge[edge_row], is_cut[edge_row] = corner[order][first], True
+    vertex_on_edge[edge_row], is_cut[edge_row] = candidate[order][first], True
     return vertex_on_edge, is_cut
 
 

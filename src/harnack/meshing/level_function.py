@@ -176,6 +176,7 @@ class LevelFunction:
             change = self._prepared.gradient_change_bound(p, r.x) + sample.gradient_error
             return sample.value, sample.gradient, change
 
+        # Each point counts twice: for the sample and for the bound.
         self.evaluations += 2 * len(points)
         # Kernels take vectors, so each radius is passed as a vector of three equal numbers.
         value, gradient, change = map_batches(

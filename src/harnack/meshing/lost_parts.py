@@ -10,13 +10,6 @@ point is farther than d from the mesh. Then the sign of the function changes wit
 but near the point all space is on the same side of the mesh. So there is a part of the solid, or of
 the space around it, that the mesh does not have.
 
-The signs at the points of a lattice do not show a wall or a gap between two points.
-`points_off_level` checks that all points of the mesh are near the level set. Here the converse is
-checked: that points that are known to lie on the level set are near the mesh. Suppose that such a
-point is farther than d from the mesh. Then the sign of the function changes within d of the point,
-and the side of the mesh does not. So there is a part of the solid, or of the space around it, that
-the mesh does not have.
-
 Points of the level set are known: on the triangles of a mesh, where the winding number jumps across
 the level; beside the points of a cloud; and along rays out of blobs. About three thousand of them
 are used, spread evenly. They are a sample, and no proof.
@@ -89,6 +82,7 @@ class PointsOnLevel:
         if mesh is not None:
             return cls._on_triangles(function, mesh[0][mesh[1]])
         field = function.field
+        # The ends of short segments that cross the level set; none for other fields.
         low = np.zeros((0, 3))
         high = low
         if isinstance(field, OrientedPoints | HRBF):

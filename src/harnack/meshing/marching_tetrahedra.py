@@ -12,14 +12,6 @@ It is checked that the crossings of the three edges of each face add up, and tha
 passes between the corners of a tetrahedron. A corner on the level, such as a vertex of the curve at
 which a surface ends, becomes a mesh vertex.
 
-For each edge of the tetrahedra, the signed number of level crossings is counted, which is 0, 1 or
--1 if cells are small enough. For a real-valued function it follows from the signs at the ends. For
-an angle it follows from the continuous change of the function along the edge, which may differ from
-the difference of the values by whole periods. From the crossings of its edges it follows on which
-side of the level each corner of a tetrahedron lies. It is checked that the crossings of the three
-edges of each face add up, and that at most one level passes between the corners of a tetrahedron. A
-corner on the level, such as a vertex of the curve at which a surface ends, becomes a mesh vertex.
-
 `delaunay` makes tetrahedra between points, by Qhull.
 """
 
@@ -111,6 +103,8 @@ def delaunay(points: FloatArray) -> Tetrahedra:
 
     qhull: Any = scipy.spatial
     middle, size = points.mean(axis=0), float(np.ptp(points, axis=0).max())
+    # The far points are the corners of a large cube. It is rotated against the axes, since many of
+    # the points may lie on the faces of a box.
     rotation = np.array([[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]])
     far_corners = np.array(list(itertools.product((-1.0, 1.0), repeat=3))) @ rotation
     n = len(points)

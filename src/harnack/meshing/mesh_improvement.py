@@ -67,6 +67,7 @@ def flip_edges(
     refused_keys = np.zeros(0, np.int64)
     boundary_keys = edge_keys(boundary_edges(faces), len(vertices))
     for _ in range(_MOST_ROUNDS_OF_FLIPS):
+        # A flip replaces the edge from a to b by the edge from c to d.
         pairs, quads = _quadrilaterals(faces)
         a, b, c, d = quads.T
         old_angle = least_angles(vertices, faces)[pairs].min(axis=1)

@@ -668,8 +668,8 @@ def _mesh_solid(
         cells: the size of their cells; both are lengths."""
 
         def mesh_angle(angle: SolidAngle, value: float) -> TriangleMesh:
-            """The mesh of the level set of `angle` at `value`. Its evaluations are added to the
-            count."""
+            """The mesh of the level set of `angle` at `value`. The evaluations of `angle` are added
+            to `angle_evaluations`."""
             angle = cast("SolidAngle", _checked(angle))
             box = _box(angle, (value,), None)
             function = LevelFunction(angle, value, most_faces=asked.most_faces)
@@ -683,12 +683,12 @@ def _mesh_solid(
 
     def check_level(surface: TriangleMesh, size: float) -> None:
         """Raise a MeshingError unless the mesh is within the tolerance of the solid's level set.
-        size: the longest side of its box, a length, to which the tolerance is relative."""
+        size: the longest side of the solid's box, a length, to which the tolerance is relative."""
         _check_level(region, surface, asked.tolerance.at(size), asked.volume)
 
     def check(surface: TriangleMesh, size: float) -> None:
         """Raise a MeshingError unless the mesh is a manifold within the tolerance of the level set.
-        size: the longest side of its box, a length, to which the tolerance is relative."""
+        size: the longest side of the solid's box, a length, to which the tolerance is relative."""
         check_manifold(surface.faces, surface.vertices)
         check_level(surface, size)
 

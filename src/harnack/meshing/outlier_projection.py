@@ -120,15 +120,15 @@ def _project_and_split(
     keys = sorted_unique(edge_keys(split_edges, count))
     ends = np.stack(np.divmod(keys, count), axis=1)
     # For each face the new vertices on its edges, or -1. Neighbors share the edges that are split.
-    midpoint = np.full(faces.shape, -1, np.int64)
+    vertex_on_edge = np.full(faces.shape, -1, np.int64)
     rows = np.flatnonzero(np.isin(faces, ends).any(axis=1))
     position = np.searchsorted(keys, face_keys := edge_keys(half_edges(faces[rows]), count))
     position = np.minimum(position, max(len(keys) - 1, 0))
     if len(keys):
         is_cut = keys[position] == face_keys
-        midpoint[rows] = np.where(is_cut, count + position, -1).reshape(3, -1).T
+        vertex_on_edge[rows] = np.where(is_cut, count + position, -1).reshape(3, -1).T
     # Other faces with a far center get a vertex there, and become a fan of three.
-    fan_rows = np.setdiff1d(center_rows, np.flatnonzero((midpoint >= 0).any(axis=1)))
+    fan_rows = np.setdiff1d(center_rows, np.flatnonzero((vertex_on_edge >= 0).any(axis=1)))
     # Move all three kinds of points at once: far vertices, new vertices on edges, new centers.
     start = np.concatenate(
         [
@@ -144,8 +144,8 @@ def _project_and_split(
         return None
     vertices = np.concatenate([vertices, moved[len(moved_vertices) :]])
     vertices[moved_vertices] = moved[: len(moved_vertices)]
-    is_split = (midpoint >= 0).any(axis=1)
-    split = split_faces(vertices, faces[is_split], midpoint[is_split])
+    is_split = (vertex_on_edge >= 0).any(axis=1)
+    split = split_faces(vertices, faces[is_split], vertex_on_edge[is_split])
     fan_centers = count + len(ends) + np.arange(len(fan_rows))
     a, b, c = faces[fan_rows].T
     new_faces = [

@@ -360,7 +360,7 @@ def _contacts(
     rows = rows[np.unique(np.sort(faces[rows], axis=1), axis=0, return_index=True)[1]]
     crossing = intersecting_faces(x, faces[rows])
     advice = "; hk.mesh(hk.solid(part)) makes one of parts that overlap" if is_closed else ""
-    crossings = _problem(
+    crossing_problem = _problem(
         "crossing faces",
         x[faces[rows[crossing]]].mean(axis=1),
         "{} {triangle passes through or lies|triangles pass through or lie} on others",
@@ -372,13 +372,15 @@ def _contacts(
     is_contact = is_without_flat_faces[first] | (
         shells.component_of_face[first] != shells.component_of_face[second]
     )
-    touching = _problem(
+    touching_problem = _problem(
         "touching faces",
         np.unique(contacts[is_contact], axis=0),
         "at {} {place|places} a corner or an edge lies on a face that it is not part of: let parts "
         "overlap, or move them apart",
     )
-    return dataclasses.replace(crossings, message=crossings.message + advice), touching
+    return dataclasses.replace(
+        crossing_problem, message=crossing_problem.message + advice
+    ), touching_problem
 
 
 def _thin_walls(x: FloatArray, faces: IntArray, wall: float, is_solid: bool) -> PrintProblem:
@@ -424,6 +426,7 @@ def _size_problems(size: tuple[float, float, float], bed: list[float] | None) ->
         if longest < _SMALLEST:
             message += f"; in meters {longest * 1000:.4g}, in inches {longest * _INCH:.4g} mm long"
         problems.append(PrintProblem("unit", 1, no_locations, message, is_error=False))
+    # Small for millimeters, but possible.
     elif longest < 10 * _SMALLEST:
         message = f"it is {text} mm; if that is meant in inches, scale it by 25.4"
         problems.append(PrintProblem("unit", 1, no_locations, message, is_error=False))

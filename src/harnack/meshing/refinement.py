@@ -44,8 +44,9 @@ __all__ = [
 Walls = tuple[FloatArray, FloatArray] | None
 # A function from points (k, 3) to the mask (k,) of those that matter; None if all do.
 Where = Callable[[FloatArray], BoolArray] | None
-# Across a crease normals turn by at least this angle; and by this fraction of the angle between the
-# middle of an edge and one of its ends.
+# An edge cuts off a crease if the normals at its ends differ by at least the first number, an
+# angle; and the normals at its middle and at one of its ends by at least the second number times
+# the angle between the normals at both ends.
 _CREASE, _SHARE = math.radians(20), 0.75
 # A vertex within this distance, relative to the tolerance, counts as on the surface.
 _ON_SURFACE = 1e-5
@@ -107,6 +108,7 @@ def refine(
             break
         if count > _DIVERGENCE_FACTOR * smallest_count:
             break
+        # The smallest count so far, once counts have begun to fall: they may grow at first.
         smallest_count = min(smallest_count, count) if count < last_count else smallest_count
         last_count = count
         # Every edge that is cut adds one triangle on each side, and so does every center.
@@ -199,6 +201,7 @@ def _project_to_creases(
         np.clip(np.minimum(row_dots(n_a, midpoint_normal), row_dots(n_b, midpoint_normal)), -1, 1)
     )
     angle_of_ends = np.arccos(np.clip(cosine, -1, 1))
+    # The last condition: the tangent planes are not nearly parallel, so that they meet in a line.
     rows = np.flatnonzero(
         (angle_of_ends > _CREASE) & (angle_to_end > _SHARE * angle_of_ends) & (1 - cosine**2 > 0.01)
     )
@@ -504,6 +507,7 @@ def smooth(
             function, target[free_rows], target_samples, 2 * move_length, walls
         )
         moved_samples = function.sample(moved[free_rows])
+        # Off the level set by more than rounding.
         is_off = moved_samples.distance > 1e-7 * size + 1e-12 * row_norms(moved[free_rows])
         moved[free_rows[is_off]] = vertices[free_rows[is_off]]
         vertices = _undo_flipped(vertices, moved, faces)

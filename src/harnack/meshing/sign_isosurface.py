@@ -168,6 +168,8 @@ def mesh_from_signs(
         layers = 2 if closed else 0
         lattice = BccLattice.covering_box(*box, spacing, layers=layers)
         try:
+            # Edges are split from 0.8 of the tolerance on, by an estimate of distances. Then
+            # distances are measured.
             mesh = extract_from_signs(function, lattice, 0.8 * tolerance, report, closed=closed)
         except EmptySurfaceError as error:
             empty_mesh = TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64))
@@ -563,11 +565,11 @@ class _CreaseRefinement:
         rows, to_line, fraction = rows[is_far], to_line[is_far], fraction[is_far]
         # Of these, the edges beside which the level set is found.
         foot, far_length = a[is_far] + fraction[:, None] * (b - a)[is_far], edge_length[is_far]
-        points, normal, is_found = _level_along(function, foot, to_line, _OFFSET * far_length)
-        rows, points, normal, fraction = (
+        points, new_normal, is_found = _level_along(function, foot, to_line, _OFFSET * far_length)
+        rows, points, new_normal, fraction = (
             rows[is_found],
             points[is_found],
-            normal[is_found],
+            new_normal[is_found],
             fraction[is_found],
         )
         ends = all_edges.vertices[rows]
@@ -576,10 +578,10 @@ class _CreaseRefinement:
         # Two angles for each split edge: between the normals at its ends; and the larger one
         # between the normal at the new vertex and that at an end.
         angle_of_ends, angle_to_end = (
-            np.arccos(np.clip(one, -1, 1))
-            for one in (
+            np.arccos(np.clip(cosine, -1, 1))
+            for cosine in (
                 row_dots(normals[ends[:, 0]], normals[ends[:, 1]]),
-                np.minimum(*(row_dots(normals[ends[:, k]], normal) for k in (0, 1))),
+                np.minimum(*(row_dots(normals[ends[:, k]], new_normal) for k in (0, 1))),
             )
         )
         is_on_crease = (angle_of_ends > _MIN_CREASE_ANGLE) & (
@@ -587,16 +589,18 @@ class _CreaseRefinement:
         )
         is_bent = np.concatenate([bent, is_on_crease])
         new_vertices_of_face = vertex_of_edge[edges]
-        # Faces whose three new vertices all lie on creases.
-        corner = np.flatnonzero(
+        # Faces whose three new vertices all lie on creases; then those that get an inner vertex.
+        fan_rows = np.flatnonzero(
             (new_vertices_of_face >= 0).all(axis=1)
             & is_bent[np.maximum(new_vertices_of_face, 0)].all(axis=1)
         )
-        inner, inner_normal, corner = _crease_corners(function, x, normals, faces, corner)
+        inner_points, inner_normal, fan_rows = _crease_corners(
+            function, x, normals, faces, fan_rows
+        )
         return cls(
-            edges, vertex_of_edge, ends, fraction, faces[corner], corner,
-            np.concatenate([points, inner]), np.concatenate([normal, inner_normal]),
-            np.concatenate([is_on_crease, np.ones(len(inner), np.bool_)]),
+            edges, vertex_of_edge, ends, fraction, faces[fan_rows], fan_rows,
+            np.concatenate([points, inner_points]), np.concatenate([new_normal, inner_normal]),
+            np.concatenate([is_on_crease, np.ones(len(inner_points), np.bool_)]),
         )  # fmt: skip
 
     def applied(self, x: FloatArray, faces: IntArray) -> tuple[FloatArray, IntArray]:
@@ -710,8 +714,8 @@ def _crease_corners(
     offsets = np.einsum("kij,kij->ki", normal, corner - center[:, None])
     solve: Any = np.linalg.solve
     direction: FloatArray = solve(normal, offsets[:, :, None])[:, :, 0]
-    points, normal, is_found = _level_along(function, center, direction, _OFFSET * longest)
-    return points[is_found], normal[is_found], rows[is_found]
+    points, new_normals, is_found = _level_along(function, center, direction, _OFFSET * longest)
+    return points[is_found], new_normals[is_found], rows[is_found]
 
 
 def _undo_until_valid(

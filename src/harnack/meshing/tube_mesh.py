@@ -148,8 +148,10 @@ class _Sweep:
             [*directions, directions[0]] if is_closed else directions
         )
         corners = [
-            self._corner(point, turn, self._directions(end))
-            for point, turn, (_, end) in zip(points[1:], direction_pairs, frames, strict=False)
+            self._corner(point, turn, self._directions(end_frame))
+            for point, turn, (_, end_frame) in zip(
+                points[1:], direction_pairs, frames, strict=False
+            )
         ]
         # The rings at the start and at the end of each edge: at corners, or half balls at ends.
         if is_closed:

@@ -251,6 +251,7 @@ def _cameras(
     boxes = [np.array(camera.box.bounds()) for camera in cameras if camera.box is not None]
     # Tracing rays for visible points is needed only without boxes.
     points = np.concatenate(boxes or [_points(moments, steps)])
+    # The box of all that has to be in view; if boxes were given, its corners.
     corners = np.array([points.min(axis=0), points.max(axis=0)])
     if boxes:
         points = np.array(np.meshgrid(*corners.T)).reshape(3, -1).T
@@ -259,6 +260,7 @@ def _cameras(
         _orbited(replace(camera, box=box, target=camera.target or center), orbit * s, turn)
         for camera, s, turn in zip(cameras, steps.tolist(), rotations, strict=True)
     ]
+    # Frame each camera by itself, with zoom 1. For that, points are only rotated until `up` is z.
     chooses_distance = [camera.position is None and camera.distance is None for camera in framed]
     poses = [
         replace(camera, zoom=1.0).pose(
@@ -267,6 +269,7 @@ def _cameras(
         for camera, turn in zip(framed, rotations, strict=True)
     ]
     distances = [float(np.linalg.norm(pose.origin - pose.target)) for pose in poses]
+    # A default of 1 is never used: it is for films in which no camera needs the number.
     farthest = max(
         (
             length
@@ -370,7 +373,7 @@ def _gif(path: Path, fps: float) -> Generator[Callable[[Pixels], None]]:
         """Add a picture (h, w, 3 or 4) to the film. A pixel that is less than half covered becomes
         transparent."""
         opaque = Image.fromarray(np.ascontiguousarray(pixels[..., :3]))
-        # 255 colors; the last entry of the palette stands for transparent pixels.
+        # 255 colors; entry 255, the last of the palette, stands for transparent pixels.
         indexed = opaque.quantize(_CLEAR, method=Image.Quantize.MEDIANCUT)
         if pixels.shape[-1] == 4:  # a GIF has no partly transparent pixels
             mask = Image.fromarray(np.where(pixels[..., 3] < 128, np.uint8(255), np.uint8(0)))

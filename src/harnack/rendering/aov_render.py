@@ -268,7 +268,7 @@ def _map_arrays(change: Callable[..., Any], *views: AovBuffers) -> AovBuffers:
 
 
 def _values(function: Field, points: FloatArray) -> FloatArray:
-    """Return the values of a function at points (n, 3), which is NaN outside the volume in which
+    """Return the values of a function at points (n, 3); NaN at points outside the volume in which
     the function is defined."""
     values: FloatArray = function.value(points)
     # The volume is enlarged a little, relative to the size of the points, as hits on its boundary
@@ -469,6 +469,9 @@ def _antialias(
     executor = LocalRenderExecutor(viewer) if executor is None else executor
     ranges = executor.split_range(len(edges), max(1, _RAYS_A_BAND // len(offsets)))
     calls = [(edges[start:stop], offsets) for start, stop in ranges]
-    for (rows, _), samples in zip(calls, executor.run_tasks("render_samples", calls), strict=True):
+    for (pixels, _), samples in zip(
+        calls, executor.run_tasks("render_samples", calls), strict=True
+    ):
+        # The samples of each pixel, in linear light.
         light = srgb_to_linear(colors(samples) / 255)
-        picture.reshape(-1, 3)[rows] = to_uint8(linear_to_srgb(light.mean(axis=1)))
+        picture.reshape(-1, 3)[pixels] = to_uint8(linear_to_srgb(light.mean(axis=1)))

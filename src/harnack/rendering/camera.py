@@ -186,6 +186,7 @@ class Camera:
         if distance is None:
             slopes = self._slopes(size)
             distance = max(float((a / s + z).max()) for a, s in zip((x, y), slopes, strict=True))
+            # Points that coincide with the target need a distance, too.
             distance = max(distance / self.zoom, 1e-3)
         elif self.fov is None:
             fov = self._fov_to_frame(np.array([x, y]), distance - z, size)
@@ -206,8 +207,10 @@ class Camera:
         """
         if depth.min() <= 0:
             return _FOV_INSIDE
+        # fov belongs to the longer side of the picture; the other side's slopes are scaled to it.
         side_ratios = max(size) / np.array(size)
         slopes = (across / depth).max(axis=1) * side_ratios
+        # The angle must not be 0 if all points lie on the axis.
         fov = 2 * math.degrees(
             math.atan(max(float(slopes.max()), 1e-4) / _FILL_FRACTION / self.zoom)
         )

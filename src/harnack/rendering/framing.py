@@ -163,7 +163,7 @@ def visible_points(surface: TracedSurface, backend: Backend) -> FloatArray:
         """Find the points anew, without the cache."""
         return _find_visible_points(surface, backend, ends)
 
-    if prepared is surface.field:  # it may have changed in place
+    if prepared is surface.field:  # without preparation, it may have been changed in place
         return find()
     settings = (
         surface.level_values,
@@ -276,9 +276,8 @@ def _rays(
     grid: the number of rays along a side of the grid, a multiple of 8.
     """
     tile_count = grid // _TILE
-    # Axes: tiles down and across, and rays down and across a tile.
     # u and v are the coordinates of the rays on a side of the box, in (0, 1), tile by tile of 8 x 8
-    # rays.
+    # rays. The axes of `index` are tiles down and across, and rays down and across in a tile.
     index = np.indices((tile_count, tile_count, _TILE, _TILE), dtype=np.float64)
     u = ((_TILE * index[1] + index[3] + 0.5) / grid).ravel()
     v = ((_TILE * index[0] + index[2] + 0.5) / grid).ravel()

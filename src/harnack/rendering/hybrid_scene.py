@@ -137,6 +137,7 @@ class HybridScene:
         if hidden is not None:
             preliminary = self._skip_emitters(ray, preliminary, active & hidden)
         t_max = dr.minimum(preliminary.t, ray.maxt)
+        # Queues trace rays at once, so their ends must be in memory.
         if self.queued:
             dr.eval(preliminary, t_max)
         hit, hit_shape = self.no_hit(dr.zeros(mi.SurfaceInteraction3f)), dr.zeros(mi.ShapePtr)
@@ -241,8 +242,8 @@ class HybridScene:
         normal_dot_d = dr.dot(normal, d)
 
         def to_neighbor(o: Any, along: Any) -> Any:
-            """Return the vector from the hit to the point at which a neighboring pixel's ray o + t
-            along meets the tangent plane."""
+            """Return the vector from the hit to the point at which the ray of a neighboring pixel
+            meets the tangent plane. o, along: (3,) the origin and the direction of this ray."""
             offset = o + t * along - ray.o - t * ray.d
             return offset - d * (dr.dot(offset, normal) / normal_dot_d)
 

@@ -143,9 +143,9 @@ def png_bytes(mi: Any, image: npt.NDArray[np.uint8]) -> bytes:
 def exr_bytes(image: npt.NDArray[np.floating[Any]], names: Sequence[str] | None = None) -> bytes:
     """Return the bytes of an OpenEXR file of an image.
 
-    image: (h, w) has the channel Y; (h, w, 3) has R, G and B; (h, w, 4) has A as well, by which the
-        others are multiplied. With `names`, (h, w, n).
-    names: the names of the n channels, if they are others.
+    image: without `names`, (h, w) with the channel Y; (h, w, 3) with R, G and B; or (h, w, 4) with
+        A as well, by which the others are multiplied. With `names`, (h, w, n).
+    names: the names of the n channels; None for those above.
     """
     # Mitsuba writes them too, but waits for ever where Dr.Jit has one thread (OpenEXR 2.5 hands
     # its work to a pool without threads).

@@ -49,10 +49,10 @@ class SobolSampler:
     counts how many numbers the path has used.
 
     A sampler with a state would have to be carried along with each path. This one has none. So
-    paths can be moved to other lanes, and a path has the same numbers whatever else is drawn. Each
-    pair of dimensions consists of the first two dimensions of Sobol' in an order of its own (Burley
-    2020, Practical Hash-based Owen Scrambling). This stratifies the samples of a pixel as well as
-    multi-jittering does, for any number of samples.
+    paths can be moved to other lanes, and a path has the same numbers whatever else is drawn. Every
+    call uses the first two dimensions of Sobol's points, but in another order and scrambled in
+    another way (Burley 2020, Practical Hash-based Owen Scrambling). This stratifies the samples of
+    a pixel as well as multi-jittering does, for any number of samples.
 
     Methods are called as those of Mitsuba's samplers. Each call takes the next dimension.
 
@@ -83,6 +83,7 @@ class SobolSampler:
         interface, and ignored."""
         del active
         uint, mi = self.mi.UInt32, self.mi
+        # The key determines the order and the scrambling; it differs for all pixels and dimensions.
         key = _hashed(uint, self.pixel + _hashed(uint, self.dimension + _hashed(uint, self.seed)))
         self.dimension = self.dimension + 1
         # Scrambling the index visits the points of each pixel and dimension in another order.
@@ -181,8 +182,8 @@ class _PathState:
         ending paths in glass.
     previous: the last vertex.
     pdf: the probability density with which the last vertex sampled the ray.
-    delta: whether the last vertex could sample no other direction, like a mirror. Both give the
-        weight of a light that the ray finds.
+    delta: whether the last vertex could sample no other direction, like a mirror. pdf and delta
+        determine the weight of light that the ray hits.
     is_diffused: whether a rough surface has scattered the path at or before the last vertex.
     was_diffused: the same, without the last vertex.
     """
@@ -264,9 +265,10 @@ class PathTracer:
     max_depth: the length of the longest path in edges, -1 for no limit.
     rr_depth: the vertex, counted from 1, at which Russian roulette begins.
     hide_emitters: whether lights and environment are invisible to the camera.
-    clamp: an upper limit of the contribution of a path whose light was scattered by a rough surface
-        before its last scattering. A finite limit removes some light, and with it the white specks
-        ("fireflies") of sharp reflections and caustics that paths sample too rarely.
+    clamp: an upper limit of the light that a path brings, if one of its vertices except the one
+        next to the light lies on a rough surface. A finite limit removes some light, and with it
+        the white specks ("fireflies") of sharp reflections and caustics that paths sample too
+        rarely.
     """
 
     def __init__(
@@ -323,6 +325,7 @@ class PathTracer:
                 dr.zeros(mi.Spectrum, width), dr.zeros(mi.Vector3f, width)
             )
             dr.make_opaque(results.features.albedo, results.features.normal)
+        # Camera rays count as sampled by a mirror: the light that they see has the weight 1.
         paths = _PathState(
             number=dr.arange(mi.UInt32, width),
             ray=mi.Ray3f(dr.detach(ray)),
@@ -370,19 +373,21 @@ class PathTracer:
         """
         mi, vertex = self.mi, dr.opaque(self.mi.UInt32, depth)
         previous = paths.previous.interaction(mi)
+        # Only camera rays pass through lights that are hidden.
         sees_no_emitter = (vertex == 0) if self.hide_emitters else None
         si, hit = world.intersect(paths.ray, previous, exist, sees_no_emitter)
         vertex_sampler = sampler.at_vertex(vertex, paths.number)
         # Glass between the last vertex and this one absorbs light.
         transmitted = transmittance(mi, world.proxies, previous, si, paths.ray.d)
         paths = replace(paths, throughput=paths.throughput * transmitted)
+        # The edge to this vertex may be the last one that the path may have.
         counts_emission = exist & ~hit.is_out_of_steps & (vertex < self._deepest)
         if sees_no_emitter is not None:
             counts_emission &= ~sees_no_emitter
         light = self._emitted(world.scene, paths, si, counts_emission)
         lost_light = paths.throughput * mi.Spectrum(self.lost_color.eval(si, hit.is_out_of_steps))
         light += dr.select(hit.is_out_of_steps, lost_light, 0)
-        # The path may only go on if it is not at its last vertex.
+        # Light that is scattered here needs one more edge.
         active = si.is_valid() & (vertex + 1 < self._deepest)
         bsdf = si.bsdf()
         connection = self._connection(world, paths, si, hit.ray_offset, vertex_sampler, active)
@@ -390,6 +395,7 @@ class PathTracer:
         sample, weight = bsdf.sample(
             mi.BSDFContext(), si, vertex_sampler.next_1d(), vertex_sampler.next_2d(), active
         )
+        # Where only one direction is possible, as in a mirror, lights cannot be sampled.
         delta = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
         throughput = paths.throughput * weight
         eta = paths.eta * sample.eta
@@ -473,12 +479,14 @@ class PathTracer:
         """
         mi, bsdf = self.mi, si.bsdf()
         active = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+        # False: whether the emitter is visible is not tested here.
         light, weight = world.scene.sample_emitter_direction(
             si, vertex_sampler.next_2d(), False, active
         )
         active &= light.pdf > 0
         scattered, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(light.d), active)
         active &= dr.max(scattered) > 0
+        # A BSDF cannot find a light that is a point: its weight is 1.
         mis_weight = dr.select(light.delta, 1, _power_heuristic(light.pdf, pdf))
         sent = self._clamped(paths.throughput * scattered * weight * mis_weight, paths.is_diffused)
         return _LightConnection(spawn_ray_to(mi, si, clearance, light.p), sent, active)
@@ -497,6 +505,7 @@ def _sobol_from(mi: Any, sampler: Any) -> SobolSampler:
     sampler, whose lanes are the samples of one pixel after the other."""
     width, spp = sampler.wavefront_size(), max(int(sampler.sample_count()), 1)
     lane = dr.arange(mi.UInt32, width)
+    # 2^24: a number in single precision has 24 bits.
     seed = mi.UInt32(dr.gather(mi.Float, sampler.next_1d(), mi.UInt32(0)) * 2.0**24)
     opaque_spp = dr.opaque(mi.UInt32, spp)
     return SobolSampler(mi, lane // opaque_spp, lane % opaque_spp, seed, dr.opaque(mi.UInt32, 0))

@@ -278,8 +278,8 @@ class PreparedIsolines:
         across, down: (3,) vectors from p to the points of the tangent plane in the middles of the
             neighboring pixels.
 
-        The edge is where |g - level| equals half_width |grad_T g|. To first order, g changes by at
-        most `reach` between p and any point of the pixel or of its neighbors' middles.
+        The edge is where |g - level| equals half_width |grad_T g|. To first order, g differs from
+        g(p) by at most `reach` in the whole pixel and at the middles of its eight neighbors.
         """
         distance_in_value, tangential_gradient = self._gap_and_gradient(p, normal)
         reach = dr.abs(dr.dot(tangential_gradient, across)) + dr.abs(
@@ -312,11 +312,12 @@ class PreparedIsolines:
         if self.period is not None:
             g = g - self.period * dr.floor(g / self.period)
         table = cast("Any", self.levels)
-        index = dr.uint32_array_t(type(g))
+        uint = dr.uint32_array_t(type(g))
         # Binary search for the number of entries below g, from its highest bit to its lowest. The
         # length of the table is a power of 2 minus 1.
-        entries_below, bit = index(0), (len(table) + 1) // 2
+        entries_below, bit = uint(0), (len(table) + 1) // 2
         while bit:
+            # Are at least `bit` more entries below g?
             entry = dr.gather(type(g), table, entries_below + (bit - 1))
             entries_below, bit = dr.select(entry < g, entries_below + bit, entries_below), bit // 2
         # The nearest level is one of the two neighbors of g in the table.

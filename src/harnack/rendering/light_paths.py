@@ -86,9 +86,10 @@ class PathRenderTask:
         return width, height
 
     def render_range(self, start: int, stop: int) -> tuple[npt.NDArray[np.float32], int]:
-        """Render the pixels from `start` to `stop`, counted by rows. Returns the means of their
-        paths, an array (n, 4), or (n, 10) with features, and the number of paths that ran out of
-        steps. The columns are radiance (3), covered fraction, albedo (3) and normal (3).
+        """Render the pixels from `start` to `stop`, counted by rows. Returns two results: the means
+        over the paths of each pixel, an array (n, 4), or (n, 10) with features; and the number of
+        paths that ran out of steps. The columns are radiance (3), covered fraction, albedo (3) and
+        normal (3).
 
         All samples of a pixel are traced at once, so that the sampler can stratify them. Every
         pixel averages only its own samples. So there are no sums whose order threads could change:
@@ -455,6 +456,7 @@ class RefractionTracer:
             index = dr.select(si.shape == mi.ShapePtr(proxy), value, index)
         normal = mi.Vector3f(si.n)
         direction, reflected_fraction = refract(normal, d, index)
+        # Reflections on the way out of a solid are left out.
         enters_solid = is_crossed & (dr.dot(normal, d) < 0)
         reflected_light = dr.select(
             enters_solid, throughput * self._reflected(si, d, index, reflected_fraction), 0
@@ -496,6 +498,7 @@ class RefractionTracer:
         gloss = self.light.shade(black, normal, -d, mi.Bool(True), one) * (
             reflectance_straight_on / _DEFAULT_REFLECTANCE
         )
+        # Variants with one channel hold luminance.
         light = mi.Spectrum(gloss) if not mi.is_monochromatic else mi.Spectrum(mi.luminance(gloss))
         sky = self.world.scene.environment()
         if sky is not None:

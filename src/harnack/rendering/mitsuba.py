@@ -285,9 +285,10 @@ def transmittance(mi: Any, carriers: Any, start: Any, si: Any, d: Any) -> Any:
     start, d: the surface interactions at which rays start, and their directions (3,).
     si: the next hits of the rays.
 
-    By Beer and Lambert's law the fraction tint^t of the light is left after a length t in a solid.
-    Going in and out of a solid alternate (`CappedSolid.intersect`). So a ray that leaves a point of
-    a solid's boundary against the outward normal is inside up to the next hit.
+    If one unit of length in a solid leaves the fraction a of the light, a length t leaves the
+    fraction a^t (Beer and Lambert). Going in and out of a solid alternate
+    (`CappedSolid.intersect`). So a ray that leaves a point of a solid's boundary against the
+    outward normal is inside up to the next hit.
     """
     remaining = mi.Spectrum(1)
     for carrier in carriers:
@@ -296,6 +297,7 @@ def transmittance(mi: Any, carriers: Any, start: Any, si: Any, d: Any) -> Any:
         inside = is_inside(mi, carrier, start, d) & si.is_valid()
         # The spectrum of a reflectance of that color, at the ray's wavelengths.
         per_unit = mi.Spectrum(carrier.tint.eval(si, inside))
+        # `power` needs a positive base.
         remaining *= dr.select(inside, dr.power(dr.maximum(per_unit, 1e-6), si.t), 1)
     return remaining
 
@@ -310,6 +312,7 @@ def refract(normal: Any, d: Any, index: Any) -> tuple[Any, Any]:
     """
     normal_dot_d = dr.dot(normal, d)
     enters = normal_dot_d < 0
+    # The refractive index before the boundary, divided by the one behind it.
     eta = dr.select(enters, 1 / index, index)
     normal_to_ray = dr.select(enters, 1, -1) * normal
     cosine = dr.clip(dr.abs(normal_dot_d), 0, 1)
@@ -326,6 +329,7 @@ def refract(normal: Any, d: Any, index: Any) -> tuple[Any, Any]:
     reflected_fraction = dr.select(
         is_refracted, 0.5 * (perpendicular * perpendicular + parallel * parallel), 1
     )
+    # Between equal indices nothing is reflected.
     reflected_fraction = dr.select(dr.abs(index - 1) < _MIN_INDEX_DIFFERENCE, 0, reflected_fraction)
     refracted = eta * d + (eta * cosine - refracted_cosine) * normal_to_ray
     mirrored = d + 2 * cosine * normal_to_ray

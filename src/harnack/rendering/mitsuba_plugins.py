@@ -109,8 +109,8 @@ def warn_unsupported_integrator(scene: Any, integrator: Any) -> None:
 
 def equivalent_path_tracer(mi: Any, scene: Any) -> PathTracer | None:
     """Return a path tracer of harnack that computes the same light as the scene's integrator. None
-    if Mitsuba has to draw the scene: its integrator follows no paths, and the scene has no level
-    sets of harnack or the integrator sees them.
+    if Mitsuba has to draw the scene. That is so if its integrator follows no paths, and either the
+    scene has no level sets of harnack or the integrator can see them.
 
     Raises:
         ValueError: the scene has level sets of harnack, and its integrator asks for something that
@@ -136,6 +136,7 @@ def equivalent_path_tracer(mi: Any, scene: Any) -> PathTracer | None:
         return _with_settings(mi, integrator)
     if not count or _sees_ours(integrator):
         return None
+    # Direct light is the light of paths of at most two edges.
     if class_name == _DIRECT:
         return PathTracer(mi, 2, hide_emitters=bool(integrator.hide_emitters))
     wrong = (
@@ -212,8 +213,8 @@ def register_surfaces(plugin: str, surface: Callable[[Any], TracedSurface]) -> A
 
 def surface_from_properties(props: Any) -> TracedSurface:
     """Return the surface that the properties of a `harnack` shape describe. The properties "low"
-    and "high" are the ends of the values of the field on a closed solid; one of them may be
-    missing.
+    and "high" make the shape a closed solid, on which the field lies between them; one of them may
+    be missing.
 
     Raises:
         ValueError: the properties describe no surface, or contradict each other.

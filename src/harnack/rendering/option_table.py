@@ -341,12 +341,9 @@ def complete_options(verb: str, keywords: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def refuse_unknown(verb: str, keywords: Mapping[str, Any]) -> None:
-    """Raise TypeError for keywords that are not options of a function of the library. The message
-    suggests a similar name, or the name that replaces one known from other programs; if there is
-    none, it lists the options of the function.
-
-    verb: the name of the function, such as "render" or "trace".
-    """
+    """Raise TypeError for keywords that are no options of the function `verb` of the library, such
+    as "render". The message suggests an option: the one that has the meaning of this name in other
+    programs, or one with a similar name. If there is none, it lists the options of the function."""
     refuse_others(verb, keywords)
     for name in keywords:
         if name not in BY_NAME:

@@ -310,6 +310,7 @@ def _render_by_mitsuba(
     ):
         if is_set:
             raise ValueError(f"{name}: Mitsuba draws this scene, by an integrator of its own")
+    # With 0 samples, Mitsuba takes the number of the scene.
     image = np.array(mi.render(scene, spp=options.spp or 0, seed=options.seed))
     # An integrator `aov` names each channel of its nested pictures (NAME.R, ...). These pictures
     # are also the first channels, so their names are left out here.

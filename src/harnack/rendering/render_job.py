@@ -49,8 +49,9 @@ class RenderJob:
     shorthand: options of surfaces and traces that were set by keywords, by name.
     variant: the Mitsuba variant.
 
-    The task is an `AovTask`, a `PathRenderTask` or a `ShadedTask`. The methods here that are named
-    like methods of a task call these, and return their results as plain arrays by name.
+    The task is an `AovTask`, a `PathRenderTask` or a `ShadedTask`. Each of the methods
+    `render_range`, `render_samples`, `render_gbuffer` and `refine_pixels` calls the method of the
+    task that has the same name, and returns its result as plain arrays by name.
     """
 
     surfaces: Any
@@ -114,6 +115,7 @@ class RenderJob:
                 aov_task = replace(aov_task, background=options.backdrop.bottom)
             return aov_task
         if options.show == "shaded":
+            # In the studio, the backdrop is added to the picture afterwards: it is cut out.
             return ShadedTask(
                 mi, scene, sensor, spp=options.spp or EDGE_SPP, cut_out=stage is not None,
                 on_floor=stage is not None and stage.has_ground, cones=options.antialias == "cones",

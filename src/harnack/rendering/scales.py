@@ -1,7 +1,7 @@
 """Colors by name, and colors for numbers. A color map turns numbers in [0, 1] into colors. A color
-scale maps an interval of numbers to a color map, and has ticks, which are numbers with their texts.
-A color bar shows the scale beside a picture. Colors are in sRGB with channels in [0, 1] unless
-stated otherwise."""
+scale gives colors to the numbers of an interval by a color map. Its ticks are numbers of the
+interval with their texts. A color bar shows the scale beside a picture. Colors are in sRGB with
+channels in [0, 1] unless stated otherwise."""
 
 from __future__ import annotations
 
@@ -291,7 +291,8 @@ def _format_number(number: float, step: float, largest: float) -> str:
     """
     if number == 0:
         return "0"
-    last_place = math.floor(math.log10(step) + 1e-9)  # the place of the last digit
+    # The place of the last digit; 1e-9 allows for rounding.
+    last_place = math.floor(math.log10(step) + 1e-9)
     if step >= _MIN_PLAIN_STEP and largest < _MAX_PLAIN_NUMBER:
         return f"{number:.{max(0, -last_place)}f}"
     # The number of digits between the number's first digit and the step's digit.
@@ -399,6 +400,7 @@ def add_color_bar(pixels: Pixels, scale: ColorScale, background: Color) -> Pixel
     width = max(bar_width + gap + tick_width, font.getlength(scale.name))
     strip = images.new("RGB", (math.ceil(width) + 2 * letter_height, height), background_bytes)
     top = (height - bar_length + letter_height) // 2
+    # In Pillow's anchors, l is left, s the baseline and m the middle of the letters.
     strip_drawing = drawings.Draw(strip)
     tip_height = gap if any(scale.exceeded) else 0
     title_y = max(0, top - gap - tip_height)

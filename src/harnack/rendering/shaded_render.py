@@ -6,9 +6,9 @@ directions above its tangent plane, from which light of the sky comes.
 The rays through the middles of all pixels are traced first. Two kinds of pixels are then drawn
 again, as the mean of a fixed grid of samples: pixels that differ visibly from a neighbor, and
 pixels through which the edge of an isoline may pass. So outlines are smooth, lines thinner than a
-pixel have no gaps, and the inside of a surface takes one ray a pixel. If requested, cones around
-the rays find more pixels to draw again: those that a surface covers in part although no ray through
-a middle hits it.
+pixel have no gaps, and the inside of a surface takes one ray a pixel. If requested, the cone about
+each ray that contains the whole pixel is tested, too. It finds pixels that a surface covers in part
+although the rays through their middles miss it. They are drawn again.
 """
 
 from __future__ import annotations
@@ -49,8 +49,8 @@ if TYPE_CHECKING:
 
 
 class ConeCoverage:
-    """Finds pixels that surfaces may cover in part, by a cone around the ray through each pixel's
-    middle.
+    """Finds pixels that surfaces may cover in part. For each pixel it tests a cone: the cone about
+    the ray through the pixel's middle that contains the whole pixel.
 
     The ray mostly misses parts of a surface that are thinner than the pixel, and so do the rays of
     the neighbors. The cone contains the whole pixel, so it does not miss them.
@@ -74,6 +74,7 @@ class ConeCoverage:
         position: (3,) the points that the rays hit; NaN for no hit.
         """
         mi = self.mi
+        # Without a hit, the cone is tested to its end.
         distance = dr.norm(position - ray.o)
         t = dr.select(dr.isfinite(distance), distance, dr.largest(mi.Float))
         # The vectors to the neighboring pixels span one pixel at distance 1.
@@ -106,6 +107,7 @@ def _prepared(mi: Any, carrier: Any) -> tuple[PlacedSurface, Any]:
             f'antialias="cones" takes fields without jumps, and {surface.field!r} jumps: its '
             'values tell no distance. Leave antialias at "edges"'
         )
+    # Cones need a tracer that finds where f crosses the level.
     placed = replace(carrier.placed, prepared=surface.prepare(backend, crosses=True))
     return placed, inner_and_outer_ball(surface.volume, backend)
 
@@ -121,20 +123,22 @@ def inner_and_outer_ball(volume: Volume | None, backend: Backend) -> tuple[Vec3,
     if not np.isfinite(upper - lower).all():
         return None
     middle = (0.5 * (lower + upper)).tolist()
-    # The inner radius is the distance from the middle to the boundary, and not half the box's
-    # side: other volumes have faces that lie nearer. It is reduced by more than its rounding.
+    # The inner radius is the distance from the middle to the boundary (signed distances are
+    # negative inside), and not half the box's side: other volumes have faces that lie nearer. It is
+    # reduced by more than its rounding.
     center = choose_backend("double").Array3f(*middle)
     inner_radius = -float(to_numpy(volume.signed_distance(center))[0]) * (1 - 1e-6)
     if not inner_radius > 0:
         return None
     outer_radius = 0.5 * float(np.linalg.norm(upper - lower))
+    # Opaque numbers are kernel parameters: other balls compile no other kernel.
     parameters = [dr.opaque(backend.Float, x) for x in (*middle, inner_radius, outer_radius)]
     return backend.Array3f(*parameters[:3]), parameters[3], parameters[4]
 
 
-# The number of directions across the picture, and of taps along each; the length that they cover, as
-# a fraction of the larger side of the picture; and the sine of an elevation below which facets and
-# rounding stay.
+# The number of directions across the picture, and of taps along each; the length that they cover,
+# as a fraction of the larger side of the picture; and the sine of an elevation below which facets
+# and rounding stay.
 SKY_DIRECTIONS = 16
 SKY_SAMPLES = 8
 SKY_REACH = 0.16
@@ -144,8 +148,8 @@ LEAST_SINE = 0.06
 def ambient_visibility(
     mi: Any, position: Any, normal: Any, width: Any, size: tuple[int, int]
 ) -> Any:
-    """Estimate for each pixel's point which fraction of the hemisphere over it nothing near it
-    hides, in [0, 1].
+    """Estimate how much of the sky reaches the point that each pixel shows: the fraction of the
+    hemisphere over the point, in [0, 1], that nothing near it hides.
 
     position: (3,) points seen by the pixels, counted by rows; NaN where nothing is seen.
     normal: (3,) unit normals there, toward the eye.
@@ -178,14 +182,15 @@ def ambient_visibility(
         point_distance = dr.norm(offset)
         fade = dr.maximum(1 - dr.square(point_distance / reach_in_space), 0)
         sine = dr.dot(offset, normal) / point_distance - LEAST_SINE
+        # The sine is NaN if nothing is seen, and then not larger than 0.
         return dr.select(is_in_picture & (sine > 0), sine * fade, 0)
 
     def add_direction(turn: Any, hidden: Any) -> tuple[Any, Any]:
-        """One step of the loop over directions. Returns the index of the next direction, and the
-        sum of hidden fractions with this direction added.
+        """Do one step of the loop over directions. Returns the index of the next direction, and the
+        sum of hidden fractions with this direction added. The hidden fraction of a direction is the
+        square of the largest sine that `tap` returns for it.
 
-        turn: the index of this direction.
-        hidden: the sum so far.
+        turn: the index of this direction. hidden: the sum so far.
         """
         s, c = dr.sincos((mi.Float(turn) + 0.5) * (dr.two_pi / SKY_DIRECTIONS))
         highest = mi.Float(0)
@@ -246,6 +251,7 @@ class GBuffer:
     def nothing(cls, mi: Any, count: int) -> GBuffer:
         """Return a buffer of zeros for `count` pixels. Buffers of parts of the picture are
         scattered into it."""
+        # The types of the attributes, in their order; width is the Float.
         vectors, colors, masks = (mi.Vector3f,) * 3, (mi.Color3f,) * 3, (mi.Bool,) * 5
         kinds = (*vectors, mi.Float, *colors, *masks)
         return cls(*(dr.zeros(kind, count) for kind in kinds))
@@ -280,13 +286,14 @@ class ShadedTask:
 
     spp: at least this many rays are averaged for a pixel at an edge; with 1, every pixel has a
         single ray.
-    on_floor: whether the scene is a studio's, whose floor shows shadows.
+    on_floor: whether the surfaces stand on the floor of the studio, which shows their shadows.
     cut_out: whether to leave out the light of the backdrop behind all objects.
-    cones: whether cones find pixels to draw again, besides edges in the picture.
+    cones: whether pixels are also drawn again if a surface may cover a part of the cone that
+        contains the pixel (`ConeCoverage`), and not only at edges in the picture.
 
     Raises:
-        ValueError: the Mitsuba variant is spectral, whose four wavelengths a ray do not give a
-            color; or cones are requested for a field that jumps.
+        ValueError: the Mitsuba variant is spectral (the four wavelengths of a ray do not determine
+            a color); or cones are requested for a field that jumps.
     """
 
     def __init__(
@@ -305,8 +312,9 @@ class ShadedTask:
         self.order = tiled_pixel_order(self.size)
         self.finder = ConeCoverage(mi, world) if cones else None
         offsets = multijitter_offsets(spp)
-        traced = (offsets == _MIDDLE).all(axis=1)  # the offset of a pixel's first ray
-        # If the first ray is one of the grid's samples, it is not traced again.
+        # The pixel's first ray goes through its middle. A sample at the same place is not traced
+        # again.
+        traced = (offsets == _MIDDLE).all(axis=1)
         self.offsets, self.share_of_first = offsets[~traced], float(traced.mean())
         self.refines = spp > 1
         matrix = np.array(sensor.world_transform().matrix, dtype=np.float64).reshape(4, 4)
@@ -344,6 +352,7 @@ class ShadedTask:
         # Adding zeros gives the mask its full width.
         lost = first.is_out_of_steps | dr.zeros(mi.Bool, dr.width(pixel))
         hit = first.is_hit & ~lost
+        # The normal points to larger values: that side is called the inner one.
         sees_inner_side, is_open = si.wi.z > 0, self._is_open(si)
         color, back = (self._reflectance(si, side) * weight for side in (1, -1))
         color, back = (as_rgb(mi, c, ray.wavelengths) for c in (color, back))
@@ -352,6 +361,7 @@ class ShadedTask:
         is_off_line = ~is_on_line  # lines have their own color
         color = two_sided_color(color, back, sees_inner_side & is_open & is_off_line)
         color = hole_filling_tint(color, first.is_hole_filling & is_off_line)
+        # The light that a shape emits to the eye, or that comes from the environment behind all.
         emitted = si.emitter(scene).eval(si, ~lost) * weight
         light = as_rgb(
             mi, hits.throughput * emitted + weight * hits.reflected_light, ray.wavelengths
@@ -396,6 +406,7 @@ class ShadedTask:
         """
         mi = self.mi
         position = film_positions(mi, pixel, offset, self.size)
+        # One fixed wavelength and the middle of the lens: no random numbers are needed.
         return self.sensor.sample_ray_differential(
             self.sensor.shutter_open(), 0.5, position, mi.Point2f(0.5)
         )
@@ -404,6 +415,7 @@ class ShadedTask:
         """Return the reflectance at normal incidence of the surface at interactions `si`. side: 1
         for the visible side, -1 for the other one."""
         mi = self.mi
+        # Light arrives along the normal.
         along_normal = mi.SurfaceInteraction3f(si)
         along_normal.wi = mi.Vector3f(0, 0, dr.mulsign(mi.Float(side), si.wi.z))
         return si.bsdf().eval_diffuse_reflectance(along_normal, si.is_valid())
@@ -414,6 +426,7 @@ class ShadedTask:
         is_open = self.mi.Bool(False)
         for carrier in self.world.proxies:
             surface = carrier.surface
+            # The zero level set of a field of the class `Solid` bounds a solid, too.
             if surface.solid_range is None and not isinstance(surface.field, Solid):
                 is_open |= si.shape == self.mi.ShapePtr(carrier)
         return is_open
@@ -427,7 +440,7 @@ class ShadedTask:
         key_fraction = 1.0
         if self.floor is not None:
             key_fraction, sky_fraction = self.floor.at(buffer.position)
-            # On the floor, its traced shadow counts if it is darker.
+            # On the floor, the traced shadow counts if it is darker.
             sky = dr.minimum(sky, sky_fraction)
         lit = self.light.shade(
             buffer.color, buffer.normal, buffer.eye, buffer.glossy, sky, key_fraction
@@ -448,6 +461,7 @@ class ShadedTask:
         mi, spp = self.mi, len(self.offsets)
         # Successive lanes are the samples of one pixel, then those of the next.
         sample = dr.arange(mi.UInt32, len(indices) * spp)
+        # Opaque numbers are kernel parameters: other numbers compile no other kernel.
         opaque_spp = dr.opaque(mi.UInt32, spp)
         pixel = dr.gather(mi.UInt32, upload_indices(mi, indices), sample // opaque_spp)
         offset_table = mi.Vector2f(

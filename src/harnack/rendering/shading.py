@@ -218,14 +218,20 @@ class StudioLight:
         key, up = _parameter(normal, self.key), _parameter(normal, self.up)
         # The key light is large: it reaches a little around the terminator.
         key_cosine = dr.clip((dr.dot(normal, key) + KEY_WRAP) / (1 + KEY_WRAP), 0, 1)
+        # What hides the sky hides a part of the large key light, too.
         key_visible = (1 - KEY_HIDDEN * (1 - visible)) * reached
         upper_fraction = 0.5 + 0.5 * dr.dot(normal, up)
         # Light of the hemisphere, between its color below and its color above.
-        sky = dr.lerp(_like(color, GROUND_IRRADIANCE), _like(color, SKY_IRRADIANCE), upper_fraction) * visible
+        sky = (
+            dr.lerp(_like(color, GROUND_IRRADIANCE), _like(color, SKY_IRRADIANCE), upper_fraction)
+            * visible
+        )
         radiance = color * (_like(color, KEY_IRRADIANCE) * (key_cosine * key_visible) + sky)
         half_vector = dr.normalize(key + eye)
         # Where the light is below the horizon there is no highlight, and no edge to it either.
-        highlight = HIGHLIGHT * dr.power(dr.maximum(dr.dot(normal, half_vector), 0), HIGHLIGHT_EXPONENT)
+        highlight = HIGHLIGHT * dr.power(
+            dr.maximum(dr.dot(normal, half_vector), 0), HIGHLIGHT_EXPONENT
+        )
         # Glossy matter reflects more sky at grazing angles (Schlick).
         rim = RIM * dr.power(1 - dr.clip(dr.dot(normal, eye), 0, 1), 5)
         gloss = _like(color, KEY_IRRADIANCE) * (highlight * key_cosine * key_visible) + sky * rim
@@ -333,9 +339,13 @@ class FloorShadow:
         """Compute the shadow of the objects of a scene on the floor, by tracing rays from the floor
         to the key light and to the sky."""
         mi = world.mi
-        cell_centers = (np.arange(FLOOR_CELLS) + 0.5) / FLOOR_CELLS * 2 * FLOOR_HALF_WIDTH - FLOOR_HALF_WIDTH
+        cell_centers = (
+            np.arange(FLOOR_CELLS) + 0.5
+        ) / FLOOR_CELLS * 2 * FLOOR_HALF_WIDTH - FLOOR_HALF_WIDTH
         y, x = np.meshgrid(cell_centers, cell_centers, indexing="ij")
-        fractions = _visible_fractions(world, x, y, np.stack([_key_directions(light.key), sky_directions()]))
+        fractions = _visible_fractions(
+            world, x, y, np.stack([_key_directions(light.key), sky_directions()])
+        )
         image = np.stack([_blurred(fraction) for fraction in fractions], axis=-1)
         numbers = mi.Float(upload_floats(mitsuba_backend(mi), image.ravel()))
         tensor = mi.TensorXf(numbers, image.shape)
@@ -366,6 +376,7 @@ def _visible_fractions(
     # The place of a point in its block of 4 x 4 points chooses its group of rays.
     j, i = np.indices(x.shape)
     d = towards[:, (j % SAMPLE_BLOCK) * SAMPLE_BLOCK + i % SAMPLE_BLOCK]
+    # A copy of each point for each of its rays.
     o = np.stack([x, y, np.zeros_like(x)], axis=-1)[:, :, None]
     o = np.broadcast_to(o, d.shape)
     ray = mi.Ray3f(_vectors(mi.Point3f, o), _vectors(mi.Vector3f, d))
@@ -386,6 +397,7 @@ def _square() -> FloatArray:
     k = np.arange(SAMPLE_BLOCK * SAMPLE_BLOCK * RAYS_PER_CELL)
     plastic = 1.32471795724474602596  # the real root of x^3 = x + 1
     points = np.mod(0.5 + np.outer(k, [1 / plastic, 1 / plastic**2]), 1.0)
+    # Successive points go to different groups.
     return points.reshape(RAYS_PER_CELL, SAMPLE_BLOCK * SAMPLE_BLOCK, 2).transpose(1, 0, 2)
 
 
@@ -393,8 +405,10 @@ def _key_directions(key: Any) -> FloatArray:
     """Return 16 groups of unit directions, (16, rays, 3), to points spread over the round key
     light. key: (3,) the direction to its middle."""
     axis = np.asarray(key, dtype=np.float64)
+    # The coordinate axis that is farthest from `axis` gives a vector at right angles.
     tangent = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
     tangent /= np.linalg.norm(tangent)
+    # The square root spreads points evenly over the disc.
     radius, angle = KEY_LIGHT_RADIUS * np.sqrt(_square()[..., :1]), 2 * math.pi * _square()[..., 1:]
     d = axis + radius * (np.cos(angle) * tangent + np.sin(angle) * np.cross(axis, tangent))
     d[..., 2] = np.maximum(d[..., 2], LEAST_KEY_HEIGHT)
@@ -404,6 +418,7 @@ def _key_directions(key: Any) -> FloatArray:
 def sky_directions() -> FloatArray:
     """Return 16 groups of unit directions, (16, rays, 3), to the sky, distributed with the cosine
     of their angle to the vertical."""
+    # Uniform squares of the sine give the cosine distribution.
     sine_squared, angle = np.moveaxis(_square(), -1, 0)
     sine = np.sqrt(sine_squared)
     return np.stack([sine * np.cos(2 * math.pi * angle), sine * np.sin(2 * math.pi * angle),
@@ -459,6 +474,7 @@ def studio_wall(
     pixel = dr.arange(mi.UInt32, width * height)
     position = film_positions(mi, pixel, mi.Vector2f(0.5), (width, height))
     ray, _ = sensor.sample_ray(sensor.shutter_open(), 0.5, position, mi.Point2f(0.5))
+    # From 0 at the horizon to 1 straight above.
     height_of_ray = np.clip(to_numpy(ray.d)[:, 2], 0, 1)
     distant = distant_ground_radiance(ground.name, azimuth)
     if show == "shaded":

@@ -120,6 +120,7 @@ def _without_table(bsdf: Dictionary) -> Dictionary:
     """Return a BSDF dictionary with the same diffuse reflectance that Mitsuba loads faster. A rough
     coat is replaced by a smooth one, for which Mitsuba need not compute a table of transmittances.
     Other dictionaries are returned unchanged."""
+    # Only dictionaries with the entries of `_coated` are known well enough.
     if bsdf.keys() != _coated((0, 0, 0), 0).keys() or bsdf["type"] != "roughplastic":
         return bsdf
     return {**{key: bsdf[key] for key in bsdf if key != "alpha"}, "type": "plastic"}
@@ -365,8 +366,8 @@ def _sensor(mi: Any, pose: CameraPose, size: tuple[int, int]) -> dict[str, Any]:
         "type": "perspective",
         "fov": pose.fov,
         "fov_axis": "larger",
-        # Rays begin at a distance that is a whole multiple of a step, since it is a literal of
-        # kernels.
+        # Rays begin one to two steps before the stage, at a whole multiple of a step, since the
+        # distance is a literal of kernels.
         "near_clip": max(1e-3, _NEAR_CLIP_STEP * (distance // _NEAR_CLIP_STEP - 1)),
         "far_clip": _FAR_CLIP,
         "to_world": to_world,

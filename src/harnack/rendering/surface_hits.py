@@ -142,6 +142,7 @@ def _refine_hits(prepared: SurfaceTracer, rays: _MarchedRays) -> SurfaceHit:
     stop.
     """
     vector, o, d, trace = prepared.backend.Array3f, rays.o, rays.d, rays.trace
+    # Of a union of patches (level sets of several functions), the patch that each ray hit.
     prepared = prepared.hit_surface(trace)
     is_hit = trace.status == int(RayStatus.HIT)
     is_smooth = is_hit & ~trace.at_jump if prepared.field.has_jumps else is_hit
@@ -165,12 +166,15 @@ def _refine_hits(prepared: SurfaceTracer, rays: _MarchedRays) -> SurfaceHit:
         sample = prepared.sample(position)
     gradient_norm = norm(sample.gradient)
     normal = dr.select(gradient_norm > 0, sample.gradient / gradient_norm, -d)
+    # A field may have another normal for shading than its gradient.
     shading_normal = normal if sample.shading_normal is None else sample.shading_normal
     uncertainty = _uncertainty(prepared, sample.gradient, t, sample.value, sample.value_error)
     # Second movement: along the gradient, by the distance to the level to first order.
     correction = prepared.levels.offset_to_nearest(sample.value) / gradient_norm
     correction = dr.select(gradient_norm > 0, dr.clip(correction, -reach, reach), 0)
-    if prepared.field.has_jumps:  # behind a facet, the value does not concern this surface
+    # If f is farther from the level than before, a facet may lie between, behind which f does not
+    # concern this surface.
+    if prepared.field.has_jumps:
         correction = dr.select(
             dr.abs(correction) * gradient_norm <= dr.abs(value_to_level), correction, 0
         )
@@ -238,6 +242,7 @@ def _hit_on_facet(
     # 1 if the ray comes from the side of smaller values, else -1.
     side = dr.mulsign(prepared.backend.Float(1), dr.dot(trace.gradient, d))
     rounding = 4 * prepared.backend.machine_epsilon * (dr.max(dr.abs(o)) + t)
+    # For |gradient| = 1, the tolerance of the value is a length.
     tolerance = prepared.tolerance.value_tolerance(prepared.backend.Float(1), t)
     return replace(
         hit,
@@ -266,6 +271,7 @@ def _uncertainty(
     gradient_norm = norm(gradient)
     # A miss has t = inf, which would make the tolerance infinite.
     t = dr.select(dr.isfinite(t), t, 0)
+    # Beside the bound `error`, the value itself is rounded by some units in its last place.
     rounding = 2 * (error + 8 * prepared.backend.machine_epsilon * dr.abs(f))
     value_tolerance = dr.maximum(prepared.tolerance.value_tolerance(gradient_norm, t), rounding)
     return dr.select(
@@ -328,6 +334,7 @@ class CappedSolid:
     def _contains(self, p: Vec3) -> Mask:
         """Return the mask of points p (3,) of the volume that belong to the solid."""
         value = self.prepared.sample(p).value
+        # `level_counts` leaves out other components if only the largest one is drawn.
         return (value >= self.low) & (value <= self.high) & self.prepared.level_counts(p)
 
     def intersect(
@@ -349,12 +356,15 @@ class CappedSolid:
         t_enter, t_leave = self.prepared.clip(o, d, zero, t_max)
         meets_volume = active & (t_enter < t_leave)
         t_enter = dr.select(meets_volume, t_enter, 0)
-        # Other rays (see `SurfaceTracer.is_resolved`) run out of steps in `_meet_levels`.
+        # If only the largest connected component is drawn, rounding may leave in doubt on some rays
+        # which points belong to it. Such rays are not resolved, and run out of steps in
+        # `_meet_levels`.
         is_resolved = self.prepared.is_resolved(o, t_leave)
         starts_inside = (
             meets_volume & is_resolved & self._contains(self._point_on_ray(o, d, t_enter))
         )
         origin_is_inside = starts_inside & (t_enter <= 0)
+        # The ray should start inside (side < 0) or outside (side > 0), and does not.
         is_on_wrong_side = (
             active
             & is_resolved
@@ -378,8 +388,9 @@ class CappedSolid:
         t = dr.select(hits_cap & ~is_on_wrong_side, dr.select(hits_exit_cap, t_leave, t_enter), 0)
         position = self._point_on_ray(o, d, t)
         # 1 where the ray leaves the solid, so that the outward normal is along it; -1 where it
-        # enters.
+        # enters. (`zero + 1` is the number 1 in the kernel's type.)
         out_along_ray = dr.select(hits_exit_cap | (side < 0), zero + 1, -1)
+        # On the wrong side, the normal is along the ray.
         normal = out_along_ray * d
         if self.prepared.volume is not None:
             cap_normal = orient_normal(
@@ -412,13 +423,15 @@ class CappedSolid:
         """Return the mask of rays o + t d, 0 <= t <= t_max, that hit the boundary of the solid.
         Rays that are not proved to miss it count as hits.
 
-        A ray hits a cap if it begins in the volume behind its origin and in the solid, or begins in
-        the solid and leaves the volume before t_max. All other active rays are tested against the
-        level sets.
+        Rays of two kinds are known to hit the boundary: rays that start outside of the volume and
+        enter it at a point of the solid, and rays that start in the solid and leave the volume
+        before t_max. All other active rays are tested against the level sets.
         """
         t_enter, t_leave = self.prepared.clip(o, d, self.prepared.backend.Float(0), t_max)
         meets_volume = active & (t_enter < t_leave)
         t_enter = dr.select(meets_volume, t_enter, 0)
+        # Rays for which rounding leaves in doubt what belongs to the solid are not resolved;
+        # `occluded` counts them as hits.
         is_resolved = self.prepared.is_resolved(o, t_leave)
         starts_inside = (
             meets_volume & is_resolved & self._contains(self._point_on_ray(o, d, t_enter))

@@ -48,6 +48,7 @@ _PARAMETER_FREE: FieldCache[bool] = FieldCache()
 def needs_derivatives(prepared: SurfaceTracer, o: Vec3, d: Vec3) -> bool:
     """Return whether rays, levels or the field's parameters have derivatives enabled.
 
+    prepared: the surface, with the levels and the field.
     o, d: (3,) origins and directions of the rays.
 
     Raises:
@@ -101,7 +102,8 @@ def refuse_derivative(
     """Return the array `value`, which raises an error if its derivative is requested: it is not
     known, and zero would be wrong. In forward mode the derivative is NaN.
 
-    o, d: (3,) origins and directions of the rays.
+    prepared, o, d: the surface, and the origins and directions (3,) of the rays; `value` depends on
+        these.
     result_name: the name of the result, for the message.
     """
     sources = [o, d, *prepared.levels.values, *prepared.field.parameters()]
@@ -114,6 +116,7 @@ def attach_derivatives(
     """Return the ray parameters t of hits, refined up to rounding, with derivatives attached; and
     the normals (3,) at these points.
 
+    prepared: the surface.
     o, d: (3,) origins and directions of the rays, possibly with derivatives.
     end: how the rays ended.
     normal: (3,) the unit normals of the trace, which are kept if there is no hit.
@@ -123,6 +126,7 @@ def attach_derivatives(
     derivative, which would need the Hessian. At hits on facets, t is exact already and does not
     depend on the level.
     """
+    # `hit_surface` takes the function of the patch that was hit, if the field is made of patches.
     t, is_hit, prepared = end.t, end.status == int(RayStatus.HIT), prepared.hit_surface(end)
     if prepared.field.has_jumps:
         t = _on_plane(prepared, o, d, end)
@@ -153,7 +157,8 @@ def attach_derivatives(
         normal = dr.select(is_hit & (length > 0), sample.gradient / length, normal)
         dr.eval(t_hit, x, slope, normal)
     point = dr.fma(backend.Array3f(t_hit), d, o)
-    # x is the same point without derivatives.
+    # The change of f at the hit by changes of the ray: a zero with a derivative, since x is the
+    # same point without derivatives.
     change = dr.dot(sample.gradient, point - x)
     if any(dr.grad_enabled(parameter) for parameter in prepared.field.parameters()):
         # f depends on parameters, too: its own derivative has all of them.
@@ -164,8 +169,11 @@ def attach_derivatives(
 
 
 def _on_plane(prepared: SurfaceTracer, o: Vec3, d: Vec3, end: MarchResult) -> Real:
-    """Return the ray parameters t. At hits on facets, they have the derivative of the intersection
-    with the facet's plane."""
+    """Return the ray parameters t at which rays o + t d ended. At hits on facets, t has the
+    derivative of the parameter at which the ray meets the facet's plane.
+
+    prepared: the surface. end: how the rays ended.
+    """
     with dr.suspend_grad():
         t_hit = dr.select(end.at_jump, end.t, 0)
         slope = dr.dot(end.gradient, dr.detach(d))

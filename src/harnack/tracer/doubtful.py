@@ -59,7 +59,8 @@ class _SearchState:
 
     distance: the distance of the next sample from the hit.
     way: the index of the direction of the next sample, 0 to 5; 0 and 1 are along the gradient.
-    above, below: whether some sample was surely above, and some surely below the level.
+    above, below: whether f was surely above the level at some sample so far, and whether it was
+        surely below the level at some sample so far.
     low, high, low_slope, high_slope: two lengths along the gradient between which f turns back, and
         the slopes of f there.
     searches: whether the point at which f turns back is being searched for.
@@ -140,7 +141,7 @@ def seen_distance(backend: Backend, field: Field, levels: Levels, hits: Doubtful
         slope = side * dr.dot(sample.gradient, direction)
         first_slope = side * dr.dot(at_hit.gradient, direction)
         is_seen = (above & below) | (now.searches & (dr.abs(offset) <= error))
-        # Does f turn back from the level in this direction?
+        # Has f turned back from the level between the hit and this sample?
         is_turning = now.may_turn & ~now.searches & (now.way < 2)
         is_turning &= (first_slope < 0) & (slope > sample.gradient_error)
         # The part of the interval in which the slope changes sign is kept.

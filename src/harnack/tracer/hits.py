@@ -71,9 +71,9 @@ class Hits:
         with f on different sides of the level: at the root of the cubic through their values and
         slopes, or found by bisection if there is a crease between them.
     position: (n, 3) the point at t, NaN for a miss.
-    normal: (n, 3) the unit normal grad f/|grad f|, or that of the facet that was hit; it points to
-        the side of larger f. Zero for rays without a hit. (A facet is a flat piece of surface at
-        which f jumps, such as a triangle of a mesh.)
+    normal: (n, 3) the unit normal grad f/|grad f|, or the normal of the facet that was hit; it
+        points to the side of larger f. Zero for rays without a hit. (A facet is a flat piece of
+        surface at which f jumps, such as a triangle of a mesh.)
     value: (n,) f at the last accepted point; for an angle-valued field up to a multiple of its
         period. For hits on facets, f just before the facet.
     evaluations: (n,) the number of evaluations of the field.
@@ -252,6 +252,7 @@ def _are_scattered(backend: Backend, o: Vec3, d: Vec3) -> bool:
         turns_much = np.square(direction_changes).sum(axis=1).mean() > _MAX_TURN**2
         # The mean square of the distance of two random origins.
         spread = 2 * starts.var(axis=0).sum()
+        # `> 0`: rays with a common origin are judged by their directions alone.
         return bool(
             turns_much or np.square(origin_changes).sum(axis=1).mean() > _MAX_STRAY**2 * spread > 0
         )
@@ -262,8 +263,8 @@ def _first_hits(
 ) -> tuple[MarchResult, Hits, _DistanceDoubt | None]:
     """Trace rays o + t d from t = near to t = far, without derivatives.
 
-    Returns the ends of rays as the tracer gives them; the `Hits` made from them; and what is known
-    of hits that may be due to rounding alone. The last is None if there can be no such hits.
+    Returns the ends of rays as the tracer gives them; the `Hits` made from them; and for each hit
+    whether it may be due to rounding alone. The last is None if there can be no such hits.
     """
     backend = prepared.backend
     end = prepared.first_hit(o, d, near, far)
@@ -276,14 +277,16 @@ def _first_hits(
     if end.patch is not None:
         index = dr.reinterpret_array(backend.Int32, end.patch)
     is_smooth_hit = is_hit & ~end.at_jump
-    # Where the gradient is NaN its length has no bound (`tracer.steep`).
-    # Rounding adds the length excess / |grad f| to the distance of the surface.
+    # Rounding adds the length excess / |grad f| to the distance of the surface. `length == length`
+    # is False where the gradient is NaN, because its length has no bound (`tracer.steep`).
     is_uncertain = is_smooth_hit & (end.tolerance_excess > 0) & (length == length)
     uncertainty = dr.select(is_uncertain, end.tolerance_excess / length, 0)
     doubt = None
-    # Other hits are at a root, or were tested on the other side of the level.
+    # No other hits are doubtful: with `end.side` rays hit at roots only, and hits of a steep field
+    # were tested on the other side of the level.
     if end.side is None and not prepared.field.is_steep:
         doubt = _DistanceDoubt.of(prepared, o, end.t, length, uncertainty)
+        # The distance as if several sheets of the surface met there.
         doubtful_uncertainty = _SHEET_COUNT * doubt.distance - doubt.tolerance
         uncertainty = dr.select(doubt.is_doubtful, doubtful_uncertainty, uncertainty)
     position = _positions(o, d, end.t)
@@ -321,6 +324,7 @@ class _DistanceDoubt:
         steepness: |grad f| at the hits.
         uncertainty: the length that rounding adds to the tolerance, to first order.
         """
+        # Rays without a hit have t = inf.
         t = dr.select(dr.isfinite(t), t, 0)
         size = max_norm(o) + t
         tolerance = prepared.tolerance.value_tolerance(steepness, t) / steepness
@@ -336,7 +340,8 @@ class _SearchedHits:
     `compute_on_active`.
 
     doubtful: the hits.
-    part: the index of the patch that each ray hit, for a field that is a union of patches.
+    part: the index of the patch that each ray hit; it is used only if the field is a union of
+        patches.
     """
 
     doubtful: Doubtful
@@ -363,7 +368,8 @@ def _with_searched_distances(prepared: SurfaceTracer, hits: Hits, doubt: _Distan
     """
     backend, field = prepared.backend, prepared.field
     is_far = doubt.is_doubtful & (doubt.distance > _SEARCH_TOLERANCES * doubt.tolerance)
-    # Whether any hit is searched, without a kernel of its own: lanes of `is_far` write a 1.
+    # Whether any hit is to be searched: lanes of `is_far` write a 1. This is computed by the kernel
+    # that computes the hits, and needs no other one.
     any_far = dr.zeros(backend.UInt32, 1)
     dr.scatter(any_far, 1, 0, is_far)
     dr.eval(any_far, *vars(hits).values())
@@ -419,8 +425,8 @@ def _trace_on_device(surface: TracedSurface, rays: RayBatch) -> Hits:
     directions = to_numpy(lanes["d"])
 
     def differences(rows: IntArray, expected: Arrays, computed: Arrays) -> str:
-        """Return a message on how the device's hits of some rays differ from the expected ones; ""
-        if they agree. rows: the indices of these rays."""
+        """Return a message on how the hits that the device computed for some rays differ from the
+        expected ones; "" if they agree. rows: the indices of these rays."""
         pair = Hits(**expected), Hits(**computed)
         return _compare_hits(*pair, directions[rows], surface.hit_tolerance)
 
@@ -461,6 +467,7 @@ def _compare_hits(
     normal = cast("FloatArray", np.where(expected.is_hit[:, None], expected.normal, actual.normal))
     cosine = np.abs((normal * directions).sum(axis=1))
     differs = expected.status != actual.status
+    # OUT_OF_STEPS is the largest status: at least one of the two is that.
     is_undecided = np.maximum(expected.status, actual.status) == int(RayStatus.OUT_OF_STEPS)
     may_differ = is_undecided | (hit & (cosine < _GRAZING))
     if (differs & ~may_differ).any() or differs.sum() > _MAX_OUTLIERS * len(differs):
@@ -476,6 +483,7 @@ def _compare_hits(
         offset = np.where(hit_both, np.abs(actual.t - t), 0) * np.maximum(cosine, _GRAZING)
     # t has single precision.
     rounding = 64 * np.finfo(np.float32).eps * np.where(hit_both, 1 + np.abs(t), 1)
+    # Each of the two hits may be as far from the surface as is allowed.
     if (offset > 2 * allowed + rounding).mean() > _MAX_OUTLIERS:
         return (
             f"hits lie up to {offset.max():.2g} off the surface, and {allowed.max():.2g} is asked"

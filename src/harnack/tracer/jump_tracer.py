@@ -199,6 +199,7 @@ class JumpTracer:
         now = self.march.advance(field, self.path, stop, now, ahead)
         # A march that ends at a facet as a miss has passed it.
         passed = active & has_facet & (now.status == int(RayStatus.MISS))
+        # Rays that look for crossings of the level have a contact.
         if now.contact is not None:
             return self._after_jump(outer, now, ahead, last, passed, active & has_facet)
         used_all_steps = passed & (now.evaluations >= self.march.max_steps)
@@ -267,6 +268,7 @@ class JumpTracer:
         point.
 
         first: the first of the crossings.
+        active: mask of rays whose crossings are merged.
 
         A ray through an edge or a vertex crosses several facets at once, in no particular order. f
         jumps there by the sum of their jumps, and there is no interval between them. The same holds
@@ -288,6 +290,7 @@ class JumpTracer:
 
         def add_next(now: _CoincidentJumps) -> _CoincidentJumps:
             """Add the next crossing to the sums, if it is at the same point."""
+            # The field looks for the next crossing after the place (t, facet) of the last one.
             crossing = self._next(
                 JumpCrossing(now.t, now.last, 0.0, first.normal), limit, now.active
             )
@@ -330,13 +333,16 @@ class JumpTracer:
         normal = dr.select(up, total.normal_up, dr.select(down, total.normal_down, first.normal))
         behind = JumpCrossing(total.t, total.last, first.jump, first.normal)
         is_unclear = total.folded & (total.jump == 0)
-        # Only where rounding is no small part of the ray.
+        # Only if rounding is no small part of the ray.
         is_unclear &= tolerance > _COARSE_FRACTION * (self.end - self.start)
         return JumpCrossing(first.t, facet, real(total.jump), normal), behind, is_unclear
 
     def _next(self, behind: JumpCrossing, end: Real, active: Mask) -> JumpCrossing:
         """Return the next crossing of a facet after the crossing `behind`, as arrays of this
-        backend. If there is none up to the parameter `end`, its t is inf and its facet NO_FACET."""
+        backend. If there is none up to the parameter `end`, its t is inf and its facet NO_FACET.
+
+        active: mask of rays that need the result.
+        """
         real, vector, count = self.backend.Float, self.backend.Array3f, self.backend.UInt32
         ahead = self.field.next_jump(self.path.origin, self.path.direction, behind, end, active)
         is_valid = real(ahead.t) <= end

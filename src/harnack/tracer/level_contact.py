@@ -335,7 +335,8 @@ class Hysteresis:
 
         free: the masks `is_free_before` and `is_free_after` of the class: whether no level lies on
             the ray before and after the interval that is marched.
-        start, rounding: as in the class.
+        start: the ray parameter at which that interval begins.
+        rounding: the distance from a facet by which rounding may move a ray that starts on it.
         """
         period = levels.period
         spacing: Real = dr.inf if period is None else period
@@ -408,9 +409,11 @@ class Hysteresis:
             place. The next level on the other side, from which the ray came, counts as lying `part`
             times half the spacing away from the level reached.
         """
+        # f minus the level reached.
         offset, far_gap = -self.levels.offset_to_nearest(value), part * _MAX_APPROACH * self.spacing
         band = part * band
-        # From the level reached, the moved levels are this far below and above it.
+        # The moved levels are this far below and above the level reached. A ray that came from
+        # below (side < 0) may go to the moved level above it, and back to the next level below.
         below = dr.select(contact.side < 0, far_gap, band)
         above = dr.select(contact.side > 0, far_gap, band)
         return LevelGaps(
@@ -454,10 +457,11 @@ class Hysteresis:
         before = dr.select(changes_side, t, dr.select(begins, accepted.t, now.before))
         after = dr.select(changes_side | begins, accepted.t, now.after)
 
-        # Is f far enough beyond the level to have crossed it, or has it left the band?
+        # Is f far enough beyond the level to have crossed it, or has it left the band? At the
+        # first sample of a ray that starts on a level, no side is known yet.
         is_first = (now.side == 0) & ~was_touching
-        # At a free end of the interval f cannot come back, so there f need differ from the level by
-        # no more than its error.
+        # Beyond a free end of the interval f meets no level, so it stays on its side. There f need
+        # differ from the level by no more than its error.
         stays_on_side = (is_first & self.is_free_before) | (accepted.is_end & self.is_free_after)
         least_offset = dr.select(stays_on_side, 0, _CROSSED_FRACTION * accepted.band)
         is_off = dr.abs(offset) > fmax(least_offset, accepted.total_error)
@@ -534,8 +538,10 @@ class Hysteresis:
         is not known while all samples of the ray were near a level.
         """
         if self.levels.period is None:
+            # The last accepted value, compared with the level.
             is_above = point.before[1] > point.value - offset
         else:
+            # If f equals the level up to its error and falls, it came from larger values.
             is_above = dr.select(dr.abs(offset) > point.total_error, offset > 0, point.slope < 0)
         # 0 stays only for a ray of which every sample so far was near a level.
         is_known = (now.side != 0) | ~point.is_near
@@ -571,7 +577,8 @@ def refine_crossing(
     evaluations.
 
     contact: the crossings. Each has two points on different sides of the level, and a first
-        approximation of the root: that of the cubic through their values and slopes.
+        approximation of the root: the root of the cubic through the values and slopes of f at these
+        points.
     active: mask of rays with a crossing.
 
     The cubic is a bad approximation of f if f has a crease between the two points. So f is

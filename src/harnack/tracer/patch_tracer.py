@@ -140,12 +140,14 @@ class PatchTracer:
         of steps in a patch ends there.
         """
         backend, path = self.march.backend, self.path
+        # The last entry. Entries are ordered by `enter` and `patch` alone; its `leave` is not used.
         after = PatchEntry(walk.enter, walk.enter, walk.box)
         entry = self.field.next_patch(
             path.origin, path.direction, after, self.start, walk.t, walk.active
         )
         active = walk.active & (entry.patch != NO_PATCH)
         start, end = fmax(entry.enter, self.start), fmin(entry.leave, walk.t)
+        # (Inactive lanes get patch 0, since NO_PATCH is no index.)
         patch = self.field.patch(dr.select(active, entry.patch, 0))
         used_all_steps = active & (walk.evaluations >= self.march.max_steps)
         now = MarchState.at(backend, start, end, active & ~used_all_steps, has_detail=False)

@@ -124,11 +124,13 @@ def find_crossings(
     """
     backend = prepared.backend
     real, vector, count = backend.Float, backend.Array3f, backend.UInt32
+    # (True: all rays are active.)
     march, path, start, end, state = prepared.begin_march(o, d, t_min, t_max, True, crosses=True)
     n = max(dr.width(array) for array in (path.origin, path.direction, start, end))
     # Crossing j of ray i is at i k + j.
     first_slot = dr.arange(count, n) * k
     # The loop scatters into these arrays, so they must lie in memory before it is recorded.
+    # `before` and `behind` are the ray parameters of the two samples around a crossing.
     t, side = dr.full(real, dr.inf, n * k), dr.zeros(real, n * k)
     before, behind = dr.zeros(real, n * k), dr.zeros(real, n * k)
     gradient, facets = dr.zeros(vector, n * k), dr.full(count, NO_FACET, n * k)
@@ -165,6 +167,7 @@ def find_crossings(
         # A ray with fewer than k crossings goes on, unless its rest is already proved to hold no
         # level.
         goes_on = is_at_crossing & (crossings < k)
+        # MISS stands for a ray without a hit so far.
         status = dr.select(goes_on, count(int(RayStatus.MISS)), after.status)
         if now.sheets is None:
             undecided = after.proved_to + after.proved_step < end
@@ -174,6 +177,7 @@ def find_crossings(
                 )
             goes_on &= undecided
         else:
+            # The tracer keeps rays active that have passed a facet without a crossing.
             goes_on |= after.active
         return next_state.with_march(
             dataclasses.replace(after, status=status, active=goes_on), crossings
@@ -185,6 +189,8 @@ def find_crossings(
     walk = loop_while_active(begin, advance, "harnack crossings")
     final = walk.now
     ray_indices, zero = dr.arange(count, n * k) // k, real(0)
+    # The crossings as a `Contact`, for `refined_crossings`. It does not use the attributes that are
+    # False and zero here.
     roots = Contact(side, backend.Bool(False), t, gradient, zero, before, behind, zero)
     # Each crossing gets the ray to which it belongs, and is refined.
     origins, directions = (

@@ -45,8 +45,9 @@ class RayBatch:
     ) -> RayBatch:
         """Make the rays from the arguments of `trace` or `crossings`, and check them.
 
-        precision: "single" or "double"; None for that of the input. Dr.Jit arrays have a precision.
-            Other rays are double if origins or directions are arrays of float64, else single.
+        precision: "single" or "double"; None for the precision of the input. Dr.Jit arrays have a
+            precision. Other rays are double if origins or directions are arrays of float64, else
+            single.
 
         Raises:
             TypeError, ValueError: shapes that do not match, numbers that are not finite, directions

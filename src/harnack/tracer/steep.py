@@ -119,9 +119,11 @@ class SteepPlace:
         ahead = dr.select(dr.isfinite(ahead), ahead, 0)
         at_point = values_between(field, p, p, slack)
         on_path = values_between(field, p, path.point(t + ahead), slack)
+        # Without a formula of values nothing is proved. (t < t is False everywhere.)
         if at_point is None or on_path is None:
             return cls(None, t < t, real(0), real(0), real(dr.inf), real(dr.inf))
         below, above = value - at_point.value.lower, at_point.value.upper - value
+        # The range contains f(p), its ends are numbers, and f is continuous in the box.
         is_valid = (below >= 0) & (above >= 0) & ~at_point.jumps
         gaps = levels.gaps(value)
         is_below = gaps.below < gaps.above
@@ -136,9 +138,11 @@ class SteepPlace:
         )
         error = error_to_level if gaps.is_one_sided else fmax(error_to_level, error_away)
         error = dr.select(is_valid & dr.isfinite(error), error, dr.inf)
+        # `nowhere`: f has no value at any point of the box.
         is_free = on_path.nowhere
         if levels.period is None:
-            # A bound that is NaN stands for an infinite bound.
+            # Start with True (t == t). An end of the range that is NaN stands for an infinite end,
+            # and comparisons with it are False.
             misses_levels = t == t
             for level in levels.values:
                 misses_levels &= (on_path.value.lower > level) | (on_path.value.upper < level)
@@ -203,8 +207,9 @@ def passes(levels: Levels, value: Real, low: Real, high: Real, gaps: LevelGaps) 
 def holds(levels: Levels, value: Real, low: Real, high: Real, gaps: LevelGaps) -> Mask:
     """Return the mask of lanes on which a level lies between `low` and `high`.
 
-    value, gaps: f at a point, and the differences between it and the next levels; used for periodic
-        levels only, which are at value - gaps.below and value + gaps.above and beyond.
+    value, gaps: f at a point, and the differences between it and the next levels. They are used for
+        periodic levels only: then the two levels next to `value` count, value - gaps.below and
+        value + gaps.above.
     """
     if levels.period is not None:
         is_held = (low - value <= -gaps.below) & (high - value >= -gaps.below)
@@ -281,7 +286,8 @@ def beyond(
         axis = (now.side_count - 1) >> 1  # no axis if the count is 0: 0 - 1 is a large number
         offset = type(p)(*(dr.select(is_side & (axis == k), axis_step, 0) for k in range(3)))
         q = dr.fma(type(p)(distance), direction, p) + offset
-        # In coordinates in which q is rounded more coarsely than this, the box is q itself.
+        # Half the sides of a box around q, a little more than the rounding of q; 0 for a coordinate
+        # of q whose own rounding is larger.
         half = type(p)(*(dr.select(shortest > epsilon * dr.abs(x), shortest, 0) for x in q))
         # Ranges of f at q up to rounding, between p and q, and on a larger box around q.
         at_q = values_between(field, q - half, q + half)
@@ -342,8 +348,9 @@ def _narrowed(now: _SearchState, length: Real, gap: Real, is_search: Mask) -> _S
     The better of this sample and the best one so far becomes `inner`; the other becomes an end of
     the interval, `low` or `high`.
     """
-    # The worse point is the low end if it is the smaller length of the two: the old best, if the
-    # new one is nearer and farther out, or the new one if it is neither.
+    # The worse of the new point and the old best one becomes an end of the interval: the low end if
+    # its length is the smaller one. That is so if the new point is the better and longer one, or if
+    # it is neither.
     is_nearer, is_farther = gap <= now.least_gap, length > now.inner
     end, is_low = dr.select(is_nearer, now.inner, length), is_nearer == is_farther
     return replace(

@@ -182,8 +182,8 @@ def as_number(number: Any, message: str) -> float:
 
 
 def _check_side(side: Any, levels: Sequence[Any]) -> Side | None:
-    """Return the option `side`. Raises ValueError if it is unknown, or if the number of levels does
-    not suit it."""
+    """Return the option `side`, which may be None, if it is valid. Raises ValueError if it is
+    unknown, or if the number of levels does not suit it."""
     if side is not None and not is_one_of(side, SIDES):
         names = ", ".join(f'"{name}"' for name in SIDES)
         raise ValueError(f"side must be one of {names}, not {side!r}{did_you_mean(side, SIDES)}")

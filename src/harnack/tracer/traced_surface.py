@@ -266,6 +266,7 @@ class TracedSurface:
         volume, region = self.volume, None
         self._check_size(backend)
         occupied = self._occupied() if self.largest or (many_rays and not crosses) else None
+        # Rays that look for crossings start a little outside the extent, but inside `region`.
         if crosses or self.require_crossing:
             region = intersection_of([self.field.domain, self.clip, self.section])
         field, known_volume = self.evaluator(backend), None
@@ -346,8 +347,8 @@ def default_tolerance(volume: Volume | None) -> HitTolerance:
 
 
 def _with_reduced_levels(levels: tuple[float, ...]) -> tuple[float, ...]:
-    """Return the levels, and after them the remainders modulo 1, in [-1/2, 1/2], of those levels
-    that are beyond 1/2 in absolute value. These are the numbers nearest to 0 that differ from a
-    level by an integer."""
+    """Return the levels, and after them the remainders modulo 1, in [-1/2, 1/2], of the levels that
+    are larger than 1/2 in absolute value. A remainder is the number nearest to 0 that differs from
+    the level by an integer."""
     remainders = dict.fromkeys(math.remainder(level, 1) for level in levels if abs(level) > 0.5)
     return levels + tuple(level for level in remainders if level not in levels)

@@ -108,6 +108,8 @@ class BalancedTree:
             # After a child's subtree comes its next sibling; after the last, what follows its
             # parent's subtree.
             after_child = np.where(position < arity - 1, child + 1, next_index[0][:, None])
+            # Behind the siblings come the descendants of the first one, then those of the second,
+            # and so on: below[level] of each.
             child_of_child = first_child[0][:, None] + arity + position * below[level]
             index.insert(0, child.reshape(-1))
             next_index.insert(0, after_child.reshape(-1))
@@ -145,6 +147,7 @@ def build_balanced_tree(points: FloatArray, *, leaf_size: int = 8, arity: int = 
     # One row for each node: the indices of its points, and their coordinates (3, nodes, points).
     point_ids = np.arange(len(points), dtype=np.int64)[None]
     positions = np.array(points.T, dtype=np.float64, order="C")[:, None]
+    # The number of splits from the root to a leaf.
     depth = max(0, math.ceil(math.log2(len(points) / leaf_size)))
     remaining = depth
     while remaining and point_ids.shape[1] > _POINTS_IN_CACHE:
@@ -190,7 +193,9 @@ def _split(point_ids: IntArray, positions: FloatArray) -> tuple[IntArray, FloatA
     # The empty slot is somewhere on the right: move it to the end of the row.
     empty_slot = (order[short_rows] == width - 1).argmax(axis=1)
     order[short_rows, empty_slot], order[short_rows, -1] = order[short_rows, -1], width - 1
-    if width % 2:  # m points of 2m on either side, the empty slot on the left
+    # A short row of odd width 2m + 1 has 2m points, and its left half has m + 1 slots. The last of
+    # these becomes the empty slot, so that both halves have m points.
+    if width % 2:
         order[short_rows, -1], order[short_rows, middle] = order[short_rows, middle], width - 1
     # From places in a row to places in the flattened array.
     order += np.arange(0, point_ids.size, width, dtype=np.int64)[:, None]
@@ -245,8 +250,8 @@ class PackedTree:
     node_heads: eight numbers for each node: six of the caller; the index of the node at which the
         walk goes on if it skips the node's subtree; and for a leaf its index among leaves, or for
         an inner node minus the index of its first child.
-    node_payloads: further numbers of the caller for each node, or None. They are stored separately
-        because a walk reads many heads in a row and few payloads.
+    node_payloads: further numbers of the caller for each node; None if there are none. They are
+        stored separately because a walk reads many heads in a row and few payloads.
     node_count: the number of nodes.
     primitives: the records of primitives, `leaf_size` for each leaf.
     """

@@ -97,6 +97,7 @@ class BoxTree:
             far."""
             best, leave, number = state
             near, far = enter_and_leave(row)
+            # The number -1 of an empty slot is no index; such a slot is never chosen.
             t, n = fmax(near, start), index(fmax(row[_BOX_NUMBER_COLUMN], real(0)))
             is_after = (t > t_after) | ((t == t_after) & (n > n_after))
             is_before_best = (t < best) | ((t == best) & (n < number))
@@ -301,6 +302,7 @@ def next_closest_triangle(
         far."""
         best, number, offset, normal, is_inner = state
         point = ClosestPointOnTriangle.of(row, x)
+        # The number -1 of an empty slot is no index; such a slot is never chosen.
         square, n = point.squared_distance, index(fmax(row[NUMBER_COLUMN], real(0)))
         is_after = (square > square_after) | ((square == square_after) & (n > number_after))
         is_before_best = (square < best) | ((square == best) & (n < number))
@@ -345,7 +347,7 @@ def _distance_test(triangles: TriangleTree, x: Vec3, pad: Real) -> Any:
         if not slab:
             return is_box_near
         n, offset, thickness, radius = vector(*slab[:3]), slab[3], slab[4], slab[5]
-        # x relative to the center of the box, along the cylinder's axis and across it.
+        # x relative to the center of the box, along the slab's normal and across it.
         relative = x - 0.5 * (low + high)
         height = dr.dot(relative, n)
         radial = dr.norm(dr.fma(vector(-height), n, relative))
@@ -468,10 +470,11 @@ def squared_distance_to_segment(a: Vec3, e: Vec3, inverse: Real) -> Real:
 
 def jump_sum_within(triangles: TriangleTree, x: Vec3, distance: Real, active: Mask = True) -> Real:
     """The sum of |jump| over all triangles within `distance` of points x. The jump is the change of
-    the winding number across a triangle, which its record holds."""
+    the winding number across a triangle. Except for its sign, it is the number in the column
+    `PARITY_COLUMN` of the triangle's record."""
     real, vector = triangles.tree.backend.Float, triangles.tree.backend.Array3f
     x, distance = vector(x), real(distance)
-    # Boxes are enlarged by `distance` besides, which covers rounding.
+    # The test enlarges boxes by a length, here `distance` itself, which is more than rounding.
     square, may_be_within = distance * distance, _distance_test(triangles, x, distance)
 
     def visit(node: VisitedNode, state: LoopValues) -> tuple[Mask, LoopValues]:

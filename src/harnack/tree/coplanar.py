@@ -99,7 +99,7 @@ def _normals(corners: FloatArray) -> tuple[FloatArray, FloatArray]:
     their heights (m,) above their longest edges."""
     u, v = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     normal = np.cross(u, v)
-    area = np.sqrt(np.einsum("ni,ni->n", normal, normal))
+    area = np.sqrt(np.einsum("ni,ni->n", normal, normal))  # twice the triangle's area
     squares = [np.einsum("ni,ni->n", edge, edge) for edge in (u, v, u - v)]
     longest = np.sqrt(np.max(squares, axis=0))
     height = area / np.where(longest > 0, longest, 1)
@@ -112,10 +112,11 @@ def _candidates(corners: FloatArray, normals: FloatArray, heights: FloatArray) -
 
     corners: (m, 3, 3) the corners of all triangles.
     normals: (m, 3) their unit normals.
-    heights: (m,) their heights over their longest edges.
+    heights: (m,) for each triangle, its height above its longest edge.
 
     A plane is a point of R^4: its unit normal and its distance from the origin. The normal is
-    turned so that its first coordinate that is larger than 0.3 in magnitude is positive. For two
+    turned so that its first coordinate that is larger than 0.3 in magnitude is positive; a unit
+    vector always has one. For two
     triangles in one plane these points differ only by rounding and by the effect of moving corners
     by `_IN_PLANE`, divided by the smaller of the triangles' heights. R^4 is divided into cells. So
     a triangle that is alone in its cell shares its plane with another triangle only in two cases:
@@ -123,7 +124,7 @@ def _candidates(corners: FloatArray, normals: FloatArray, heights: FloatArray) -
     nearer to 0.3 in magnitude than this difference.
     """
     excess = np.abs(normals) - 0.3
-    # The coordinate that decides the orientation.
+    # The first coordinate larger than 0.3 in magnitude decides the orientation.
     deciding = np.take_along_axis(normals, (excess > 0).argmax(axis=1)[:, None], axis=1)
     normals = np.where(deciding < 0, -normals, normals)
     plane = np.column_stack([normals, np.einsum("ni,ni->n", normals, corners[:, 0])]) / _PLANE_CELL
@@ -132,7 +133,8 @@ def _candidates(corners: FloatArray, normals: FloatArray, heights: FloatArray) -
     wall_distance = np.minimum(in_cell, 1 - in_cell).min(axis=1) * _PLANE_CELL
     tolerance = 4 * (_IN_PLANE + _NORMAL_ROUNDING) / np.where(heights > 0, heights, 1e-300)
     is_sure = (wall_distance > tolerance) & (np.abs(excess).min(axis=1) > tolerance)
-    # Cells with the same number count as one cell.
+    # Each cell of R^4 is hashed to one number. If two cells get the same number, they count as one
+    # cell, which only adds candidates.
     number = (cell.astype(np.int64).astype(np.uint64) * _HASH_FACTORS).sum(axis=1)
     _, group, count = np.unique(number, return_inverse=True, return_counts=True)
     return np.flatnonzero((count[group] > 1) | ~is_sure)
@@ -147,8 +149,8 @@ def overlapping_faces(
     tree: a tree of the same faces, with coordinates of at most about 1.
 
     The search begins at the smaller face of each pair: for each face it finds the overlapping faces
-    that are at least as large, and there are few of them. The size of a face is its height over its
-    longest edge.
+    that are at least as large, and there are few of them. The size of a face is its height above
+    its longest edge.
     """
     backend = tree.tree.backend
     corners = vertices[faces]
@@ -183,7 +185,7 @@ def _next_in_plane(
 
     tree: a tree of all faces.
     corners, face: the corners and the number of the lane's face.
-    sizes: the heights of all faces over their longest edges; of two faces with equal heights the
+    sizes: the height of each face above its longest edge; of two faces with equal heights the
         later one counts as larger.
     """
     backend = tree.tree.backend
@@ -199,8 +201,8 @@ def _next_in_plane(
         return is_near, for_each_primitive(node, is_near & node.is_leaf, nearer, state)
 
     def nearer(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
-        """Take the face in the record `row` if it fits and has a lower number than the best so
-        far."""
+        """Take the face in the record `row` if it is one of those that are sought, and has a lower
+        number than the best so far."""
         number = index(fmax(row[NUMBER_COLUMN], real(0)))
         other_corners = corners_of(row, vector)
         other_size = dr.gather(real, sizes, number, active)
@@ -234,7 +236,8 @@ def _in_plane(ours: tuple[Vec3, ...], theirs: tuple[Vec3, ...]) -> Mask:
     """
 
     def lies_in(corners: tuple[Vec3, ...], plane: tuple[Vec3, ...]) -> Mask:
-        """Whether three corners lie in the plane of a triangle; False if that has no normal."""
+        """Whether three corners lie in the plane of the triangle with the corners `plane`; False if
+        this triangle has no area."""
         normal = _normal(plane)
         is_near = [dr.abs(dr.dot(normal, p - plane[0])) <= _IN_PLANE for p in corners]
         return is_near[0] & is_near[1] & is_near[2] & (dr.squared_norm(normal) > 0.5)

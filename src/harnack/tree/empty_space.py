@@ -109,6 +109,7 @@ class BoxCells:
         """
         if not len(self.corners):
             return np.zeros(0, np.bool_)
+        # The margin counts twice, for both sides of a box; 1e-9 is for rounding.
         return clearance(self.centers) > self.half_diagonal * (1 + 2 * margin + 1e-9)
 
 
@@ -197,7 +198,7 @@ def nonempty_cells(
     return refine_cells(root, clearance, max_cells, finest).occupied
 
 
-# The part of the margin around an empty cell that is reserved for rounding, in cells.
+# The part of `EmptySpaceGrid.margin` that is reserved for the rounding of positions, in cells.
 _ROUNDING_SHARE = 1 / 64
 
 
@@ -296,7 +297,8 @@ class EmptySpaceGrid:
             ), free_cells > 0
 
         def body(s: Real, active: Mask) -> tuple[Real, Mask]:
-            """Extend s on active lanes; they stay active while cells are empty and s < length."""
+            """Extend s on active lanes. A lane stays active while the cell at p + s d is empty and
+            s is less than `length`."""
             further, empty = extend(s)
             return dr.select(active, further, s), active & empty & (further < length)
 
@@ -305,7 +307,8 @@ class EmptySpaceGrid:
         active = dr.full(self.backend.Bool, True, 1) & (start == start) & (length > 0)
 
         def running(s: Real, active: Mask) -> Mask:
-            """Whether a lane is still in empty cells and shorter than `length`."""
+            """Whether s is to be extended further: the path up to s ended in an empty cell, and s
+            is less than `length`."""
             del s
             return active
 
@@ -429,12 +432,14 @@ class OccupancyGrid(GridData):
         # For rounding the corner down, and for the margin beyond the box.
         room = (_MARGIN + 1e-3) * cell
         origin = np.nextafter((lower - room).astype(np.float32), np.float32(-np.inf))
-        origin = origin.astype(np.float64)
+        origin = origin.astype(np.float64)  # the same numbers
         # The grid is first filled with cubes of this width, which are then halved down to cells.
         side = cell * 2**_ROUNDS
         nx, ny, nz = (int(count) for count in np.ceil((upper + room - origin) / side))
         indices = np.indices((nx, ny, nz)).reshape(3, -1).T
         roots = BoxCells(origin + side * indices, np.full(3, side))
+        # Margins are fractions of a cube: those of large cubes are larger than needed, never
+        # smaller.
         roots = roots.subset(~roots.is_proved_empty(clearance, _MARGIN))
         cells = refine_cells(roots, clearance, np.iinfo(np.int64).max, _ROUNDS, _MARGIN).occupied
         nx, ny, nz = (count << _ROUNDS for count in (nx, ny, nz))

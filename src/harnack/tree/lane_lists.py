@@ -101,6 +101,7 @@ def build_lists(backend: Backend, walk: Callable[[WriteEntry | None], Any]) -> L
     start = np.concatenate([[0], np.cumsum(to_numpy(count).astype(np.int64))])
     if start[-1] >= 2**31:
         raise ValueError(_TOO_LONG)
+    # One entry at least, so that the array is never empty.
     first, entries = upload_integers(backend, start[:-1]), dr.zeros(index, max(1, int(start[-1])))
 
     def write_entry(position: Any, entry: Any, active: Mask) -> None:
@@ -114,8 +115,9 @@ def build_lists(backend: Backend, walk: Callable[[WriteEntry | None], Any]) -> L
 def traverse_subtrees(
     tree: PackedTree, lists: LaneLists, visit: Visit, state: LoopValues
 ) -> LoopValues:
-    """Visit the subtrees below the listed nodes of a tree, depth first, and return the final state.
-    Each lane walks through the nodes of its own list, one subtree after the other.
+    """Visit the subtrees whose roots are the listed nodes of a tree, each from its root on, depth
+    first; and return the final state. Each lane goes through its own list, one subtree after the
+    other.
 
     lists: the indices of nodes, one list for each lane.
     visit: a function that takes a `VisitedNode` and the state. It returns a mask, whether to visit

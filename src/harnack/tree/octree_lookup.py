@@ -84,7 +84,8 @@ class OctreeLookup:
             depth above.
         """
         root, *below = levels
-        nodes = np.concatenate([*below, np.zeros(8, np.int64)])  # room for any octant
+        # Eight unused entries: if the root is a leaf, lookups of children still read something.
+        nodes = np.concatenate([*below, np.zeros(8, np.int64)])
         corner = backend.Array3f(*(dr.opaque(backend.Float, float(number)) for number in low))
         return cls(
             backend, corner, dr.opaque(backend.Float, 2**MAX_DEPTH / side),
@@ -117,12 +118,14 @@ class OctreeLookup:
             return node >= 0
 
         def step(node: Any, bit: Any) -> tuple[Any, Any]:
-            """Go to the child that contains the point: bit number `bit` of its coordinates chooses
-            it."""
+            """Go from a node to its child that contains x. Bit number `bit` of the integer
+            coordinates of x chooses the child."""
             octant = ((ix >> bit) & 1) * 4 + ((iy >> bit) & 1) * 2 + ((iz >> bit) & 1)
             return dr.gather(integer, self.encoded_nodes, index(node) + octant), bit - 1
 
         node = dr.gather(integer, self.top_grid, first)
+        # The first bit below the uniform grid; 0 * ix makes it an array with an entry for each
+        # lane.
         node, _ = dr.while_loop((node, index(down - 1) + 0 * ix), is_inner, step, label="cell")
         return index(-1 - node), is_inside
 
@@ -136,7 +139,8 @@ def _build_top_grid(encoded_root: int, nodes: IntArray) -> IntArray:
     """
     grid = np.full((1, 1, 1), encoded_root, np.int64)
     for _ in range(_TOP_DEPTH):
-        # Halve the cells: each takes the child of its cell's node, or stays with a leaf.
+        # Halve the cells. A half of a cell takes the child of the cell's node that fills it, or the
+        # node itself if that is a leaf.
         x, y, z = np.indices([2 * side for side in grid.shape])
         node = grid[x >> 1, y >> 1, z >> 1]
         octant = (x & 1) * 4 + (y & 1) * 2 + (z & 1)

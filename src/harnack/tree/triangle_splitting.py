@@ -72,7 +72,7 @@ def split_intersecting_faces(
     pieces, owner = _cut_up(corners[~is_uncut], place_among_cut[cut], knives)
     edges = pieces - np.roll(pieces, 1, axis=1)
     longest = np.linalg.norm(edges, axis=2).max(axis=1)
-    # Twice the area, against the is_thickness times the longest edge.
+    # The thickness is the height above the longest edge: twice the area divided by that edge.
     is_thick = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) > _MIN_THICKNESS * longest
     owner = np.concatenate([np.flatnonzero(is_uncut), np.flatnonzero(~is_uncut)[owner[is_thick]]])
     return np.concatenate([corners[is_uncut], pieces[is_thick]]), owner
@@ -147,15 +147,17 @@ def _crossing_faces(
     face with each face at the edge.
     """
     ends = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    # edge: for each side of each face, three sides a face, the index of its edge.
     edges, edge = np.unique(ends, axis=0, return_inverse=True)
     edge = edge.reshape(-1)
     # The faces at edge 0, then those at edge 1, and so on; edge_start is where each begins.
     faces_by_edge = np.argsort(edge, kind="stable") // 3
     edge_start = np.searchsorted(np.sort(edge), np.arange(len(edges) + 1))
-    crossed, crossing = _crossings_of_edges(tree, vertices, faces, edges)
-    count = edge_start[crossed + 1] - edge_start[crossed]
-    places = np.repeat(edge_start[crossed], count) + _ranks_in_groups(count)
-    passing, passed = faces_by_edge[places], np.repeat(crossing, count)
+    crossing_edge, crossed_face = _crossings_of_edges(tree, vertices, faces, edges)
+    # For each crossing, all faces at the edge, each paired with the crossed face.
+    count = edge_start[crossing_edge + 1] - edge_start[crossing_edge]
+    places = np.repeat(edge_start[crossing_edge], count) + _ranks_in_groups(count)
+    passing, passed = faces_by_edge[places], np.repeat(crossed_face, count)
     pairs = np.concatenate([np.column_stack([passing, passed]), np.column_stack([passed, passing])])
     pairs = np.unique(pairs[pairs[:, 0] != pairs[:, 1]], axis=0)
     return pairs[:, 0], pairs[:, 1]
@@ -178,7 +180,7 @@ def _crossings_of_edges(
         (k,) the index of the edge and (k,) the index of the face of each crossing.
     """
     backend = tree.tree.backend
-    corner = [upload_integers(backend, ids) for ids in faces.T]
+    face_columns = [upload_integers(backend, ids) for ids in faces.T]
     edge_vectors = vertices[edges[:, 1]] - vertices[edges[:, 0]]
     length = np.linalg.norm(edge_vectors, axis=1)
     # In each round, find the next crossing of each edge of `searching`, as a ray from its first
@@ -194,7 +196,7 @@ def _crossings_of_edges(
         p, q = (upload_integers(backend, ids) for ids in edges[searching].T)
 
         after = backend.Float(after_t[searching]), upload_integers(backend, after_n[searching])
-        t, n = _next_foreign_crossing(tree, corner, frame, (p, q), end, after)
+        t, n = _next_foreign_crossing(tree, face_columns, frame, (p, q), end, after)
         number = to_numpy(n).astype(np.int64)
         is_found = number != NO_TRIANGLE
         after_t[searching], after_n[searching] = to_numpy(t), number
@@ -204,16 +206,17 @@ def _crossings_of_edges(
 
 
 def _next_foreign_crossing(
-    tree: TriangleTree, corner: list[Any], frame: RayFrame, ends: tuple[Any, Any], end: Any,
-    after: tuple[Any, Any],
+    tree: TriangleTree, face_columns: list[Any], frame: RayFrame, ends: tuple[Any, Any],
+    t_max: Any, after: tuple[Any, Any],
 ) -> tuple[Any, Any]:  # fmt: skip
-    """The next crossing of each ray with a face of which neither of two vertices is a corner.
+    """The next crossing of each ray, along an edge, with a face that has neither end of this edge
+    as a corner.
 
     tree: a tree of the faces.
-    corner: three index arrays, the first, second and third vertices of all faces.
+    face_columns: three index arrays: the first, second and third corners of all faces.
     frame: the rays.
-    ends: the two vertices, two index arrays with an entry for each ray.
-    end: the largest t.
+    ends: the vertices at the ends of the edges, two index arrays with an entry for each ray.
+    t_max: the largest t.
     after: (t, number of a face), the crossing behind which the search begins.
 
     Returns t and the number of the face; NO_TRIANGLE if there is none.
@@ -221,19 +224,19 @@ def _next_foreign_crossing(
     index = tree.tree.backend.UInt32
 
     def body(t: Any, n: Any, active: Any) -> tuple[Any, ...]:
-        """Go to the next crossing; the lane stays active while its face has one of the two
-        vertices."""
-        t, n, _, _ = tree.next_crossing(frame, (t, n), end, active, _COINCIDENT)
+        """Go to the next crossing, (t, number n of the crossed face). The lane stays active while
+        an end of its edge is a corner of the crossed face: such crossings are skipped."""
+        t, n, _, _ = tree.next_crossing(frame, (t, n), t_max, active, _COINCIDENT)
         is_found = active & (n != NO_TRIANGLE)
-        corners = [dr.gather(index, vertex, n, is_found) for vertex in corner]
+        corners = [dr.gather(index, column, n, is_found) for column in face_columns]
         return (
             t,
             n,
-            is_found & dr.any([(vertex == ends[0]) | (vertex == ends[1]) for vertex in corners]),
+            is_found & dr.any([(corner == ends[0]) | (corner == ends[1]) for corner in corners]),
         )
 
     def is_running(t: Any, n: Any, active: Any) -> Any:
-        """Whether a lane's crossing is with a face that has one of the two vertices."""
+        """Whether an end of the lane's edge is a corner of the face that it crossed last."""
         del t, n
         return active
 
@@ -340,7 +343,7 @@ def _cut_meets_triangle(pieces: FloatArray, heights: FloatArray, knives: FloatAr
     heights: (k, 3) the signed distances of the corners of pieces from the planes.
 
     The segment is clipped by the three edges of the knife: low and high are the ends of what is
-    left, as fractions of the segment.
+    left, as fractions of the segment. The mask is true where something is left, low <= high.
     """
     a, b, c = np.moveaxis(knives, 1, 0)
     normal = np.cross(b - a, c - a)
@@ -353,7 +356,8 @@ def _cut_meets_triangle(pieces: FloatArray, heights: FloatArray, knives: FloatAr
         ends.append(pieces[:, i] + fraction[:, None] * (pieces[:, j] - pieces[:, i]))
     low, high = np.zeros(len(pieces)), np.ones(len(pieces))
     points = np.stack(ends, axis=1)
-    # The two ends: at most two of the three points differ.
+    # The two ends of the segment: of the three points at most two differ. The first that is not NaN
+    # is one end, and the point farthest from it is the other.
     start = np.where(np.isnan(points[:, 0]), points[:, 1], points[:, 0])
     distances = np.nan_to_num(np.linalg.norm(points - start[:, None], axis=2), nan=-1.0)
     end = points[np.arange(len(points)), distances.argmax(axis=1)]
@@ -362,9 +366,11 @@ def _cut_meets_triangle(pieces: FloatArray, heights: FloatArray, knives: FloatAr
         inward /= np.maximum(np.linalg.norm(inward, axis=1, keepdims=True), 1e-300)
         # Heights of the segment's ends above the knife's edge, positive inside, with a tolerance.
         at_start, at_end = (np.einsum("nk,nk->n", x - p, inward) + 1e-9 for x in (start, end))
+        # The height is linear along the segment: 0 at the fraction `root`.
         rate = at_end - at_start
         root = -at_start / np.where(rate == 0, 1, rate)
         low = np.where(rate > 0, np.maximum(low, root), low)
         high = np.where(rate < 0, np.minimum(high, root), high)
+        # A segment parallel to the knife's edge and outside of it: nothing is left.
         high = np.where((rate == 0) & (at_start < 0), -1.0, high)
     return low <= high

@@ -50,8 +50,8 @@ NO_TRIANGLE = 0xFFFFFFFF
 
 
 def triangle_records(vertices: FloatArray, faces: IntArray) -> FloatArray:
-    """The records (m, 14) of the triangles `faces` (m, 3): the rows of numbers from which a tree
-    and its rays know each triangle.
+    """The records (m, 14) of the triangles `faces` (m, 3): for each triangle the row of numbers by
+    which a tree describes it to kernels.
 
     A record has the corners (9 numbers), ordered by the indices of their vertices; +1, or -1 if
     that order reverses the face; the index of the face; and 1/length^2 of the edges between corners
@@ -59,6 +59,7 @@ def triangle_records(vertices: FloatArray, faces: IntArray) -> FloatArray:
     """
     order = np.argsort(faces, axis=1, kind="stable")
     corners = vertices[np.take_along_axis(faces, order, axis=1)]
+    # Orders that keep the orientation of the face.
     is_even = np.isin(order @ np.array([9, 3, 1]), (5, 15, 19))  # 012, 120, 201 in base three
     edges = corners[:, [1, 2, 2]] - corners[:, [0, 1, 0]]
     square = (edges * edges).sum(axis=2)
@@ -115,11 +116,14 @@ def node_slabs(
     for the triangle nearest to a far point would visit the whole cap of the surface whose depth is
     less than the width of a box.
     """
+    # Empty slots have NaN corners, which `nanmin` and `nanmax` leave out.
     points = tree.values_in_slots(corners, np.nan).reshape(len(tree.leaf_slots), -1, 3)
     edges = corners - corners[:, :1]
     normals = tree.values_in_slots(np.cross(edges[:, 1], edges[:, 2])).sum(axis=1)
     levels: list[FloatArray] = []
+    # The last arity, 1, is that of no level: above the root nothing is summed.
     for box, arity in zip(boxes, (*tree.arities, 1), strict=True):
+        # The sum of the normals, scaled to length 1; it stays near 0 if the sum is 0 or tiny.
         n = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
         n[~(np.linalg.norm(n, axis=1) > 0.5)] = (0.0, 0.0, 1.0)
         # Offsets of all corners below each node from its center: h along n, and |r|^2 across.
@@ -127,6 +131,7 @@ def node_slabs(
         height = (offset @ n[:, :, None])[..., 0]
         low, high = np.nanmin(height, axis=1), np.nanmax(height, axis=1)
         square = np.einsum("nij,nij->ni", offset, offset) - height * height
+        # A little larger, against rounding.
         radius = np.sqrt(np.maximum(np.nanmax(square, axis=1), 0)) * (1 + 1e-6) + 1e-7
         levels.append(np.column_stack([n, 0.5 * (low + high), 0.5 * (high - low), radius]))
         normals = normals.reshape(-1, arity, 3).sum(axis=1)
@@ -253,8 +258,8 @@ class TriangleTree:
         Returns:
             t (inf if there is none); the number of the triangle (NO_TRIANGLE if there is none); the
             sign of the crossing; and the unit normal of the triangle by the right-hand rule. The
-            sign is 1 if the normal points along the ray, -1 if it points back, and 0 if there is no
-            crossing.
+            sign is 1 if the normal points along the ray, and -1 if it points back. It is 0 if there
+            is no crossing, or if only the border of the triangle is within `reach` of the ray.
         """
         real, index, vector = (
             self.tree.backend.Float,
@@ -294,6 +299,7 @@ class TriangleTree:
         # The best crossing so far: t, number of the triangle, sign, and a normal of any length.
         start = (real(dr.inf), index(NO_TRIANGLE), real(0), vector(0))
         best, number, sign, normal = traverse(self.tree, visit, start, active)
+        # 1e-37 only keeps the normal finite (0) where there is no crossing.
         return best, number, sign, normal * dr.rsqrt(fmax(dr.squared_norm(normal), real(1e-37)))
 
     def signed_crossings_ahead(self, frame: RayFrame, t_min: Real, active: Mask = True) -> Real:
@@ -339,13 +345,15 @@ class TriangleTree:
             total, is_sure = state
             t, sign = signed_crossing(row, frame)
             normal = normal_of(row, self.tree.backend.Array3f)
-            # |normal| times the cosine, and times the error of t times the cosine.
+            # Is |t| larger than the error of t? Both sides are multiplied by |normal| and by the
+            # cosine, so that nothing is divided by a cosine near 0.
             steep, error = (
                 dr.abs(dr.dot(normal, frame.d)),
                 _UNCERTAIN_ROUNDINGS * unit * dr.norm(normal),
             )
             is_certain = (dr.abs(t) * steep > error) & (dr.abs(t - end) * steep > error)
             is_between = active & (t > 0) & (t < end)
+            # A triangle that the ray does not cross (sign 0) adds no doubt, whatever its t.
             return total + dr.select(is_between, sign, 0), is_sure & (
                 is_certain | (sign == 0) | ~active
             )
@@ -379,7 +387,8 @@ class TriangleTree:
             return is_met, for_each_primitive(node, is_met & node.is_leaf, add, state)
 
         def add(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
-            """Add the sign of the crossing with a record's triangle, if it is ahead."""
+            """Add the sign of the ray's crossing with the triangle in the record `row`, if the
+            crossing is ahead of x."""
             t, sign = signed_crossing(row, VerticalRayFrame(x))
             return (state[0] + dr.select(active & (way * t > 0), sign, 0),)
 
@@ -484,7 +493,7 @@ def _is_beside(row: list[Real], frame: RayFrame, reach: float) -> Mask:
     p, q, r = corners_of(row, type(frame.o))
     a, b, c = frame.transverse(p), frame.transverse(q), frame.transverse(r)
     is_near: Mask = False
-    zero = type(a[0])(0)
+    zero = type(a[0])(0)  # stands for the depths, which `_square` does not read
     for start, end in ((a, b), (b, c), (a, c)):
         twice_area, square = edge_function(start, end), _square((*start, zero), (*end, zero))
         # Where the ray, at (0, 0), is projected on the edge: 0 at its start, 1 at its end. Its
@@ -535,12 +544,13 @@ def _crossing_depth(
     )
     e = end[0] - start[0], end[1] - start[1]
     # The positions of the ray and of the apex (s') along the longest edge.
-    share = dr.rcp(select_longest(*squares))
-    ray_position = -dr.fma(start[0], e[0], start[1] * e[1]) * share
-    apex_position = dr.fma(apex[0] - start[0], e[0], (apex[1] - start[1]) * e[1]) * share
+    inverse_square = dr.rcp(select_longest(*squares))
+    ray_position = -dr.fma(start[0], e[0], start[1] * e[1]) * inverse_square
+    apex_position = dr.fma(apex[0] - start[0], e[0], (apex[1] - start[1]) * e[1]) * inverse_square
     zero = type(ab)(0)
     ray_position, apex_position = clamp(ray_position, zero, 1), clamp(apex_position, zero, 1)
-    # So that 0 <= s <= 1 - w for s = ray_position - w apex_position.
+    # So that 0 <= s <= 1 - w for s = ray_position - w apex_position. `fmin` ignores the NaN of a
+    # quotient 0/0.
     max_w = fmin(
         (1 - ray_position) / (1 - apex_position), fmin(ray_position / apex_position, type(ab)(1))
     )
@@ -552,9 +562,9 @@ def _crossing_depth(
     for (tail, head), area, square in zip(
         ((a, b), (b, c), (a, c)), (ab, bc, ac), squares, strict=True
     ):
-        share = -dr.fma(tail[0], head[0] - tail[0], tail[1] * (head[1] - tail[1])) / square
-        edge_depth = dr.fma(clamp(share, zero, 1), head[2] - tail[2], tail[2])
-        is_on_edge = (area * area <= close_square * square) & (share > 0) & (share < 1)
+        position = -dr.fma(tail[0], head[0] - tail[0], tail[1] * (head[1] - tail[1])) / square
+        edge_depth = dr.fma(clamp(position, zero, 1), head[2] - tail[2], tail[2])
+        is_on_edge = (area * area <= close_square * square) & (position > 0) & (position < 1)
         t = dr.select(is_on_edge, edge_depth, t)
     for u, v, depth in corners:
         t = dr.select(dr.fma(u, u, v * v) <= 4 * close_square, depth, t)

@@ -320,8 +320,8 @@ class _LLVMParser:
         self._current_block.append(Operation(result, kind, name, operands))
 
     def _label_parameter(self, parameter: int) -> None:
-        """Give the current label, if there is one, to the array of a kernel parameter that has none
-        yet."""
+        """If there is a current label, give it to the array of a kernel parameter, unless this
+        array has a label already."""
         if self._label is not None:
             self.labels.setdefault(parameter, self._label)
 

@@ -355,6 +355,7 @@ def _float_class_test(classes: int, x: str) -> str:
         0x04: f"({bits} == 0x80000000u)",
         0x08: f"({bits} == 0x7f800000u)",
         0x10: f"({bits} == 0xff800000u)",
+        # Bits from 1 to 0x7fffff: for 0, the subtraction gives the largest integer.
         0x20: f"((({bits} & 0x7fffffffu) - 1u) < 0x7fffffu)",
     }
     if classes & 0x40 or not classes:

@@ -81,12 +81,7 @@ class AxialBound:
         powers = sorted({i for i, _ in terms}, reverse=True)
         return cls(
             tuple(
-                (
-                    i,
-                    tuple(
-                        (j, terms[i, j]) for _, j in sorted(terms, reverse=True) if (i, j) in terms
-                    ),
-                )
+                (i, tuple((j, terms[k, j]) for k, j in sorted(terms, reverse=True) if k == i))
                 for i in powers
             )
         )

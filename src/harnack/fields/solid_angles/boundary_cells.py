@@ -118,7 +118,7 @@ class BoundaryCells:
         )
         if cells is None:
             return None
-        # w at the centers, in the mesh's own coordinates, where it is certain.
+        # w at the centers; NaN where it is not certain: near triangles, or if its error is large.
         centers = cells.centers()
         triangle_distance = distance_lower_bound(rays, to_vector3(backend, centers))
         w, error = value(centers * mesh.size + mesh.center)
@@ -224,12 +224,14 @@ class BoundaryCells:
             line = RayLine(x, direction, rounding)
 
             def rates(lengths: tuple[Real, ...], lanes: Mask) -> tuple[Real, ...]:
-                """Bound the derivative of f along the line, for each length within that length of x
-                (`CurveCells.rates_along`). lanes: the mask of the lanes to compute."""
+                """For each length T, bound the derivative of f along the line at its points within
+                T of x (`CurveCells.rates_along`). lanes: the mask of the lanes to compute."""
                 return self.cells.rates_along(cell_sums, line, lengths, lanes & inside)
 
             ray_promises = lipschitz_along(line, sums.gradient, sums.distance, rates)
-        # All numbers of f become numbers of w by the factor 1/(4 pi).
+        # All numbers of f become numbers of w by the factor 1/(4 pi). The rounding of the gradient
+        # is at most SLOPE_ROUNDINGS unit s4 (`source_sums`), and s4 = I3/4 <= I3/3 with the
+        # integral I3 of |dp|/D^3 over the boundary.
         sample = Sample(
             _PER_SPHERE * sums.angle,
             _PER_SPHERE * sums.gradient,

@@ -108,6 +108,11 @@ class UnitCircle:
         r, z: the distance r >= 0 of the point from the axis, and its height z, as Dr.Jit numbers.
 
         On the circle's own plane z = 0 the sign of the zero decides the side.
+
+        The class docstring has the formulas. Here kc is the ratio of the distances from the nearest
+        and the farthest point of the circle; K and E are the complete elliptic integrals of that
+        complementary modulus; cel is Bulirsch's general complete integral; and the solid angle is
+        -W for z > 0 and W for z < 0. I3 and J are integrals from which the gradient follows.
         """
         real: Any = cast("Any", type(r))
         agm_rounds = _AGM_ROUNDS["double" if float(dr.epsilon(r)) < 1e-10 else "single"]
@@ -136,7 +141,7 @@ class UnitCircle:
         cel = (math.pi / 2) * dr.fma(c, m, d) / (m * (m + p))
         first = (math.pi / 2 * 2.0**agm_rounds) / m  # K
         second = first * (1 - 0.5 * kc_gap * (1 + kc) - kc_gap * kc_gap * (0.25 + total))  # E
-        # w: W of the class, with its own formula on the cylinder r = 1.
+        # w: W, with its own formula on the cylinder r = 1.
         height = dr.abs(z)
         w = dr.select(r < 1, real(2 * math.pi), 0) - 4 * height * inverse / (1 + r) * cel
         w = dr.select(r == 1, math.pi - 2 * height * inverse * first, w)
@@ -150,13 +155,15 @@ class UnitCircle:
 
     @property
     def across(self) -> Real:
-        """z J, with the integral J of the class. At the point (x, y, z), this number times (x, y)
-        is the component of the gradient perpendicular to the axis."""
+        """z J, where r J is the integral of cos(phi) dphi/D^3 over the circle, and D the distance
+        of the circle's point at the angle phi. At the point (x, y, z), this number times (x, y) is
+        the component of the gradient perpendicular to the axis."""
         return (self.z * self.share) * (self.share * self.radial)
 
     def second_derivatives(self) -> tuple[Real, Real, Real]:
         """Compute three numbers from which the Hessian of the solid angle follows: its entry zz,
-        its entry rz divided by r, and its entry tt, which is z J with the integral J of the class.
+        its entry rz divided by r, and its entry tt. The class docstring has the formulas, and the
+        integrals J, I3, I5 and C5 over the circle in them.
 
         z is the direction of the circle's axis, r the radial and t the tangential direction. The
         entry rr is minus the sum of the entries zz and tt; the entries rt and zt are 0.
@@ -386,7 +393,8 @@ class CircleSet:
                 )
                 # A lower bound of |r - a| on the part of the line.
                 plane_distance = fmax(lowest - relative.a, relative.a - fmax(first, last))
-                # near and far: the distances d and P at all points of the line within `length`.
+                # near and far: lower bounds of the distances d and P at all points of the line
+                # within `length`. P is at least d.
                 near = fmax(relative.distance - length, plane_distance) - slack
                 far = fmax(relative.farthest - length, near + slack) - slack
                 bound = 2 * math.pi * relative.a / (near * far)

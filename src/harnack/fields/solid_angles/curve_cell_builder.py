@@ -91,11 +91,14 @@ def build_curve_cells(
     angle of the curve, modulo 4 pi.
     """
     loops = tuple(loop.astype(backend.dtype).astype(np.float64) for loop in loops)
-    # The cube's center and half side are multiples of `_GRID_STEP`; one step is in hand.
+    # The cube's center and half side are multiples of `_GRID_STEP`; the cube is larger by one step
+    # than the box needs.
     middle = np.round(0.5 * (low + high) / _GRID_STEP) * _GRID_STEP
     half = float(np.maximum(high - middle, middle - low).max())
     half = (math.ceil(half / _GRID_STEP) + 1) * _GRID_STEP
     edges = LoopEdges.upload(backend, loops)
+    # A cell is split if it has more near edges than the first number, or if its truncation error is
+    # more than the second number times a bound of the gradient.
     max_near, max_tail = (
         max(_MIN_NEAR, _NEAR_PER_CUBE_ROOT * sum(map(len, loops)) ** (1 / 3)),
         _MAX_TAIL_RATIO,
@@ -150,7 +153,9 @@ class _CurveCellBuilder:
         """Build all cells, one depth of the octree after the other. Returns False as soon as the
         cells exceed `most_bytes` or there are too many records of near edges, and True when all are
         built."""
-        # far: the expansions of the cells of a depth; split_count: the cells split so far.
+        # far: the expansions of the cells of a depth; split_count: the cells split so far. An
+        # octant's center is half of the half side from the cell's center along each axis, and the
+        # ball's radius is sqrt(3) BALL_MARGIN half sides: hence the offset in units of the radius.
         shifts = local_to_local_matrices(DEGREE, 0.5 / (math.sqrt(3) * BALL_MARGIN))
         centers, runs, far = (
             self.middle[None],
@@ -218,6 +223,7 @@ class _CurveCellBuilder:
         )
         # `remaining` refers to a table of the vertices, the old apexes and the new apexes.
         points = np.concatenate([self.vertices.points, runs.apex, near_runs.apex])
+        # Zeros fill each record up to a packet of eight numbers.
         point_records = RecordTable.upload(
             double, np.column_stack([points, np.zeros((len(points), 5))])
         )
@@ -309,13 +315,15 @@ class _FarBounds:
             inverse: 1/|q - p|^2.
             state: the smallest squared distance of a far edge; then, summed over the far edges,
                 the integral of |dp|/D^3, the gradient of this integral, and an estimate of the
-                truncation error; then, summed over all edges, the integral of |dp|/D^2.
+                truncation error; then, summed over all edges, a bound of the integral of |dp|/D^2.
 
             Returns the new state.
             """
             least_square, inverse_cubes, slope, tail, total = state
             edge = Edge.between(p, q, inverse, c)
             square, length = edge.squared_distance, dr.rsqrt(inverse)
+            # weight: the integral of |dp|/D^3 over the edge, which is the factor w of `Edge` times
+            # the length. The second one of `hessian_factors` is grad w.
             weight, inverse_distance = edge.biot_savart()[0] * length, dr.rsqrt(square)
             is_far, radius_ratio = square > far_from * far_from, ball_radius * inverse_distance
             # The first omitted term, of degree p + 1: proportional to (radius/D)^(p+1)/D per
@@ -324,6 +332,8 @@ class _FarBounds:
             for _ in range(DEGREE + 1):
                 truncation = truncation * radius_ratio
             new_slope = dr.fma(type(slope)(length), edge.hessian_factors()[1], slope)
+            # The integral of |dp|/D^2 is at most 2 D times that of |dp|/D^3, with the least D
+            # (`edges.sum_over_edges`).
             return (
                 dr.select(is_far, fmin(least_square, square), least_square),
                 inverse_cubes + dr.select(is_far, weight, 0),
@@ -333,6 +343,7 @@ class _FarBounds:
             )
 
         zero = backend.Float(0)
+        # The first number is larger than all squared distances; it stays if no edge is far.
         start = (backend.Float(1e6), zero, backend.Array3f(0), zero, zero)
         sums = edges.for_each(add, start, "around cells")
         dr.eval(*sums)

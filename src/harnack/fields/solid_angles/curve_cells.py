@@ -161,6 +161,8 @@ class CurveCells:
         value, *slopes = evaluate_expansion(polynomial, [*(u * inverse)], DEGREE)
         slope = inverse * vector(*slopes)
         bound = dr.norm(slope) + slope_error
+        # An error of x of at most 2.25 epsilon (1 + |x|) changes the value by at most that length
+        # times the bound of the gradient.
         rounding = dr.fma(2.25 * self.backend.machine_epsilon * (1 + dr.norm(x)), bound, rounding)
         first, count = index(row[13]), dr.select(active, index(row[14]), 0)
         near = self._sum_near(x, first, count)

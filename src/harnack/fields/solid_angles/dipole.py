@@ -237,6 +237,7 @@ def _dipole_adder(x: Vec3, unit: Real, derivatives: int) -> AddPrimitive:
         # second and third derivatives follow.
         fourth = row[6] * dr.square(upper * upper)
         is_nearest = has_area & (distance <= sums.singularity_distance)
+        # At a dipole itself, where `inverse` is infinite, its term is left out.
         added = sums.add_term(terms, active & (inverse < dr.inf))
         new_sums = dataclasses.replace(
             added,
@@ -429,9 +430,10 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
             )
 
         def gradients(x: FloatArray, n: FloatArray, areas: FloatArray, length: float) -> FloatArray:
-            """Compute the gradients (n, 3) of a smoothed dipole potential at its own points.
+            """Compute the gradients (k, 3) of a smoothed dipole potential at the dipoles
+            themselves.
 
-            x, n, areas: the points (n, 3), their normals (n, 3), and their areas (n,).
+            x, n, areas: the points (k, 3) of the dipoles, their normals (k, 3) and areas (k,).
             length: the smoothing length.
             """
             field = DipolePotential(x, n, areas, smoothing=length)
@@ -610,7 +612,7 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
 
         unit: (n, 3) the points in unit coordinates.
         """
-        # As in `extent`, with 0.1 % in hand for rounding.
+        # As in `extent`, and larger by 0.1 % for rounding.
         margin = math.sqrt(float(self.areas.sum()) / self.default_level) / self._size
         return 1.001 * (float(np.abs(unit).max()) + margin)
 

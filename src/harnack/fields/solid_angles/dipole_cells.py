@@ -481,7 +481,8 @@ def _octree(
         side = half_side / 2 ** len(levels)
         radius = math.sqrt(3) * side * BALL_MARGIN
         is_last = len(levels) == MAX_DEPTH
-        # Counting stops above the limit; cells of the last depth need the exact number.
+        # Counting stops above the limit; cells of the last depth need the exact number. With the
+        # negative radius `none_stay`, near nodes are replaced by their primitives.
         limit = dr.opaque(backend.UInt32, _UNLIMITED if is_last else max_near)
         near, none_stay = (dr.opaque(backend.Float, _NEAR * radius), dr.opaque(backend.Float, -1.0))
         # Each cell searches the whole tree for its near primitives.

@@ -224,6 +224,7 @@ class DipoleExpansions:
             error, slope_error, *norms = payload[len(_MOMENTS) :]
             r = c - tree.backend.Array3f(*head[:3])
             expansion = _ClusterExpansion.of(r, _pairs(moments), norms, radius)
+            # head[4] and head[5]: the radius and the area of the node.
             return expansion.of_cluster(error, slope_error, head[4], head[5], radius)
 
         return cls._accumulated(tree.backend, lists, term)
@@ -453,8 +454,8 @@ class PendingSources:
         tree: the tree of the primitives.
         c: (3, n) the centers of the balls.
         radius: the radius of the balls.
-        factor: k of this module: a dipole is far if it is farther than `factor` radii from the
-            center.
+        factor: the number k of the module docstring: a dipole is far if it is farther than `factor`
+            radii from the center of the ball.
         max_node_radius: an inner node that is not far remains a node if its radius is at most this.
             A larger one is replaced by its children, and a leaf by its primitives, each of which
             is far or near by itself.
@@ -463,28 +464,28 @@ class PendingSources:
         exactly one far node, or is itself far, or is among the remaining sources.
         """
         backend, far_radius = tree.backend, factor * radius
-        # `far=far` binds the value of this pass of the loop.
-        far, pending = (
+        # `is_far=is_far` binds the value of this pass of the loop.
+        far_nodes, pending_nodes = (
             build_lists(
                 backend,
-                lambda store, far=far: _count_nodes(
-                    tree, self.nodes, c, far_radius, max_node_radius, store, far=far
+                lambda store, is_far=is_far: _count_nodes(
+                    tree, self.nodes, c, far_radius, max_node_radius, store, far=is_far
                 ),
             )
-            for far in (True, False)
+            for is_far in (True, False)
         )
         far_primitives, near_primitives = (
             build_lists(
                 backend,
-                lambda store, far=far: self.primitives_of(
-                    tree, c, far_radius, max_node_radius, store, far=far
+                lambda store, is_far=is_far: self.primitives_of(
+                    tree, c, far_radius, max_node_radius, store, far=is_far
                 ),
             )
-            for far in (True, False)
+            for is_far in (True, False)
         )
-        sums = DipoleExpansions.over_nodes(tree, far, c, radius)
+        sums = DipoleExpansions.over_nodes(tree, far_nodes, c, radius)
         sums = sums.plus(DipoleExpansions.over_primitives(tree, far_primitives, c, radius))
-        return sums, PendingSources(pending, near_primitives)
+        return sums, PendingSources(pending_nodes, near_primitives)
 
     def primitives_of(
         self,
@@ -501,14 +502,16 @@ class PendingSources:
         their indices to lists. `build_lists` calls this function twice, to count and to write.
 
         The search goes through two sets: the primitives in the list `primitives`; and the
-        primitives in leaves that are not far, in the subtrees of the nodes in the list `nodes`. A
-        node that is far or remains a node is not entered.
+        primitives in leaves that are not far, in the subtrees of the nodes in the list `nodes`. The
+        search does not enter a node that is far, nor an inner node whose radius is at most
+        `max_node_radius`, which stays in a list of nodes (`split_far`).
 
         tree: the tree of the primitives.
         c: (3, n) the centers of the balls.
         far_radius: a dipole is far if its distance from c is more than this, which is k times the
             radius of the balls. For a triangle `TRIANGLE_RATIO` times its radius is added.
-        max_node_radius: inner nodes up to this radius remain nodes.
+        max_node_radius: the largest radius of inner nodes that are not entered; negative to enter
+            all that are not far.
         store: a function that writes an entry; None to count only.
         far: whether far primitives are sought, and not near ones.
         count_limit: once a count exceeds this, the remaining primitives need not be counted.
@@ -525,6 +528,7 @@ class PendingSources:
         def is_chosen(row: list[Real], active: Mask) -> Mask:
             """Decide on which active lanes a primitive is counted: it is far, or with far=False
             near, and its slot is not empty (its area is positive). row: the primitive's record."""
+            # row[6]: the area. row[7]: for a triangle, `TRIANGLE_RATIO` times its radius.
             far_distance = far_radius if are_points else far_radius + row[7]
             is_far = dr.squared_norm(c - vector(*row[:3])) > dr.square(far_distance)
             return (is_far if far else ~is_far) & (row[6] > 0) & active

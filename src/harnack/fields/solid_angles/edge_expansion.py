@@ -104,6 +104,8 @@ class EdgeExpansions:
         """
         coefficients, matrix = self.coefficients[is_split], shifts.reshape(-1, COEFFICIENTS)
         shifted = (coefficients @ matrix.T).reshape(-1, COEFFICIENTS)
+        # For each octant and each coefficient of the cell, by how much the coefficients of the
+        # octant can be larger. 2^-44 is 2^-46, times 2 as harmonics count twice, and twice that.
         column_sums = np.abs(shifts).sum(axis=1)
         rounding = 2.0**-44 * (np.abs(coefficients) @ column_sums.T).ravel()
         error, slope = (np.repeat(bound[is_split], 8) for bound in (self.error, self.slope))
@@ -286,7 +288,7 @@ def tail_bounds(q: Any) -> tuple[Any, Any]:
     By the addition theorem the squares of the orthonormal harmonics of degree j add up to
     (2j+1)/(4 pi); the squares of the two of order 1 or -1 alone add up to
     2 (2j+1)/(4 pi) (1-s^2) P_j'^2/(j (j+1)). So sqrt(1-s^2)|P_j'|/j <= sqrt((j+1)/(2j)), which
-    falls with j, and its value at j = p+1 (the local `factor`) bounds all terms.
+    falls with j, and its value at j = p+1 (`factor` in the code) bounds all terms.
 
     The sum over j > p of q^j is q^(p+1)/(1-q), and that of j q^j is
     q^(p+1) (p+1 - p q)/(1-q)^2. By Bernstein and Szego's inequality a harmonic polynomial of degree

@@ -181,14 +181,15 @@ class LiftedEdge:
         other two are the terms that the edge adds to `s4` and `s5` of `SourceSums`.
 
         Symbols. L = 2a is the edge's length, d its distance from the point x (reduced by its
-        rounding), e' = a/(d sqrt(d^2 + a^2)) the local `half_field`, and e = e'/d the local
-        `half_integral`.
+        rounding), e' = a/(d sqrt(d^2 + a^2)), and e = e'/d. In the code e' is `half_field`, and e
+        is `half_integral`.
 
         Rounding. The ends of the edge, x, and their differences together are off by half a unit.
         This changes the angle by at most that length times the edge's Biot and Savart field, which
-        is at most 2e'. The rounding of the number s of an end (see the module) acts as if the end
-        had moved by another half unit. Both edges at an end use the same bits of s, so that this
-        moves a single point of the boundary. The sums in the factor, and the product, add
+        is at most 2e'. The factor also contains, for each end, the number s: the distance of the
+        end from x, minus its component along the ray. Rounding of s acts as if the end had moved by
+        another half unit. Both edges at an end use the same bits of s, so that this moves a single
+        point of the boundary. The sums in the factor, and the product, add
         `FACTOR_ROUNDINGS` unit roundoffs, and `STEEP_ROUNDINGS` L e' unit roundoffs if the edge
         subtends more than a right angle. An angle is off by less than 4 pi in any case.
 
@@ -199,7 +200,8 @@ class LiftedEdge:
         bounds 1/(1 - q), for q = t/rho up to its largest value b, by 1 + q/(1 - b), and adds up the
         two parts with the weights s4 and s5. So the terms e/2 and 3e/(8d) bound the edge's share.
         """
-        # factor_rounding is not multiplied by anything, steep_rounding by e'.
+        # factor_rounding is a bound by itself; steep_rounding is multiplied by e'. `dr.epsilon` is
+        # the unit roundoff, half the distance from 1 to the next number.
         distance = fmax(dr.sqrt(self.edge.squared_distance) - 2 * unit, 0)
         half_field, half_integral = edge_variation(
             distance * distance, self.edge.inverse_square_length
@@ -210,6 +212,7 @@ class LiftedEdge:
             * float(dr.epsilon(half_field))
             * dr.rsqrt(self.edge.inverse_square_length)
         )
+        # Two moves by half a unit, times a field of at most 2 e'.
         rounding = fmin(
             dr.fma(dr.fma(2.0, unit, steep_rounding), half_field, factor_rounding), 4 * dr.pi
         )
@@ -376,7 +379,8 @@ def edge_factor(a: Vec3, b: Vec3, la: Real, lb: Real) -> tuple[Real, Real]:
         and the coordinate along it.
     la, lb: |a| and |b|.
 
-    s_a is computed as |a'|^2/(|a| + a.d) where a.d > 0, so that nothing cancels.
+    The number s_a = |a| - a.d is computed as |a'|^2/(|a| + a.d) where a.d > 0, so that nothing
+    cancels. a' is a without its component along d.
     """
     return _factor((a.x, a.y), (b.x, b.y), _length_less_axial(a, la), _length_less_axial(b, lb))
 
@@ -394,7 +398,7 @@ def _factor(a: tuple[Real, Real], b: tuple[Real, Real], sa: Real, sb: Real) -> t
     `tree.triangle_tree.signed_crossing` uses the same rule for crossings.
     """
     real, (au, av), (bu, bv) = cast("Any", type(sa)), a, b
-    # An end that lies on the ray is moved off it a little.
+    # An end that lies on the ray is moved off it, by far less than rounding.
     on_ray = (au == 0) & (av == 0), (bu == 0) & (bv == 0)
     ax, bx = dr.select(on_ray[0], real(-1e-18), au), dr.select(on_ray[1], real(-1e-18), bu)
     im = -edge_function((ax, av), (bx, bv))
@@ -450,13 +454,13 @@ class LiftedProduct:
         new_re = dr.fma(self.re, re, -(self.im * im))
         new_im = dr.fma(self.re, im, self.im * re)
         scale = dr.rcp(dr.abs(new_re) + dr.abs(new_im))
-        unit = type(new_re)(1)
+        one = type(new_re)(1)
         new_im = dr.select(new_im == 0, 0, new_im)  # no zero with a sign, which would be -pi
         # The sum can leave the interval only if one of the arguments is at least pi/2 in size;
         # testing for this keeps underflow from counting.
         may_wrap = (self.re <= 0) | (re <= 0)
-        turns_up = dr.select((self.im >= 0) & (im >= 0) & (new_im < 0) & may_wrap, unit, 0)
-        turns_down = dr.select((self.im < 0) & (im < 0) & (new_im >= 0) & may_wrap, unit, 0)
+        turns_up = dr.select((self.im >= 0) & (im >= 0) & (new_im < 0) & may_wrap, one, 0)
+        turns_down = dr.select((self.im < 0) & (im < 0) & (new_im >= 0) & may_wrap, one, 0)
         is_finite = dr.isfinite(scale)
         return LiftedProduct(
             dr.select(is_finite, new_re * scale, self.re),

@@ -244,8 +244,7 @@ def subtract_runs(
     vertices: int,
 ) -> CellEdges:
     """List the edges that remain when closed runs are subtracted from other closed runs. They form
-    a
-    cycle for each cell: the edges of `before` that are not in `after`, the closing edges of
+    a cycle for each cell: the edges of `before` that are not in `after`, the closing edges of
     `before`, and the reversed closing edges of `after`.
 
     before: the runs that cells inherit.

@@ -126,9 +126,10 @@ class LoopEdges:
 
         By (1) and (2) Omega is off by 2 (2.5 + 3.2/c) u for each factor. If the edge subtends at
         most a right angle, 1/c <= sqrt(2), and this is 7.1 epsilon. If it subtends more, x lies in
-        the ball over the edge: with half length h <= 1 and distance d <= h, 1/c <= sqrt(2) h/d, and
-        the integral of |dp|/D^2 is at least pi/2/d. Then Omega is also off by 2.9 epsilon times
-        that integral, which is counted by `vertex_rounding`.
+        the ball over the edge: with half length h <= 1 and distance d <= h, 1/c <= sqrt(2) h/d. Let
+        D be the distance from x to a point p of the edge; then the integral of |dp|/D^2 over the
+        edge is at least pi/2/d. So Omega is also off by 2.9 epsilon times that integral, which is
+        counted by `vertex_rounding`.
 
         (3) Vertices. |a| and s have relative errors of 2.5 u and 3.5 u, which turn chi as if the
         vertex had moved by 3.5 u |a|; the rounding of p - x moves it by u |a|. Both edges at a
@@ -304,8 +305,12 @@ class Edge:
         return dr.select(square > 0, numerator / denominator, 0), c
 
     def hessian_factors(self) -> tuple[Vec3, Vec3]:
-        """Compute the vectors c = a x e and grad w of the class. The edge's term of the Hessian of
-        the solid angle is (c grad w^T + grad w c^T)/2.
+        """Compute the vectors c = a x e and grad w, where w c is the edge's Biot and Savart field.
+        The edge's term of the Hessian of the solid angle is (c grad w^T + grad w c^T)/2.
+
+        By the formulas of the class docstring grad w = J h + K e/L^2. Here h is the vector from x
+        to the nearest point of the edge's line, L = |e|, K = 1/|a|^3 - 1/|b|^3, and J is a product
+        of sums of positive terms.
 
         Lengths should be of order one, to stay far from overflow: at the distance d, the terms fall
         like d^-5 far away and grow like d^-3 near the edge.
@@ -328,7 +333,8 @@ class Edge:
         return c, h_factor * h + e_factor * e
 
     def _denominator(self, square: Real) -> Real:
-        """Compute D = |a||b| + a.b of the class, near the edge in the form that does not cancel.
+        """Compute D = |a||b| + a.b, a factor in the denominator of the edge's field. Near the edge,
+        where the sum cancels, it is computed as |c|^2/(|a||b| - a.b).
 
         square: |c|^2 with c = a x e.
         """

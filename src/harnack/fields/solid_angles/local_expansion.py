@@ -139,6 +139,7 @@ def local_to_local_matrices(degree: int, offset: float) -> FloatArray:
         shifted = regular_harmonics(x, y, z, degree)
         for (j, k, part), column in index.items():
             for sign in (1, -1) if k else (1,):  # L_j,-k = (-1)^k conj L_jk counts too
+                # phase: L_j,(sign k) if this coefficient is 1 and all others are 0.
                 phase = 1j if part else 1.0
                 if sign < 0:
                     phase = (-1) ** k * np.conj(phase)
@@ -179,7 +180,9 @@ def evaluate_expansion(coefficients: Sequence[Any], y: Sequence[Any], degree: in
         total[0] = total[0] + weight * (real * re + (imag * im if k else 0.0))
         if j == degree:
             continue
-        # up, iup: real and imaginary part of L_j+1,k+1; down, idown: of L_j+1,k-1.
+        # up, iup: real and imaginary part of L_j+1,k+1; down, idown: of L_j+1,k-1; zr, zi: of
+        # L_j+1,k. From these, x, xi: of the difference up - down, for d/dx; v, vi: of the sum up +
+        # down, for d/dy. For k = 0 `up` alone is used, as L_j+1,-1 follows from it.
         up, down = a[j + 1, k + 1, 0], a.get((j + 1, k - 1, 0), 0.0)
         iup, idown = a[j + 1, k + 1, 1], a.get((j + 1, k - 1, 1), 0.0)
         zr, zi = a[j + 1, k, 0], a.get((j + 1, k, 1), 0.0)

@@ -148,6 +148,12 @@ class Morph(BatchedField):
     def at_accuracy(self, detail: Real) -> Field:
         return self._slice.at_accuracy(detail)
 
+    def for_ray_count(self, count: int) -> Field:
+        return self._slice.for_ray_count(count)
+
+    def without_jumps(self) -> Field | None:
+        return self._slice.without_jumps()
+
     def validate_levels(self, levels: tuple[float, ...]) -> None:
         self._slice.validate_levels(levels)
 

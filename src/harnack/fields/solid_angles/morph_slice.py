@@ -123,16 +123,17 @@ class SlicedKernel(RadialKernel):
         self._degree = _DEGREES[np.dtype(backend.dtype).itemsize]
 
     def at(self, distance: Real, inverse: Real, last: int) -> KernelValues:
-        """Compute the functions psi_0 to psi_last of the class at a distance D in four dimensions.
-        The integral i_n with the largest n comes from a polynomial, and all others from the
-        recurrence of the class, from larger to smaller n.
+        """Compute the functions psi_0, ..., psi_last at a distance D in four dimensions. psi_k is a
+        constant times i_(k+1)/D^(2k+1), with the integrals i_n of the class docstring. The integral
+        with the largest n comes from a polynomial, and all others from the recurrence i_n = (2n s^2
+        i_(n+1) + c)/(2n-1), where c = w/D and s = r/D.
 
         distance: D, which is not used.
         inverse: 1/D.
         last: the largest index.
         """
         del distance
-        # c = w/D, s2 = (r/D)^2; moment: i_n, and theta_k = psi_k D^(2k+1).
+        # c = w/D, s2 = (r/D)^2; moment: i_(k+1), from k = last down; theta_k = psi_k D^(2k+1).
         c = self.height * inverse
         s2 = dr.fma(-c, c, 1)
         moment = _horner(dr.fma(2, c, -1), moment_polynomial(last + 1, self._degree))
@@ -161,7 +162,7 @@ class SlicedKernel(RadialKernel):
         radius: (k,) the radii of the clusters.
         accuracy: a cluster is used from this many times its radius on.
         """
-        return accuracy * radius + 1e-5
+        return accuracy * radius + 1e-5  # not 0 for a cluster of radius 0
 
 
 @functools.cache

@@ -75,11 +75,13 @@ def regular_harmonics(x: Any, y: Any, z: Any, order: int) -> Pairs:
         if m:
             u, v = x * (1 / (2 * m)), y * (1 / (2 * m))
             re, im = harmonics[m - 1, m - 1]
+            # R_00 is real.
             harmonics[m, m] = (re * u, re * v) if m == 1 else (re * u - im * v, re * v + im * u)
         for l in range(m + 1, order + 1):
             scale = 1 / ((l + m) * (l - m))
             z_factor, r2_factor = (scale * (2 * l - 1)) * z, scale * r2
             re, im = harmonics[l - 1, m]
+            # For m = 0 the imaginary part is the number 0.
             re, im = z_factor * re, z_factor * im if m else 0.0
             if l - 2 >= m:
                 second = harmonics[l - 2, m]
@@ -96,8 +98,8 @@ def dipole_moments(harmonics: Pairs, nx: Any, ny: Any, nz: Any) -> Pairs:
         points, these are the means of R_lm over the points.
     nx, ny, nz: n, the dipole's normal times its area.
 
-    By the derivatives of R_lm in the module's description,
-    M_lm = nz R_l-1,m - (x - iy) R_l-1,m+1 + (x + iy) R_l-1,m-1 with x = nx/2 and y = ny/2.
+    From d/dz R_lm = R_l-1,m, (d/dx + i d/dy) R_lm = -R_l-1,m+1 and (d/dx - i d/dy) R_lm = R_l-1,m-1
+    follows M_lm = nz R_l-1,m - (x - iy) R_l-1,m+1 + (x + iy) R_l-1,m-1 with x = nx/2 and y = ny/2.
     """
     # A harmonic is a + ib; a product such as (x - iy)(a + ib) is written out in its two parts.
     r, x, y = _with_negative_orders(harmonics), 0.5 * nx, 0.5 * ny
@@ -329,8 +331,9 @@ def _leaf_moments(
         return fmin(low, source.low), fmax(high, source.high), area, weighted
 
     def sum_up(source: _DipolePrimitive, *parts: Real) -> tuple[Any, ...]:
-        """Add the primitive `source` to the sums `parts` about the leaf's center. The first sums
-        are those of `_power_terms`, the further ones the real and imaginary parts of M_lm."""
+        """Add the primitive `source` to the sums `parts` about `center`, the leaf's center, which
+        is computed below before this function is used. The first sums are those of `_power_terms`,
+        the further ones the real and imaginary parts of M_lm."""
         for dipole in source.dipoles:
             offsets = [(weight, point - center) for weight, point in dipole.points]
             more = _power_terms(dr.norm(dipole.normal), offsets) + _flatten(
@@ -359,8 +362,9 @@ def _leaf_moments(
 
 
 def _power_terms(area: Real, points: Sequence[tuple[float, Vec3]]) -> list[Real]:
-    """Compute what a spread dipole adds to the moments of its node: to the entries xx, yy, zz, xy,
-    xz, yz of `NodeMoments.second_moment`, then to `third_moment` and `fourth_moment`.
+    """Compute what a dipole that is spread over points adds to the moments of its node: ten numbers
+    for the entries xx, yy, zz, xy, xz, yz of `NodeMoments.second_moment`, then for `third_moment`
+    (3,) and `fourth_moment`.
 
     area: the area of the dipole.
     points: pairs of a fraction of the area, and an offset from the node's center.
@@ -569,9 +573,11 @@ def truncation_bounds(
     Proof. Let R be the node's radius and q = R/r.
 
     1. Values. A dipole of area a at the offset d from the center gives a term of degree l of at
-       most a l |d|^(l-1)/r^(l+1): rho^l P_l is on the sphere of radius rho a trigonometric
-       polynomial of degree l along each great circle, so by Bernstein's and Szego's inequality its
-       gradient is at most l rho^(l-1).
+       most a l |d|^(l-1)/r^(l+1). It is a times a derivative, by d along a line, of |d|^l P_l(s)
+       over r^(l+1), with Legendre's polynomial P_l and the cosine s of the angle between d and the
+       vector to the point. On the sphere |d| = rho, rho^l P_l is a trigonometric polynomial of
+       degree l along each great circle, so by Bernstein's and Szego's inequality its gradient is at
+       most l rho^(l-1).
     2. Terms up to degree 5 are known exactly and bounded by `sup_norm`. For the terms l >= 6,
        |d|^(l-1) <= R^(l-5) |d|^4, and sum_{l>=6} l q^(l-5) = q (6 - 5q)/(1-q)^2.
     3. Gradients. The term of degree l is a harmonic function that is homogeneous of degree -(l+1)
@@ -606,16 +612,17 @@ def truncation_bounds(
     return _ROUND_UP * value, _ROUND_UP * slope, _ROUND_UP * second
 
 
-def remainder_constants(level: NodeMoments, rough: float) -> tuple[FloatArray, FloatArray]:
+def remainder_constants(level: NodeMoments, nearest_ratio: float) -> tuple[FloatArray, FloatArray]:
     """Compute numbers A and K, each (k,), for k nodes of a tree. They bound how much the potential
     f of a node's dipoles differs from its linear Taylor polynomial at a point x.
 
     level: the moments of the k nodes at one level of the tree.
-    rough: the smallest distance of x from the node's center, as a multiple of the node's radius.
+    nearest_ratio: the smallest distance of x from the node's center, as a multiple of the node's
+        radius.
 
-    Let R be the node's radius, and r >= r0 = rough R the distance of x from its center. At the
-    distance t = q r from x, with q <= Q = `max_step_fraction(rough)`, f differs from the linear
-    polynomial by at most
+    Let R be the node's radius, and r >= r0 = nearest_ratio R the distance of x from its center. At
+    the distance t = q r from x, with q <= Q = `max_step_fraction(nearest_ratio)`, f differs from
+    the linear polynomial by at most
 
         (A + K/r^2) t^2/r^4 Phi_1(q),   Phi_l(q) = ((1-q)^-(l+1) - 1 - (l+1)q)/q^2.
 
@@ -628,13 +635,16 @@ def remainder_constants(level: NodeMoments, rough: float) -> tuple[FloatArray, F
     B_l <= l R^(l-5) sum a |d|^4 (a dipole has the area a and the offset d from the center) and
     Phi_l(Q) < (1-Q)^-(l+1)/Q^2.
     """
-    r0, q = np.maximum(rough * level.radius, 1e-50), max_step_fraction(rough)
-    # first: Q^2 Phi_1(Q). ratio[n]: W_n. terms[n - 1]: W_n B_n. tail: the sum over l >= 6.
-    first = q * q * remainder_factor(q)
-    ratio = [((1 - q) ** -(n + 1) - 1 - (n + 1) * q) / first for n in range(MAX_DEGREE + 1)]
-    terms = [ratio[n] * sup_norm(level.moments, n) for n in range(1, MAX_DEGREE + 1)]
-    x = 1 / (rough * (1 - q))
-    tail = x * (6 - 5 * x) / (1 - x) ** 2 / ((1 - q) ** 6 * first)
+    # q: the number Q. 1e-50 prevents a division by zero for nodes of radius 0.
+    r0, q = np.maximum(nearest_ratio * level.radius, 1e-50), max_step_fraction(nearest_ratio)
+    # scaled_phi: Q^2 Phi_1(Q). weights[n]: W_n. terms[n - 1]: W_n B_n.
+    scaled_phi = q * q * remainder_factor(q)
+    weights = [((1 - q) ** -(n + 1) - 1 - (n + 1) * q) / scaled_phi for n in range(MAX_DEGREE + 1)]
+    terms = [weights[n] * sup_norm(level.moments, n) for n in range(1, MAX_DEGREE + 1)]
+    # The bounds for l >= 6 add up to `tail` times the fourth moment over r0^2. They contain the sum
+    # of l y^(l-5) with y = R/(r0 (1 - Q)), which is y (6 - 5 y)/(1 - y)^2.
+    y = 1 / (nearest_ratio * (1 - q))
+    tail = y * (6 - 5 * y) / (1 - y) ** 2 / ((1 - q) ** 6 * scaled_phi)
     higher = tail * level.fourth_moment / r0**2 + sum(
         term / r0**n for n, term in enumerate(terms[2:])
     )

@@ -78,7 +78,8 @@ def lies_on_own_level(mesh: WindingMesh, level: float) -> bool:
     corners = mesh.corners
     has_inner = is_inner.any()
     points = _spaced_rows(x[is_inner] if has_inner else corners.mean(axis=1), _MAX_TESTED)
-    # In units in which the mesh has a size of one to two.
+    # A distance, in units in which the mesh has a size of one to two; without inner vertices a
+    # difference of w.
     max_distance = 2 * _ON_SURFACE if has_inner else _ROUNDING
 
     def is_on(queries: FloatArray) -> BoolArray:

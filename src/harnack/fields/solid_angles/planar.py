@@ -70,7 +70,10 @@ class PlanarRegion:
     ) -> HarmonicBall:
         """A ball around each point, and a proved range of the lift on it: of the curves' solid
         angle f, continued from the point without its jumps of 4 pi. The docstring of the module has
-        the proof.
+        the proof. In short: the ball whose radius is the distance d to the curves meets the plane
+        in a disk D, which is inside or outside of the region that the curves bound. Which one it
+        is, and so the range, follows from |f| and from the distance h to the plane. If rounding
+        leaves it open, a smaller ball that does not meet the plane is used.
 
         angle: f at the point, known modulo 4 pi.
         height: the signed distance of the point from the plane, positive on the normal's side. It
@@ -85,7 +88,8 @@ class PlanarRegion:
         # Upper bounds of h and of h/d in the module's notation.
         height_bound = dr.abs(height) + slack
         ratio = height_bound / distance
-        # Near the curve the rounding of positions moves f by up to about 2 slack/distance.
+        # Near the curve the rounding of positions moves f by up to about 2 slack/distance. The
+        # tolerance is much larger than that, and than the rounding of f elsewhere.
         tolerance = 1e-3 + 16 * slack / distance + error
         # If D is outside, |f| is at most 2 pi h/d; if inside, at least 2 pi (1 - h/d). So an |f|
         # above the first number proves D inside, one below the second number proves D outside. If
@@ -93,8 +97,8 @@ class PlanarRegion:
         is_inside = dr.abs(f) > turn * fmax(ratio, 0.5) + tolerance
         is_outside = dr.abs(f) < turn * fmin(1 - ratio, 0.5) - tolerance
         free_height = fmax(dr.abs(height) - slack, 0)
-        # If neither is certain, the smaller ball, which does not meet the plane, is used if it is
-        # large enough.
+        # If neither is certain, the smaller ball, which does not meet the plane, is used. The proof
+        # gives it a radius of at least d/2; it is not used if rounding left it below 0.4 d.
         is_beside = ~(is_inside | is_outside) & (free_height >= 0.4 * distance)
         zero = type(f)(0)
         radius = dr.select(is_beside, free_height, distance)
@@ -164,6 +168,7 @@ def planar_region(loops: Loops, circles: Sequence[Circle]) -> PlanarRegion | Non
     for polygon in loops:
         centered = (polygon - origin) / size
         edges = np.roll(centered, -1, axis=0) - centered
+        # No edge may have the length 0.
         if len(polygon) < 3 or not (edges * edges).sum(axis=1).all() or not is_simple(centered):
             return None
         points = centered @ axes.T
@@ -206,6 +211,7 @@ def _plane_of(
     origin: FloatArray = 0.5 * (lower + upper)
     if not 0.0 < size < np.inf:
         return None
+    # The points relative to a point of the plane; which point that is, is decided below.
     x: FloatArray = (points - origin) / size
     if circles:
         normal = np.array(circles[0].normal)

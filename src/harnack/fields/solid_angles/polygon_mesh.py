@@ -66,7 +66,7 @@ class FaceLoops:
         sign as a mark that the face's vertices are in convex position (on the boundary of their
         convex hull); and bounds of the rounding of a point in the face's unit coordinates, and of
         the rounding of its solid angle.
-    edges: the records of all edges, four to a record, each face in its own unit coordinates.
+    edges: the edges of all faces, four to a record, each face in its own unit coordinates.
     """
 
     heads: RecordTable
@@ -87,6 +87,7 @@ class FaceLoops:
         x = faces.vertices[faces.corners] - center[face]
         first_corner = np.flatnonzero(np.diff(face, prepend=-1))
         size = np.maximum.reduceat(np.linalg.norm(x, axis=1), first_corner)
+        # The largest coordinate of a face, in units of its size: by it positions are rounded.
         magnitude = np.maximum(np.abs(low), np.abs(high)).max(axis=1) / size
         x /= size[face][:, None]
         loops = tuple(np.split(x, faces.loop_starts[1:]))
@@ -101,6 +102,8 @@ class FaceLoops:
             )
         signed_counts = np.where(faces.in_convex_position, -counts, counts)
         edges = LoopEdges.upload(backend, loops, EDGES_PER_RECORD)
+        # A point has a few roundings of size 1 in unit coordinates, and was rounded once before, at
+        # its distance from the origin, which is about `magnitude`.
         heads = np.column_stack(
             [
                 center, size, np.cumsum(counts) - counts, signed_counts,
@@ -115,8 +118,9 @@ class FaceLoops:
         to lane."""
         row = self.heads.read_record(index)
         backend = self.heads.backend
-        count = backend.UInt32
-        edges = self.edges.records_of(count(row[4]), count(dr.abs(row[5])))
+        integer = backend.UInt32
+        # The index of the first record, and the number of records without its sign.
+        edges = self.edges.records_of(integer(row[4]), integer(dr.abs(row[5])))
         return FaceSolidAngle(FaceData(backend, backend.Array3f(*row[:3]), row[3], edges, *row[5:]))
 
 
@@ -249,6 +253,7 @@ def face_boxes(faces: PolygonFaces, levels: tuple[float, ...]) -> tuple[FloatArr
     nearest = min(abs(math.remainder(level, PERIOD)) for level in levels)
     # Half the diagonal of each face's box.
     size = 0.5 * np.linalg.norm(high - low, axis=1)[:, None]
+    # If 2 pi is the least distance, all levels are 2 pi modulo 4 pi.
     is_in_hull = faces.in_convex_position & (nearest > 2 * math.pi * (1 - 1e-9))
     # The isoperimetric box: rho = L/sqrt(l (4 pi - l)) around the face.
     margin = 1.0001 * faces.face_perimeters()[:, None] / math.sqrt(nearest * (PERIOD - nearest))
@@ -396,7 +401,7 @@ def _are_empty(
     def add(p: Vec3, q: Vec3, inverse: Real, state: tuple[Any, ...]) -> tuple[Any, ...]:
         """Add the edge from p to q to the state: the product (zr, zi) of the factors whose
         arguments are half the angles of edges, the gradient, the distance of the nearest edge, and
-        the sums of both bounds.
+        the sums over edges in the two bounds S.
 
         inverse: 1/|q - p|^2.
         """

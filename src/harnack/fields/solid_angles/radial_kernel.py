@@ -3,7 +3,8 @@ only on the distance: the *kernel* K(r). A *dipole* is an oriented point y with 
 *moment*; its weight is |m|. At the point x it adds -m.grad_y K(|y - x|). A *cluster* of far dipoles
 is added as a single source. f is the sum over all dipoles. psi_0 = K, psi_1, psi_2, ... are
 functions of the distance, with psi_(k+1) = -psi_k'/r. The numbers Q_2, Q_3, ... bound the
-derivatives of K: the m-th derivative along lines is at most m! Q_m/D^(m+1) at the distance D.
+derivatives of K: the m-th derivative along lines is at most m! Q_m/D^(m+1) at the distance D. D is
+r, or sqrt(r^2 + height^2) if the kernel has a height.
 
 A dipole m at y = x + z adds -m.grad_y K = m.z psi_1. A polynomial P(z) times psi_k has the gradient
 grad P psi_k - P psi_(k+1) z and, with the Hessian HP of P, the Hessian HP psi_k - (grad P z^T + z
@@ -196,7 +197,8 @@ class RadialSums:
         radii. Each bounds the difference between f and its linear Taylor polynomial at x, by
         `remainder`.
 
-        growth: the function `RadialKernel.growth`.
+        growth: the function `RadialKernel.growth`: for a radius r, a bound of the factor by which
+            the numbers Q_m grow if distances shrink by r.
         least_distance: a lower bound of the distance to the nearest dipole.
         size: the length, in the user's unit, that is 1 in the coordinates of the sums. The results
             are in the user's unit.
@@ -260,10 +262,12 @@ def combine_terms(
     radial: the numbers psi_0 to psi_(len(parts) + derivatives) at the distance D.
     derivatives: 0 for the value, 1 with the gradient, 2 with the Hessian.
 
-    The module has the formulas. They contain the same sums over k with psi_k, psi_(k+1) and
-    psi_(k+2); the latter two are called `next` and `after_next` in the code. The common factor
-    `scale` and powers of 1/D, which `parts` and `radial` leave out, are multiplied at the end, so
-    that no factor overflows.
+    A term P psi_k has the gradient grad P psi_k - P psi_(k+1) z by z, and the Hessian HP psi_k -
+    (grad P z^T + z grad P^T) psi_(k+1) - P psi_(k+1) I + P psi_(k+2) z z^T, with the Hessian HP of
+    P. The gradient by the point has the opposite sign. So the same sums over k occur with psi_k,
+    psi_(k+1) and psi_(k+2); the latter two are called `next` and `after_next` in the code. The
+    common factor `scale` and powers of 1/D, which `parts` and `radial` leave out, are multiplied at
+    the end, so that no factor overflows.
     """
     vector = _type_of(z)
     theta, scale, u2 = radial.thetas, radial.scale, inverse * inverse

@@ -4,30 +4,38 @@ oriented point with a vector m, its moment; its weight is |m|. A *record* is a r
 describes a dipole or a node of the tree. A *node* stands for the cluster of all dipoles below it;
 its *accepting distance* is the distance beyond which its moments may be used.
 
-Expansion. A cluster consists of dipoles m_i at c + d_i with |d_i| <= R. At the point x = c - z, at
-the distance r = D of z, Taylor's formula in d_i gives
+Expansion. A cluster consists of dipoles m_i at c + d_i with |d_i| <= R. At a point x let z = c - x,
+and let r be the distance of c from x: |z|, or more if the kernel has a height (`radial_kernel`).
+Taylor's formula in d_i gives
 
-    f = -sum_i m_i.grad K(z + d_i) = -(T1[D] + T2[D^2] + T3[D^3]/2) K(z) + (rest),
+    f = -sum_i m_i.grad K(z + d_i) = -(T1[G] + T2[G,G] + T3[G,G,G]/2) K(z) + (rest).
 
-with T1 = sum m_i, T2 = sym sum m_i d_i, T3 = sym sum m_i d_i d_i, where in brackets D stands for
-the derivative and sym for the symmetric part. With psi_k as in `radial_kernel`, D K = -z psi_1,
-T2[D^2] K = T2[z,z] psi_2 - tr T2 psi_1, T3[D^3] K = 3 z.tr T3 psi_2 - T3[z,z,z] psi_3. K is not
-harmonic in three dimensions, so that traces count: there are 19 numbers instead of 15.
+Here G is the derivative with respect to z. The tensors are T1 = sum m_i, T2 = sym sum m_i d_i and
+T3 = sym sum m_i d_i d_i, where sym is the symmetric part. Brackets apply a tensor to vectors:
+T2[z,z] = z.T2 z. With the functions psi_k of `radial_kernel`
 
-Truncation. The rest of Taylor's formula is an integral of the fourth derivative of K along the
-segment from c to c + d_i. At the fraction s of the segment this derivative is at most 4! Q_4/(r - s
-|d_i|)^5. There Q_4 is at most its value at r - R. The integral of the other factor is the rest of
-the Taylor series of 1/(r - .)^2: with q = |d_i|/r
+    T1[G] K = -T1[z] psi_1,     T2[G,G] K = T2[z,z] psi_2 - tr T2 psi_1,
+    T3[G,G,G] K = 3 z.tr T3 psi_2 - T3[z,z,z] psi_3.
+
+K is not harmonic in three dimensions, so that traces do not drop out: the tensors have 19 numbers,
+where 15 would do for a harmonic kernel.
+
+Truncation. The numbers Q_m of `radial_kernel` bound derivatives of K: the m-th one at the distance
+D is at most m! Q_m/D^(m+1). They are constant or fall with D. The rest of Taylor's formula is an
+integral of the fourth derivative of K along the segment from c to c + d_i. At the length t from c
+the distance is at least r - t, so that this derivative is at most Q_4 4!/(r - t)^5, with Q_4 at
+the distance r - R. 4!/(r - t)^5 is the third derivative of 1/(r - t)^2 by t. So the rest is at most
+Q_4 |m_i| times the rest of the Taylor series of that function, at t = |d_i|. With q = |d_i|/r
 
     |rest| <= Q_4 |m_i| (1/(1-q)^2 - 1 - 2q - 3q^2)/r^2 = Q_4 |m_i| |d_i|^3 (4-3q)/((1-q)^2 r^5).
 
 For Q_4 = 1 the bound is attained by a dipole on the line to x that points along it. (4-3q)/(1-q)^2
 grows with q, so that q = R/r gives a bound for all dipoles. For the gradient, likewise from 2/(r -
-.)^3,
+t)^3,
 
     Q_5 |m_i| |d_i|^3 (20 - 30q + 12q^2)/((1-q)^3 r^6),
 
-and for second derivatives from 6/(r - .)^4,
+and for second derivatives from 6/(r - t)^4,
 
     Q_6 |m_i| |d_i|^3 (120 - 270q + 216q^2 - 60q^3)/((1-q)^4 r^7).
 """
@@ -215,8 +223,10 @@ def cluster_source(
     bounds = kernel.bounds(nearest, 6)
     tail = KernelBounds.of(nearest, inverse_nearest, bounds)
     fourth, fifth, sixth = bounds[2:]
-    # The errors of the module, with |m_i| |d_i|^3 summed to the third moment c[23], and with
-    # 1/((1-q)^j r^(j+3)) written as 1/r^3 times 1/nearest^j.
+    # The errors of the module. Let r = D and q = R/r, with the radius R. A dipole m_i at the offset
+    # d_i from the center has an error of at most Q_4 |m_i| |d_i|^3 (4-3q)/((1-q)^2 r^5) of the
+    # value, and similar ones of the derivatives. The sum of |m_i| |d_i|^3 is the third moment
+    # c[23], and 1/((1-q)^j r^(j+3)) is 1/r^3 times 1/nearest^j, as nearest = (1-q) r.
     q = radius * inverse
     common = c[23] * inverse * inverse * inverse * inverse_nearest * inverse_nearest
     error = common * fourth * dr.fma(-3, q, 4)
@@ -292,6 +302,7 @@ def taylor_tree_moments(tree: BalancedTree, rows: FloatArray) -> list[TaylorMome
     """
     slots = records_in_slots(tree, rows)
     levels: list[TaylorMoments] = []
+    # Leaves have no children: the first arity, 0, is not used.
     for count, arity in zip(tree.counts, (0, *tree.arities), strict=True):
         # (count, dipoles below a node, ...): positions, moments, weights.
         position, moment, weights = np.split(

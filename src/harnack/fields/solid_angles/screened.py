@@ -102,16 +102,19 @@ class YukawaKernel(RadialKernel):
         self.kappa = dr.opaque(backend.Float, kappa)
 
     def at(self, distance: Real, inverse: Real, last: int) -> KernelValues:
-        """The values psi_0 to psi_last of the class at a distance, by the polynomials theta_k.
-        inverse: 1/distance."""
+        """The values psi_0, ..., psi_last of the class docstring at the given distance rho. They
+        are psi_k = exp(-kappa rho) theta_k(kappa rho)/rho^(2k+1), with polynomials theta_k.
+
+        inverse: 1/distance.
+        """
         # Farther away exponentials are not computed, as they would underflow.
         t = fmin(self.kappa * distance, MAX_LENGTHS)
         return KernelValues(dr.exp(-t) * inverse, thetas(t, last))
 
     def bounds(self, distance: Real, last: int) -> list[Real]:
-        """The numbers Q_2(t) to Q_last(t) of the class for t = kappa times `distance`, which bound
-        derivatives of the kernel at this distance and beyond: exp(-t) times a sum of powers of t.
-        """
+        """The numbers Q_2(t), ..., Q_last(t) for t = kappa times `distance`, which bound
+        derivatives of the kernel at this distance and beyond. Q_m(t) is exp(-t) times the sum of
+        t^j/j! over j <= m."""
         t = fmin(self.kappa * distance, MAX_LENGTHS)
         decay = dr.exp(-t)
         sum2 = dr.fma(t, dr.fma(t, 0.5, 1), 1)
@@ -159,8 +162,9 @@ def screened_promises(
         user's unit.
     epsilon: the machine epsilon of the backend.
 
-    Radii stay below 36 screening lengths. So exp(kappa r) times sums in which exponentials are at
-    least exp(-80) neither overflows nor grows.
+    kappa is one over the screening length. Radii r stay below 36 screening lengths. So the factor
+    exp(kappa r), times sums in which exponentials are at least exp(-80), neither overflows nor
+    grows.
     """
     sums, kappa = radial.sums, kernel.kappa
     nearest = fmax(sums.singularity_distance * (1 - SUM_MARGIN) - 8 * epsilon, 0)
@@ -174,7 +178,8 @@ def screened_promises(
         (1 + SUM_MARGIN) * r * dr.fma(r, radial.remainder(BALL_FRACTION, r, growth), slope)
     )
     max_change = fmin(radial.variation(r, growth), change_by_taylor)
-    # The products of f - S and f + S with the least cosine and with 1.
+    # The values on the ball in four dimensions are products of a number in [f - S, f + S] and a
+    # cosine in [min_cosine, 1]: they lie between the products of the ends of these intervals.
     min_cosine = dr.cos(fmin(kappa * r, math.pi))
     ends = (f - max_change, f + max_change)
     products = [end * min_cosine for end in ends]
@@ -204,7 +209,7 @@ def accepting_distance(radius: FloatArray, kappa: float, accuracy: float) -> Flo
         q4 = np.exp(-t) * (1 + t * (1 + t / 2 * (1 + t / 3 * (1 + t / 4))))
         is_accepted = accuracy * radius * q4**0.2 <= r
         low, high = np.where(is_accepted, low, r), np.where(is_accepted, r, high)
-    return high + 1e-5
+    return high + 1e-5  # not 0 for a cluster of radius 0
 
 
 def mean_at_dipoles(rows: FloatArray, kappa: float) -> float:
@@ -217,8 +222,8 @@ def mean_at_dipoles(rows: FloatArray, kappa: float) -> float:
     """
     n = len(rows)
     count = min(n, max(_MIN_LEVEL_POINTS, min(_MAX_LEVEL_POINTS, _MAX_LEVEL_PAIRS // n)))
+    # The dipoles at whose positions w is computed, evenly spaced in the order of the records.
     probes = np.unique(np.linspace(0, n - 1, count).astype(np.int64))
-    # Some positions, evenly spaced in the order of the records; and all coordinates and moments.
     x, y, z, *moment = np.ascontiguousarray(rows[:, :6].T)
     values: list[float] = []
     for i in probes:
@@ -239,6 +244,7 @@ MethodName = Literal["auto", "sum", "tree"]
 _MAX_SUMMED = 2000
 # The largest number of cells that are tested in one round for an extent.
 _MAX_CELLS = 4096
+# Levels smaller than this in magnitude are not told from 0.
 _SMALLEST_LEVEL = 1e-20
 # A point nearer to a dipole than `_ON_DIPOLE` roundings counts as on it. There w may be any number
 # up to `_ANY_LEVEL`.
@@ -428,6 +434,7 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
         Q_4(t) <= (1 + t/4) Q_3(t), and a coordinate is off by `unit`: this adds to the error of
         second derivatives.
         """
+        # The error of the value is proportional to 1/rho^2; its derivatives to 2/rho^3 and 6/rho^4.
         inverse = dr.rcp(sums.singularity_distance)
         value_error = 2e-30 * float(self._rows[:, 6].sum()) * inverse * inverse
         fourth = 0.25 * data.kernel.kappa * sums.s4

@@ -65,9 +65,10 @@ class SmoothedKernel(RadialKernel):
         self.height_square = dr.opaque(backend.Float, height * height)
 
     def at(self, distance: Real, inverse: Real, last: int) -> KernelValues:
-        """The values psi_0 to psi_last of the class at the distance D, by their closed form.
+        """The values psi_0, ..., psi_last at the distance D, by their closed form psi_k = (2k-1)!!
+        (1 + (2k+1) q/2)/D^(2k+1) with q = h^2/D^2.
 
-        inverse: 1/D.
+        distance, inverse: D and 1/D. Only 1/D is used.
         """
         del distance
         half_q = 0.5 * self.height_square * inverse * inverse
@@ -79,8 +80,9 @@ class SmoothedKernel(RadialKernel):
         return KernelValues(inverse, thetas)
 
     def bounds(self, distance: Real, last: int) -> list[Real]:
-        """The numbers Q_2 to Q_last of the class, which bound derivatives of the kernel. They hold
-        at all distances D of at least 0.55 (`_BOUND_FRACTION`) times `distance`."""
+        """The numbers Q_2, ..., Q_last, which bound derivatives of the kernel: Q_m = 1 + q
+        (m+1)(m+2)/4 with q = h^2/D^2. They hold at all distances D of at least 0.55
+        (`_BOUND_FRACTION`) times `distance`."""
         # h/D at the least of these distances; its square is q.
         ratio = dr.sqrt(self.height_square) / (_BOUND_FRACTION * fmax(distance, 1e-30))
         q = fmin(ratio * ratio, 1)
@@ -95,7 +97,7 @@ class SmoothedKernel(RadialKernel):
     def accepting_distance(self, radius: FloatArray, accuracy: float) -> FloatArray:
         """The distances (k,) beyond which k clusters of dipoles may be replaced by their moments:
         `accuracy` times their radii (k,)."""
-        return accuracy * radius + 1e-5
+        return accuracy * radius + 1e-5  # not 0 for a cluster of radius 0
 
 
 @dataclass(frozen=True)
@@ -148,6 +150,8 @@ class SmoothedSum:
         epsilon = self.dipoles.backend.machine_epsilon
         # A lower bound of the distance to the nearest dipole, also after rounding.
         nearest = fmax(sums.singularity_distance * (1 - SUM_MARGIN) - 8 * epsilon, 0)
+        # Bounds of second derivatives need no growth factor for this kernel (`SmoothedKernel`), and
+        # no scaling, since lengths stay in the unit of x.
         return Sample(
             sums.value,
             sums.gradient,

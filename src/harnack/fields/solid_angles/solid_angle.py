@@ -84,10 +84,10 @@ _LEVEL_MARGIN = 1e-9 * _PERIOD
 _MAX_PAIRS = 3_000_000
 # The number of sides of the polygons by which circles are drawn where a boundary is drawn.
 _CIRCLE_SIDES = 256
-# Cells pay if the number of rays times the number of edges is at least `_MIN_WORK`, and there are
-# at least `_MIN_RAYS` rays and `_MIN_EDGES` edges. To trace these rays takes five times as long as
-# to build the cells of a knot. The cells of a tangle of a thousand edges take ten times as long to
-# build as those of a knot.
+# FMM cells save more time than they take to build if the number of rays times the number of edges
+# is at least `_MIN_WORK`, and there are at least `_MIN_RAYS` rays and `_MIN_EDGES` edges. To trace
+# these rays takes five times as long as to build the cells of a knot. The cells of a tangle of a
+# thousand edges take ten times as long to build as those of a knot.
 _MIN_WORK, _MIN_RAYS, _MIN_EDGES = 2.5e8, 1e6, 48
 # The largest number of planes of the extent of a curve in convex position with cells, by
 # experiment: with hundreds, clipping rays takes longer than the march.
@@ -295,11 +295,13 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         records = (
             0 if edges is None else sum(-(-len(loop) // edges.edges_per_record) for loop in unit)
         )
+        # For circles alone: the last operations, as in `LoopEdges.rounding`.
         value_rounding = 16 * backend.machine_epsilon if edges is None else edges.rounding(records)
         cells = None
         if self.has_variable_accuracy and traced:
             low, high = self._box(center)
             cells = build_curve_cells(backend, unit, low, high, self.max_bytes())
+        # The number of roundings of a position: `_CurveData.rounding` lists them.
         return _CurveData(
             *frame_parameters(backend, center, self._size),
             edges,
@@ -511,9 +513,13 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         x = data.to_unit(p)
         sums, unit = data.sums(x), coordinate_rounding(x)
         distance = sums.distance - 4 * unit
-        is_off_curve = (distance > 0) & (sums.distance > 2 * data.rounding)  # see `evaluate`
+        # The second condition is that of `_sample`.
+        is_off_curve = (distance > 0) & (sums.distance > 2 * data.rounding)
         # By this factor |dp|/D^4 can grow if the distance D is reduced by its rounding.
         growth = dr.select(is_off_curve, dr.square(dr.square(sums.distance / distance)), dr.inf)
+        # With the integrals I3 and I4 of |dp|/D^3 and |dp|/D^4 the sums of `source_sums` are s4 =
+        # I3/4 and s5 = 3 I4/16 (`LiftedEdge.bounds`), and I4 <= I3/distance. The factors 1/3 and
+        # 1/4 in their places are a little larger.
         gradient_error = SLOPE_ROUNDINGS / 3 * unit * sums.inverse_cubes * growth / data.size
         second_error = 0.25 * SECOND_ROUNDINGS * unit * sums.inverse_cubes / sums.distance * growth
         return gradient_error, second_error / (data.size * data.size)
@@ -733,14 +739,15 @@ class _CurveData(UnitFrame):
         return sums, errors
 
     def edge_rates(
-        self, left_out: CellErrors, line: RayLine, lengths: tuple[Real, ...], active: Mask
+        self, sum_errors: CellErrors, line: RayLine, lengths: tuple[Real, ...], active: Mask
     ) -> tuple[Real, ...]:
         """For each length T, a proved bound of |df/ds| along the line x + s v at all |s| <= T,
-        where f is the solid angle of the edges without the circles (`trail_sums.line_rates`). On
-        lanes whose sums come from FMM cells, the bound is the smaller of the cells' bound and the
-        bound from all edges, which is infinite there.
+        where f is the solid angle of the edges without the circles. On lanes whose sums at x come
+        from an FMM cell, the bound is computed from that cell (`CurveCells.rates_along`); on all
+        other lanes, from all edges (`trail_sums.line_rates`).
 
-        left_out: the error bounds of the sums at x, as `at_detail` returned them.
+        sum_errors: the error bounds of the sums at x, as `at_detail` returned them. They also say
+            on which lanes the sums come from a cell, and from which one.
         line: the lines, with their points x and directions v.
         lengths: the lengths T, in unit coordinates.
         active: mask of the lanes on which bounds are wanted. On other lanes they are infinite.
@@ -748,12 +755,13 @@ class _CurveData(UnitFrame):
         Returns a tuple with one bound for each length.
         """
         assert self.edges is not None
-        if self.cells is None or left_out.cell is None:
+        if self.cells is None or sum_errors.cell is None:
             return line_rates(self.edges, line, lengths, active)
-        is_in_cell = left_out.in_cells
-        # Each call returns infinity on the lanes of the other one.
+        is_in_cell = sum_errors.in_cells
         outside_rates = line_rates(self.edges, line, lengths, active & ~is_in_cell)
-        cell_rates = self.cells.rates_along(left_out.cell, line, lengths, active & is_in_cell)
+        cell_rates = self.cells.rates_along(sum_errors.cell, line, lengths, active & is_in_cell)
+        # Each of the two is infinite on the lanes of the other one, so that the minimum takes the
+        # one that was computed.
         return tuple(
             fmin(cell_rate, edge_rate)
             for cell_rate, edge_rate in zip(cell_rates, outside_rates, strict=True)
@@ -780,9 +788,9 @@ class _CurveData(UnitFrame):
 
 @dataclass(frozen=True)
 class CellErrors:
-    """Error bounds of the sums over a curve at points x. On some lanes the sums come from FMM
-    cells, in which far edges are approximated by a polynomial; on the other lanes all edges are
-    summed.
+    """Error bounds of the sums over a curve at points x, and where the sums come from: on some
+    lanes from FMM cells, in which far edges are approximated by a polynomial; on the other lanes
+    from all edges.
 
     value, slope: bounds of the truncation errors of the solid angle and of its gradient. They are 0
         on lanes on which all edges are summed.

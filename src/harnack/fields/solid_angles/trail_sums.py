@@ -91,8 +91,9 @@ def lipschitz_along(
     """Proved bounds of the change of the solid angle f of a curve along lines: for several lengths
     T, a Lipschitz constant of f on the points of a line within T of its point x. The lengths begin
     with half the distance to the curve and grow towards the size of the curve. The constants are
-    finite only on lanes on which they may save more time than they take: near the curve if the line
-    is not steep for f, elsewhere if f hardly changes along the line.
+    finite only on lanes on which they may save more time than they take. These are the lanes on
+    which the derivative of f along the line is small relative to |gradient|: at most a quarter of
+    it near the curve, at most a thousandth elsewhere.
 
     line: the lines, with their points x.
     gradient: the gradient of f at x.
@@ -104,6 +105,7 @@ def lipschitz_along(
     """
     slope, norm = dr.dot(gradient, line.v), dr.norm(gradient)
     max_slope = dr.select(distance < _NEAR_CURVE, _NEAR_SLOPE, _FAR_SLOPE) * norm
+    # Not 0, so that the power below is finite.
     shortest = 0.5 * fmax(distance, type(distance)(1e-30))
     # After `_LENGTHS` steps of this ratio the length would be 1, the size of the curve.
     ratio, lengths = dr.power(shortest, -1 / _LENGTHS), [shortest]
@@ -180,7 +182,7 @@ def add_edge_rates(
     right angle. So the edge, seen along the line, runs from m to m + n, and the line is seen as the
     point 0: rho' is the distance of this segment from 0. Also c = v . (m x n). So c is small if m
     and n are, whatever the lengths of a and e: its error is at most 8 epsilon |m| |e| plus slack
-    |n|. Twice that is added.
+    |n|, where slack bounds the rounding of positions (`RayLine.slack`). Twice that is added.
     """
     a, e, inverse, slack = edge.a, edge.e, edge.inverse_square_length, line.slack
     epsilon = float(dr.epsilon(type(inverse)))
@@ -203,8 +205,8 @@ def add_edge_rates(
         s = clamp(s_nearest, -length, length)
         segment_distance = dr.norm(dr.fma(type(a)(s), n, area)) * per_length - slack
         rho = fmax(fmax(distance - length, line_distance), segment_distance)
-        square = rho * rho
-        term = c * dr.rcp(square) * dr.rsqrt(square + quarter)
+        rho_square = rho * rho
+        term = c * dr.rcp(rho_square) * dr.rsqrt(rho_square + quarter)
         # Infinite where the line may meet the edge.
         new_rates.append(rate + dr.select(rho > 0, term, dr.inf))
     return tuple(new_rates)
@@ -225,7 +227,8 @@ _SIGN_ROUNDINGS = 16
 # precision.
 _MAX_COORDINATE = 1024.0
 
-# A point, and 1 or -1 for the direction of its ray along the z axis.
+# A point, and its ray_sign (`TrailValues.turns`): 1 or -1 for the direction of its ray along the z
+# axis.
 Point: TypeAlias = "tuple[Vec3, Real]"
 Complex: TypeAlias = "tuple[Real, Real]"
 # A vertex a = (u, v, z) relative to a point: (u t, v t, s t) with t = |a| + |z| and s as in
@@ -284,6 +287,7 @@ class _AngleProduct:
     @classmethod
     def of(cls, bits: _FloatFormat, factor: Complex) -> _AngleProduct:
         """The product of the single complex factor `factor`. bits: the format of its numbers."""
+        # Its argument lies in [-pi, 0], with half = -1, or in [0, pi], with half = 0.
         return cls(*factor, bits.sign(factor[1]))
 
     def times(self, bits: _FloatFormat, factor: Complex) -> _AngleProduct:
@@ -325,6 +329,7 @@ class _AngleProduct:
         real = cast("Any", type(self.x))
         # atan2 may ignore the sign of a zero, so that a zero becomes a tiny number of its sign.
         y = dr.copysign(fmax(dr.abs(self.y), real(1e-30)), self.y)
+        # theta is atan2(y, x), in [-pi, pi], plus (half + 1)/2 full turns, rounded down.
         return dr.fma(dr.atan2(y, self.x), 0.5 / dr.pi, real((self.half + 1) >> 1))
 
 
@@ -367,15 +372,19 @@ class TrailValues:
 
     def turns(self, x: Vec3, ray_sign: Real) -> tuple[Real, Mask]:
         """The sum of the solid angles Omega_e of the edges' triangles (`edge_lift`) at points x,
-        divided by 4 pi; and a mask (n,) of the points at which it must be computed again.
+        divided by 4 pi; and a mask (n,), true where the sum is uncertain, so that it must be
+        computed again by `edge_lift`.
 
         x: (3, n) the points, in units in which the mesh has a size of about one.
-        ray_sign: (n,) 1 for triangles whose apex is opposite to the direction d = z; -1 if x and
-            the edges are first mirrored in a plane z = const.
+        ray_sign: (n,) 1 or -1, for each point. With 1 all triangles have their apex at infinity in
+            the direction -z. With -1 the edges and x are mirrored in a plane z = const before the
+            sum is computed (`_relative_vertex` does it). The result is then minus the sum of the
+            given edges for an apex in the direction +z.
 
         Each lane of the kernel computes several points. The mask is true in three cases: rounding
-        could have changed the sign of an imaginary part; a product of factors nearly underflows
-        (near an edge or at a short edge); or a coordinate of x is larger than 1024.
+        could have changed the sign of the imaginary part of a factor F_e; a product of factors
+        nearly underflows (near an edge or at a short edge); or a coordinate of x is larger than
+        1024.
         """
         dr.eval(x, ray_sign)
         backend, n = self.records.backend, dr.width(x)
@@ -390,7 +399,9 @@ class TrailValues:
             for point_id in point_ids
         ]
         products, margins = self._over_records(points)
-        turns = [-product.turns() for product in products]  # of conjugate factors
+        # Omega_e is twice the argument of F_e. So the sum of all Omega_e over 4 pi is the argument
+        # of the product of all F_e in turns. The products have the conjugate factors, hence minus.
+        turns = [-product.turns() for product in products]
         dr.eval(*turns, *margins)
         all_turns, all_margins = dr.empty(real, n), dr.empty(real, n)
         for point_id, turn, margin in zip(point_ids, turns, margins, strict=True):
@@ -421,6 +432,7 @@ class TrailValues:
                 _multiplied_by_record(bits, row, slacks, x, previous) for x, previous in pairs
             )
 
+        # Each point begins with the product 1, without half turns, and with the margin 1.
         entry = (real(1), real(0), bits.integer(0), real(1))
         products = self.records.for_each(add, tuple(entry for _ in points), "trails")
         return [_AngleProduct(*entry[:3]) for entry in products], [entry[3] for entry in products]
@@ -468,7 +480,8 @@ def _multiplied_by_record(
 def _relative_vertex(bits: _FloatFormat, vertex: list[Real], point: Point) -> Seen:
     """A vertex relative to a point, in the form that the factors of edges need. For the vector a =
     (u, v, z) from the point to the vertex it is (u t, v t, s t), with t = |a| + |z| and s = |a| -
-    ray_sign z.
+    ray_sign z. For ray_sign = -1 this is the vertex mirrored in a plane z = const: z changes its
+    sign, u and v do not.
 
     bits: the format of the numbers.
     vertex: the coordinates of the vertex.
@@ -574,16 +587,25 @@ class LiftedTrails:
 
         frame: the rays, with points x on them.
 
-        Bounds of derivatives. Let L be the length of an edge, d the distance to it, and w that of
-        `Edge`. L w is the integral of |dp|/rho^3 over the edge, and 1/d times that bounds the
-        integral of |dp|/rho^4. For all edges of a record the d of the nearest edge gives a bound.
-        So the terms s4 += L w/4 and s5 += 3 L w/(16 d) bound the part of the remainder that these
-        edges cause (`LiftedEdge.bounds`).
+        Symbols. Let L be the length of an edge, e the vector along it, a the vector from x to its
+        start, d the distance from x to the edge, and rho the distance from x to a point p of the
+        edge. w is a factor of the edge's Biot and Savart field w a x e (`Edge`), and L w is the
+        integral of |dp|/rho^3 over the edge.
 
-        Rounding is bounded as in `LiftedEdge.bounds`, with Biot and Savart's field itself in place
-        of 2 e'. The field is at most d L w, because |a x e| is L times the distance from the line
-        of e. By Cauchy and Schwarz the fields add up over a record to at most the square root of
-        (sum of L w) (sum of d^2 L w). In all bounds d is reduced by its rounding.
+        Bounds of derivatives. `LiftedEdge.bounds` shows that 1/4 times the integral of |dp|/rho^3
+        and 3/16 times the integral of |dp|/rho^4 are terms s4 and s5 of an edge. The second
+        integral is at most L w/d. For all edges of a record the d of the nearest edge is used,
+        reduced by its rounding. So s4 += L w/4 and s5 += 3 L w/(16 d).
+
+        Rounding. By `LiftedEdge.bounds` the solid angle of an edge changes by at most |field|
+        times the length `unit`, by which rounding moves the edge. The sums in its factor add a
+        constant, and STEEP_ROUNDINGS L e' unit roundoffs if the edge subtends more than a right
+        angle, with a number e' <= 1/d. Then |field| >= 1/d >= e': it is (sin A + sin B)/d, where A
+        and B are the angles that the two parts of the edge subtend on both sides of its nearest
+        point, and A + B is at least a right angle. So |field| (unit + STEEP_ROUNDINGS roundoffs L)
+        bounds both. |field| is at most d L w, because |a x e| is L times the distance of x from the
+        line of e. By Cauchy and Schwarz the sum of d L w over a record is at most the square root
+        of (sum of L w) (sum of d^2 L w). The largest L of the record is used for all its edges.
         """
         backend = self.records.backend
         real, unit = backend.Float, fmax(coordinate_rounding(frame.o), coordinate_rounding(x))
@@ -601,12 +623,14 @@ class LiftedTrails:
             # nearest the least d^2, and longest the largest L.
             for k in range(self.edges_per_record):
                 p, q = self._vertex(row, k), self._vertex(row, k + 1)
+                # length is L, with a sign for the order of the ends' indices; 0 if there is no edge
                 inverse, length = self._edge(row, k)
                 b = view_vertex(q, frame, x)
                 re, im = edge_factor_of_views(a, b, length)
                 is_edge = length != 0
                 product = product.times(dr.select(is_edge, re, 1), dr.select(is_edge, im, 0))
                 edge = Edge(a.offset, b.offset, q - p, inverse)
+                # c = a x e
                 w, c = edge.biot_savart_of_lengths(a.length, b.length)
                 g = dr.fma(type(g)(w), c, g)
                 integral = dr.abs(length) * w
@@ -616,8 +640,9 @@ class LiftedTrails:
                 weighted = weighted + dr.select(is_edge, integral * square, 0)
                 a = b
             distance = fmax(dr.sqrt(nearest) - 2 * unit, 0)
-            field = dr.fma(steep_rounding, longest, unit) * dr.sqrt(total * weighted)
-            rounding = rounding + (field + factor_rounding)
+            # (unit + STEEP_ROUNDINGS roundoffs L) times the bound of the sum of |field|
+            steep = dr.fma(steep_rounding, longest, unit) * dr.sqrt(total * weighted)
+            rounding = rounding + (steep + factor_rounding)
             s5 = dr.fma(0.1875 * total, dr.rcp(distance), s5)
             return (product.parts(), g, fmin(nearest, min_square), rounding, s4 + 0.25 * total, s5)
 

@@ -249,8 +249,8 @@ def _hessian(
     )  # fmt: skip
     # The first three entries, on the diagonal, contain s I.
     parts = [
-        (square * u2 + cube * u4 - left - right + w * a * b - (s if k < 3 else 0)) * u3
-        for k, (square, cube, (left, right), (a, b)) in enumerate(
+        (p2_entry * u2 + p3_entry * u4 - left - right + w * a * b - (s if k < 3 else 0)) * u3
+        for k, (p2_entry, p3_entry, (left, right), (a, b)) in enumerate(
             zip(p2_entries, p3_entries, crossed, pairs, strict=True)
         )
     ]
@@ -398,6 +398,8 @@ class Treecode:
         active: the mask of the active lanes.
         derivatives: 0 for the value only, 1 with the gradient, 2 with the Hessian.
         """
+        # The records of nodes hold accepting distances for the coarse ratio; `closer` is the factor
+        # from these to the distances for this accuracy scale.
         free_fraction, closer = (
             free_radius_fraction(self.coarse_ratio),
             self.acceptance_ratio(detail) / self.coarse_ratio,
@@ -407,7 +409,7 @@ class Treecode:
         def add_cluster(node: ClusterView, state: ExtraState) -> ExtraState:
             """Add a node to the state on lanes on which it is far. The state consists of the state
             of the sums and the caller's own state."""
-            # 15 coefficients and E.
+            # The coefficients c[:15] of the moments, and c[15] = E (`node_records`).
             c, inverse = node.payload, node.inverse
             error = c[15] * self._decay(inverse)
             slope = error * inverse
@@ -435,6 +437,8 @@ class Treecode:
         no_source = _NO_SOURCE_DISTANCE * (1 + dr.max(dr.abs(x)))
         start = (SourceSums.zero(self.backend, no_source, derivatives).to_state(), extra_state)
         state = traverse_clusters(self.tree, x, closer, add_cluster, add_primitive, start, active)
+        # Below the accuracy scale 1, nodes may be nearer than the distance at which their bounds E
+        # hold: they hold times this ratio.
         sums, error_ratio = (
             SourceSums.from_state(state[0]),
             dr.select(detail < 1, self.coarse_error_ratio, 1),

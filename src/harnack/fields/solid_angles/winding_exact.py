@@ -112,13 +112,13 @@ class ExactWinding:
         uncertain about an edge, the sum over edges is computed again by `lifted_sums`, which
         decides by the same bits as the crossings.
         """
-        # Rays lead away from the middle of the mesh, so that less of it lies ahead. For a mirrored
-        # mesh the winding number changes its sign.
+        # Rays lead away from the middle of the mesh, so that less of it lies ahead. A ray along -z
+        # is one along z in the mesh mirrored in a plane z = const, whose winding number is -w.
         ray_sign = dr.select(x.z >= 0, self.backend.Float(1), -1)
         # The signed number of crossings of the ray from each x.
         turns = self.rays.signed_crossings_vertical(x, ray_sign)
         if self.trails is None or self.edges is None:
-            return dr.select(ray_sign > 0, turns, 0 - turns)  # no zero with a sign
+            return dr.select(ray_sign > 0, turns, 0 - turns)  # 0 - 0 is 0, but -(0) is -0
         dr.eval(x, ray_sign, turns)
         edge_turns, is_uncertain = self.trails.turns(x, ray_sign)
         value = ray_sign * (turns + edge_turns)

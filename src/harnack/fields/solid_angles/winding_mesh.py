@@ -123,6 +123,7 @@ class WindingMesh:
                 )
         center, size = _center_and_size(x, self.faces)
         mesh = dataclasses.replace(self, vertices=x, center=center, size=size)
+        # A cached property is in the dictionary of its object once it has been computed.
         properties = vars(self)
         vars(mesh).update(
             {name: properties[name] for name in _KEPT_PROPERTIES if name in properties}
@@ -203,7 +204,8 @@ class WindingMesh:
         for k, (i, j) in enumerate(((0, 1), (1, 2), (0, 2))):
             candidates = np.flatnonzero(is_end[ends[:, i]] & is_end[ends[:, j]])
             edges: IntArray = ends[candidates, i] * count + ends[candidates, j]
-            # The key at the place of an edge in the sorted keys is the edge's own, or it has none.
+            # If an edge is singular, its key is at the place where it belongs in the sorted keys;
+            # if not, another key is there. "clip" keeps the place within the array.
             flags[candidates, k] = keys.take(np.searchsorted(keys, edges), mode="clip") == edges
         return flags
 

@@ -69,11 +69,11 @@ if TYPE_CHECKING:
 
 __all__ = ["WindingModuloOne", "winding_box", "winding_cells", "winding_extent"]
 
-# The largest number of cells that are tested in one round for an extent, and the number of times
-# that the box is halved.
+# For `winding_extent`, which cuts a box into cells, tests them, and halves those that are left: the
+# largest number of cells that are tested in one round, and the largest number of rounds.
 _MAX_CELLS = 20_000
 _MAX_HALVINGS = 6
-# The number of cells of the grid along its longest side, by experiment.
+# The number of cells of the grid of `winding_cells` along its longest side, by experiment.
 _CELLS_ACROSS = 192
 
 
@@ -148,7 +148,8 @@ def winding_extent(
     winding: ModuloOneEvaluable, mesh: WindingMesh, levels: tuple[float, ...]
 ) -> Volume | None:
     """A polytope that is proved to contain the level sets of the winding number w of a mesh. For a
-    closed mesh it is a box.
+    closed mesh it is a box. There always is one; None occurs only in the type of the result, which
+    is that of `Field.extent`.
 
     winding: an object that evaluates w of the mesh modulo 1.
     levels: the values of w whose level sets are meant.
@@ -159,9 +160,10 @@ def winding_extent(
     at triangles, is not proved to be off the level.
     """
     box = winding_box(mesh, levels)
+    # A closed mesh has its level sets on its triangles, and these lie in the box.
     if not len(mesh.singular_edges):
         return box
-    # The polytope must also contain these points.
+    # The polytope must contain the triangles, and so their corners.
     corners = mesh.vertices[mesh.faces].reshape(-1, 3)
     lower, upper = box.bounds()
     return tight_extent(
@@ -171,8 +173,9 @@ def winding_extent(
 
 def winding_box(mesh: WindingMesh, levels: tuple[float, ...]) -> Box:
     """A box that is proved to contain the level sets of the winding number w of a mesh. It contains
-    the mesh, and reaches beyond it at most by margin (a), nor farther from the singular edges than
-    margin (b).
+    the mesh. Where it is larger than the box of the mesh, two bounds limit it: the level sets reach
+    at most the length (a) beyond the mesh; and off the triangles, at most the length (b) beyond the
+    singular edges.
 
     (a) At distance rho from a mesh of this area |w| <= area/(4 pi rho^2). So a level lies within
     rho = sqrt(area/(4 pi |level|)) of the mesh. (b) Off the triangles 4 pi w is, modulo 4 pi, the
@@ -181,8 +184,10 @@ def winding_box(mesh: WindingMesh, levels: tuple[float, ...]) -> Box:
     `SolidAngle.extent`).
     """
     low, high = mesh.box
-    slack = 1e-4 * float((high - low).max())
+    slack = 1e-4 * float((high - low).max())  # for the rounding of the box
+    # The numbers 1e-12 below only prevent a division by zero.
     min_level = min(abs(level) for level in levels)
+    # 1e-12 prevents divisions by 0: margins are huge for levels that have no bound.
     area_margin = math.sqrt(mesh.area / (4 * math.pi * max(min_level, 1e-12)))
     level_gap = min(abs(math.remainder(level, 1.0)) for level in levels) * 4 * math.pi  # l
     edge_margin = mesh.boundary_length / math.sqrt(
@@ -205,13 +210,13 @@ MethodName = Literal["auto", "exact", "tree"]
 # Up to this number of boundary edges the exact method is used: an edge costs about a nanosecond, a
 # tree two to three microseconds.
 _MAX_EXACT_EDGES = 2048
-# With fewer edges samples cost so little that cells do not pay.
+# With fewer edges samples take so little time that cells save none.
 _MIN_CELL_EDGES = 64
-# Cells pay if there are at least `_PAYS_PER_EDGE` rays per edge and `_MIN_RAYS` rays, and at most
-# `_MAX_CELL_EDGES` edges.
+# Cells save more time than they take to build if there are at least `_PAYS_PER_EDGE` rays per edge
+# and `_MIN_RAYS` rays, and at most `_MAX_CELL_EDGES` edges.
 _PAYS_PER_EDGE, _MIN_RAYS, _MAX_CELL_EDGES = 3.0, 5e3, 100_000
 # A mesh is a soup if it has more singular edges than `_SOUP_RATIO` times the number of triangles.
-# The cells of a soup sum over near triangles, not edges. They pay if there are at least
+# The cells of a soup sum over near triangles, not edges. They save time if there are at least
 # `_PAYS_PER_TRIANGLE` rays per triangle, and at most `_MOST_OF_SOUP` triangles.
 _SOUP_RATIO, _PAYS_PER_TRIANGLE, _MOST_OF_SOUP = 1.5, 12.0, 50_000
 # The cube of a soup's cells is larger than the extent, where all rays begin, by this factor. So the
@@ -410,16 +415,23 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         return self._rates[data.backend]
 
     def _stated(self, data: _WindingData, x: Vec3, values: PointValues) -> PointValues:
-        """Complete results at points: add the remaining parts of their errors, and convert them to
-        the user's units. The parts are the jump of a triangle so near that rounding hides on which
-        side of it x is, and errors far from the mesh.
+        """Complete results at points: enlarge their error bounds by two errors that are still
+        missing, and convert results and bounds to the user's units. The first error is the jump of
+        w at a triangle, if rounding hides on which side of the triangle x is. The second one
+        matters only far from the mesh, where small numbers underflow and the terms of triangles
+        nearly cancel (`PointValues.with_far_field_errors`).
 
+        data: the mesh on the backend of the points.
         x: (3, n) the points in unit coordinates.
         values: w and its derivatives in unit coordinates, with error bounds.
+
+        Returns w and its derivatives in the user's units, with complete error bounds.
         """
         # If a triangle is within rounding of x, it is not known on which side of it x is.
         possible_jump = jump_sum_within(data.rays, x, _TRIANGLE_ROUNDINGS * coordinate_rounding(x))
         values = dataclasses.replace(values, error=values.error + possible_jump)
+        # The sum of the weights of all triangles as dipoles: the area in unit coordinates, over
+        # 4 pi.
         weight = self.mesh.area / (4 * math.pi * self.mesh.size**2)
         return values.with_far_field_errors(x, 64 + len(self.mesh.singular_edges), weight).rescaled(
             data.size
@@ -453,7 +465,7 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         """
         mesh, most_bytes, winding = self.mesh, self.max_bytes(), data.winding
         extent = self.extent((self.default_level,))
-        assert extent is not None
+        assert extent is not None  # for the type: there always is an extent
         low, high = extent.bounds()
         if self._is_soup and isinstance(winding, TreeWinding):
             # Half the edge of the cube around the origin of the unit coordinates that contains the
@@ -488,8 +500,8 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
 
     @property
     def has_unknown_branch(self) -> bool:
-        """Whether samples along rays may give w only up to an unknown integer. Samples from FMM
-        cells of edges do."""
+        """Whether samples along rays may give w only up to an unknown integer. It is true if the
+        field was prepared with FMM cells of edges: samples from these do."""
         return self._device is not None and self._device.cells is not None
 
     def cells_pay_from(self) -> float:
@@ -515,7 +527,7 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         ):
             return None
         extent = self.extent(levels)
-        if extent is None:
+        if extent is None:  # only for the type: there always is an extent
             return None
         if levels not in self._occupied:
             self._occupied[levels] = winding_cells(self, extent, levels)
@@ -638,6 +650,7 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         facet = next_closest_triangle(
             data.rays, data.to_unit(p), after, dr.square(limit / data.size), active
         )
+        # Triangles without an area get an arbitrary normal, and count as having no inner points.
         length = dr.norm(facet.normal)
         up = data.backend.Array3f(0, 0, 1)
         normal = dr.select(length > 0, facet.normal / length, up)
@@ -764,7 +777,8 @@ class _WindingOnInterval(Field):
             sample = data.winding.sample_interval(frame, x, self._behind, self._offset, detail)
             return space_scaled(sample, data.size)
         unit = fmax(coordinate_rounding(frame.o), coordinate_rounding(x))
-        # Cells are coarser than the coarsest samples whose branch is known.
+        # Samples from cells leave an integer unknown. So they count as coarser than all others, and
+        # serve only accuracy scales below the coarsest one.
         from_cells, is_in_cell = data.cells.sample(
             x, frame.d, unit, detail < self.coarsest_accuracy
         )
@@ -793,7 +807,8 @@ class _BesideSheets(Field):
         """The parameters are described at the class."""
         real = backend.Float
         # A positive jump ahead leads up through the level, so that the field is below it before.
-        # After a positive jump behind the field is above it.
+        # After a positive jump behind the field is above it. A jump of 0 means that there is no
+        # triangle.
         jump = dr.select(real(ahead.jump) != 0, -real(ahead.jump), real(behind.jump))
         self._value = dr.select(jump > 0, real(level + 0.5), level - 0.5)
 

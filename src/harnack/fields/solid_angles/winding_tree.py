@@ -267,21 +267,25 @@ class TreeWinding:
         active_lanes: Mask, derivatives: int = 1,
     ) -> tuple[SourceSums, tuple[Any, ...]]:  # fmt: skip
         """Sums at points x over far clusters, to which the caller's function adds near triangles.
-        They come from the FMM cells if there are cells, no second derivatives are requested, and
-        the accuracy scale `detail` is at most 1; otherwise from the tree.
+        They come from the FMM cells if there are cells and no second derivatives are requested, on
+        lanes on which x is in the cells' cube and the accuracy scale `detail` is at most 1;
+        otherwise from the tree.
 
         adder: a function that makes the function that adds a near triangle. Its argument is the
             number of radii beyond which nodes are far.
-        state: a further state of the caller, which that function updates.
+        state: a further state of the caller, which the made function updates.
         active_lanes: the mask of the lanes on which sums are wanted.
-        derivatives: 0 for the value, 1 with the gradient, 2 with the Hessian.
+        derivatives: 0 for the value, 1 with the gradient, 2 with the Hessian. If there are cells, 0
+            counts as 1.
 
         Returns the sums and the caller's last state.
         """
         if self.cells is None or derivatives == 2:
             add = adder(self.clusters.acceptance_ratio(detail))
             return self.clusters.sums(x, detail, add, state, active_lanes, derivatives=derivatives)
-        # On lanes whose sums come from the tree after all, the accuracy scale is at least 1.
+        # Two functions that add near triangles. In a cell, triangles are far beyond TRIANGLE_RATIO
+        # times their size. On lanes whose sums come from the tree, `sums_with_tree` raises the
+        # accuracy scale to at least 1 (x may be outside of the cube at a smaller scale).
         acceptance = self.clusters.acceptance_ratio(fmax(detail, self.backend.Float(1)))
         adders = adder(self.backend.Float(TRIANGLE_RATIO)), adder(acceptance)
         return self.cells.sums_with_tree(self.clusters, x, detail, adders, state, active_lanes)
@@ -309,9 +313,10 @@ class TreeWinding:
         count as behind x, all others as ahead. So it does not matter on which side of a triangle
         rounding puts x.
 
-        The proved bounds near x come from two parts. For far clusters see `SourceSums.sample`. The
-        near triangles' field is that of their open edges, and it is harmonic up to the nearest of
-        them; `LiftedEdge.bounds` has their terms of the remainder.
+        The proved bounds near x bound the remainder of the linear Taylor polynomial of w at x. It
+        has two parts. The part of far clusters is bounded in `SourceSums.sample`. The field of near
+        triangles is that of their open edges, and harmonic up to the nearest of these; the part of
+        an open edge is bounded in `LiftedEdge.bounds`.
         """
         del turns
         # `unit` is the rounding of a coordinate.
@@ -342,8 +347,8 @@ class TreeWinding:
         """
 
         def rates(lengths: tuple[Real, ...], active: Mask) -> tuple[Real, ...]:
-            """For each length, a bound of the derivative of 4 pi w along the line within that
-            length of x; infinite on lanes that are not active."""
+            """For each length T, a bound of the derivative of 4 pi w along the line at its points
+            within T of x; infinite on lanes that are not active."""
             active = active & active_lanes
 
             def adder(reach: Real) -> AddPrimitive:
@@ -356,9 +361,11 @@ class TreeWinding:
                     """Add the open edges of the triangle in the record `row` to the bounds `old`,
                     one for each length, on active lanes. The sums over far clusters stay as they
                     are."""
-                    for near in edges_of(row, line.x, VerticalRayFrame(line.x)):
-                        is_open = active & near.is_open(reach)
-                        new = add_edge_rates(line, near.edge.edge, lengths, old)
+                    # Of the edges only the positions relative to x are used. The rays matter only
+                    # for their solid angles, so any direction does.
+                    for near_edge in edges_of(row, line.x, VerticalRayFrame(line.x)):
+                        is_open = active & near_edge.is_open(reach)
+                        new = add_edge_rates(line, near_edge.edge.edge, lengths, old)
                         old = tuple(dr.select(is_open, a, b) for a, b in zip(new, old, strict=True))
                     return sums, old
 
@@ -366,7 +373,11 @@ class TreeWinding:
 
             start = tuple(self.backend.Float(0) for _ in lengths)
             # Accuracy scale 0: the coarsest sums are enough for bounds.
-            far, near = self._near_sums(line.x, self.backend.Float(0), adder, start, active)
-            return far.add_line_rates(line.v, line.slack, lengths, near, active)
+            far_sums, edge_rates = self._near_sums(
+                line.x, self.backend.Float(0), adder, start, active
+            )
+            # Add the bounds of the far clusters; this makes the bounds infinite on other lanes.
+            # `line.slack` bounds the rounding of points of the line.
+            return far_sums.add_line_rates(line.v, line.slack, lengths, edge_rates, active)
 
         return rates

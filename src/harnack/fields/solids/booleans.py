@@ -1,9 +1,10 @@
 """Combinations of solids: unions, intersections, complements, offsets, and blends. A solid is the
 set of points where its function f is at most 0; the solids that are combined are called operands
-(or parts), with the functions f_i. The union has the function min f_i, the intersection max f_i,
-the complement -f. A sample of f at a point is its value and gradient there, with bounds of their
-errors, and with promises (proved bounds of f near the point). A ray sample adds enclosures: proved
-bounds of the change of f along the ray, in front of the point and behind it."""
+(in the code also parts), and their functions f_i. The union has the function min f_i, the
+intersection max f_i, the complement -f. A sample of f at a point is its value and gradient there,
+with bounds of their errors, and with promises (proved bounds of f near the point). A ray sample
+adds enclosures: proved bounds of the change of f along the ray, in front of the point and behind
+it."""
 
 from __future__ import annotations
 
@@ -33,9 +34,10 @@ if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
     from harnack.geometry import Volume
 
-# The bounds of other operands may narrow the range of the value, which moves the middle of the
-# range. This is done only if the middle moves by more than this fraction of the value's error; at
-# creases it nearly always moves less.
+# The value of a combination is known to lie in a range. Bounds from other operands may narrow this
+# range and so move its middle. They are used only if the middle moves by more than this fraction of
+# the value's error. (At creases it nearly always moves less, and the value would change for
+# nothing.)
 _MIN_SHIFT = 0.25
 
 
@@ -86,16 +88,17 @@ def _flatten_operands(solids: tuple[Solid, ...], *, is_union: bool) -> tuple[Sol
 class BooleanSolid(Solid):
     """The union of solids, whose function is the minimum of their functions f_i; or their
     intersection, whose function is the maximum of the f_i. The solids are called operands. At a
-    point, the extreme operand is the one whose value is the minimum (or maximum). A union is
-    computed as an intersection of negated functions: min f_i = -max(-f_i).
+    point, the extreme operand is the one whose value is the minimum (of a union) or the maximum (of
+    an intersection). A union is computed as an intersection of negated functions: min f_i =
+    -max(-f_i).
 
     parts: the operands.
     is_union: True for the union, False for the intersection.
 
     If the f_i are distances, the minimum is the exact distance outside and only a bound inside, and
-    the maximum is only a bound. Hart 1996, equation 16, calls the union exact inside too. Unit
-    discs about -1/2 and 1/2 are a counterexample: at 0 the distance is 0.866, but the minimum gives
-    0.5.
+    the maximum is only a bound. Hart 1996, equation 16, calls the union exact inside too. A
+    counterexample in the plane are the unit discs about (-1/2, 0) and (1/2, 0): at (0, 0) the
+    distance from the border of the union is 0.866, but the minimum is -0.5.
     """
 
     parts: tuple[Solid, ...]
@@ -114,8 +117,9 @@ class BooleanSolid(Solid):
         )
         coarsest = min((part.coarsest_accuracy for part in self.parts), default=1.0)
         object.__setattr__(self, "coarsest_accuracy", coarsest)
-        # The smallest factor: a step longer than the proved one is accepted only if every operand
-        # proves the rest looking back, so one operand without such proofs refuses all of them.
+        # The smallest factor of all operands. A step longer than the proved one is accepted only if
+        # every operand proves the rest of it, looking back from the new point. So one operand
+        # without such proofs makes longer steps useless.
         object.__setattr__(
             self, "over_relaxation", min(part.over_relaxation for part in self.parts)
         )
@@ -139,10 +143,12 @@ class BooleanSolid(Solid):
         """
         extents = [part.sublevel_extent(level, above=above) for part in self.parts]
         bounded = [part for part in extents if part is not None]
-        # The first case: min and >=, or max and <=. An operand without a volume limits nothing.
+        # The first case, an intersection of volumes: min f_i >= level, or max f_i <= level. An
+        # operand without a volume limits nothing, and without any volume the result is None.
         if self.is_union == above:
             return VolumeIntersection(bounded) if len(bounded) > 1 else next(iter(bounded), None)
-        # The second case: an operand without a volume may have such points anywhere.
+        # The second case, a box around all volumes: an operand without a volume may have such
+        # points anywhere.
         if len(bounded) < len(extents):
             return None
         return _box_around_volumes(bounded)
@@ -168,6 +174,8 @@ class BooleanSolid(Solid):
         """The same combination of other operands, which need not be solids."""
         combination = copy.copy(self)
         object.__setattr__(combination, "parts", tuple(parts))
+        coarsest = min((part.coarsest_accuracy for part in parts), default=1.0)
+        object.__setattr__(combination, "coarsest_accuracy", coarsest)
         return combination
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
@@ -197,10 +205,10 @@ class BooleanSolid(Solid):
         return rows
 
     def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
-        """Two error bounds at p: of the gradient, as a length, and of the Hessian. If rounding
-        leaves no doubt which operand has the smallest value (for a union) or the largest (for an
-        intersection), they are the bounds of that operand. Otherwise both are infinite, since
-        derivatives jump from one operand to the other."""
+        """Two error bounds at p: of the gradient, as a length, and of the Hessian. If the errors of
+        the values leave no doubt which operand has the smallest value (for a union) or the largest
+        (for an intersection), they are the bounds of that operand. Otherwise both are infinite,
+        since derivatives jump from one operand to the other."""
         size = max_norm(p)
         sign = -1.0 if self.is_union else 1.0
         total_error = value_error_bound(sample, safe_norm(sample.gradient), size)
@@ -208,10 +216,12 @@ class BooleanSolid(Solid):
         for part in self.parts:
             part_sample = part.evaluate(p)
             part_error = value_error_bound(part_sample, safe_norm(part_sample.gradient), size)
+            # True unless the operand's value is clearly not the extreme one. (With ~, it is true
+            # for NaN.)
             may_be_extreme = ~(sign * (sample.value - part_sample.value) > part_error + total_error)
             candidate_count = candidate_count + dr.select(may_be_extreme, 1.0, 0.0)
             first, second = part.derivative_errors(p, part_sample)
-            # NaN is kept, as it bounds nothing.
+            # The larger of both, written so that a NaN is kept: it says that no bound is known.
             max_first = dr.select(may_be_extreme & ~(first <= max_first), first, max_first)
             max_second = dr.select(may_be_extreme & ~(second <= max_second), second, max_second)
         is_single = candidate_count <= 1
@@ -230,7 +240,8 @@ class BooleanSolid(Solid):
         sample, deficits, extreme = self._combine_samples(
             [operand.sample for operand in ray_samples], size
         )
-        # The slope is that of the extreme operand.
+        # The slope is that of the extreme operand, the one whose value is `extreme`; the last
+        # operand, if no other one is.
         slope, slope_error = ray_samples[-1].slope, ray_samples[-1].slope_error_bound
         for ray_sample in ray_samples[:-1]:
             is_chosen = ray_sample.sample.value == extreme
@@ -248,8 +259,9 @@ class BooleanSolid(Solid):
         if an operand has none.
 
         operands: the enclosures of each operand's function f_i.
-        deficits: for each operand, bounds (lower, upper) of the difference between the greatest
-            value of all operands and its own value. For a union they are about the values of -f_i.
+        deficits: for each operand, bounds (lower, upper) of its deficit. That is the difference
+            between the greatest value of all operands and its own value; for a union, values are
+            those of -f_i.
         """
         if not all(operands):
             return ()
@@ -273,20 +285,20 @@ class BooleanSolid(Solid):
         samples: the samples of the operands.
         size: a bound of the absolute values of the point's coordinates.
 
-        Returns three results: the sample; for each operand, bounds (lower, upper) of its deficit,
-        which is the difference between the greatest value of all operands and its own value; and
-        the extreme value itself as the operand computed it. For a union, all of this is done for
-        the functions -f_i, and the third result is the least value of an operand.
+        Returns three results: the sample; for each operand, bounds (lower, upper) of its deficit;
+        and the extreme value, exactly as the operand computed it. The deficit is the difference
+        between the greatest value of all operands and the operand's own value. For a union the
+        values are those of -f_i, and the extreme value is the least f_i.
 
         Proof of the errors. Let v_i be the values of the operands f_i, e_i bounds of their errors
         (all rounding included, `value_error_bound`), and v = v_k the greatest value. Then max f_i
         <= max(v_i + e_i) = v + max(e_i - (v - v_i)), and max f_i >= v_k - e_k. So max(e_i - (v -
         v_i)) bounds the error of the combination. As max f_i >= v_j - e_j for every j, an operand
         with a smaller error may exclude most of that range. Then the value is set to the middle of
-        the remaining range. Otherwise a ray would hit, by the rounding of one operand, a surface
-        that lies inside of another operand. The tracer subtracts the error of the combination from
-        the differences between f and the levels. If the error of an operand is larger, the bounds
-        of its deficit are widened by the excess.
+        the remaining range. Without this, a large rounding error of one operand could make a ray
+        hit a surface of it that lies inside of another operand. The tracer reduces the differences
+        between f and the levels by the error of the combination. If the error of an operand is
+        larger than that, the bounds of its deficit are widened by the excess.
         """
         sign = -1.0 if self.is_union else 1.0
         values = [sign * operand.value for operand in samples]
@@ -305,8 +317,8 @@ class BooleanSolid(Solid):
         errors = [
             value_error_bound(operand, safe_norm(operand.gradient), size) for operand in samples
         ]
-        # The error of the greatest value, and the part of it that more accurate samples would
-        # reduce.
+        # The error of the greatest value, max(e_i - (v - v_i)) in the proof; and the part of it
+        # that more accurate samples would reduce.
         error, truncation = 0 * greatest, 0 * greatest
         for sample, operand_value, operand_error in zip(samples, values, errors, strict=True):
             deficit = greatest - operand_value
@@ -318,10 +330,12 @@ class BooleanSolid(Solid):
             lower_bound = fmax(operand_value - operand_error, lower_bound)
         shift = 0.5 * (lower_bound - (greatest - error))
         shift = dr.select(shift > _MIN_SHIFT * error, shift, 0)
-        # Note the unshifted value: it tells the extreme operand.
+        # The unshifted value is returned, too: it tells the extreme operand. For a union f is minus
+        # the greatest value, so the shift has the other sign.
         extreme, value = value, value + sign * shift
         greatest, error = greatest + shift, error - shift
-        # `Sample.value_error` leaves out the rounding that follows from value and gradient.
+        # `Sample.value_error` must leave out the rounding that `value_error_bound` adds by itself,
+        # from the value and the gradient (`stated`).
         plain = Sample(value, gradient, ())
         stated = value_error_bound(plain, safe_norm(gradient), size)
         joined = Sample(
@@ -367,9 +381,9 @@ def min_wavelength(parts: Iterable[Solid]) -> float | None:
 
 
 def lipschitz_of(sample: Sample) -> Lipschitz | None:
-    """A Lipschitz constant of f near the point of a sample, as a promise: one that the sample
-    states, or one that follows from another of its promises (proved bounds near the point); None if
-    there is none."""
+    """A Lipschitz constant of f on a ball about the point of a sample, as a promise (a proved bound
+    near the point): one that the sample has, or one that follows from another of its promises; None
+    if there is none."""
     implied = [promise.implied_lipschitz(sample.value) for promise in sample.all_promises]
     stated = (promise for promise in sample.all_promises if isinstance(promise, Lipschitz))
     return next(stated, None) or next((promise for promise in implied if promise is not None), None)
@@ -456,8 +470,8 @@ class OffsetSolid(SolidOfField):
     field: the solid.
     distance: the level of f that becomes the surface. Where f is a distance, the solid grows by it.
 
-    Proof. The function f - distance changes as f does. So it has the enclosures of f along a ray,
-    and its Lipschitz constant.
+    Proof. The function f - distance changes along a ray as f does. So enclosures of f, and a
+    Lipschitz constant of f, are also those of f - distance.
     """
 
     field: Solid
@@ -501,8 +515,8 @@ class OffsetSolid(SolidOfField):
 
 @dataclass(frozen=True, eq=False)
 class BlendedSolid(FormulaSolid):
-    """The union or intersection of two solids with a fillet where their surfaces meet.
-    `arithmetic.norms.blend_union` has the function, the blend of the functions of both solids, and
+    """The union or intersection of two solids with a fillet where their surfaces meet. Its function
+    is a blend of the functions of both solids; `arithmetic.norms.blend_union` has the formula and
     its proofs.
 
     parts: the two solids.
@@ -550,11 +564,11 @@ class BlendedSolid(FormulaSolid):
         """A volume that is proved to contain all points where f <= level or, if `above`, all points
         where f >= level; None if no such volume is known.
 
-        It is a volume of the same combination without a fillet. A fillet makes the function of a
-        union smaller, so it adds points with f <= level: for these, the level is raised by
-        `_min_operand_bound`. A fillet makes the function of an intersection larger, so the same
-        holds for points with f >= level, with opposite signs. In the other two cases the level
-        stays.
+        The result is such a volume for the same combination without a fillet. A fillet makes the
+        function of a union smaller, so it adds points with f <= level: for these, the level is
+        raised by `_min_operand_bound`. A fillet makes the function of an intersection larger, so
+        the same holds for points with f >= level, with opposite signs. In the other two cases the
+        level stays.
         """
         sharp = union(*self.parts) if self.is_union else self.parts[0] & self.parts[1]
         if self.is_union:
@@ -573,9 +587,9 @@ class BlendedSolid(FormulaSolid):
         """A bound of the smaller of the two solids' functions at all points where their blended
         union is at most `level`.
 
-        Proof. The blend grows with both functions. So it is at least the blend of the smaller value
-        m with itself. With r the radius and p the power, that is r - 2^(1/p) (r - m) for m < r, and
-        m for larger m. Solving r - 2^(1/p) (r - m) <= level for m gives the bound.
+        Proof. The blend grows with both values that are blended. So it is at least the blend of the
+        smaller value m with itself. With r the radius and p the power, that is r - 2^(1/p) (r - m)
+        for m < r, and m for larger m. Solving r - 2^(1/p) (r - m) <= level for m gives the bound.
         """
         if level >= self.radius:
             return level

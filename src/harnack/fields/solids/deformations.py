@@ -51,10 +51,10 @@ class Deformation(SpaceMap):
     @property
     def min_scale(self) -> float:
         """The smallest factor by which the map multiplies lengths, and so the wavelengths of a
-        solid's function.
+        solid's function. It is an estimate, for `Field.min_wavelength`.
 
-        The default is 1, for maps whose factor has no positive lower bound: a twist compresses
-        waves more the farther they are from its axis.
+        The default is 1. It is also used for maps whose factors have no positive lower bound: a
+        twist compresses waves the more, the farther they are from its axis.
         """
         return 1.0
 
@@ -145,8 +145,8 @@ class Twist(Deformation):
     Proof of `preimage_lipschitz`. Let a be the rate, and x and y the coordinates across the axis.
     The derivative of the inverse map is a rotation times the matrix [[1, 0, -y a], [0, 1, x a], [0,
     0, 1]]. Its largest singular value is (m + sqrt(m^2 + 4))/2, where m is |a| times the distance
-    from the axis. On the ball m has its largest value. (Hart's equation 51 is too small for large
-    a.)
+    from the axis. It grows with m, so on a ball it is bounded by its value for the largest m there.
+    (Hart's equation 51 is too small for large a.)
     """
 
     rate: Any
@@ -200,8 +200,8 @@ class Taper(Deformation):
     along it, k = 1/r and m = rho |r'|/r^2. The derivative of the inverse map acts on the radial and
     the axial direction as the matrix [[k, m], [0, 1]], and on the third direction as the factor k.
     The square of its largest singular value is (S + sqrt(S^2 - 4 k^2))/2 with S = k^2 + m^2 + 1,
-    which grows with k and m. On the ball k and m are replaced by their largest values. (Hart's
-    equation 49 has min 1/r.)
+    which grows with k and m. So on a ball it is bounded by its value for the largest k and m there.
+    (Hart's equation 49 has min 1/r.)
     """
 
     start: tuple[Any, Any]
@@ -263,6 +263,7 @@ class Taper(Deformation):
         The class docstring has the proof, with the symbols k, m and S (here `total`)."""
         (a, r), (b, s) = ((0 * p.x + u, 0 * p.x + v) for u, v in (self.start, self.end))
         axis_distance = _distance_from_axis(p, self.axis)
+        # Any radius is valid; a larger one has a larger constant.
         radius = 0.25 * axis_distance + 0.25 * (b - a)
         # The largest k and m on the ball.
         k = 1 / fmin(r, s)
@@ -305,7 +306,8 @@ def _cylinder_around(volume: Volume | None, axis: str) -> tuple[float, tuple[flo
     if not (np.isfinite(lower).all() and np.isfinite(upper).all()):
         return None
     k = AXES[axis]
-    # The cylinder around the box of the volume; for a ball, a smaller one.
+    # The cylinder around the box of the volume; for a ball, the smaller one around the ball. The
+    # factor is for rounding.
     max_abs = np.maximum(np.abs(lower), np.abs(upper))
     radius = float(np.hypot(max_abs[(k + 1) % 3], max_abs[(k + 2) % 3])) * (1 + 1e-12)
     if isinstance(volume, Ball):

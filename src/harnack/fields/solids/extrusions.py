@@ -40,8 +40,8 @@ if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
     from harnack.geometry import Volume
 
-# The next ray sample is bounded up to this multiple of the last step (`RaySample.reach_growth`).
-# Evaluations take long, so that long steps save time.
+# The next ray sample is bounded on a length that is this multiple of the last step
+# (`RaySample.reach_growth`). An evaluation takes long, so that long steps save time.
 _REACH_GROWTH = 4.0
 # A lower bound of |gradient| of a signed distance, which is 1 wherever the gradient exists.
 _MIN_GRADIENT = 0.99
@@ -72,12 +72,13 @@ class Extrusion(Solid):
     proved: see `ExtrusionEnclosure`.
 
     With twist or taper, f at p is this function at the preimage of p, which has the same z. Along a
-    ray f changes no faster than the preimage moves; ranges of the preimage's derivative bound its
-    speed. Proof of the Lipschitz constant in all directions. Let c be the Lipschitz constant of the
-    inverse of the taper on a ball about p of radius R, and b that of the inverse of the twist on a
-    ball of radius S about the point that the first returns (proofs: `Taper`, `Twist`). Then both
-    maps together have the constant b c within min(R, S/c). So has f, because the signed distance
-    has the constant 1.
+    ray f changes no faster than the preimage moves; ranges of the preimage's derivative along the
+    ray bound the speed of the preimage. Proof of the Lipschitz constant in all directions. Let c be
+    a Lipschitz constant of the inverse of the taper on the ball of radius R about p, and let p' be
+    the image of p under this inverse. Let b be a Lipschitz constant of the inverse of the twist on
+    the ball of radius S about p' (proofs: `Taper`, `Twist`). Points within min(R, S/c) of p go to
+    points within S of p'. So on this ball both inverses together have the constant b c. So has f,
+    because the signed distance has the constant 1.
 
     Raises:
         ValueError: loops that enclose no area; a height or a taper that is not positive.
@@ -131,7 +132,8 @@ class Extrusion(Solid):
             max_scale = max(1.0, self.taper)
             lower, upper = max_scale * np.minimum(lower, 0.0), max_scale * np.maximum(upper, 0.0)
         if self.twist:
-            # Turned by any angle, the outline stays in a disc about the axis.
+            # Turned by any angle, the outline stays in a disc about the axis, with the distance of
+            # its farthest vertex as radius.
             radius = float(np.linalg.norm(points, axis=1).max()) + max(level, 0.0)
             upper = np.full(2, radius * max(1.0, self.taper))
             lower = -upper
@@ -167,7 +169,9 @@ class Extrusion(Solid):
         zero = 0 * p.x
         u, v = (zero + component.value.midpoint for component in (x, y))
         planar = solid._outline.sample(u, v)
-        # A bound of the error of the preimage's position; then gradients as ranges.
+        # A bound of the error of the preimage's position. Then the components of the gradient of
+        # the outline's distance as a function of p, as ranges: the chain rule, with the planar
+        # gradient times the derivatives a and b of the preimage's x and y.
         spread = zero + x.value.radius + y.value.radius
         gradient_ranges = [
             Interval.point(planar.gradient[0]) * a + Interval.point(planar.gradient[1]) * b
@@ -181,6 +185,8 @@ class Extrusion(Solid):
             sum((component.radius for component in gradient_ranges), zero)
             + planar.gradient_error * constant
         )
+        # The distance changes by at most as much as the preimage, which `spread` bounds; the bound
+        # is doubled as a margin.
         moved = OutlineSample(planar.value, planar.gradient, planar.error + 2 * spread, error)
         return solid._sample_of_outline(p, moved, gradient, Lipschitz(constant, radius))
 
@@ -196,12 +202,14 @@ class Extrusion(Solid):
         epsilon = 2 * float(dr.epsilon(type(p.x)))
         half = cast("Any", self)._half
         end_distance = dr.abs(p.z - half) - half
+        # f, and its derivatives by the two distances.
         value, side_weight, end_weight = _corner(side.value, end_distance)
         vertical = dr.mulsign(end_weight, p.z - half)
         gradient = gradient * side_weight + cast("Any", type(p))(0, 0, vertical)
         error = side.error + 8 * epsilon * (dr.abs(p.z) + half)
         gradient_error = side.gradient_error + 8 * epsilon
-        # Where both distances count, their weights are as accurate as the distances.
+        # Outside near an edge, both weights are quotients of a distance and of f: their error is
+        # that of the distances over f.
         gradient_error = gradient_error + dr.select(
             (side_weight > 0) & (end_weight > 0), fmin(2 * error / value, 2), 0
         )
@@ -232,7 +240,8 @@ class Extrusion(Solid):
             ray_sample = path.enclose(replace(sample, ray_promises=(path_constant,)))
             # The speed has no bound looking back.
             return replace(ray_sample, backward=(), min_gradient_norm=min_norm)
-        # This kind is in the sharpest choice of enclosures; otherwise others were asked for.
+        # The caller chooses kinds of enclosures. The one below is used with the sharpest choice,
+        # which is the one that has `PiecewiseTaylorEnclosure`.
         if PiecewiseTaylorEnclosure not in path.proofs.kinds:
             return path.enclose(self.evaluate(p))
         solid = _prepared_for(self, p)
@@ -284,7 +293,8 @@ class Extrusion(Solid):
         return Lipschitz(dr.select(is_known, speed, dr.inf), dr.select(is_known, length, 0))
 
     def _min_gradient_norm(self, sample: Sample) -> Real:
-        """A lower bound of |grad f|, from the Lipschitz constant c in a sample of f.
+        """A lower bound of |grad f| at a point, from the Lipschitz constant c of f near it, which
+        is the only promise of the sample.
 
         Proof. f at p is the signed distance from a straight extrusion, taken at the preimage of p.
         The gradient of the signed distance is at least `_MIN_GRADIENT` long. So |grad f| is at
@@ -299,15 +309,15 @@ class Extrusion(Solid):
         return _MIN_GRADIENT / (max(1.0, self.taper) * cast("Lipschitz", promise).constant)
 
     def _preimage_lipschitz(self, p: Vec3) -> tuple[Real, Real]:
-        """A Lipschitz constant of the inverse map (`_preimage`) on a ball about p, and the radius
-        of that ball. The class docstring has the proof."""
+        """A Lipschitz constant of the inverse of twist and taper (the map `_preimage`) on a ball
+        about p, and the radius of that ball. The class docstring has the proof."""
         taper, twist = cast("Any", self)._tapering, cast("Any", self)._turning
         constant, radius = 0 * p.x + 1, 0 * p.x + dr.inf
         if taper is not None:
             constant, radius = taper.preimage_lipschitz(p)
             p = cast("Any", type(p))(*taper.preimage(p.x, p.y, p.z))
-        # The proof in the class docstring: constants are multiplied, and the inner ball, taken back
-        # by the first map, is smaller by its constant.
+        # As in the proof of the class docstring: the constants are multiplied, and the radius is
+        # min(R, S/c), where c is `constant`.
         if twist is not None:
             inner_constant, inner_radius = twist.preimage_lipschitz(p)
             constant, radius = (
@@ -381,8 +391,9 @@ class ExtrusionEnclosure(Enclosure):
 
         gaps: the differences between f at the start and its next levels.
 
-        The deficits in the code are bounds of how much w and d are less than f at the start, error
-        included.
+        In the code `end_distance` is w and `side` is about d. The deficits are bounds of f - w and
+        of f - d at the start, with the error added: by so much less than f may w or d fall before
+        it is at the level below.
         """
         inf = type(gaps.below)(dr.inf)
         end_distance = dr.abs(self.height) - self.half
@@ -399,7 +410,9 @@ class ExtrusionEnclosure(Enclosure):
         )
         # The level above: if it is <= 0, both d and w must stay below it.
         is_inside = self.value + gaps.above + self.error <= 0  # also for unrounded numbers
-        # The deficits contain the error with the sign that is safe for the level below.
+        # w rises to the level above when it has risen by the gap plus f - w. The deficit is f - w
+        # plus the error, and for this level the error has to be subtracted; so it is subtracted
+        # twice.
         error = 2 * self.error
         up = fmin(
             self._rise(gaps.above + end_deficit - error),
@@ -412,7 +425,8 @@ class ExtrusionEnclosure(Enclosure):
     def _fall(self, gap: Real) -> Real:
         """A length of the ray on which w falls by less than `gap`; infinite if it never falls so
         far."""
-        # w rises, or the height comes to 0 before.
+        # w never falls by the gap if |height| grows along the ray, or if |height| is less than the
+        # gap, so that the height comes to 0 before.
         is_unreached = (self.height * self.rate >= 0) | (gap > dr.abs(self.height))
         length = dr.select(is_unreached, dr.inf, gap / dr.abs(self.rate))
         return dr.select((gap > 0) & (length >= 0), length, 0)
@@ -442,9 +456,9 @@ def outline_distance_jet(nearest: Callable[[Real, Real], OutlineSample], x: Jet,
     used.
     """
     # The jets at the start of the piece; at a point, the jets themselves.
-    starts = [jet_u if jet_u.jet_at_start is None else jet_u.jet_at_start for jet_u in (x, y)]
+    starts = [coord if coord.jet_at_start is None else coord.jet_at_start for coord in (x, y)]
     zero = 0 * x.piece_length
-    u, v = (zero + jet_u.value.midpoint for jet_u in starts)
+    u, v = (zero + coord.value.midpoint for coord in starts)
     nearest_sample = nearest(u, v)
     # A bound of the error of the coordinates at the start.
     input_error = zero + starts[0].value.radius + starts[1].value.radius
@@ -463,20 +477,25 @@ def outline_distance_jet(nearest: Callable[[Real, Real], OutlineSample], x: Jet,
         limit = dr.sqrt(dr.fma(a, a, b * b)) * (1 + 1e-5)
         return Interval(-limit, limit)
 
-    def or_range_on_ball(jet_u: Interval, limit: Interval) -> Interval:
-        """An interval: `jet_u` where the coordinates are those of a point, and `limit` where they
-        are ranges that stand for a ball.
+    def or_range_on_ball(at_point: Interval, on_ball: Interval) -> Interval:
+        """An interval that is `at_point` on lanes where the coordinates are those of a point, and
+        `on_ball` on lanes where they are ranges that stand for a ball.
 
-        jet_u: an interval that holds at a point.
-        limit: an interval that holds on a ball.
+        at_point: an interval that holds at a point.
+        on_ball: an interval that holds on a ball.
         """
-        lower, upper = (zero + jet_u.lower, limit.lower), (zero + jet_u.upper, limit.upper)
+        lower, upper = (
+            (zero + at_point.lower, on_ball.lower),
+            (zero + at_point.upper, on_ball.upper),
+        )
         return Interval(*(dr.select(is_ball, b, a) for a, b in (lower, upper)))
 
     all_numbers = Interval(zero - dr.inf, zero + dr.inf)
     errors = Interval(zero - nearest_sample.gradient_error, zero + nearest_sample.gradient_error)
-    # The gradient of d with its error, as intervals; then its product with derivatives of (u, v).
-    gx, gy = (Interval.point(jet_u) + errors for jet_u in nearest_sample.gradient)
+    # The gradient of d with its error, as intervals. By the chain rule, the derivative of d by a
+    # variable is its product with the derivative of (u, v) by that variable; the Lipschitz constant
+    # narrows it. From here on u and v are the jets of the coordinates at the start.
+    gx, gy = (Interval.point(component) + errors for component in nearest_sample.gradient)
     count = range(len(x.first_derivatives))
     u, v = starts
     ranges = tuple(lipschitz_range(i, u, v) for i in count)
@@ -505,6 +524,8 @@ def outline_distance_jet(nearest: Callable[[Real, Real], OutlineSample], x: Jet,
     start = Jet(value, slopes, second, piece_length=u.piece_length)
     if x.jet_at_start is None:
         return start
+    # On a piece only the Lipschitz constant is used. The first variable is the length along the
+    # piece.
     first = tuple(lipschitz_range(i, x, y) for i in count)
     piece_value = value + range_times_length(first[0], x.piece_length)
     unknown_second = (all_numbers,) * len(x.second_derivatives)
@@ -521,14 +542,15 @@ class SolidOfRevolution(Solid):
         arrays (a point is inside if an odd number of loops surrounds it). Edges on the axis are
         inside of the solid, and no part of its surface.
 
-    f has the Lipschitz constant 1. Proof. The nearest point of a surface of revolution lies in the
-    half-plane of p, so f is the signed distance of (r, z) from the outline. Along a ray,
-    `OutlineEdges.sample` bounds the distance on the line that is tangent to the curve (r(s), z(s))
-    at its start. The curve departs from that line in r alone. r(s) is convex along the ray, and
-    lies above its tangent by e(s) = (c/r)^2 s^2/(r(s) + r + r' s) >= 0, where c/r is the component
-    of the direction across the half-plane. As the distance has the constant 1, it is less by at
-    most e(s). A concave bound minus a convex function is still concave, and `TangentEnclosure`
-    needs no more than that.
+    f has the Lipschitz constant 1. Proof. The point of the surface nearest to p lies in the
+    half-plane that is bounded by the axis and contains p. So f is the signed distance of (r, z)
+    from the outline. Along a ray, `OutlineEdges.sample` bounds the distance on the line that is
+    tangent to the curve (r(s), z(s)) at its start. The curve departs from that line in r alone.
+    r(s) is convex along the ray, and lies above its tangent by e(s) = (c/r)^2 s^2/(r(s) + r + r' s)
+    >= 0, where c/r is the component of the direction across the half-plane. As the distance has the
+    Lipschitz constant 1, at the true point it is less than at the point of the line by at most
+    e(s). So the lower bounds along the line are reduced by e(s). A concave bound minus a convex
+    function is still concave, and `TangentEnclosure` needs no more than that.
 
     Raises:
         ValueError: loops that enclose no area, or with points of r < 0.
@@ -613,7 +635,8 @@ class SolidOfRevolution(Solid):
         """
         del back
         p, d = path.point(t), path.direction
-        # This kind is in the sharpest choice of enclosures; otherwise others were asked for.
+        # The caller chooses kinds of enclosures. The one below is used with the sharpest choice,
+        # which is the one that has `PiecewiseTaylorEnclosure`.
         if PiecewiseTaylorEnclosure not in path.proofs.kinds:
             return path.enclose(self.evaluate(p))
         outline: OutlineEdges = _prepared_for(self, p)._outline
@@ -627,8 +650,10 @@ class SolidOfRevolution(Solid):
             bound - _tangent_gap(r, rate, across, knot, epsilon)
             for bound, knot in zip(side.lower_bounds, knots, strict=True)
         )
-        # A bound that is NaN, as at an infinite knot, proves nothing.
+        # A bound that is NaN (infinity minus infinity, at an infinite knot) proves nothing. Only
+        # NaN differs from itself.
         lower_bounds = tuple(dr.select(bound == bound, bound, -dr.inf) for bound in lower_bounds)
+        # For the rounding of r.
         rounding = 8 * epsilon * r
         side = OutlineSample(
             side.value, side.gradient, side.error + rounding, side.gradient_error + 8 * epsilon,
@@ -667,6 +692,7 @@ def _tangent_gap(r: Real, rate: Real, across: Real, s: Real, epsilon: float) -> 
     """
     line, sideways = r + rate * s, across * s
     length = dr.sqrt(dr.fma(line, line, sideways * sideways))
-    # The first form has no cancellation, but needs a positive divisor.
+    # The gap is length - line. In the first form, sideways^2/(length + line), nothing cancels, but
+    # it needs a positive divisor.
     gap = dr.select(line > 0, sideways / (length + line) * sideways, length - line)
     return gap * (1 + 1e-5) + 16 * epsilon * (dr.abs(line) + dr.abs(sideways))

@@ -2,8 +2,9 @@
 noise is a random smooth function: space is cut into the cubic cells of a lattice; each lattice
 point has a pseudo-random unit vector; and in a cell the noise interpolates eight linear functions
 (ramps), one for each corner, whose gradients are these vectors. The interpolation weights come from
-a fade function. Fractal noise is a sum of such noises, the octaves, each with half the spacing of
-the one before. `NoiseConstants` holds the proved bounds of gradient noise."""
+a fade function. Fractal noise is a sum of such noises, the octaves. The lattice of each octave has
+half the spacing of the octave before. `NoiseConstants` holds the proved bounds of gradient
+noise."""
 
 from __future__ import annotations
 
@@ -44,11 +45,12 @@ class NoiseConstants:
     max_gradient: a bound of |grad noise|.
     max_second_derivative: a bound of the second derivative along any line.
 
-    Proof. Let c run over the corners of a cell, with the weights w_c, the unit vectors g_c and r_c
-    = x - c. Then noise is the sum of w_c g_c . r_c. So |noise| <= sum w_c |r_c| <= sqrt(sum w_c
-    |r_c|^2). The last sum has one term for each axis, and each is at most 1/4: the weight s(t) lies
-    below the line (1 + 2t)/4 on the first half of the edge, where it is convex. The bound sqrt(3)/2
-    is attained at the cell's center.
+    Proof. Let c run over the corners of a cell. Let w_c be the interpolation weight of the corner
+    at x, g_c its unit vector, and r_c = x - c. Then noise is the sum of w_c g_c . r_c. So |noise|
+    <= sum w_c |r_c| <= sqrt(sum w_c |r_c|^2). The last sum has one term for each axis: with s(t)
+    the fade function, it is (1 - s) t^2 + s (1 - t)^2. Each of them is at most 1/4: s(t) lies below
+    the line (1 + 2t)/4 on the first half of the edge, where it is convex. The bound sqrt(3)/2 is
+    attained at the cell's center.
 
     The derivative along v is the sum of g_c . (A_c v) with A_c = w_c I + r_c grad w_c^T. It is at
     most sum |A_c v| <= sqrt(v^T (sum A_c^T A_c / o_c) v) for any weights o_c > 0 whose sum is 1
@@ -59,9 +61,9 @@ class NoiseConstants:
     attained. Hart's 3 (1996, appendix F) is a bound, but his argument (3/2 of the fade times 2 of
     the vectors) does not prove it: the values of a table have no Lipschitz constant.
 
-    A second derivative d_ij is bounded in the same way: by a sum over the corners along one or two
-    axes, with the weights of the other axes. The largest row sum of these bounds is a bound of the
-    spectral norm of the Hessian: 17.64 (cubic) and 24.35 (quintic) on a grid.
+    The entry d_ij of the Hessian is bounded in the same way, by a sum over the corners. The largest
+    row sum of these bounds is a bound of the spectral norm of the Hessian: 17.64 (cubic) and 24.35
+    (quintic) on a grid.
     """
 
     max_abs: float
@@ -76,9 +78,9 @@ CONSTANTS: dict[Fade, NoiseConstants] = {
 
 
 def fade(kind: Fade, t: Any) -> tuple[Any, Any, Any]:
-    """The interpolation weight of the far end of an edge at the position t from the near end, 0 <=
-    t <= 1; and its first two derivatives with respect to t. The weight rises from 0 to 1, with
-    slope 0 at both ends."""
+    """The fade function and its first two derivatives at t, 0 <= t <= 1. It is the interpolation
+    weight of the far end of an edge, at the position t from the near end. The weight rises from 0
+    to 1, with slope 0 at both ends."""
     if kind == "cubic":
         return t * t * (3 - 2 * t), 6 * t * (1 - t), 6 - 12 * t
     rest = 1 - t
@@ -148,7 +150,8 @@ def lattice_vector(x: Any, y: Any, z: Any, seed: Any, like: Real) -> list[Any]:
     for shift, factor in ((16, 0x7FEB352D), (15, 0x846CA68B)):
         h = (h ^ (h >> shift)) * factor
     h = h ^ (h >> 16)
-    # Odd numbers of absolute value below 1024: exact, and never 0.
+    # Three groups of ten bits become odd numbers of absolute value below 1024: floats represent
+    # them exactly, and they are never 0.
     real = cast("Any", type(like))
     parts = [real((h >> (10 * k)) & 1023) * 2 - 1023 for k in range(3)]
     scale = 1 / dr.sqrt(parts[0] * parts[0] + parts[1] * parts[1] + parts[2] * parts[2])
@@ -162,14 +165,14 @@ class FractalNoise(FormulaSolid):
 
     octaves: the number of octaves.
     beta: how fast amplitudes fall: 0 for white noise, 1 for 1/f noise, 2 for Brownian motion.
-    frequency: k, the number of lattice points per unit of length of the first octave.
+    frequency: k, the number of lattice points per unit of length in the first octave.
     amplitude: of the first octave.
     seed: an integer of 32 bits that chooses the noise.
     fade: "quintic", with a continuous second derivative, or "cubic", which is Hart's.
 
-    This is Hart 1996, equations 52 to 55. The Lipschitz constant is at most the sum of the octaves'
-    constants. The amplitudes 2^(-beta i) give the Hurst exponent beta, so that the graph has the
-    fractal dimension 3 - beta. (Hart's equation after 53 has 2 + (3 - beta)/2.)
+    This is Hart 1996, equations 52 to 55. The Lipschitz constant of f is at most the sum of the
+    octaves' constants. The amplitudes 2^(-beta i) give the Hurst exponent beta, so that the graph
+    has the fractal dimension 3 - beta. (Hart's equation after 53 has 2 + (3 - beta)/2.)
     """
 
     octaves: int = 6
@@ -280,7 +283,7 @@ class FractalNoise(FormulaSolid):
             cell_position = [a - b for a, b in zip(position, floors, strict=True)]
             integer = dr.int32_array_t(cast("Any", type(q[0])))
             unsigned = dr.uint32_array_t(cast("Any", type(q[0])))
-            # Negative indices wrap around to large ones.
+            # Negative indices become large unsigned ones, for which the hash function is as good.
             cell_index = [unsigned(integer(entry)) for entry in floors]
             seed = data["_seed"] + octave
             vectors: list[Any] = []
@@ -330,9 +333,10 @@ class FractalNoise(FormulaSolid):
         scale, amplitude = data["frequency"], data["amplitude"]
         total: Jet | None = None
         for value, gradient, hessian in self._octaves(center, each=True):
-            # Thirty operations for each corner. The position in the cell has the rounding error of
-            # the coordinate, so that there is no bound where the lattice is finer than the spacing
-            # of numbers.
+            # The rounding errors of the octave. There are about thirty operations for each corner.
+            # And the position in the cell has the rounding error of the whole coordinate: where
+            # coordinates, in units of the lattice, are 2^30 or more, the position has no meaning,
+            # and there is no bound.
             size = fmax(fmax(dr.abs(center[0]), dr.abs(center[1])), dr.abs(center[2])) * scale
             position_error = dr.select(size < 2.0**30, epsilon * size, dr.inf)
             octave = _Octave(
@@ -459,7 +463,8 @@ class _Octave:
         error = self.error + self.slope * start_error * (1 + 1e-5)
         value = Interval(self.value - error, self.value + error)
         if coordinates[0].jet_at_start is None:
-            # At points of space, not on pieces of length 0, the Hessian is known.
+            # A jet at a point of space has three variables, a jet along a line only one. Only for
+            # points of space the Hessian is used.
             is_point = len(coordinates[0].first_derivatives) > 1
             return self._derivatives(coordinates, start_error, value, is_point=is_point)
         start = self._derivatives(starts, start_error, value, is_point=False)
@@ -499,9 +504,11 @@ class _Octave:
             # A bound of the length of the derivative of (x, y, z) by variable i.
             speed = _norm3([0 * self.value + r.max_abs for r in rates]) * (1 + 1e-5)
             rate = _interval_sum([g * r for g, r in zip(slopes, rates, strict=True)])
+            # The Lipschitz constant of the octave bounds the rate as well.
             limit = self.slope * speed
             first.append(Interval(fmax(rate.lower, -limit), -fmax(-rate.upper, -limit)))
             speeds.append(speed)
+        # 64 machine epsilons, relative to the bound of the Hessian.
         rounding = 64 * 2 * float(dr.epsilon(cast("Any", type(self.value)))) * self.bend
         second: list[Interval] = []
         for k, (i, j) in enumerate(jets[0].hessian_indices()):

@@ -1,9 +1,10 @@
 """Solids that are made of a field with the function f: all points at which f is below a level,
 above a level, or between two levels. f may be angle-valued: then it is known up to multiples of its
-period, and differences of f are reduced to the nearest multiple. A sample of f at a point is its
-value and gradient there, with proved bounds of f near the point. An enclosure is a proved bound of
-the change of f along a ray, from which follows a length of ray on which f meets no level. The gaps
-are the differences between f and the next level below and above."""
+period, and a difference of values of f is reduced by the multiple of the period that is nearest to
+it. A sample of f at a point is its value and gradient there, with proved bounds of f near the
+point. An enclosure is a proved bound of the change of f along a ray, from which follows a length of
+ray on which f meets no level. The gaps are the differences between f and the next level below and
+above."""
 
 from __future__ import annotations
 
@@ -41,8 +42,8 @@ def solid(
     between: tuple[float, float] | None = None,
     around: tuple[float, float] | None = None,
 ) -> Solid:
-    """The solid that a closed mesh bounds; or the solid of all points at which a field is below a
-    level, above a level, or between two levels.
+    """Make a solid: the one that a closed mesh bounds; or the set of all points at which a field is
+    below a level, above a level, or between two levels.
 
     field: a field, together with exactly one of the four level arguments; or, without these, a
         mesh: a trimesh.Trimesh, a pair (vertices (n, 3), faces (m, 3)), or the path of a surface
@@ -76,7 +77,7 @@ def solid(
             f"{type(field).__name__} jumps across sheets: values on both sides of a level may meet "
             "without any in between, so it bounds no solid"
         )
-    # A band has two numbers, a single level one.
+    # `between` and `around` have two numbers, `below` and `above` one.
     is_band = between is not None or around is not None
     numbers = _levels(bounds[0] if is_band else (bounds[0],), 2 if is_band else 1)
     if numbers is None:
@@ -165,8 +166,10 @@ class SublevelSolid(SolidOfField):
 def bounded_side_extent(
     field: Field, levels: tuple[float, ...], is_inside: Callable[[float], bool]
 ) -> Volume | None:
-    """A volume that contains all points inside a solid made of the field f. If none is proved, the
-    field's domain, outside of which f is not defined; None if there is no domain.
+    """A volume that contains all points inside a solid made of the field f. If f is defined only in
+    the field's domain, or the field has no extent, it is the domain (None if there is none).
+    Otherwise it is the extent, if that has bounds and all points outside of it are outside of the
+    solid; else None.
 
     field: the field f.
     levels: the values of f on the surface of the solid.
@@ -179,13 +182,14 @@ def bounded_side_extent(
     """
     extent = field.extent(levels)
     if field.is_global and extent is field.domain:
-        # The domain only clips the picture, and bounds no level set.
+        # For a global field the domain only clips the picture, and bounds no level set.
         return None
     if extent is None or (field.domain is not None and not field.is_global):
         return field.domain
     lower, upper = extent.bounds()
     if not (np.isfinite(lower).all() and np.isfinite(upper).all()):
         return None
+    # Any point outside of the extent's box decides, as in the proof.
     outside = upper + (upper - lower) + 1e-3
     value = float(field.value(outside, precision="double"))
     return None if is_inside(value) or not math.isfinite(value) else extent
@@ -198,8 +202,8 @@ def _vector(x: Real, y: Real, z: Real) -> Vec3:
 
 def field_jet(field: Field, x: Jet, y: Jet, z: Jet) -> Jet:
     """The jet of a field f (proved ranges of its value and derivatives), from the jets of the
-    coordinates. So a field without a formula can be used in formulas of solids. Its second
-    derivatives must be bounded near a point.
+    coordinates. It lets a field without a formula be used in formulas of solids. The field's
+    samples must promise a bound of second derivatives near the point.
 
     x, y, z: the jets of the coordinates, at a point or on a piece of a line.
 
@@ -209,8 +213,8 @@ def field_jet(field: Field, x: Jet, y: Jet, z: Jet) -> Jet:
     line follow by the chain rule. The value is the value at the start plus the length times the
     range of the derivative. If m > r, derivatives are not bounded. Second derivatives at a point,
     if all six are asked for, are those of the field's Hessian. Their error is the one that the
-    field states (without the effect of the rounding of coordinates), or else 2 H, as both are at
-    most H.
+    field states (without the effect of the rounding of coordinates). It is at most 2 H, as the
+    computed and the true second derivatives are at most H.
 
     Raises:
         TypeError: the field has no proved bound of its second derivatives.
@@ -337,9 +341,9 @@ def _hessian_rows(field: Field, q: Vec3) -> list[list[Interval]] | None:
 
 
 def _second_derivative_bound(field: Field, sample: Sample) -> tuple[Real, Real]:
-    """A bound of all second derivatives of a field near the point of a sample, and the radius of
-    the ball on which it holds. It follows from one of the sample's promises (proved bounds of f
-    near the point).
+    """A bound of the second derivatives of a field along all lines, on a ball about the point of a
+    sample, and the radius of that ball. It follows from the first of the sample's promises (proved
+    bounds of f near the point) that implies one.
 
     Raises:
         TypeError: no promise implies such a bound.
@@ -361,9 +365,10 @@ class BandSolid(SolidOfField):
     half_width. The function of the solid is |f - level| - half_width. If f is angle-valued, f -
     level is reduced by the nearest multiple of the period.
 
-    Proof of steps. The function of the solid changes as f does, up to the sign. So it does not
-    reach a value v as long as f stays away from level + v + half_width and from level - v -
-    half_width, and from these plus multiples of the period (`FoldedEnclosure`).
+    Proof of steps. The function of the solid changes as f does, up to the sign. It takes the value
+    v only where f is level + v + half_width or level - v - half_width, or one of these plus a
+    multiple of the period. So it does not reach v as long as f stays away from all these numbers
+    (`FoldedEnclosure`).
     """
 
     field: Field
@@ -384,8 +389,8 @@ class BandSolid(SolidOfField):
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
         """A volume that is proved to contain all points where |f - level| - half_width is at most
         the number `level`. These points lie between two level sets of f. If no such volume is
-        known, or if `above`, it is the field's domain, outside of which f is not defined; None if
-        there is no domain."""
+        known, or if `above` (a volume for all points where that difference is at least `level`), it
+        is the field's domain, outside of which f is not defined; None if there is no domain."""
         # The two values of f on the surface of these points.
         ends = tuple(self.level + sign * (self.half_width + level) for sign in (-1, 1))
         if above or (self.field.is_global and self.field.period is None):
@@ -416,7 +421,8 @@ class BandSolid(SolidOfField):
         inner_sample = self.field.evaluate(p)
         first_error, second_error = self.field.derivative_errors(p, inner_sample)
         error = value_error_bound(inner_sample, safe_norm(inner_sample.gradient), max_norm(p))
-        # The difference between f and the nearest value at which derivatives jump.
+        # The difference between f and the nearest value at which derivatives jump: the level or,
+        # for an angle-valued f, also the value half a period away from it.
         kink_distance = dr.abs(self._level_difference(inner_sample.value))
         if self.field.period is not None:
             kink_distance = fmin(kink_distance, 0.5 * self.field.period - kink_distance)
@@ -466,7 +472,8 @@ class BandSolid(SolidOfField):
         difference f - level of `_level_difference`.
 
         The only promise of the new sample (a proved bound near the point) is a Lipschitz constant
-        of f, as others do not hold across the level.
+        of f, if one is known. Other bounds of f are not bounds of |f - level|, whose gradient jumps
+        at the level.
         """
         offset = self._level_difference(sample.value)
         negated = negated_sample(sample)
@@ -524,10 +531,10 @@ class FoldedEnclosure(Enclosure):
 
         Let s = |r| at the start. The levels of |r| are B = s - gaps.below and A = s + gaps.above. B
         is reached only if B >= 0. If r has a period P, then s <= P/2, |r| stands for the distance
-        of r from the nearest multiple of P, and A is reached only if A <= P/2. Let r >= 0 at the
-        start. If r rises, |r| can be A at r = A, and B at r = P - B, which is at the distance B
-        from the multiple P. If r falls, |r| can be B at r = B, and A at r = -A. If r < 0, the two
-        directions are exchanged.
+        of r from the nearest multiple of P, and |r| is at most P/2, so A is reached only if A <=
+        P/2. Let r >= 0 at the start. If r rises, |r| can be A at r = A, and B at r = P - B, which
+        is at the distance B from the multiple P. If r falls, |r| can be B at r = B, and A at r =
+        -A. If r < 0, the two directions are exchanged.
         """
         size, inf = dr.abs(self.offset), type(self.offset)(dr.inf)
         has_below = gaps.below <= size * _ROUNDING_FACTOR

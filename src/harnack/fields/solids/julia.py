@@ -1,8 +1,9 @@
 """Quaternion Julia sets as solids. The orbit of a quaternion q_0 is the sequence q_0, q_1 = q_0^2 +
 c, q_2 = q_1^2 + c, ... with a constant c; its members are called iterates. The filled Julia set
 consists of the points whose orbits stay bounded. It is drawn in a slice of the space of
-quaternions. The function f of the solid is positive outside; a Lipschitz constant of f on a ball
-about a point outside proves that the ball holds no point of the set."""
+quaternions, in which the fourth coordinate is constant. The function f of the solid is positive
+outside; a Lipschitz constant of f on a ball about a point outside proves that the ball holds no
+point of the set."""
 
 from __future__ import annotations
 
@@ -26,8 +27,8 @@ if TYPE_CHECKING:
 
 Quaternion = tuple[float, float, float, float]
 
-# Radii of the balls on which a Lipschitz constant is computed, as fractions of the longest possible
-# step.
+# Radii of the balls on which a Lipschitz constant is computed, as fractions of the longest step
+# that could be proved.
 _RADIUS_FRACTIONS = (0.8, 0.6, 0.45, 0.3, 0.15)
 # An iterate whose absolute value is above this number has escaped. Later iterates are not computed;
 # their logarithms follow from this one.
@@ -50,12 +51,13 @@ class Julia(Solid):
     <= 0 on the set, for any N.
 
     Proof of the Lipschitz constants. Consider all orbits that begin in a ball of radius r about a
-    point, and let q_n be that of the point itself. The n-th iterates of the ball are within e_n of
-    q_n, where e_0 = r and e_(n+1) = 2 |q_n| e_n + e_n^2, since the squares of q and q + d differ by
-    d q + q d + d^2. The derivative of an iterate by the starting point in any direction is at most
-    d_n, where d_0 = 1 and d_(n+1) = 2 (|q_n| + e_n) d_n. So g_n = d_n/(|q_n| - e_n) is a bound of
-    the derivative of the logarithm of the iterate's absolute value. A second bound is g_(n+1) <= 2
-    g_n/(1 - |c|/m_n^2), as |q q' + q' q| <= 2 |q| |q'|. Here m_n is a lower bound of the absolute
+    point, and let q_n be that of the point itself. The n-th iterates of these orbits are within e_n
+    of q_n, where e_0 = r and e_(n+1) = 2 |q_n| e_n + e_n^2, since the squares of q and q + d differ
+    by d q + q d + d^2. The derivative of an iterate by the starting point in any direction is at
+    most d_n, where d_0 = 1 and d_(n+1) = 2 (|q_n| + e_n) d_n. So g_n = d_n/(|q_n| - e_n) is a bound
+    of the derivative of the logarithm of the iterate's absolute value. A second bound is g_(n+1) <=
+    2 g_n/(1 - |c|/m_n^2), as the derivative of q^2 in a direction in which q has the derivative q'
+    is q q' + q' q, of a length of at most 2 |q| |q'|. Here m_n is a lower bound of the absolute
     values of the n-th iterates: the larger of |q_n| - e_n and m_(n-1)^2 - |c|. The smaller bound of
     the two is used. Then 2^-N g_N is a Lipschitz constant of f in the ball. So is 2^-N d_N
     exp(1)/B, since f is constant where the N-th iterate is smaller than B/exp(1). The sample of a
@@ -65,7 +67,7 @@ class Julia(Solid):
 
     Rounding. q_n is computed with rounding. So e_(n+1) is increased by a bound of the rounding of
     one iteration, 8 machine epsilons times |q_n|^2 + |c|. For r = 0, e_n is then a bound of the
-    error of q_n.
+    rounding error of q_n.
 
     Early end. The iteration ends at an n < N if |q_n| is above a large number. Then f is taken as
     2^-n log|q_n| - 2^-N log B, with an error of at most 2^-n 2 |c|/|q_n|^2: each later iterate q_j
@@ -244,12 +246,13 @@ class Julia(Solid):
         change, slopes, min_q, rates = _split_in_four(state[16:])
         square = _squared_norm(q)
         norm = dr.sqrt(square)
-        # 2^-n, where n is the number of iterations that were done.
+        # 2^-n, where n is the number of iterations that were done on the lane, rounded up.
         factor = dr.exp2(-real(n)) * (1 + 4 * epsilon)
         is_complete = n >= self.iterations
         last = 2.0**-self.iterations
         offset = last * dr.log(b)
-        # Where log(|q_N|/B) < -1, f is constant.
+        # Where log(|q_N|/B) < -1, f is constant, -2^-N. (An orbit that ended early is far outside
+        # of that.)
         is_floor = norm <= b * math.exp(-1.0)
         value = dr.select(is_floor, -last, factor * dr.log(norm) - offset)
         # The gradient of log|q| is q/|q|^2, times the Jacobian.
@@ -267,7 +270,8 @@ class Julia(Solid):
             constants.append(factor * dr.select(is_complete, at_end, escaped) * (1 + 8 * epsilon))
         # The error of logarithms is a few roundings of their size, or of 1.
         rounding = 16 * epsilon * (factor * (dr.abs(dr.log(norm)) + 1) + dr.abs(offset))
-        # The error of leaving out later iterates, and below the effect of the error of q_n.
+        # The error of leaving out later iterates. Then the effect of the error of q_n: `change[0]`
+        # is e_n for the radius 0, and the derivative of log|q| is 1/|q|.
         rounding += dr.select(is_complete, 0, factor * 2 * size / square)
         error = factor * change[0] / fmax(norm - change[0], cut)
         return value, gradient, error + rounding, constants

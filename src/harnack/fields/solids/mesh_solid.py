@@ -212,11 +212,12 @@ class MeshSolid(Solid):
 
     def evaluate(self, p: Vec3) -> Sample:
         """The sample of f at p: value, gradient, error bounds and the Lipschitz constant 1. Within
-        the context `share_samples`, a sample at the same Dr.Jit points is taken from the cache."""
+        the context `share_samples`, a sample at the same Dr.Jit points is computed once and then
+        taken from a cache."""
         data, cache = _data_on_backend(self, p), _SAMPLE_CACHE.get()
         if cache is None or dr.flag(dr.JitFlag.SymbolicScope):
             return data.sample(p)
-        # Dr.Jit numbers its arrays: equal indices are the same arrays.
+        # Dr.Jit numbers its arrays: points with the same three indices are the same arrays.
         key = id(data), p.x.index, p.y.index, p.z.index
         if key not in cache:
             cache[key] = p, data.sample(p)  # with p, so that its indices name nothing else
@@ -255,8 +256,9 @@ _SAMPLE_CACHE: ContextVar[dict[tuple[int, ...], tuple[Vec3, Sample]] | None] = C
 
 @contextmanager
 def share_samples() -> Generator[None]:
-    """A context within which a mesh is sampled only once at the same Dr.Jit points. So a shell and
-    a lattice of the same mesh share one search for the nearest triangles.
+    """A context within which a mesh is sampled only once at the same Dr.Jit points. So several
+    operands of a combination that are made of the same mesh, such as a shell of it and a lattice
+    cut off by it, share one search for the nearest triangles.
 
     While loops are recorded, samples are not shared, as their values are defined inside the loop
     only.
@@ -286,7 +288,7 @@ class _MeshData(UnitFrame):
     rays: a tree of all faces, which form a closed mesh, with which the crossings of rays are found.
     near: a tree of the triangles that bound the solid, with which closest points are found.
     corners: a record of nine numbers for each triangle of `near`, its corners.
-    low, high: the lowest and the highest corner of the box of `near`.
+    low, high: the lowest and the highest corner of the box around the solid.
     """
 
     rays: TriangleTree
@@ -299,7 +301,8 @@ class _MeshData(UnitFrame):
     def upload(cls, backend: Backend, surface: ClosedSurface) -> _MeshData:
         """Upload the triangles of a surface to a backend, and make the trees."""
         vertices, faces, weights = surface.vertices, surface.faces, surface.weights
-        # One tree serves both purposes, unless the boundary of the solid is not just the faces.
+        # If the boundary of the solid is just the faces, one tree serves both purposes. Otherwise
+        # there is another tree for closest points.
         near = rays = _triangle_tree(
             backend, vertices, faces, weights, slabs=surface.boundary_triangles is None
         )
@@ -321,20 +324,21 @@ class _MeshData(UnitFrame):
         return self._signed_sample(p, x, self._closest_triangle(x))
 
     def sample_with_feature(self, p: Vec3) -> tuple[Sample, Vec3, Mask, Mask]:
-        """The sample of the signed distance at p, and what the closest point of the mesh is: a
-        point inside a triangle, a point on an edge, or a vertex.
+        """The sample of the signed distance at p, and which kind of point the closest point of the
+        mesh is: a point inside a triangle, a point on an edge, or a vertex.
 
-        Returns four results: the sample; a unit vector along the triangle's edge that is nearest to
-        the closest point; a mask, whether the closest point is on that edge and no vertex; and a
-        mask, whether it is a vertex. Both masks are False where the closest point is inside a
-        triangle.
+        Returns four results: the sample; a unit vector along an edge of the closest triangle, the
+        edge that is nearest to the closest point; a mask, true where the closest point lies on that
+        edge and is no vertex; and a mask, true where it is a vertex. Where the closest point is
+        inside a triangle, both masks are false.
         """
         vector = self.backend.Array3f
         x = self.to_unit(p)
         closest = self._closest_triangle(x)
         corners = self.corners.read_record(closest.triangle, closest.triangle != NO_TRIANGLE)
-        # The vectors from the closest point to the corners of its triangle.
+        # The vectors from the closest point (x + closest.offset) to the corners of its triangle.
         to_corners = [vector(*corners[k : k + 3]) - (x + closest.offset) for k in (0, 3, 6)]
+        # A corner nearer than this to the closest point is taken as the closest point itself.
         rounding = _DISTANCE_ROUNDINGS * self.backend.machine_epsilon * (1 + dr.max(dr.abs(x)))
         at_vertex, along, min_distance = (
             self.backend.Bool(False),
@@ -349,6 +353,7 @@ class _MeshData(UnitFrame):
             along = dr.select(edge_distance < min_distance, edge / length, along)
             min_distance = fmin(edge_distance, min_distance)
             at_vertex |= dr.norm(to_corners[a]) <= rounding
+        # `is_inner` is true where the closest point is inside the triangle.
         on_edge = ~closest.is_inner & ~at_vertex
         return (self._signed_sample(p, x, closest), along, on_edge, ~closest.is_inner & at_vertex)
 
@@ -356,7 +361,9 @@ class _MeshData(UnitFrame):
         """The triangle closest to x, a point in unit coordinates."""
         backend = self.backend
         upper_bound = initial_squared_distance(self.near, x)
-        # Begin the enumeration of triangles by distance: no triangle came before.
+        # `next_closest_triangle` returns the triangle that follows another one in the order of
+        # distance. A distance of -1 and no triangle as the one before give the first, which is the
+        # closest.
         before = backend.Float(-1), backend.UInt32(NO_TRIANGLE)
         return next_closest_triangle(self.near, x, before, upper_bound, backend.Bool(True))
 
@@ -376,22 +383,29 @@ class _MeshData(UnitFrame):
         has_area = double_area > 0
         normal = dr.select(has_area, closest.normal / double_area, vector(0, 0, 1))
         height = -dr.dot(closest.offset, normal)  # of x above the triangle's plane
-        # The normal decides if the distance is well above its error; otherwise a ray does.
+        # The normal decides the sign if the closest point is inside the triangle, the distance is
+        # well above its error, and x is nearly straight above the triangle, as it must be then.
+        # Otherwise a ray decides.
         normal_decides = closest.is_inner & (distance > _CLEAR_MULTIPLE * error)
         normal_decides &= 2 * dr.abs(height) > distance
         inside = self._is_inside(x, ~normal_decides)
         inside = dr.select(normal_decides, height < 0, inside)
         sign = dr.select(inside, real(-1), real(1))
 
-        # Across a face the direction is that of its normal, also where the distance is rounding.
-        # Far from the face the sign decides the side, since both faces of a wall thinner than
-        # rounding are near.
+        # If the closest point is inside a face, the gradient is plus or minus the face's normal,
+        # also where the distance is mere rounding. If the distance is larger than its error, the
+        # sign of f says which: the gradient points away from the face outside of the solid, and
+        # towards it inside. (Behind a wall thinner than rounding the nearest face may be that of
+        # the wall's other side.) Nearer to the face, the normal is taken as it is.
         on_face = (closest.is_inner & has_area) | (distance == 0)
         normal_sign = dr.select(distance > error, sign * dr.mulsign(real(1), height), 1)
         gradient = dr.select(on_face, normal * normal_sign, -closest.offset * (sign / distance))
-        # Corners are rounded: that turns a triangle by the rounding over its height.
+        # Corners are rounded, which turns a triangle by an angle of about the rounding over its
+        # height. The height is twice the area over the longest edge, whose length is of the order
+        # of 1 at most.
         normal_error = 8 * epsilon / double_area
         gradient_error = dr.select(on_face, fmin(normal_error, 2), fmin(2 * error / distance, 2))
+        # On a triangle without area nothing is known of the gradient.
         gradient_error = dr.select((distance == 0) & ~has_area, 2, gradient_error)
         return Sample(
             sign * distance * self.size,
@@ -402,8 +416,10 @@ class _MeshData(UnitFrame):
         )
 
     def _is_inside(self, x: Vec3, active: Mask) -> Mask:
-        """Whether the winding number at x, a point in unit coordinates, is above 1/2, on active
-        lanes. It is counted along a ray in direction z or -z, towards the nearer end of the box."""
+        """A mask, true on active lanes where the winding number at x is above 1/2, so that x is
+        inside the solid. x is a point in unit coordinates. The winding number is counted along a
+        ray from x in the direction z or -z, whichever leads to the nearer end of the mesh's box.
+        Points outside of the box are outside of the solid."""
         is_in_box = dr.all((x >= self.low) & (x <= self.high))
         ray_sign = dr.select(x.z > 0.5 * (self.low.z + self.high.z), self.backend.Float(1), -1)
         crossings = self.rays.signed_crossings_vertical(x, ray_sign, active & is_in_box)
@@ -417,7 +433,9 @@ def _triangle_tree(
 
     vertices, faces: (n, 3), and (m, 3) indices of vertices.
     weights: (m,) or a number: how many times the crossings of a face count.
-    slabs: whether the nodes of the tree have slabs besides boxes, for closest points from far away.
+    slabs: whether the nodes of the tree store slabs (flat cylinders around their triangles) besides
+        boxes. They make searches for closest points from far away faster; crossings do not use
+        them.
     """
     tree = build_balanced_tree(vertices[faces].mean(axis=1), leaf_size=_LEAF_SIZE)
     records = triangle_records(vertices, faces)
@@ -447,8 +465,8 @@ def mesh_distance_jet(solid: MeshSolid, x: Jet, y: Jet, z: Jet) -> Jet:
     sample, edge, on_edge, at_vertex = _data_on_backend(solid, q).sample_with_feature(q)
     input_error = sum((coord.value.radius for coord in starts), zero)
     error = sample.value_error + input_error
-    # Where coordinates are ranges, and not numbers with their rounding, another face may be
-    # nearest.
+    # True where the coordinates are ranges, and not numbers with their rounding: at other points of
+    # the ranges another face may be nearest.
     size = max_norm(q) + dr.abs(sample.value)
     is_range = input_error > _MAX_POINT_ROUNDINGS * float(dr.epsilon(zero)) * size
     value = Interval(sample.value, sample.value).widened(1e-6, 0.0) + Interval(-error, error)
@@ -468,8 +486,8 @@ def mesh_distance_jet(solid: MeshSolid, x: Jet, y: Jet, z: Jet) -> Jet:
     # The components of the gradient with their error, as intervals.
     slopes = [Interval.point(coord) + errors for coord in sample.gradient]
     first: list[Interval] = []
-    # First derivatives: by the chain rule, and by the Lipschitz constant alone on a range of
-    # points.
+    # First derivatives: by the chain rule, narrowed by the Lipschitz constant; on ranges of points
+    # by the Lipschitz constant alone.
     for i, limit in enumerate(speeds(starts)):
         rate = Interval(0.0, 0.0)
         for slope, coord in zip(slopes, starts, strict=True):
@@ -494,7 +512,10 @@ def mesh_distance_jet(solid: MeshSolid, x: Jet, y: Jet, z: Jet) -> Jet:
         return total
 
     count = range(len(x.first_derivatives))
-    # Second derivatives: the curvature times the squared motion across the gradient (and the edge).
+    # Second derivatives of d by the variables i and j. The curvature is 1/d near an edge or a
+    # vertex, else 0. It is multiplied by the product of the motions across the gradient (and across
+    # the edge): that is the product of the whole motions, minus the product of their parts along
+    # the gradient (and along the edge).
     gradient_rates = [rate_along(sample.gradient, starts, i) for i in count]
     edge_rates = [rate_along(edge, starts, i) for i in count]
     curvature = dr.select(on_edge | at_vertex, 1 / sample.value, 0)
@@ -523,10 +544,11 @@ def mesh_distance_jet(solid: MeshSolid, x: Jet, y: Jet, z: Jet) -> Jet:
 
 # The surface of a mesh.
 
-# A triangle is thin if its height is below this fraction of the mesh's size. The winding numbers
-# beside thin triangles are not tested.
+# A triangle is thin if its height is below this number in unit coordinates, that is, this fraction
+# of the mesh's size. Its computed winding numbers are not reliable, so they are not tested.
 _THIN_HEIGHT = 1e-9
-# The integral of the normal over a closed surface must be 0 up to this fraction of its area.
+# The integral of the normal over a closed surface must be 0 up to this fraction of the surface's
+# area.
 _CLOSED_TOLERANCE = 1e-10
 # Barycentric coordinates of the points of a triangle at which the winding numbers of both sides are
 # compared.
@@ -576,7 +598,8 @@ class ClosedSurface:
         Raises:
             MeshError: the mesh bounds no solid.
         """
-        # Faces whose reversed copies are also faces cancel each other; the rest is the net.
+        # A face and a reversed copy of it cancel each other. The faces that remain are called the
+        # net; `multiplicity` says how many times each counts.
         welded = Welded.of(vertices, faces)
         net = welded.net
         if not len(net.faces):
@@ -621,10 +644,10 @@ def _boundary_pieces(
     area, pieces that coincide count once. If several faces coincide, and more of them are turned
     one way than the opposite way, each of these is a piece of the boundary.
 
-    Triangles thinner than `_THIN_HEIGHT` have no reliable normal, and so no reliable winding
-    numbers beside them. If the boundary is all faces, it includes such triangles. Else their
-    computed winding numbers decide; a wrong decision moves the surface by no more than their
-    height.
+    Triangles thinner than `_THIN_HEIGHT` have no reliable normal, and so the winding numbers on
+    their two sides are not reliable. If the boundary is all faces, it includes these triangles,
+    too. Otherwise their computed winding numbers decide whether they are part of it; a wrong
+    decision moves the surface by no more than their height.
 
     Raises:
         MeshError: the mesh is inside out, or faces lie on each other.
@@ -639,9 +662,12 @@ def _boundary_pieces(
     pieces, _ = split_intersecting_faces(proper_tree, unit, proper)
     edges = pieces - np.roll(pieces, 1, axis=1)
     longest = np.linalg.norm(edges, axis=2).max(axis=1)
+    # The cross product has twice the area as its length, which is height times longest edge.
     is_thick = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) > _THIN_HEIGHT * longest
     # The winding numbers in front of and behind each piece.
     front, back = windings_of_sides(rays, pieces)
+    # Across a face the winding number falls by 1 from back to front. A negative one says that
+    # something is inside out.
     lower, upper = np.minimum(front, back), np.maximum(front, back)
     if (wrong := is_thick & (lower < 0)).any():
         if (upper[is_thick] <= 0).all():
@@ -654,7 +680,8 @@ def _boundary_pieces(
             "faces of that part (trimesh.repair.fix_normals(mesh, multibody=True) tries), or take "
             "harnack.WindingNumber, which asks for no sides"
         )
-    # A piece is wrong if the winding numbers beside it differ from point to point.
+    # A piece is wrong if the winding numbers on its two sides are not the same at several of its
+    # points: then another face crosses it or lies on a part of it.
     wrong = np.zeros(len(pieces), np.bool_)
     for barycentric in _PROBE_POINTS:
         front_probe, back_probe = winding_numbers_of_sides(rays, pieces, barycentric)
@@ -675,12 +702,14 @@ def _boundary_pieces(
     )
     if not is_uncut and not is_kept.any():
         raise MeshError("the mesh bounds no volume: its parts cancel each other")
-    # At one position, the number of pieces that look outwards less that of pieces that look inwards
-    # is the jump of the winding number.
+    # At one position, the number of pieces that face outwards minus the number of pieces that face
+    # inwards is the jump of the winding number. So 1/jump is the share of each piece, and
+    # coinciding pieces count once in all.
     area = (
         0.5 * np.linalg.norm(np.cross(edges[is_kept, 0], edges[is_kept, 1]), axis=1) / jump[is_kept]
     )
     area = float((area * np.where(is_inward[is_kept], -1.0, 1.0)).sum())
+    # Pieces that face inwards are turned around.
     oriented = np.where(is_inward[:, None, None], pieces[:, ::-1], pieces)
     return None if is_uncut else oriented[is_kept], area
 
@@ -692,17 +721,18 @@ def _is_closed(pieces: FloatArray, jump: FloatArray, is_thick: BoolArray) -> boo
     jump: (k,) by how much the winding number changes across each piece.
     is_thick: (k,) whether the piece is thick enough to have a reliable normal.
 
-    Proof. Over a closed surface the integral of the normal n is 0 by Gauss's theorem, and the
-    integral of x_i n_j is the volume for i = j, else 0. A piece that is in contact with another and
-    should be left out violates this. At each position of pieces that coincide, the number of pieces
-    turned one way minus the number turned the other way is the jump. So each piece counts with
-    1/jump. Pieces that are not thick may count or not, so their area is a tolerance.
+    Proof. By Gauss's theorem, the integral over a closed surface of the normal n is 0, and the
+    integral of x_i n_j is the volume for i = j, else 0. A piece that does not belong to the surface
+    violates this. At each position of pieces that coincide, the number of pieces turned one way
+    minus the number turned the other way is the jump. So each piece counts with 1/jump. Pieces that
+    are not thick may count or not, so their area is a tolerance.
     """
     # The integral of n over each piece; `moment` is the sum of the integrals of x_i n_j.
     normal_integral = 0.5 * np.cross(pieces[:, 1] - pieces[:, 0], pieces[:, 2] - pieces[:, 0])
     piece_area = np.linalg.norm(normal_integral, axis=1)
     normal_integral = normal_integral / np.maximum(jump, 1)[:, None]
     moment = np.einsum("ki,kj->ij", pieces.mean(axis=1), normal_integral)
+    # `moment` must be the volume times the identity matrix.
     deviation = moment - np.trace(moment) / 3 * np.eye(3)
     tolerance = _CLOSED_TOLERANCE * piece_area.sum() + 4 * piece_area[~is_thick].sum()
     return bool(
@@ -716,14 +746,16 @@ def _check_closed(vertices: FloatArray, welded: Welded) -> None:
     turned differently.
 
     vertices: (n, 3).
-    welded: the faces, and the edges that occur more often in one direction.
+    welded: the faces; its `edges` are those that occur more often in one direction than in the
+        other, and its `weights` say how many times more.
     """
     faces, edges, edge_weights = welded.net.faces, welded.edges, welded.weights
     if not len(edges):
         return
     face_edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     pairs, count = np.unique(face_edges, axis=0, return_counts=True)
-    # Find each of these edges among all edges of faces, by the number that stands for its vertices.
+    # Find each edge of `edges` among all edges of faces. An edge with the vertices a < b has the
+    # key a n + b, with n the number of vertices; `pairs` is sorted by this key.
     key = len(vertices)
     indices = np.searchsorted(pairs @ [key, 1], np.sort(edges, axis=1) @ [key, 1])
     is_open = (count[indices] == 1) & (edge_weights == 1)

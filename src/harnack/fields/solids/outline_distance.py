@@ -83,14 +83,14 @@ class OutlineEdges:
     or 2 crossings there, as is right. The side of an edge on which a point lies is decided up to
     the rounding of the point, which is no more than the stated error of its distance.
 
-    Proof for chains. Each side of a chain's box holds a point of the chain. So there is a distance
-    from x within which the chain must have a point (MINMAXDIST of Roussopoulos et al. 1995). A
-    chain whose box begins farther away than this distance of another chain does not hold the
-    nearest edge. Now for the crossings of the ray towards +x. If it starts to the left of the box,
-    it crosses the chain an odd number of times when the chain's two ends lie on different sides of
-    the ray, else an even number of times. If it starts to the right, above or below of the box, it
-    never crosses the chain. If it starts in the box, the distance from the box is 0, so that the
-    chain's edges are read.
+    Proof for chains. Each side of a chain's box holds a point of the chain. So for each chain there
+    is a computable distance from the query point within which the chain must have a point
+    (MINMAXDIST of Roussopoulos et al. 1995). If the box of one chain is farther away than this
+    distance of another chain, the first chain does not hold the nearest edge. Now for the crossings
+    of the ray towards +x. If it starts to the left of the box, it crosses the chain an odd number
+    of times when the chain's two ends lie on different sides of the ray, else an even number of
+    times. If it starts to the right, above or below of the box, it never crosses the chain. If it
+    starts in the box, the distance from the box is 0, so that the chain's edges are read.
     """
 
     edges: RecordTable
@@ -116,8 +116,8 @@ class OutlineEdges:
             # Another chain begins behind an edge that is left out.
             loop = loop + np.cumsum(~keep)
             start, end, loop = start[keep], end[keep], loop[keep]
-        # In the backend's precision, so that both edges at a vertex have the same coordinates of
-        # it.
+        # The coordinates are rounded to the backend's precision now, and not when they are
+        # uploaded, so that the two edges at a vertex have exactly the same coordinates there.
         start, end = (array.astype(backend.dtype).astype(np.float64) for array in (start, end))
         square = ((end - start) ** 2).sum(axis=1)
         # Rounding may have made an edge a point.
@@ -175,9 +175,11 @@ class OutlineEdges:
         distance, error, away_x, away_y, normal_x, normal_y, on_edge, inside, *bounds = final
         error = error + epsilon * (size + distance)
         sign = dr.select(inside, real(-1), real(1))
-        # Across an edge the direction is that of its normal, also where the distance is rounding.
-        # Far from the edge the sign decides the side, since both edges of a wall thinner than
-        # rounding are near.
+        # If the nearest point is inside an edge, the gradient is plus or minus the edge's normal,
+        # also where the distance is mere rounding. If the distance is larger than its error, the
+        # sign of d says which: the gradient points away from the edge outside, and towards it
+        # inside. (At a wall thinner than rounding the nearest edge may be that of the wall's other
+        # side.) Nearer to the edge, the normal is taken as it is.
         on_edge |= distance == 0
         normal_sign = sign * dr.mulsign(real(1), away_x * normal_x + away_y * normal_y)
         normal_sign = dr.select(distance > error, normal_sign, 1)
@@ -203,7 +205,8 @@ class OutlineEdges:
         chains: the records of the chains.
         state: the state before any edge.
         """
-        # The distance within which some chain must have a point.
+        # A distance within which some chain must have a point, so that the nearest edge is not
+        # farther away.
         (square,) = chains.for_each(query.chain_upper_bound, (query.x + dr.inf,), "outline chains")
         max_distance = dr.sqrt(square) * (1 + 1e-5) + query.error
         index = type(chains.iteration_count)(0)
@@ -278,13 +281,15 @@ class _OutlineQuery:
         is_inner = (fraction > 0) & (fraction < 1)
         distance = dr.sqrt(dr.fma(to_x, to_x, to_y * to_y))
         distance = dr.select(is_inner, dr.abs(cross_product) * inverse_length, distance)
-        # A few roundings of the vectors, in the direction across the edge.
+        # A bound of the rounding of the distance: a few roundings of the vectors' components.
         size = dr.abs(from_x) + dr.abs(from_y) + dr.abs(edge_x) + dr.abs(edge_y)
         rounding = _VECTOR_ROUNDINGS * self.unit * size
         bounds = self._with_tangent(bounds, to_x, to_y, distance, rounding)
         # The ray towards +x crosses the edge if one end of the edge is above the ray, the other is
         # not, and the edge is to the right of the point.
         crosses = (row[1] > self.y) != (row[3] > self.y)
+        # `cross_product` is positive if the point is to the left of the edge; if the edge goes
+        # upwards, the edge is then to the right of the point.
         inside = inside ^ (crosses & ((cross_product > 0) == (row[3] > row[1])))
         is_nearer = distance < nearest
         return (
@@ -374,13 +379,13 @@ def _chain_records(start: FloatArray, end: FloatArray, loop_index: IntArray) -> 
     start, end: (n, 2) the ends of the edges.
     loop_index: (n,) a number for each edge. Edges of different numbers belong to different chains.
 
-    A query reads all chains twice, and the edges of about three chains. So the number of edges per
-    chain that takes the least time is about the square root of two thirds of the number of all
-    edges.
+    Of n edges, chains of m edges make n/m chains. A query reads all chains twice, and the edges of
+    about three chains: 2 n/m + 3 m records, which are fewest for m^2 = 2 n/3.
     """
     length = max(8, round(math.sqrt(2 * len(start) / 3)))
     rows: list[Any] = []
-    # The index of the first edge of each run of edges with the same number, and the end.
+    # The index of the first edge of each run of edges with the same number; and the number of all
+    # edges, as the end of the last run.
     loop_starts = np.concatenate([[0], np.flatnonzero(np.diff(loop_index)) + 1, [len(loop_index)]])
     for loop_start, loop_end in itertools.pairwise(loop_starts.tolist()):
         for k in range(loop_start, loop_end, length):
@@ -433,8 +438,8 @@ class SignedDistanceEnclosure(Enclosure):
         gaps: the differences between d at the start and these levels.
         """
         is_positive = self.value > 0
-        # In terms of |d|: the gap toward 0, and the gap away from 0. If d passes 0, |d| tells
-        # nothing more, so the first gap is at most |d|.
+        # In terms of |d|: the gap towards 0 and the gap away from 0. Beyond the point at which d
+        # passes 0, |d| tells nothing about d, so the first gap is taken as at most |d|.
         nearer = dr.select(is_positive, gaps.below, gaps.above)
         farther = dr.select(is_positive, gaps.above, gaps.below)
         length = self.size.free_length(LevelGaps(fmin(nearer, dr.abs(self.value)), farther))

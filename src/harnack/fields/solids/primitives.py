@@ -1,8 +1,9 @@
 """Primitive solids: plane, sphere, ellipsoid, cylinder, cone, capsule, torus, box, superquadrics. A
 solid is the set of points where its function f is at most 0. The f of each shape is its signed
-distance, negative inside, or a bound of it (Hart 1996, appendix A). The Lipschitz constant of f is
-1, so that f is no larger than the distance outside; superquadrics have a larger constant. Shapes
-lie at the origin with their axis along z; they can be moved and rotated."""
+distance, negative inside, or a bound of the distance (Hart 1996, appendix A). Where the Lipschitz
+constant of f is 1, f is no larger than the distance outside. All shapes have this constant but the
+superquadrics, whose constant is larger. Shapes lie at the origin with their axis along z; they can
+be moved and rotated."""
 
 from __future__ import annotations
 
@@ -86,8 +87,8 @@ class Sphere(FormulaSolid):
 
 
 def _box_of_radii(radii: tuple[float, float, float], level: float) -> Volume:
-    """A box that contains all points where f = m (g - 1) <= level. g is a norm whose unit ball g <=
-    1 lies in the box with the half sides `radii`, and m is the smallest of them.
+    """A box that contains all points where f = m (g - 1) <= level. Here g is a norm, the set g <= 1
+    lies in the box with the half sides `radii`, and m is the smallest of these.
 
     radii: (3,) the half sides of that box.
 
@@ -105,9 +106,10 @@ class Ellipsoid(FormulaSolid):
 
     radii: (a, b, c).
 
-    Proof of the Lipschitz constant 1. The norm has the constant 1, and the stretched coordinates
-    have 1/m, which is attained along the shortest axis. So f is no larger than the distance
-    outside. The distance itself has no closed form.
+    Proof of the Lipschitz constant 1. The length of a vector has the Lipschitz constant 1, and the
+    map (x, y, z) -> (x/a, y/b, z/c) has 1/m, attained along the shortest axis. The factor m makes
+    their product 1. So f is no larger than the distance outside. The distance itself has no closed
+    form.
     """
 
     is_convex = True
@@ -180,9 +182,9 @@ class DoubleCone(FormulaSolid):
     angle: between the axis and the sides, in degrees, above 0 and below 90.
 
     The gradient of f is a unit vector off the axis and off the plane z = 0, so that the Lipschitz
-    constant is 1. Let L be the line of the cone's side in the half-plane of the point and the axis.
-    f is the signed distance where the nearest point of L is not past the apex, and smaller
-    elsewhere.
+    constant is 1. Consider a point p, and the half-plane that is bounded by the axis and contains
+    p. Let L be the line of the cone's side in it. f is the signed distance where the point of L
+    nearest to p is not beyond the apex, and smaller elsewhere.
     """
 
     angle: float = 30.0

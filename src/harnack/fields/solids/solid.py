@@ -36,10 +36,10 @@ Point = tuple[float, float, float]
 
 
 def box_around(half: tuple[float, float, float], center: Any = (0.0, 0.0, 0.0)) -> Volume:
-    """The box around a center with the half sides `half`, enlarged by `_EXTENT_MARGIN` for
-    rounding. Negative half sides count as 0.
+    """The box with a given center and given half sides, enlarged by `_EXTENT_MARGIN` for rounding.
+    Negative half sides count as 0.
 
-    half: (3,) half of the side along each axis.
+    half: (3,) half of the length of the side along each axis.
     center: (3,).
     """
     sizes = [
@@ -278,20 +278,20 @@ class Solid(Field):
 
     @functools.cached_property
     def _ray_count_variants(self) -> TransientCache[tuple[int, ...], Solid]:
-        """The combinations that `_for_rays` has made so far. The key of a combination is the tuple
-        of the identities (`id`) of its parts."""
+        """A cache of the combinations that `_for_rays` has made so far. The key of a combination is
+        the tuple of the identities (`id`) of its parts."""
         return TransientCache()
 
     def _for_rays(
         self, parts: Sequence[Field], count: int, make: Callable[[list[Field]], Solid]
     ) -> Field:
-        """The combination of the same kind as this solid, whose parts are prepared to be traced by
-        `count` rays: each part is replaced by part.for_ray_count(count) (`Field.for_ray_count`). If
+        """The field to use in place of this solid when `count` rays are traced: the same
+        combination with each part replaced by part.for_ray_count(count) (`Field.for_ray_count`). If
         no part changes, it is this solid itself. Combinations are cached, so that nothing is
         prepared twice.
 
         parts: the parts of this solid.
-        make: a function that makes the combination from its parts.
+        make: a function that makes the combination from a list of parts.
         """
         variants = [part.for_ray_count(count) for part in parts]
         # Fields are compared by identity: each part is an object that the solid keeps alive.
@@ -349,8 +349,8 @@ class Solid(Field):
         return self._apply_map(Taper(start, end, axis))
 
     def _apply_map(self, change: SpaceMap) -> Solid:
-        """The image of the solid under a map of space. In a combination of solids, the map is
-        applied to each operand."""
+        """The image of the solid under a map of space. The map is applied to each operand of a
+        combination of solids."""
         return self.map_operands(change.apply)
 
 
@@ -390,9 +390,10 @@ class SolidOfField(Solid):
         return self._with_inner(self.field.at_accuracy(detail))
 
     def _with_inner(self, inner: Field) -> Solid:
-        """The same solid made of another inner field."""
+        """The same solid made of another inner field, such as one that is prepared."""
         solid = copy.copy(self)
         object.__setattr__(solid, "field", inner)
+        object.__setattr__(solid, "coarsest_accuracy", inner.coarsest_accuracy)
         return solid
 
     def for_ray_count(self, count: int) -> Field:

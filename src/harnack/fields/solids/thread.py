@@ -46,12 +46,13 @@ _MAX_STARTS = 32
 class Thread(Solid):
     """An endless screw along the z axis. Its profile, a periodic polyline of points (z, r), moves
     along the axis by `starts` pitches in each turn; the solid is all points nearer to the axis than
-    the profile. At a point p with the distance r from the axis, u is the position along the axis in
-    the coordinates of the profile, from which the turning has been subtracted.
+    the profile. At a point p with the distance r from the axis, u is p's position along the axis
+    relative to the profile: z minus the distance by which the profile has moved at the angle of p.
 
     profile: (n, 2) points (z, r) of a polyline, at most 32. r is the distance from the axis and
-        positive. z begins within half a pitch of 0 and rises by less than a pitch. From the last
-        point the polyline goes on to the first, one pitch further.
+        positive. The first z is within half a pitch of 0, and z rises from point to point, by less
+        than a pitch in all. From the last point the polyline goes on to the first point of the next
+        period, one pitch further along z.
     pitch: the period of the profile along the axis.
     starts: the number of parallel grooves.
     left_handed: whether the screw turns clockwise as it rises.
@@ -109,12 +110,14 @@ class Thread(Solid):
             raise ValueError("r of the profile of a thread must be positive")
         rows = tuple((float(a), float(b)) for a, b in points)
         set_frozen(self, "profile", rows)
-        # Three periods: a nearest point is at most half a period away along the axis, and these
-        # periods reach that far beyond the period from 0 to the pitch.
+        # Three periods. Points have u in the period from 0 to the pitch, and the nearest point of
+        # the profile is at most half a period away along the axis. The three periods reach that
+        # far.
         shifted = [(a + k * self.pitch, b) for k in (-1, 0, 1) for a, b in rows]
         shifted.append((rows[0][0] + 2 * self.pitch, rows[0][1]))
         set_frozen(self, "_points", tuple(shifted))
-        # The lead, divided by a full turn: u = z - _lead * angle.
+        # The lead is the distance by which the screw moves in a full turn; `_lead` is that per
+        # radian, so that u = z - _lead * angle.
         lead = self.starts * self.pitch * (-1 if self.left_handed else 1)
         set_frozen(self, "_lead", lead / (2 * math.pi))
         min_radius = min(b for _, b in rows)
@@ -148,8 +151,8 @@ class Thread(Solid):
 
     def evaluate(self, p: Vec3) -> Sample:
         """The sample at p: the signed distance of (r, u) from the profile, where u is reduced to
-        the period from 0 to the pitch. Near the axis (in the core) f is constant, and its gradient
-        0."""
+        the period from 0 to the pitch. In the core, the points near the axis where f is at its
+        lower limit, f is constant, and its gradient is 0."""
         real, data = cast("Any", type(p.x)), cast("Any", self)
         epsilon = 2 * float(dr.epsilon(real))
         r = dr.sqrt(dr.fma(p.x, p.x, p.y * p.y))
@@ -161,14 +164,15 @@ class Thread(Solid):
         sign = dr.select(is_outside, real(1), real(-1))
         distance, d_r, d_z, gradient_error = self._distance_with_gradient(r, axial, sign, error)
         value = sign * distance
-        # Where d < -m/2, in the docstring's symbols, f is -m/2.
+        # Where d < -m/2, in the symbols of the class docstring, f is -m/2; `_least` is m/2.
         is_core = value <= -data._least
         value = dr.select(is_core, -data._least, value)
         d_r, d_z = (dr.select(is_core, 0, derivative) for derivative in (d_r, d_z))
         # The unit vector away from the axis; 0 on the axis.
         divisor = dr.select(r > 0, r, 1)
         x, y = p.x / divisor, p.y / divisor
-        # The gradient in cylindrical coordinates, turned to x, y and z.
+        # u = z - _lead * angle, so the derivative of f along the tangent is that by u times
+        # -_lead/r. The radial, tangential and axial components are turned to x, y and z.
         tangential = -d_z * data._lead / divisor
         gradient = cast("Any", type(p))(d_r * x - tangential * y, d_r * y + tangential * x, d_z)
         # A Dr.Jit array, with the number in each lane.
@@ -190,7 +194,8 @@ class Thread(Solid):
         del ahead, back
         p, d = path.point(t), path.direction
         ray_sample = path.enclose(self.evaluate(p))
-        # This kind is in the sharpest choice of enclosures; otherwise others were asked for.
+        # The caller chooses kinds of enclosures. The one below is used with the sharpest choice,
+        # which is the one that has `PiecewiseTaylorEnclosure`.
         if PiecewiseTaylorEnclosure not in path.proofs.kinds:
             return ray_sample
         numbers = cast("Any", self)
@@ -235,16 +240,17 @@ class Thread(Solid):
             inverse_length = dr.rsqrt(edge_z * edge_z + edge_r * edge_r)
             from_z, from_r = z - start_z, r - start_r
             fraction = (from_z * edge_z + from_r * edge_r) * inverse_length * inverse_length
-            # The nearest point of the edge, as a fraction of it; and the vector from there to the
-            # point.
+            # minus_t is minus the position of the nearest point of the edge, as a fraction of the
+            # edge. Then the vector from there to (r, z).
             minus_t = -clamp(fraction, 0, 1)
             to_z, to_r = dr.fma(edge_z, minus_t, from_z), dr.fma(edge_r, minus_t, from_r)
             line_distance = dr.abs(from_r * edge_z - from_z * edge_r) * inverse_length
             is_inner = (fraction > 0) & (fraction < 1)
             distance = dr.select(is_inner, line_distance, dr.sqrt(to_z * to_z + to_r * to_r))
             is_nearer = distance < nearest
-            # If an inner point of the edge is nearest, or the distance is mere rounding, take the
-            # edge's normal.
+            # The gradient is the edge's normal if an inner point of the edge is nearest or the
+            # distance is mere rounding; else it is the direction away from the vertex, with the
+            # sign.
             by_normal, scale = is_inner | (distance <= error), sign / distance
             for_r = dr.select(by_normal, edge_z * inverse_length, to_r * scale)
             for_z = dr.select(by_normal, -edge_r * inverse_length, to_z * scale)
@@ -301,7 +307,8 @@ class OutsideCylinderEnclosure(Enclosure):
         root = excess / (dr.sqrt(fmax(discriminant, 0)) - self.radial_slope)
         # A ray that moves away from the axis, or has no root, never reaches the cylinder.
         length = dr.select((self.radial_slope >= 0) | (discriminant < 0), dr.inf, root)
-        # Only for a level >= 0 and a start well outside of the cylinder.
+        # The proof is for a level >= 0 and a start well outside of the cylinder; the numbers must
+        # not have overflowed.
         is_known = (
             (gaps.below <= self.value)
             & (excess > 1e-5 * level_radius * level_radius)
@@ -377,7 +384,9 @@ def metric_thread(
     # The clearance makes a bolt thinner, and the hole of a nut wider.
     sign = 1.0 if internal else -1.0
     crest, root = 0.5 * diameter + sign * clearance, 0.5 * diameter - depth + sign * clearance
-    # Edges moved across themselves by c meet c tan(30 degrees) farther along, at both ends.
+    # The clearance moves each edge of the profile by c at right angles to it. Where a flat meets a
+    # flank, the corner then moves along the flat by c tan(30 degrees). So crests become longer by
+    # twice that, and roots shorter, or the other way round.
     shift = sign * clearance * math.tan(math.radians(30.0))
     # The lengths along the axis of the flat crest, of a flank, and of the flat root.
     flat, flank, bottom = pitch / 8 + 2 * shift, 5 * pitch / 16, pitch / 4 - 2 * shift

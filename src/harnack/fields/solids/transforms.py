@@ -38,9 +38,10 @@ class AffineMap(SpaceMap):
 
     matrix: (3, 3), row by row, not singular.
     translation_vector: (3,).
-    value_factor: the factor by which the function of a solid is multiplied. For a similarity it is
-        the factor by which lengths grow, so that a distance stays a distance; for other maps it is
-        1. For a composition of maps it is the product of their factors.
+    value_factor: the factor by which the function of a solid is multiplied. For a similarity (a map
+        that multiplies all lengths by the same factor) it is that factor, so that a distance stays
+        a distance; for other maps it is 1. For a composition of maps it is the product of their
+        factors.
     """
 
     matrix: tuple[tuple[float, ...], ...]
@@ -114,7 +115,8 @@ class AffineMap(SpaceMap):
                     f'{axis!r}: write rotated(degrees, axis), such as rotated(30, "x")'
                 )
             unit = unit / length
-        # The matrix of the cross product with the axis, for Rodrigues' formula.
+        # Rodrigues' formula: I + sin(angle) k + (1 - cos(angle)) k^2, with k the matrix of the
+        # cross product with the axis.
         angle = math.radians(float(degrees))
         k = np.cross(np.eye(3), unit)  # k v = unit x v
         turn = np.eye(3) + math.sin(angle) * k + (1 - math.cos(angle)) * (k @ k)
@@ -180,8 +182,8 @@ class AffineMap(SpaceMap):
 
 def _length_factor(m: FloatArray) -> float | None:
     """The factor by which the linear map with the matrix m (3, 3) multiplies all lengths; None if
-    it multiplies them by different factors. For a similarity m^T m is factor^2 times the identity
-    matrix."""
+    it multiplies them by different factors. If there is such a factor, m^T m is factor^2 times the
+    identity matrix, and |det m| is factor^3."""
     factor = abs(float(np.linalg.det(m))) ** (1 / 3)
     deviation = np.abs(m.T @ m - factor**2 * np.eye(3)).max()
     return factor if deviation <= 1e-14 * factor**2 else None
@@ -256,7 +258,8 @@ class TransformedSolid(SolidOfField):
         Hessian of the inner solid at the preimage of p."""
         numbers = self.numbers
         rows = self.field.hessian(type(p)(*numbers.local(p.x, p.y, p.z)))
-        # Each row r of H becomes M^-T r; with the same for the columns, the result is M^-T H M^-1.
+        # `pull_back` multiplies a vector by M^-T. Applied to each row of H it gives the rows of H
+        # M^-1; applied to the columns of that, M^-T H M^-1, which is symmetric.
         columns = [numbers.pull_back(row) for row in rows]
         product = [numbers.pull_back(type(p)(*(columns[j][k] for j in range(3)))) for k in range(3)]
         x, y, z = (vector * numbers.factor for vector in product)
@@ -277,8 +280,9 @@ class TransformedSolid(SolidOfField):
             return first, second * numbers.stretch * numbers.stretch * numbers.factor
         coordinates = Jet.at_point(p, order=2)
         jet = as_jet(self.formula(*coordinates), coordinates[0], type(self.field).__name__)
-        # The gradient need not be the middle of its range (`Formula._with_one_sided_gradient`):
-        # both errors are added.
+        # The gradient of the inner solid need not be the middle of its range
+        # (`Formula._with_one_sided_gradient`). So the half widths of the ranges are added to its
+        # error.
         return first + sum(rate.radius for rate in jet.first_derivatives), hessian_error(jet, p.x)
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
@@ -292,8 +296,9 @@ class TransformedSolid(SolidOfField):
         numbers, vector = self.numbers, cast("Any", type(path.origin))
         o, d = path.origin, path.direction
         direction = vector(*numbers.local_direction(d.x, d.y, d.z))
-        # The preimage moves this much for each unit of length on the ray; the inner ray has a unit
-        # direction, so lengths on it are multiplied by the speed.
+        # The preimage moves by this length for each unit of length on the ray. The inner ray, the
+        # line of the preimages, is given a unit direction; so lengths on the ray are multiplied by
+        # the speed to become lengths on the inner ray.
         speed = safe_norm(direction)
         inner_ray = Ray(vector(*numbers.local(o.x, o.y, o.z)), direction / speed, path.proofs)
         ray_sample = self.field.sample_ray(inner_ray, t * speed, ahead * speed, back * speed)
@@ -426,8 +431,9 @@ class _InverseMap:
 
 
 def _weighted_sum(weights: tuple[Any, ...], terms: tuple[Any, ...]) -> Any:
-    """The sum of the terms times their weights. Terms whose weight is the Python number 0 are left
-    out, and factors that are the Python number 1. None if all terms are left out."""
+    """The sum of the terms, each times its weight. A term whose weight is the Python number 0 is
+    left out, and so is the multiplication by a weight that is the Python number 1. None if all
+    terms are left out."""
     total: Any = None
     for weight, term in zip(weights, terms, strict=True):
         if _is_literal(weight, 0.0):

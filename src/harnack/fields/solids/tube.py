@@ -3,7 +3,8 @@ cubic Bezier curves; its function f is the signed distance from its surface, whi
 from the nearest segment minus the radius. `TubeNetwork` is a surface of a large number of separate
 tubes, one for each segment. An enclosure is a proved bound of the change of a function along a ray.
 Bounds along a ray are computed at knots, which are increasing lengths along it; the last may be
-infinite. Segments are read by loops, as records of numbers."""
+infinite. Segments are read by loops, as records of numbers. The state of a loop is the tuple of
+numbers that it changes from one segment to the next."""
 
 from __future__ import annotations
 
@@ -64,10 +65,11 @@ class Tube(Solid):
 
     points: (n, 3) the vertices of the polyline in order. Repeat the first to close it.
     radius: of the tube.
-    starts: indices of vertices at which another polyline starts, which is not joined to the one
-        before: see `from_polylines`.
-    flattening_error: if the polyline stands for a curve, a bound of the distance between the two,
-        and so of the distance between the surfaces: see `bezier`.
+    starts: if `points` holds several polylines one after another, the indices of the first vertices
+        of the second, third, ... polyline. Polylines are not joined to each other: see
+        `from_polylines`.
+    flattening_error: if the polyline approximates a curve, a bound of the distance between curve
+        and polyline, which also bounds the distance between the two tubes' surfaces: see `bezier`.
 
     f has the Lipschitz constant 1 (Hart 1996, equations 32 to 35, for cubic Bezier curves). Along a
     ray a stronger bound is proved: see `TangentEnclosure`.
@@ -101,6 +103,7 @@ class Tube(Solid):
         # Split at the starts of polylines, and leave out repeated points of each polyline.
         for part in np.split(points, starts):
             if len(part):
+                # For each point but the first, whether it differs from the point before.
                 differs = np.any(part[1:] != part[:-1], axis=1)
                 part = part[np.concatenate([[True], differs])]
             if len(part) < 2:
@@ -190,8 +193,8 @@ class Tube(Solid):
         tolerance: the largest distance allowed between the surface and the exact surface, in units
             of length; None for a thousandth of the wire's radius.
 
-        Proof of the error. The helix c is parametrized by the angle, so that |c''| is the radius. A
-        chord between two angles that differ by h is within h^2/8 max |c''| of the helix.
+        Proof of the error. Let c be the helix as a function of the angle; then |c''| is its radius.
+        A chord between two points whose angles differ by h is within h^2/8 max |c''| of the helix.
 
         Raises:
             ValueError: numbers that are not positive, or more than a million segments.
@@ -256,14 +259,15 @@ class Tube(Solid):
         """The sample at the point of a ray with parameter t, with an enclosure (a proved bound of
         the change of f along the ray) in front of the point, up to the length `ahead`; there is
         none behind it. It is a `TangentEnclosure`. If the caller asks for other kinds of
-        enclosures, they follow from the Lipschitz constant 1.
+        enclosures, they follow from the Lipschitz constant 1, in front of the point and behind it.
 
         path: the ray.
         ahead, back: the lengths in front of and behind the point; `back` is not used.
         """
         del back
         p = path.point(t)
-        # This kind is in the sharpest choice of enclosures; otherwise others were asked for.
+        # The caller chooses the kinds of enclosures. `TangentEnclosure` is used with the sharpest
+        # choice, which is the one that has `PiecewiseTaylorEnclosure`.
         if PiecewiseTaylorEnclosure not in path.proofs.kinds:
             return path.enclose(self.evaluate(p))
         if not hasattr(self, "_records"):
@@ -283,8 +287,8 @@ class Tube(Solid):
     def _sample_with_bounds(
         self, p: Vec3, direction: Vec3 | None, knots: tuple[Real, ...]
     ) -> tuple[Sample, Real, tuple[Real, ...]]:
-        """The sample of f at p; the distance D of p from the nearest segment; and, for each knot, a
-        lower bound of the change of the distance from p to the point p + knot direction.
+        """Three results: the sample of f at p; the distance D of p from the nearest segment; and,
+        for each knot, a lower bound of the change of D from p to the point p + knot direction.
 
         direction: the unit directions of lines from p; None if there are no knots.
         knots: increasing lengths along these lines; the last may be infinite.
@@ -296,7 +300,7 @@ class Tube(Solid):
         records: RecordTable = cast("Any", self)._records
 
         def add_segment(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
-            """The state of the loop over segments after one more segment.
+            """Return the state of the loop over segments after one more segment was visited.
 
             row: the record of the segment: its start (3), the vector to its end (3), and 1 /
                 length^2.
@@ -405,8 +409,8 @@ def _add_segments_by_groups(
     epsilon = 2 * float(dr.epsilon(real))
 
     def add_ball_end(ball: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
-        """Update the state of a loop over balls, a tuple of one number: the smallest |p - c| + r so
-        far.
+        """Update the state of a loop over balls: the smallest |p - c| + r so far, in a tuple of one
+        number.
 
         ball: the record (center c, radius r) of one more ball.
         """
@@ -429,7 +433,7 @@ def _add_segments_by_groups(
             slope = dr.dot(from_center, direction) / distance - 2 * rounding / distance
             start = dr.select(is_near, dr.inf, distance - ball[3] - rounding)
             # From index 5 on the state holds the bounds at the knots. If the group is near, the
-            # tangent is infinite and changes nothing.
+            # tangent starts at infinity and changes no bound: the segments do that below.
             updated[5:] = min_with_tangent(
                 updated[5:], knots, start, slope, 4 * epsilon * distance, epsilon
             )
@@ -463,8 +467,8 @@ def min_with_tangent(
     rounding: Real,
     unit: float,
 ) -> list[Real]:
-    """For each knot (a length along a line), the smaller of the bound in `lows` and of the value of
-    a tangent there. The tangent is the line start + slope * knot.
+    """For each knot (a length along a line), the smaller of two numbers: the bound in `lows`, and
+    the value start + slope * knot of a tangent.
 
     lows: a bound for each knot.
     knots: the lengths; the last may be infinite.
@@ -473,9 +477,9 @@ def min_with_tangent(
         itself, counts as -1.
     unit: the machine epsilon.
 
-    The slope is lowered by four roundings, for the rounding of its product with a knot. It is never
-    0, since 0 times the infinite knot would be NaN: so the tangent at infinity is infinite, with
-    the sign of the slope.
+    The slope is lowered by four roundings, for the rounding of its product with a knot. A slope of
+    0 is lowered once more, because 0 times an infinite knot would be NaN. So the tangent at an
+    infinite knot is infinite, with the sign of the slope.
     """
     slope = fmax(slope, -1) - 4 * unit
     slope = dr.select(slope == 0, -unit, slope)
@@ -503,9 +507,9 @@ class TangentEnclosure(Enclosure):
     F never falls below the bound at the knot before.
 
     From above, F(s) is at most the distance from the point that is nearest at s = 0. With D = F(0)
-    and m the slope, that is sqrt(D^2 + 2 D m s + s^2). So F does not rise by g before s^2 + 2 D m s
-    = g^2 + 2 D g. Where these squares overflow, F does not rise by g before s = g, as it is a
-    distance.
+    and m the slope, that is sqrt(D^2 + 2 D m s + s^2). So F does not rise by g before this root is
+    D + g, that is, before s^2 + 2 D m s = g^2 + 2 D g. Where these squares overflow, F does not
+    rise by g before s = g, since a distance rises at most as fast as the length.
     """
 
     distance: Real
@@ -520,7 +524,8 @@ class TangentEnclosure(Enclosure):
 
         gaps: the differences between F(0) and these levels.
         """
-        # D m, and g^2 + 2 D g; the root of the quadratic equation in the form without cancellation.
+        # With g the gap above: D m, and g^2 + 2 D g. The positive root s of s^2 + 2 D m s = g^2 + 2
+        # D g, in the form without cancellation for each sign of D m.
         half_slope = self.distance * self.slope
         product = gaps.above * (gaps.above + 2 * self.distance)
         root = dr.sqrt(fmax(dr.fma(half_slope, half_slope, product), 0))
@@ -531,8 +536,11 @@ class TangentEnclosure(Enclosure):
         is_free = gaps.below >= 0  # and not NaN
         for knot, next_bound in zip(self.knots, self.lower_bounds, strict=True):
             is_clear = next_bound >= -gaps.below
-            # Where the chord from the knot before (`start`, `bound`) falls by the gap below.
+            # Where the chord from the knot before falls by the gap below. `start` is that knot and
+            # `bound` the bound there; before the first knot both are 0.
             part = fmax((gaps.below + bound) / (bound - next_bound) * (knot - start), 0)
+            # Up to the whole knot, if the bound there is above the level. Knots after the first one
+            # that is not clear (`is_free` is False) change nothing.
             length = dr.select(is_clear, knot, fmin(start + part, knot))
             length_down = dr.select(is_free, length, length_down)
             is_free &= is_clear
@@ -593,8 +601,8 @@ class TubeNetwork(PatchField["_TubeBuffers"]):
         return lower - slack, upper + slack
 
     def evaluate(self, p: Vec3) -> NoReturn:
-        """Refuse to evaluate the field: each segment has a function of its own, and there is none
-        for all segments together.
+        """Refuse to evaluate the field: there is no single function whose level set is the surface,
+        as each segment has a function of its own.
 
         Raises:
             TypeError: always.
@@ -671,7 +679,8 @@ class _Segment(Field):
         vector, epsilon = backend.Array3f, 2 * backend.machine_epsilon
         from_start = vector(p) - self._boxes.center - vector(*row[:3])
         segment = vector(*row[4:7])
-        # The nearest point of the segment, as a fraction of it; and the vector from there to p.
+        # The position of the segment's point nearest to p, as a fraction of the segment; and the
+        # vector from that point to p.
         fraction = clamp(dr.dot(from_start, segment) * row[7], 0, 1)
         away = dr.fma(segment, vector(-fraction), from_start)
         distance = dr.norm(away)
@@ -681,7 +690,9 @@ class _Segment(Field):
         )
         error = vector_error + 4 * epsilon * (distance + row[3])
         gradient = dr.select(distance > 0, away / distance, vector(0))
+        # The error of a unit vector is that of the vector over its length, and at most 2.
         gradient_error = dr.select(distance > 0, dr.minimum(4 * error / distance, 2), 2)
+        # s = D/2 of the proof, from the smallest possible distance; the bound is 1/s.
         taylor_radius = _TAYLOR_RADIUS * fmax(distance - error, 0)
         promises: tuple[Promise, ...] = (
             Lipschitz(backend.Float(1)),
