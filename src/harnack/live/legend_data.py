@@ -9,25 +9,25 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from harnack.rendering.aov_render import STATUS_COLORS
 from harnack.rendering.images import to_uint8
 from harnack.rendering.integrator import OUT_OF_STEPS_COLOR
 from harnack.rendering.scales import viridis
+from harnack.tracer import RayStatus
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
 __all__ = [
-    "BACKGROUNDS", "EVALUATIONS_TOP", "FAR_GRAY", "HIT_COLOR", "NEAR_GRAY", "css_color",
-    "evaluations_share", "legends",
+    "EVALUATIONS_TOP", "FAR_GRAY", "NEAR_GRAY", "css_color", "evaluations_share", "legends",
 ]  # fmt: skip
 
 # The evaluations that are brightest, and where a scale of them has ticks.
 EVALUATIONS_TOP = 64
 _EVALUATIONS = (0, 3, 15, EVALUATIONS_TOP)
 _STOPS = 13
-# sRGB of what is nearest, of what is farthest, and of what is hit; and behind it, by backdrop.
-NEAR_GRAY, FAR_GRAY, HIT_COLOR = 0.95, 0.12, (0.93, 0.93, 0.90)
-BACKGROUNDS = {"light": (0.90, 0.90, 0.89), "dark": (0.10, 0.10, 0.11)}
+# sRGB of what is nearest, and of what is farthest.
+NEAR_GRAY, FAR_GRAY = 0.95, 0.12
 
 
 def evaluations_share(evaluations: Any) -> Any:
@@ -46,6 +46,7 @@ def legends() -> dict[str, Any]:
     the picture. "swatches" are pairs of a name and its CSS color (None for the background).
     """
     out_of_steps_swatch = ["out of steps", css_color(OUT_OF_STEPS_COLOR)]
+    hit_swatch = ["hit", css_color(STATUS_COLORS[RayStatus.HIT])]
     ticks = [[float(evaluations_share(n)), str(n)] for n in _EVALUATIONS[:-1]] + [
         [1.0, f"{EVALUATIONS_TOP}+"]
     ]
@@ -78,7 +79,7 @@ def legends() -> dict[str, Any]:
         },
         "status": {
             "title": "outcome of a ray",
-            "swatches": [["hit", css_color(HIT_COLOR)], ["miss", None], out_of_steps_swatch],
+            "swatches": [hit_swatch, ["miss", None], out_of_steps_swatch],
         },
     }
 

@@ -26,6 +26,7 @@ from harnack.cluster.executor import Executor, TaskResult, open_executor
 from harnack.files.file_geometry import write_atomically
 from harnack.live.live_scene import ControlState, LiveScene, encode_arrays, state_delta
 from harnack.live.scene_file import with_flat_options
+from harnack.live.shading_data import shader_constants
 from harnack.live.sliders import slider_values_in_errors
 from harnack.progress import progress_bar
 from harnack.rendering.camera import Camera
@@ -37,7 +38,9 @@ if TYPE_CHECKING:
     from harnack.live.live_scene import JsonDict
     from harnack.tracer import TraceOptions
 
-__all__ = ["MODULES", "check_title", "document", "page", "resource", "script", "still_png"]
+__all__ = [
+    "MODULES", "check_title", "document", "page", "passes", "resource", "script", "still_png",
+]  # fmt: skip
 
 _STILL_SIZE = (640, 480)
 # The largest number of values of a slider without a step; the number of combinations of values of
@@ -301,17 +304,22 @@ def document(scene: Mapping[str, Any], still: str, link: str = "frames") -> str:
     link: where the page gets other states from: "frames" for states stored in it, or "server" for
         Python's answers.
     """
-    passes = json.dumps(resource("passes.wgsl"))
     return _PAGE.substitute(
         title=html.escape(scene["title"]),
         style=resource("panel.css"),
         # Text must not end the element in which it stands.
         script=script(*MODULES).replace("</script", "<\\/script"),
-        passes=passes.replace("</", "<\\/"),
+        passes=json.dumps(passes()).replace("</", "<\\/"),
         scene=json.dumps(scene).replace("<", "\\u003c"),
         still=still,
         link=_CHANNEL_SCRIPTS[link],
     )
+
+
+def passes() -> str:
+    """Return the shaders of a page, in WGSL: the constants of shading, and the text of
+    passes.wgsl."""
+    return shader_constants() + resource("passes.wgsl")
 
 
 def resource(name: str) -> str:

@@ -19,14 +19,9 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import to_numpy
-from harnack.live.legend_data import (
-    BACKGROUNDS,
-    FAR_GRAY,
-    HIT_COLOR,
-    NEAR_GRAY,
-    evaluations_share,
-)
+from harnack.live.legend_data import FAR_GRAY, NEAR_GRAY, evaluations_share
 from harnack.live.live_scene import color_index
+from harnack.rendering.aov_render import AOV_BACKGROUNDS, STATUS_COLORS
 from harnack.rendering.backdrops import FLOOR_HEIGHT, FLOOR_RADIUS, reflectance_of
 from harnack.rendering.images import compress_highlights, linear_to_srgb, to_uint8
 from harnack.rendering.integrator import OUT_OF_STEPS_COLOR
@@ -35,6 +30,7 @@ from harnack.rendering.mitsuba_plugins import register
 from harnack.rendering.scales import viridis
 from harnack.rendering.shaded_render import ambient_visibility
 from harnack.rendering.shading import FloorShadow, StudioLight, wall_brightness
+from harnack.tracer import RayStatus
 
 if TYPE_CHECKING:
     from harnack.backend import FloatArray
@@ -127,7 +123,7 @@ class PreviewRenderer:
             dr.eval(self._hit_cache[1])
         hits = self._hit_cache[1]
         if show != "shaded":
-            return _aov_preview(hits, show, BACKGROUNDS[ground], size)
+            return _aov_preview(hits, show, AOV_BACKGROUNDS[ground], size)
         # The shadow is computed first: it evaluates arrays, and whatever was recorded before
         # would then be evaluated separately.
         if has_floor and (is_idle or self.floor is None):
@@ -298,7 +294,7 @@ def _aov_preview(
     elif show == "evaluations":
         picture[:] = viridis(evaluations_share(to_numpy(hits["evaluations"])))
     elif show == "status":
-        picture[met] = HIT_COLOR
+        picture[met] = STATUS_COLORS[RayStatus.HIT]
     # Rays out of steps are magenta in all pictures.
     picture[lost] = linear_to_srgb(np.array(OUT_OF_STEPS_COLOR))
     opaque = np.column_stack([picture, np.ones(len(picture))])

@@ -46,7 +46,7 @@ AOV_BACKGROUNDS = {"dark": _BACKGROUND, "light": (0.90, 0.90, 0.89)}
 """One color for each of the studio's backdrops, to be behind views."""
 _UNKNOWN = (0.45, 0.45, 0.45)
 _IDENTITY = Placement.identity()
-_STATUS_COLORS = {
+STATUS_COLORS = {
     RayStatus.HIT: (0.93, 0.93, 0.90),
     RayStatus.OUT_OF_STEPS: OUT_OF_STEPS_COLOR,
 }
@@ -287,7 +287,7 @@ def status_picture(view: AovBuffers) -> npt.NDArray[np.uint8]:
     """Draw the status of rays as a picture (h, w, 3), in which misses are dark, hits are white, and
     rays out of steps are magenta."""
     picture = np.zeros((*view.status.shape, 3))
-    for status, color in {RayStatus.MISS: view.background, **_STATUS_COLORS}.items():
+    for status, color in {RayStatus.MISS: view.background, **STATUS_COLORS}.items():
         picture[view.status == int(status)] = color
     return to_uint8(picture)
 

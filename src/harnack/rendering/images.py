@@ -104,11 +104,12 @@ def linear_to_srgb(x: Any, select: Callable[..., Any] = np.where) -> Any:
     return select(x <= SRGB_LINEAR_END, SRGB_SLOPE * x, power)
 
 
-def srgb_to_linear(x: Any) -> Any:
+def srgb_to_linear(x: Any) -> FloatArray:
     """Convert sRGB in [0, 1], a number or an array, to linear sRGB, in which amounts of light can
     be added: the inverse of `linear_to_srgb`."""
     power = ((x + SRGB_OFFSET) / (1 + SRGB_OFFSET)) ** SRGB_GAMMA
-    return np.where(x <= SRGB_LINE_END, x / SRGB_SLOPE, power)
+    linear: FloatArray = cast("Any", np.where)(x <= SRGB_LINE_END, x / SRGB_SLOPE, power)
+    return linear
 
 
 def to_uint8(image: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.uint8]:

@@ -401,6 +401,15 @@ def _square() -> FloatArray:
     return points.reshape(RAYS_PER_CELL, SAMPLE_BLOCK * SAMPLE_BLOCK, 2).transpose(1, 0, 2)
 
 
+def key_light_points() -> FloatArray:
+    """Return 16 groups of points, (16, rays, 2), spread over the round key light: the distance to
+    its middle, for a light at distance 1, and the angle around it, in radians."""
+    # The square root spreads points evenly over the disc.
+    return np.stack(
+        [KEY_LIGHT_RADIUS * np.sqrt(_square()[..., 0]), 2 * math.pi * _square()[..., 1]], axis=-1
+    )
+
+
 def _key_directions(key: Any) -> FloatArray:
     """Return 16 groups of unit directions, (16, rays, 3), to points spread over the round key
     light. key: (3,) the direction to its middle."""
@@ -408,8 +417,7 @@ def _key_directions(key: Any) -> FloatArray:
     # The coordinate axis that is farthest from `axis` gives a vector at right angles.
     tangent = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
     tangent /= np.linalg.norm(tangent)
-    # The square root spreads points evenly over the disc.
-    radius, angle = KEY_LIGHT_RADIUS * np.sqrt(_square()[..., :1]), 2 * math.pi * _square()[..., 1:]
+    radius, angle = np.split(key_light_points(), 2, axis=-1)
     d = axis + radius * (np.cos(angle) * tangent + np.sin(angle) * np.cross(axis, tangent))
     d[..., 2] = np.maximum(d[..., 2], LEAST_KEY_HEIGHT)
     return d / np.linalg.norm(d, axis=-1, keepdims=True)
