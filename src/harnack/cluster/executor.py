@@ -30,7 +30,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from harnack.cluster.serialization import SerializedObject, content_hash, import_optional
+from harnack.cluster.serialization import SerializedObject, content_hash, import_cluster_package
 from harnack.cluster.workers import (
     SCHEDULER_LOST,
     connect_client,
@@ -199,7 +199,7 @@ def open_executor(
     """
     folder = None
     if checkpoint is not None:
-        import_optional("cloudpickle", "checkpoint")
+        import_cluster_package("cloudpickle", "checkpoint")
         folder = CheckpointFolder.open(checkpoint)
     with connect_client(client) as dask_client:
         yield Executor(dask_client, folder, chunks)
@@ -248,11 +248,13 @@ class _DaskTasks:
     def __init__(self, client: Any, packed: SerializedObject, step: str) -> None:
         """Send the serialized job `packed` to the cluster of `client`. step: the name of the job's
         method that a task calls."""
-        distributed = import_optional("distributed", "client")
+        distributed = import_cluster_package("distributed", "client")
         self.client, self.step = client, step
         # Classes of errors of Dask, by which lost workers and a lost scheduler are recognized.
         self.worker_lost = distributed.KilledWorker
-        self.scheduler_lost = import_optional("distributed.client", "client").FuturesCancelledError
+        self.scheduler_lost = import_cluster_package(
+            "distributed.client", "client"
+        ).FuturesCancelledError
         self.completed = distributed.as_completed(loop=client.loop)
         self.names: dict[Any, str] = {}
         self.checked_workers = set(worker_threads(client))

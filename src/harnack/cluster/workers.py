@@ -18,7 +18,7 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend import choose_backend, to_numpy
-from harnack.cluster.serialization import import_optional, package_versions
+from harnack.cluster.serialization import import_cluster_package, package_versions
 
 # How long to wait for a scheduler to answer.
 _CONNECT_TIMEOUT = "10s"
@@ -47,7 +47,7 @@ def connect_client(client: Any) -> Generator[Any]:
     if client is None:
         yield None
         return
-    distributed = import_optional("distributed", "client")
+    distributed = import_cluster_package("distributed", "client")
     own_client = None
     # A client that is opened here is closed here.
     if isinstance(client, str):
@@ -94,7 +94,7 @@ def exclusive_compute() -> Generator[str]:
     if worker is not None:
         adopt_worker_threads(worker.nanny is not None, worker.state.nthreads)
     # A lock of this name is the same one for all tasks of this process.
-    with import_optional("dask.utils", "client").SerializableLock("harnack"):
+    with import_cluster_package("dask.utils", "client").SerializableLock("harnack"):
         yield "" if worker is None else worker.address
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from harnack.backend.validation import no_derivatives
 from harnack.cluster.dask_arrays import is_dask_array
-from harnack.cluster.serialization import import_optional
+from harnack.cluster.serialization import import_cluster_package
 from harnack.cluster.workers import connect_client
 from harnack.progress import Advance, progress_bar
 
@@ -50,8 +50,8 @@ def to_zarr(
         ValueError: there is another array at the path, or the blocks have unequal lengths.
         OSError: the file cannot be written, or workers wrote to another file system.
     """
-    zarr = import_optional("zarr", "to_zarr")
-    dask = import_optional("dask", "to_zarr")
+    zarr = import_cluster_package("zarr", "to_zarr")
+    dask = import_cluster_package("dask", "to_zarr")
     if not is_dask_array(array):
         raise TypeError(f"to_zarr writes a Dask array, not a {type(array).__name__}")
     for lengths in array.chunks:
@@ -97,7 +97,7 @@ def _compute_tasks(client: Any, tasks: list[Any]) -> Iterator[None]:
         return
     futures = client.compute(tasks)
     try:
-        for future in import_optional("distributed", "client").as_completed(
+        for future in import_cluster_package("distributed", "client").as_completed(
             futures, loop=client.loop
         ):
             future.result()
@@ -154,7 +154,7 @@ def _chunk_slices(array: Any, index: tuple[int, ...]) -> tuple[slice, ...]:
 def _write_block(path: str, slices: tuple[slice, ...], block: Any) -> None:
     """Write a block of numbers into the Zarr array at `path`. It is run on a worker. slices: the
     place of the block in the array."""
-    zarr = import_optional("zarr", "to_zarr")
+    zarr = import_cluster_package("zarr", "to_zarr")
     # By default Zarr leaves out chunks of zeros, which would then be computed again.
     with zarr.config.set({"array.write_empty_chunks": True}):
         zarr.open_array(path, mode="r+")[slices] = block

@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from harnack.backend import FloatArray
 from harnack.files.file_geometry import check_writable, write_atomically
+from harnack.optional_packages import import_optional
 from harnack.rendering.mitsuba import load_mitsuba
 
 FloatImage = npt.NDArray[np.float32]
@@ -217,13 +218,8 @@ class Picture(np.ndarray[Any, np.dtype[Any]]):
         Raises:
             ModuleNotFoundError: Pillow is not installed.
         """
-        try:
-            from PIL import Image
-        except ModuleNotFoundError:
-            raise ModuleNotFoundError(
-                "to_pil needs Pillow: pip install pillow, or take the bytes in `.srgb`"
-            ) from None
-        return Image.fromarray(self.srgb)
+        message = "to_pil needs Pillow: pip install pillow, or take the bytes in `.srgb`"
+        return import_optional("PIL.Image", message).fromarray(self.srgb)
 
     def _repr_png_(self) -> bytes | None:
         """Return the bytes of a PNG file, which notebooks show; None for an array that was computed

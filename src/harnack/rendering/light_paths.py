@@ -12,7 +12,6 @@ lies in glass, which absorbs light, depends only on the hit at which the segment
 
 from __future__ import annotations
 
-import importlib
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -23,6 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import Mask, Real, to_numpy
+from harnack.optional_packages import import_optional
 from harnack.rendering.hybrid_scene import HybridScene, spawn_ray
 from harnack.rendering.integrator import PathResults, PathTracer, SobolSampler
 from harnack.rendering.mitsuba import refract, refractive_index, transmittance
@@ -318,11 +318,9 @@ def load_denoiser() -> Any:
         ModuleNotFoundError: it is not installed, or its library cannot be loaded.
     """
     try:
-        return importlib.import_module("pyoidn")
-    except ModuleNotFoundError:
-        raise ModuleNotFoundError(
-            "denoise needs Open Image Denoise: pip install 'harnack[denoise]'"
-        ) from None
+        return import_optional(
+            "pyoidn", "denoise needs Open Image Denoise: pip install 'harnack[denoise]'"
+        )
     except OSError as wrong:
         raise ModuleNotFoundError(f"Open Image Denoise cannot be loaded: {wrong}") from None
 

@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.name_suggestions import did_you_mean
+from harnack.optional_packages import import_optional
 from harnack.rendering.images import linear_to_srgb, srgb_to_linear
 
 Color = tuple[float, float, float]
@@ -342,13 +343,11 @@ def require_pillow() -> tuple[Any, Any, Any]:
     Raises:
         ModuleNotFoundError: Pillow is not installed.
     """
-    try:
-        from PIL import Image, ImageDraw, ImageFont
-    except ModuleNotFoundError:
-        raise ModuleNotFoundError(
-            "a color bar needs Pillow: pip install 'harnack[film]', or leave color_bar away"
-        ) from None
-    return Image, ImageDraw, ImageFont
+    message = "a color bar needs Pillow: pip install 'harnack[film]', or leave color_bar away"
+    image, draw, font = (
+        import_optional(f"PIL.{name}", message) for name in ("Image", "ImageDraw", "ImageFont")
+    )
+    return image, draw, font
 
 
 def typeface_for(text: str, size: int) -> Any:

@@ -20,6 +20,7 @@ import numpy.typing as npt
 
 from harnack.backend import IntArray, backend_of, to_numpy
 from harnack.backend.arrays import upload_integers
+from harnack.optional_packages import import_optional
 from harnack.webgpu.recording import labeled_leaves, record_kernel
 from harnack.webgpu.wgsl import WORKGROUP, Shader
 
@@ -76,12 +77,11 @@ def find_device() -> Device:
     Raises:
         NoDeviceError: there is no device, or the package `wgpu` is not installed.
     """
+    message = 'backend="webgpu" needs the package wgpu: pip install "harnack[webgpu]"'
     try:
-        import wgpu
-    except ImportError:
-        raise NoDeviceError(
-            'backend="webgpu" needs the package wgpu: pip install "harnack[webgpu]"'
-        ) from None
+        wgpu = import_optional("wgpu", message)
+    except ModuleNotFoundError:
+        raise NoDeviceError(message) from None
     try:
         adapter: Any = wgpu.gpu.request_adapter_sync(power_preference="high-performance")
     except RuntimeError as error:
