@@ -119,7 +119,7 @@ def page(
     with progress_bar("page", progress) as advance:
         live = job.live
         scene = live.scene(title or live.content.name)
-        with open_executor(client, checkpoint) as workers:
+        with open_executor(job, client, checkpoint) as workers:
             scene["frames"] = _slider_states(job, workers, advance)
     text = document(scene, still_png(live)).encode()
     with write_atomically(target) as partial:
@@ -282,7 +282,7 @@ def _slider_states(job: PageJob, workers: Executor, advance: Any) -> JsonDict:
     """
     frames: list[JsonDict] = []
     tasks = [(values, job.digest) for values in _slider_combinations(job.places)]
-    for result in workers.run_tasks(job, "state", tasks):
+    for result in workers.run_tasks("state", tasks):
         frames.append(json.loads(result["text"].tobytes()))
         advance(1 / len(tasks))
     return {"places": job.places, "frames": frames}

@@ -146,9 +146,9 @@ def animate(
         job, parts = _job(frames, {"size": size, "progress": False})
         with (
             progress_bar("film", progress) as advance,
-            open_executor(client, checkpoint) as workers,
+            open_executor(job, client, checkpoint) as workers,
         ):
-            for frame in workers.run_tasks(job, "frame", parts):
+            for frame in workers.run_tasks("frame", parts):
                 add(frame["shown"])
                 advance(1 / count)
     return Animation(target, size)

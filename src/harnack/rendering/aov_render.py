@@ -20,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import FloatArray, IntArray, to_numpy, upload_floats
+from harnack.cluster.executor import Executor
 from harnack.fields import Field
 from harnack.rendering.hybrid_scene import HybridScene
 from harnack.rendering.images import linear_to_srgb, srgb_to_linear, to_uint8
@@ -29,8 +30,6 @@ from harnack.rendering.mitsuba import mitsuba_backend
 from harnack.rendering.placed_surface import Placement
 from harnack.rendering.scales import Color, ColorScale, add_color_bar, gray_colormap, viridis
 from harnack.rendering.shading import (
-    LocalRenderExecutor,
-    RenderExecutor,
     edge_pixels,
     film_positions,
     multijitter_offsets,
@@ -138,15 +137,15 @@ class AovTask:
         )
 
     def look(
-        self, executor: RenderExecutor | None = None, advance: Callable[[float], None] | None = None
+        self, executor: Executor | None = None, advance: Callable[[float], None] | None = None
     ) -> AovBuffers:
         """Trace all pixels. Returns their `AovBuffers`, with arrays (h, w).
 
-        executor: calls `render_range` of a copy of this task, for example on a cluster; None to
+        executor: runs `render_range` of this task, for example on a cluster; None to
             call it in this process.
         advance: called with the fraction of the pixels that has been finished since the last call.
         """
-        executor = LocalRenderExecutor(self) if executor is None else executor
+        executor = Executor(self) if executor is None else executor
         width, height = self.size
         order = self.order
         ranges, buffers = executor.split_range(width * height, _RAYS_A_BAND), list[AovBuffers]()
@@ -409,7 +408,7 @@ def aov_picture(
     value_range: tuple[float, float] | None,
     bar: str | bool,
     spp: int,
-    executor: RenderExecutor | None = None,
+    executor: Executor | None = None,
 ) -> npt.NDArray[np.uint8]:
     """Draw the pixels (h, w, 3) of a picture of normals, depths, values or other numbers, with a
     color bar if requested.
@@ -452,7 +451,7 @@ def _antialias(
     picture: npt.NDArray[np.uint8],
     colors: Callable[[AovBuffers], npt.NDArray[np.uint8]],
     spp: int,
-    executor: RenderExecutor | None,
+    executor: Executor | None,
 ) -> None:
     """Draw pixels at edges again, each as the mean light of a grid of rays. This changes `picture`
     (h, w, 3) in place. A pixel is at an edge if it differs visibly from a neighbor, or if the edge
@@ -466,7 +465,7 @@ def _antialias(
     order = tiled_pixel_order(viewer.size)
     edges = order[(edge_pixels(picture) | view.is_near_isoline).ravel()[order]]
     offsets = multijitter_offsets(spp)
-    executor = LocalRenderExecutor(viewer) if executor is None else executor
+    executor = Executor(viewer) if executor is None else executor
     ranges = executor.split_range(len(edges), max(1, _RAYS_A_BAND // len(offsets)))
     calls = [(edges[start:stop], offsets) for start, stop in ranges]
     for (pixels, _), samples in zip(

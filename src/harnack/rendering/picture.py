@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from rich.console import Console
 
-from harnack.cluster.executor import open_executor
+from harnack.cluster.executor import Executor, open_executor
 from harnack.fields import Field
 from harnack.progress import Advance, progress_bar
 from harnack.rendering.aov_render import AOV_MODES, AovTask, aov_picture
@@ -38,12 +38,10 @@ from harnack.rendering.option_table import (
     shorthand_among,
     shows_options,
 )
-from harnack.rendering.render_job import EDGE_SPP, ClusterRenderExecutor, RenderJob
+from harnack.rendering.render_job import EDGE_SPP, RenderJob
 from harnack.rendering.render_options import check_chunks, refuse_studio_options
 from harnack.rendering.shaded_render import ShadedTask, render_shaded
 from harnack.rendering.shading import (
-    LocalRenderExecutor,
-    RenderExecutor,
     backdrop_image,
     studio_wall,
 )
@@ -178,9 +176,8 @@ def render(
     task = job.task
     if is_divided:
         _check_can_be_divided(surfaces, task)
-    with open_executor(client, checkpoint, chunks) as workers:
-        is_local = workers.client is None and workers.checkpoint is None
-        executor = LocalRenderExecutor(task) if is_local else ClusterRenderExecutor(workers, job)
+    with open_executor(job, client, checkpoint, chunks) as workers:
+        executor = Executor(task) if workers.is_local else replace(workers, decode=job.decode)
         title = arguments["color_by"]
         image, shown, names = _render_job(job, executor, title, progress, alone=client is None)
     if target is not None:
@@ -191,7 +188,7 @@ def render(
 
 def _render_job(
     job: RenderJob,
-    executor: RenderExecutor,
+    executor: Executor,
     color_by: Any,
     progress: bool | Advance,
     *,
@@ -214,9 +211,7 @@ def _render_job(
         return _render_by_mitsuba(mi, job.scene, options)
     if isinstance(task, AovTask):
         # A progress bar is shown only if an executor divides the work.
-        with progress_bar(
-            "rendering", progress and not isinstance(executor, LocalRenderExecutor)
-        ) as advance:
+        with progress_bar("rendering", progress and not executor.is_local) as advance:
             view = task.look(executor, advance)
         color_bar = (
             color_by
@@ -231,9 +226,7 @@ def _render_job(
     if isinstance(task, PathRenderTask) and alone and progress:
         # A picture on a cluster is not estimated: the estimate measures this process.
         task = _with_time_estimate(job, task, progress)
-        executor = (
-            LocalRenderExecutor(task) if isinstance(executor, LocalRenderExecutor) else executor
-        )
+        executor = Executor(task) if executor.is_local else executor
     with progress_bar("rendering", progress) as advance:
         if isinstance(task, ShadedTask):
             image, lost = render_shaded(task, executor, advance)

@@ -44,8 +44,8 @@ from harnack.rendering.shading import (
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
+    from harnack.cluster.executor import Executor
     from harnack.geometry import Volume
-    from harnack.rendering.shading import RenderExecutor
 
 
 class ConeCoverage:
@@ -516,7 +516,7 @@ def _nearest_sky(mi: Any, samples: GBuffer, row: Any, position: FloatArray, sky:
 
 
 def render_shaded(
-    shading: ShadedTask, executor: RenderExecutor, advance: Callable[[float], None]
+    shading: ShadedTask, executor: Executor, advance: Callable[[float], None]
 ) -> tuple[npt.NDArray[np.float32], int]:
     """Render a shaded picture. Returns the image (h, w, 4), linear sRGB radiance and last the
     covered fraction, and the number of rays that ran out of steps.

@@ -42,38 +42,6 @@ def pixel_ranges(pixels: int, step: int) -> Iterator[tuple[int, int]]:
         yield start, min(start + step, pixels)
 
 
-class RenderExecutor(Protocol):
-    """Interface to what runs the tasks of a render: this process, or a Dask cluster. A task is a
-    call of a method of one fixed object that draws the picture."""
-
-    def split_range(self, count: int, max_size: int) -> list[tuple[int, int]]:
-        """Divide range(count) into ranges (start, stop) of at most `max_size` elements each."""
-        ...
-
-    def run_tasks(self, step: str, parts: Sequence[tuple[Any, ...]]) -> Iterator[Any]:
-        """Call the method named `step` once for each entry of `parts`, which holds the arguments of
-        one call. Yields the results in order."""
-        ...
-
-
-@dataclass(frozen=True)
-class LocalRenderExecutor:
-    """Runs the tasks of a render in this process. drawing: the object whose methods are called."""
-
-    drawing: Any
-
-    def split_range(self, count: int, max_size: int) -> list[tuple[int, int]]:
-        """Divide range(count) into as few ranges (start, stop) of at most `max_size` elements as
-        possible."""
-        return list(pixel_ranges(count, max_size))
-
-    def run_tasks(self, step: str, parts: Sequence[tuple[Any, ...]]) -> Iterator[Any]:
-        """Call the method named `step` once for each entry of `parts`, which holds the arguments of
-        one call. Yields the results, each computed when it is asked for."""
-        method = getattr(self.drawing, step)
-        return (method(*part) for part in parts)
-
-
 def tiled_pixel_order(size: tuple[int, int]) -> IntArray:
     """Return the indices (n,) of all pixels of a picture of `size` (width, height), ordered by
     squares of 4 x 4 pixels. An index counts pixels by rows.
