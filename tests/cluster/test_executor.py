@@ -135,10 +135,10 @@ def test_a_worker_that_is_killed_takes_nothing_with_it(tmp_path: Path) -> None:
     alone = hk.render(POLYGON, progress=False, **{**way, "chunks": None})
     kept: dict[str, Any] = {**way, "checkpoint": tmp_path}
     local = {"threads_per_worker": 1, "processes": True, "dashboard_address": None}
-    done: list[float] = []
+    done: list[hk.Progress] = []
 
-    def kill(part: float) -> None:
-        done.append(part)
+    def kill(progress: hk.Progress) -> None:
+        done.append(progress)
         if len(done) == 4:
             os.kill(next(iter(client.run(os.getpid).values())), signal.SIGKILL)
         if len(done) == 10:

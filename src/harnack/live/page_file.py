@@ -28,7 +28,7 @@ from harnack.live.live_scene import ControlState, LiveScene, encode_arrays, stat
 from harnack.live.scene_file import with_flat_options
 from harnack.live.shading_data import shader_constants
 from harnack.live.sliders import slider_values_in_errors
-from harnack.progress import progress_bar
+from harnack.progress import show_progress
 from harnack.rendering.camera import Camera
 from harnack.rendering.mitsuba import set_variant
 from harnack.rendering.mitsuba_plugins import register
@@ -116,11 +116,11 @@ def page(
         raise ValueError(f"{target}: a page is written as .html")
     # The states for all slider values are computed part by part, here or on a cluster.
     job = PageJob(surfaces, settings, register().variant())
-    with progress_bar("page", progress) as advance:
+    with show_progress("page", progress) as reporter:
         live = job.live
         scene = live.scene(title or live.content.name)
         with open_executor(job, client, checkpoint) as workers:
-            scene["frames"] = _slider_states(job, workers, advance)
+            scene["frames"] = _slider_states(job, workers, reporter.advance)
     text = document(scene, still_png(live)).encode()
     with write_atomically(target) as partial:
         partial.write_bytes(text)

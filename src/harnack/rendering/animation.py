@@ -25,7 +25,7 @@ from harnack.cluster.executor import TaskResult, open_executor
 from harnack.files.file_geometry import check_writable, write_atomically
 from harnack.geometry import Box
 from harnack.optional_packages import import_optional
-from harnack.progress import progress_bar
+from harnack.progress import show_progress
 from harnack.rendering.camera import Camera
 from harnack.rendering.framing import UnboundedSurfaceError, rotation_to_z_up, visible_points
 from harnack.rendering.mitsuba import mitsuba_backend, set_variant
@@ -145,12 +145,12 @@ def animate(
         # Pictures are drawn by `render`, in this process or on a cluster, and added in order.
         job, parts = _job(frames, {"size": size, "progress": False})
         with (
-            progress_bar("film", progress) as advance,
+            show_progress("film", progress) as reporter,
             open_executor(job, client, checkpoint) as workers,
         ):
             for frame in workers.run_tasks("frame", parts):
                 add(frame["shown"])
-                advance(1 / count)
+                reporter.advance(1 / count)
     return Animation(target, size)
 
 
