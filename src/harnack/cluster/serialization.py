@@ -89,8 +89,14 @@ def package_versions() -> str:
 
 
 class TransientCache(dict[Key, Value]):
-    """A dictionary in which an object caches computed values. It is empty in copies and pickles of
-    the object."""
+    """A dictionary in which an object caches computed values, as long as it lives: a
+    `functools.cached_property` for each key. It is empty in copies and pickles of the object."""
+
+    def get_or_make(self, key: Key, make: Callable[[], Value]) -> Value:
+        """Return the value of a key; without one, that of `make()`, which is then kept."""
+        if key not in self:
+            self[key] = make()
+        return self[key]
 
     def __reduce__(self) -> Any:
         """Return how pickle rebuilds the cache: as an empty one."""

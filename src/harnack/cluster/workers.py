@@ -171,6 +171,8 @@ def adopt_worker_threads(has_nanny: bool, threads: int) -> None:
     """Set Dr.Jit's number of threads to the number `threads` that Dask gave this worker, if the
     process belongs to this worker alone.
 
+    A second call with the same arguments does nothing: users may have set another number since.
+
     has_nanny: whether Dask runs a supervising process (a nanny) for this worker; then the process
         belongs to it alone.
     """

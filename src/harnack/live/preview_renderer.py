@@ -87,6 +87,7 @@ class PreviewRenderer:
     same surfaces, camera and size."""
 
     floor: FloorShadow | None = None
+    # Of the last picture alone, as hits take much memory.
     _hit_cache: tuple[Any, dict[str, Any]] | None = None
 
     def paint(

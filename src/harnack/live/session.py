@@ -75,7 +75,7 @@ class Cancelled(Exception):
 @dataclass
 class _PreviewCache:
     """The surfaces of one state of the controls, prepared for previews (quick pictures that Python
-    draws).
+    draws). Only that of the last state is kept: a person rarely returns to an earlier one.
 
     key: the state of the controls, as a tuple that can be compared.
     drawn: the surfaces as objects of the studio.
