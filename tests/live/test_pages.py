@@ -49,7 +49,7 @@ def run(surface: dict[str, Any], data: Any) -> tuple[Any, Any]:
     places = surface["results"]
     outputs = tuple(map(str, range(sum(place < 99 for place in places))))
     program: CompiledShader = device.compile(Shader(surface["code"], (), (), names, outputs))
-    given = program._dispatch(data, lanes)
+    given = program.run_words(data, lanes)
     found = np.array([0 * given[0] if place == 99 else given[place] for place in places])
     return words(surface["check"]["results"]).reshape(7, -1), found
 
