@@ -176,7 +176,8 @@ class _ArrayLabels:
         original, thread = module.gather, threading.get_ident()
 
         def gather(dtype: Any, source: Any, index: Any, *args: Any, **kwargs: Any) -> Any:
-            """Call `drjit.gather`, and label its result if this thread records."""
+            """Call `drjit.gather` with these arguments, and label its result if this thread
+            records. source: the array that is read."""
             gathered = original(dtype, source, index, *args, **kwargs)
             is_array = dr.is_array_v(type(source)) and dr.depth_v(type(source)) == 1
             if is_array and threading.get_ident() == thread:
