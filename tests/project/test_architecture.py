@@ -14,6 +14,7 @@ FILES = sorted(SOURCE.rglob("*.py"))
 # Each room imports from itself and from the rooms before it.
 ROOMS = (
     "name_suggestions",
+    "optional_packages",
     "progress",
     "backend",
     "webgpu",

@@ -259,9 +259,7 @@ class DeviceField(Field, Generic[Uploaded]):
     def _batch_data(self, backend: Backend) -> Uploaded:
         """The data for values at points, which are uploaded once for each backend and then
         cached."""
-        if backend not in self._batches:
-            self._batches[backend] = self._upload(backend, traced=False)
-        return self._batches[backend]
+        return self._batches.get_or_make(backend, lambda: self._upload(backend, traced=False))
 
 
 class VariableAccuracyField(DeviceField[Uploaded], BatchedField):

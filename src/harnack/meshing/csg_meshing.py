@@ -72,7 +72,6 @@ from harnack.meshing.lattice_meshing import (
 )
 from harnack.meshing.level_function import (
     CELLS_PER_WAVE,
-    EvaluatorCache,
     LevelFunction,
     LevelSamples,
 )
@@ -80,6 +79,7 @@ from harnack.meshing.outlier_projection import project_outliers
 from harnack.meshing.self_intersection_repair import resolve_self_intersections
 from harnack.meshing.thread_mesh import thread_manifold
 from harnack.meshing.tube_mesh import tube_manifold
+from harnack.tracer.traced_surface import CallCache
 
 if TYPE_CHECKING:
     from manifold3d import Manifold
@@ -172,7 +172,7 @@ class CsgMesher:
     evaluations: int = 0
     levels: int = 0
     smallest_cell: float = math.inf
-    uploads: EvaluatorCache = dataclasses.field(default_factory=EvaluatorCache)
+    uploads: CallCache = dataclasses.field(default_factory=CallCache)
     intersected_with: IntersectedOperands = ()
     irrelevant_region_cache: tuple[IntersectedOperands, IrrelevantRegion] | None = None
 
@@ -717,7 +717,7 @@ def mesh_solid(
     max_error = 0.5 * tolerance.at(size)
     attempts = _MAX_ATTEMPTS if spacing is None else 1
     per_wave = CELLS_PER_WAVE if spacing is None else None
-    uploads = EvaluatorCache()
+    uploads = CallCache()
     first: MeshingError | None = None
     before: MeshingError | None = None
     while True:

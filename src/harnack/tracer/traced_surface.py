@@ -51,6 +51,23 @@ _FIRST_HITS_ONLY = (
 )
 
 
+class CallCache:
+    """Keeps results for the length of one call of the library, by a field and a key. Unlike those
+    of a `FieldCache`, which last as long as the field, they need not be compared with the field's
+    attributes, which do not change during a call; and they may refer to the field."""
+
+    def __init__(self) -> None:
+        self._kept: dict[Any, tuple[Any, Field]] = {}
+
+    def get_or_make(self, field: Field, key: Any, make: Callable[[], _T]) -> _T:
+        """Return the result for this field and key: that of `make()` at the first time."""
+        full_key = id(field), key
+        if full_key not in self._kept:
+            # With a reference to the field, so that no other field gets its id.
+            self._kept[full_key] = make(), field
+        return self._kept[full_key][0]
+
+
 @dataclass(frozen=True)
 class TracedSurface:
     """A surface and how rays are traced to it, for one call of the library. The surface consists of
@@ -84,7 +101,7 @@ class TracedSurface:
     over_relaxation: float = 1.4
     require_crossing: bool = False
     # Results of `memoize`; None outside of a call of the library.
-    _call_cache: dict[Any, Any] | None = dataclasses.field(
+    _call_cache: CallCache | None = dataclasses.field(
         default=None, repr=False, compare=False, kw_only=True
     )
 
@@ -178,20 +195,16 @@ class TracedSurface:
         begins: whether to start with an empty cache even if the surface has one, as users may have
             changed the field in place since the last call.
         """
-        return (
-            self if self._call_cache is not None and not begins else replace(self, _call_cache={})
-        )
+        if self._call_cache is not None and not begins:
+            return self
+        return replace(self, _call_cache=CallCache())
 
     def memoize(self, key: Any, compute: Callable[[], _T]) -> _T:
         """Return `compute()`. Within a call of the library the result is cached for this field,
         these levels and `key`; otherwise `compute` is called each time."""
         if self._call_cache is None:
             return compute()
-        full_key = key, id(self.field), self.level_values
-        if full_key not in self._call_cache:
-            # With a reference to the field, so that no other field gets its id.
-            self._call_cache[full_key] = compute(), self.field
-        return self._call_cache[full_key][0]
+        return self._call_cache.get_or_make(self.field, (key, self.level_values), compute)
 
     @property
     def extent(self) -> Volume | None:

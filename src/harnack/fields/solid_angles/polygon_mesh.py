@@ -519,9 +519,7 @@ class PolygonMesh(PatchField["_MeshBuffers"]):
         levels: values of the solid angle; None for the levels of this mesh.
         """
         levels = self.levels if levels is None else levels
-        if levels not in self._boxes:
-            self._boxes[levels] = face_boxes(self.faces, levels)
-        return self._boxes[levels]
+        return self._boxes.get_or_make(levels, lambda: face_boxes(self.faces, levels))
 
     def evaluate(self, p: Vec3) -> NoReturn:
         """Not defined: there is a function for each face, but none for the mesh. Always raises

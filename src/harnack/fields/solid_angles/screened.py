@@ -504,9 +504,7 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
         falls with D, so there is no level beyond the D at which it is the smallest |level|. Cells
         of that box that are proved empty are removed (`tight_extent`).
         """
-        if levels not in self._extents:
-            self._extents[levels] = self._extent(levels)
-        return self._extents[levels]
+        return self._extents.get_or_make(levels, lambda: self._extent(levels))
 
     def _extent(self, levels: tuple[float, ...]) -> Volume | None:
         """Compute the volume that `extent` returns and caches; None for level 0. The distance D of

@@ -625,9 +625,7 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         L/sqrt(l (4 pi - l)) of the curves. Cells of the box with this margin that are proved to
         contain no level are then cut away (`tight_extent`).
         """
-        if levels not in self._extents:
-            self._extents[levels] = self._extent(levels)
-        return self._extents[levels]
+        return self._extents.get_or_make(levels, lambda: self._extent(levels))
 
     def _extent(self, levels: tuple[float, ...]) -> Volume | None:
         """Compute the volume that `extent` returns and caches; None if a level is a multiple of 4

@@ -415,11 +415,9 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         data: the mesh on that backend.
         winding: the tree over the mesh's triangles, which is used where the edges are of no use.
         """
-        if data.backend not in self._rates:
-            self._rates[data.backend] = BoundaryRates.of(
-                data.backend, self.mesh, self.order, winding
-            )
-        return self._rates[data.backend]
+        return self._rates.get_or_make(
+            data.backend, lambda: BoundaryRates.of(data.backend, self.mesh, self.order, winding)
+        )
 
     def _stated(self, data: _WindingData, x: Vec3, values: PointValues) -> PointValues:
         """Complete results at points: enlarge their error bounds by two errors that are still
@@ -536,9 +534,7 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         extent = self.extent(levels)
         if extent is None:  # only for the type: there always is an extent
             return None
-        if levels not in self._occupied:
-            self._occupied[levels] = winding_cells(self, extent, levels)
-        return self._occupied[levels]
+        return self._occupied.get_or_make(levels, lambda: winding_cells(self, extent, levels))
 
     def evaluate(self, p: Vec3) -> Sample:
         """A sample of w itself at points p, jumps included: value, gradient, errors and proved
@@ -614,9 +610,7 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         for several levels."""
         if len(levels) != 1:
             return False
-        if levels not in self._own_levels:
-            self._own_levels[levels] = lies_on_own_level(self.mesh, levels[0])
-        return self._own_levels[levels]
+        return self._own_levels.get_or_make(levels, lambda: lies_on_own_level(self.mesh, levels[0]))
 
     def with_levels(self, levels: tuple[float, ...]) -> WindingNumber:
         """The field by which these levels are traced. If the surface is the mesh itself
@@ -685,9 +679,9 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         """A volume that is proved to contain the level sets: all triangles, and the cells around
         them that are not proved empty (`winding_extent`). It is computed once for these levels, and
         is never None."""
-        if levels not in self._extents:
-            self._extents[levels] = winding_extent(self.with_cells(False), self.mesh, levels)
-        return self._extents[levels]
+        return self._extents.get_or_make(
+            levels, lambda: winding_extent(self.with_cells(False), self.mesh, levels)
+        )
 
     def describe(self) -> dict[str, Any]:
         """Facts about the field for users, as a dictionary of names and values: the numbers of

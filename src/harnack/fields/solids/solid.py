@@ -298,9 +298,7 @@ class Solid(Field):
         key = tuple(map(id, variants))
         if key == tuple(map(id, parts)):
             return self
-        if key not in self._ray_count_variants:
-            self._ray_count_variants[key] = make(variants)
-        return self._ray_count_variants[key]
+        return self._ray_count_variants.get_or_make(key, lambda: make(variants))
 
     @no_derivatives
     def scaled(self, factors: float | Sequence[float]) -> Solid:
