@@ -493,7 +493,10 @@ def points_around(field: hk.Field, n: int, seed: int = 0) -> np.ndarray:
 
 def boundary_distance(field: hk.Field, x: np.ndarray) -> np.ndarray:
     """From points (n, 3) to the curve that the surface ends in; inf without one."""
-    nearest = field.closest_boundary_point(to_vector3(choose_backend("double"), x))
+    p, boundary = to_vector3(choose_backend("double"), x), field.boundary
+    nearest = None
+    if boundary is not None and boundary.closest_point is not None:
+        nearest = boundary.closest_point(p)
     if nearest is None:
         return np.full(len(x), np.inf)
     return np.linalg.norm(to_numpy(nearest) - x, axis=1)
