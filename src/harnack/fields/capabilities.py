@@ -123,19 +123,24 @@ class Jumps(abc.ABC):
         self, o: Vec3, d: Vec3, after: JumpCrossing, t_max: Real, active: Mask
     ) -> JumpCrossing:
         """The first crossing of the ray o + t d with a facet strictly after the crossing `after`,
-        with t <= t_max.
+        with t <= t_max, on active lanes.
 
         Crossings are ordered by (t, facet): facets that are crossed at the same t follow each other
         by index. NO_FACET is the largest index, so nothing follows it at the same t. Repeated calls
         must give every crossing of the ray in this order. The t and the jump of a crossing must not
         depend on the crossing at which the calls began. If there is no further crossing, t = inf,
         facet = NO_FACET and jump = 0.
+
+        o, d: origin and direction of each ray.
+        after: the crossing after which the search begins.
+        t_max: the largest t.
         """
 
     def initial_offset(self, o: Vec3, d: Vec3, t_min: Real, active: Mask) -> Real:
-        """A number that describes f at the start of a ray o + t d, of a kind that the field
-        chooses; for example the sum of the signs of the ray's crossings beyond the start. The
-        tracer adds the jump at each crossing to it, and passes the sum to `continuation`.
+        """A number that describes f at the start of a ray o + t d, on active lanes. The field
+        chooses what kind of number it is, for example the sum of the signs of the ray's crossings
+        beyond the start. The tracer adds the jump at each crossing to it, and passes the sum to
+        `continuation`.
 
         t_min: the parameter of the start. Crossings with t <= t_min lie behind the start
             (`next_crossing` after (t_min, NO_FACET)); all others lie in front of it.
@@ -176,10 +181,12 @@ class Jumps(abc.ABC):
     def nearest_facet(
         self, p: Vec3, after: tuple[Real, Any], limit: Real, active: Mask
     ) -> NearestFacet | None:
-        """The facet that follows the facet `after` in the order of distance from p, if it is nearer
-        than `limit`.
+        """The facet that follows the facet `after` in the order of distance from p. On lanes where
+        it would be farther than `limit` from p, and on lanes that are not active, no facet is found
+        (NO_FACET).
 
         after: (sort_key, index) of a facet; (-1, NO_FACET) to begin with the nearest.
+        limit: a length.
 
         Facets are ordered by `NearestFacet.sort_key`, then by index. Repeated calls must give each
         facet once. The default is None: computations of distances then search for the nearest facet
@@ -215,9 +222,10 @@ class ModuloOne(abc.ABC):
     """Samples that give f only up to an integer, for a field whose jumps are all integers.
 
     Samples of `Jumps.continuation` may then give f only modulo 1
-    (`VariableAccuracy.may_lack_integer`). Besides, `Field.extent` has to keep a condition. Consider a set of levels that contains, for each of its levels L, also the number
-    nearest to 0 among L plus all integers. At points outside of the extent of such a set, none of
-    the numbers L plus an integer lies between 0 and f.
+    (`VariableAccuracy.may_lack_integer`). Besides, `Field.extent` has to fulfill a condition. Take
+    a set of levels that contains, with each level L, also that one of the numbers L + k, k an
+    integer, which is nearest to 0. Then at points outside of the extent of this set no number L + k
+    lies between 0 and f.
     """
 
     @property
@@ -261,8 +269,8 @@ class Patches(abc.ABC):
     def next_entry(
         self, o: Vec3, d: Vec3, after: PatchEntry, start: Real, end: Real, active: Mask
     ) -> PatchEntry:
-        """The first box that a ray enters after the entry `after`, with start <= t <= end. Each box
-        is proved to contain one patch.
+        """The first box that a ray o + t d enters after the entry `after`, with start <= t <= end,
+        on active lanes. Each box is proved to contain one patch.
 
         A ray that begins in a box enters it at `start`. Entries are ordered by (enter, patch).
         Repeated calls, the first of them with an entry before `start`, must give every box that the

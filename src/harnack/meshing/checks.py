@@ -119,8 +119,8 @@ def orient2d(a: FloatArray, b: FloatArray, c: FloatArray) -> SignArray:
 
 def _scaled(points: FloatArray) -> FloatArray:
     """The points, times a power of two that makes the largest absolute value of a coordinate at
-    least 1/2 and less than 1. The signs of determinants stay the same. Short of underflow no
-    coordinate is rounded."""
+    least 1/2 and less than 1. The signs of determinants stay the same. No coordinate is rounded,
+    unless it underflows."""
     largest = float(np.abs(points).max(initial=0.0))
     return points if largest == 0 else np.ldexp(points, -int(np.frexp(largest)[1]))
 
@@ -300,10 +300,11 @@ def touching_pairs(vertices: FloatArray, faces: IntArray) -> tuple[IntArray, Flo
 def _pairs_in_doubt(
     vertices: FloatArray, faces: IntArray, among: BoolArray | None
 ) -> Generator[tuple[IntArray, tuple[SignArray, SignArray]]]:
-    """Generate the pairs of faces that floating point does not prove to have only vertices in
-    common, in batches. Each batch consists of the indices (k, 2) of the faces, and two arrays (k,
-    3) of signs: for each corner of the second face, the side of the first face's plane on which it
-    lies; and the reverse (`_side_signs`).
+    """Generate, in batches, the pairs of faces for which floating point leaves it open whether they
+    have only vertices in common. Each batch consists of the indices (k, 2) of the faces, and two
+    arrays (k, 3) of signs (`_side_signs`). The first array holds for each corner of the second face
+    the side of the first face's plane on which it lies. The second array holds the same with the
+    faces exchanged.
 
     vertices, faces: (n, 3), (m, 3) the mesh.
     among: (m,) mask of chosen faces; pairs without a chosen face are left out. None if all are
@@ -412,10 +413,10 @@ def _are_separated(vertices: FloatArray, faces: IntArray, pairs: IntArray) -> Bo
 
 
 def _side_signs(vertices: FloatArray, base: IntArray, other: IntArray) -> SignArray:
-    """For each corner of the faces `other`, the side of the plane of the face in the same row of
-    `base` on which it lies; (k, 3) signs, decided exactly. The sign is 1 below the plane, from
-    where the corners of `base` run clockwise; -1 above the plane; and 0 on it. Corners that both
-    faces have get 0.
+    """(k, 3) signs, decided exactly: for each corner of the faces `other`, on which side of a plane
+    it lies, that of the face in the same row of `base`. The sign is 1 below the plane, from where
+    the corners of `base` run clockwise; -1 above the plane; and 0 on it. Corners that both faces
+    have get 0.
 
     vertices: (n, 3).
     base, other: (k, 3) indices of the corners of faces.
@@ -581,9 +582,9 @@ def is_retry_promising(
     now: MeshingError, before: MeshingError | None, smallest: float = 1.0
 ) -> bool:
     """Whether to try again with smaller cells after an attempt at meshing failed. It is not
-    worthwhile if smaller cells cannot help. Nor is it if a check failed at more than 20 places, and
-    at more than half as many as in the attempt before: along a pole of the function, or where
-    surfaces on which it jumps cross, cells of every size fail.
+    worthwhile if smaller cells cannot help. Nor is it worthwhile if a check failed at more than 20
+    places, and at more than half as many as in the attempt before. That happens along a pole of the
+    function, or where surfaces on which it jumps cross: there cells of every size fail.
 
     now: the error of the last attempt.
     before: the error of the attempt before it, or None.
@@ -610,9 +611,9 @@ def euler_characteristic(faces: IntArray, edges: Edges | None = None) -> int:
 
 
 def check_manifold(faces: IntArray, vertices: FloatArray | None = None) -> None:
-    """Raise an error unless faces (m, 3) form a manifold: every edge has one or two faces, two
-    faces run their common edge in opposite directions, and the faces around every vertex are joined
-    to each other by edges.
+    """Raise an error unless faces (m, 3) form a manifold. Three conditions must hold: every edge
+    has one or two faces; two faces run their common edge in opposite directions; and the faces
+    around every vertex are joined to each other by edges.
 
     vertices: (n, 3), for the locations of failures; may be None.
 

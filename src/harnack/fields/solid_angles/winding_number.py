@@ -120,7 +120,7 @@ class WindingModuloOne(Field):
     period: ClassVar[float | None] = 1.0
 
     def __init__(self, winding: ModuloOneEvaluable) -> None:
-        """The parameter is described at the class."""
+        """The parameter `winding` is described at the class."""
         self._winding = winding
 
     def prepare(self, backend: Backend) -> Self:
@@ -141,7 +141,8 @@ class WindingModuloOne(Field):
         )
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
-        """A volume that is proved to contain the level sets of w."""
+        """A volume that is proved to contain the level sets of w; None if there is no bounded
+        one."""
         return self._winding.extent(levels)
 
 
@@ -182,10 +183,10 @@ def winding_extent(
 
 
 def winding_box(mesh: WindingMesh, levels: tuple[float, ...]) -> Box:
-    """A box that is proved to contain the level sets of the winding number w of a mesh. It contains
-    the mesh. Where it is larger than the box of the mesh, two bounds limit it: the level sets reach
-    at most the length (a) beyond the mesh; and off the triangles, at most the length (b) beyond the
-    singular edges.
+    """A box that is proved to contain the level sets, for these levels, of the winding number w of
+    a mesh. It contains the mesh. Where it is larger than the box of the mesh, two proofs bound its
+    size. By (a), the level sets reach at most a certain length beyond the mesh. By (b), off the
+    triangles they reach at most another length beyond the singular edges.
 
     (a) At distance rho from a mesh of this area |w| <= area/(4 pi rho^2). So a level lies within
     rho = sqrt(area/(4 pi |level|)) of the mesh. (b) Off the triangles 4 pi w is, modulo 4 pi, the
@@ -302,8 +303,8 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         order: int = 2,
         cells: bool | float | None = None,
     ) -> None:
-        """Validate the mesh and the options, and choose the method. The parameters are described at
-        the class."""
+        """Validate the mesh and the options, and choose the method. The parameters (vertices,
+        faces, method, accuracy, order, cells) are described at the class."""
         super().__init__()
         if not is_one_of(method, ("auto", "exact", "tree")):
             hint = did_you_mean(method, ("auto", "exact", "tree"))
@@ -390,7 +391,8 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
     def sharp_values_at(self, x: Vec3) -> PointValues:
         """w and its gradient at points x (3, n) in user coordinates, with error bounds. With a
         tree, gradients come from the singular edges (`winding_rates`), unless the user chose the
-        accuracy. Their error is then about 1 % of their length in most places, or far less."""
+        accuracy. The error of a gradient is then about 1 % of the gradient's length in most places,
+        or far less."""
         data = self._batch_data(backend_of(x))
         winding = data.winding
         if not isinstance(winding, TreeWinding) or self.accuracy is not None:
@@ -597,7 +599,8 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
         """A volume that is proved to contain the level sets: all triangles, and the cells around
-        them that are not proved empty (`winding_extent`). It is computed once for these levels."""
+        them that are not proved empty (`winding_extent`). It is computed once for these levels, and
+        is never None."""
         if levels not in self._extents:
             self._extents[levels] = winding_extent(self.with_cells(False), self.mesh, levels)
         return self._extents[levels]
@@ -859,7 +862,8 @@ class _BesideSheets(Field):
     def __init__(
         self, backend: Backend, level: float, behind: JumpCrossing, ahead: JumpCrossing
     ) -> None:
-        """The parameters are described at the class."""
+        """The parameters level, behind and ahead are described at the class. backend: that of the
+        crossings."""
         real = backend.Float
         # A positive jump ahead leads up through the level, so that the field is below it before.
         # After a positive jump behind the field is above it. A jump of 0 means that there is no
