@@ -324,17 +324,17 @@ def test_an_approximate_field_keeps_its_promises() -> None:
 def samples(field: Field, x: np.ndarray, fine: float = 1.0) -> tuple[Sample, Any]:
     """A sample in double precision and a function that makes its numbers arrays (n,) or (n, 3).
 
-    fine: the detail, as `Field.at_detail` takes it.
+    fine: the accuracy scale, as `VariableAccuracy.at` takes it.
     """
     backend = choose_backend("double")
     p, seen = to_vector3(backend, x), field.prepare(backend)
-    if field.has_jumps:
+    if seen.jumps is not None:
         up = backend.Array3f(0, 0, 1)
         nowhere = JumpCrossing(0.0, backend.UInt32(NO_FACET), backend.Float(0), up)
-        ahead = seen.initial_offset(p, up, backend.Float(0), backend.Bool(True))
-        seen = seen.continuation(p, up, nowhere, nowhere, ahead)
-    assert seen.has_variable_accuracy
-    sample = seen.at_accuracy(backend.Float(fine)).evaluate(p)
+        ahead = seen.jumps.initial_offset(p, up, backend.Float(0), backend.Bool(True))
+        seen = seen.jumps.continuation(p, up, nowhere, nowhere, ahead)
+    assert seen.variable_accuracy is not None
+    sample = seen.variable_accuracy.at(backend.Float(fine)).evaluate(p)
 
     def on_host(one: Any) -> np.ndarray:
         array = to_numpy(one) if dr.is_array_v(type(one)) else np.asarray(one)

@@ -116,7 +116,7 @@ def signed_distance(
     x, result = in_batches(backend, estimate, points)
     if method == "lower_bound":
         _check_domain(field, x)
-    if field.has_jumps and method != "lower_bound":
+    if field.jumps is not None and method != "lower_bound":
         # These methods do not see facets: the nearest one of the surface is searched for.
         jump_distance = find_closest(backend, traced, levels, x, lambda message: None).distance
         result = np.copysign(np.fmin(jump_distance, np.abs(result)), result)
@@ -229,7 +229,7 @@ def _find(
     Raises NotImplementedError for a clip or section of a field with jumps.
     """
     if surface.clip_volume is not None:
-        if surface.field.has_jumps:
+        if surface.field.jumps is not None:
             raise NotImplementedError(
                 f"{name} takes no clip and no section of a {type(surface.field).__name__}, which "
                 "jumps: cut its mesh by the volume, and give the winding number of that"
@@ -264,10 +264,10 @@ def _surface(
     """
     target, choices = surface_and_options(verb, surface, options, keywords, _HONORED)
     field = target.field
-    if field.has_jumps and type(field).distance_to_jumps is Field.distance_to_jumps:
+    if field.jumps is not None and not field.jumps.gives_distances:
         raise NotImplementedError(
-            f"{type(field).__name__} has jumps but does not say how far they are: define its "
-            "method distance_to_jumps(p)"
+            f"{type(field).__name__} has jumps but does not say how far they are: define the "
+            f"method distance(p) of its {type(field.jumps).__name__}"
         )
     closely = TraceOptions(tolerance=_RAY_TOLERANCE, over_relaxation=1.0)
     return TracedSurface.of(target, closely).with_call_cache(), choose_backend(

@@ -303,7 +303,7 @@ class BatchedField(Field):
 
 class SumAtDetail(EvaluateOnly):
     """A sum over sources, sampled at one accuracy scale (larger is more accurate; the parameter of
-    `VariableAccuracy.at_accuracy`), with second derivatives. It is made of two functions of a point
+    `VariableAccuracy.at`), with second derivatives. It is made of two functions of a point
     p, a Dr.Jit 3-vector.
 
     evaluate: returns the sample at p: value, gradient and proved bounds of f near p.

@@ -32,7 +32,6 @@ from harnack.backend.validation import (
 from harnack.cluster.dask_arrays import accepts_dask_arrays
 from harnack.enclosures import BoundedLaplacian, HarmonicBall, Lipschitz, TaylorRemainder
 from harnack.fields.batch_evaluation import accepts_numpy_points, evaluate_points
-from harnack.fields.capabilities import CommonBoundary, JumpSurface, PatchUnion, VariableAccuracy
 from harnack.fields.parameters import Parametrized, record_call
 from harnack.fields.samples import Ray, RaySample, Sample, space_scaled, validate_samples
 from harnack.geometry.volume import check_volume
@@ -41,6 +40,7 @@ if TYPE_CHECKING:
     from typing import Self
 
     from harnack.backend import Backend, Precision, Real, Vec3
+    from harnack.fields.capabilities import Boundary, Jumps, ModuloOne, Patches, VariableAccuracy
     from harnack.geometry import Volume
     from harnack.tree.empty_space import OccupancyGrid
 
@@ -74,15 +74,15 @@ _SOLID_METHODS = frozenset(
 )
 
 
-class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, Parametrized, abc.ABC):
+class Field(Parametrized, abc.ABC):
     """A scalar function f on R^3 whose level sets can be traced with a proof. A level is a number,
     and its level set is the surface f = level. A sample at a point holds value and gradient of f
     there, and promises: proved bounds of f near the point. Points p are Dr.Jit 3-vectors, one point
     per lane. A prepared field has its data on a backend (a Dr.Jit device and precision).
 
     Subclasses define `evaluate`. The class attributes are defaults, which an instance may override.
-    The base classes declare optional capabilities: jumps, patches, variable accuracy, and curves at
-    which level sets end. Their defaults describe a field that has none of these.
+    Optional capabilities are objects (`capabilities`): `jumps`, `modulo_one`, `patches`,
+    `boundary` and `accuracy`. They are None for a field that has none of these.
     """
 
     period: ClassVar[float | None] = None
@@ -234,6 +234,40 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, Parametri
         for name, value in attributes.items():
             object.__setattr__(prepared, name, value)  # also of frozen dataclasses
         return prepared
+
+    @property
+    def jumps(self) -> Jumps | None:
+        """The facets across which f jumps; None, the default, for a field without jumps."""
+        return None
+
+    @property
+    def modulo_one(self) -> ModuloOne | None:
+        """How f is sampled up to an unknown integer; None, the default, if it is not."""
+        return None
+
+    @property
+    def patches(self) -> Patches | None:
+        """The patches of a surface that is a union of many level sets, each of a function of its
+        own; None, the default, for a field with one function."""
+        return None
+
+    @property
+    def boundary(self) -> Boundary | None:
+        """The curves and points at which all level sets end; None, the default, if there are
+        none."""
+        return None
+
+    @property
+    def variable_accuracy(self) -> VariableAccuracy | None:
+        """How f is sampled with different accuracy; None, the default, for a single accuracy."""
+        return None
+
+    def with_levels(self, levels: tuple[float, ...]) -> Field:
+        """The field by which the level sets of these levels are traced, not yet prepared for a
+        backend; for example with the boxes of their patches. Equal levels must return the same
+        object. The default is the field itself."""
+        del levels
+        return self
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
         """A volume that is proved to contain every point of the level sets of these levels; None if
@@ -434,7 +468,7 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, Parametri
 
 class EvaluateOnly(Field):
     """A field that consists of its method `evaluate` only, such as the result of
-    `Field.at_accuracy`. Its constructor takes the function that returns the sample at a point."""
+    `VariableAccuracy.at`. Its constructor takes the function that returns the sample at a point."""
 
     def __init__(self, evaluate: Callable[[Vec3], Sample]) -> None:
         self._evaluate = evaluate

@@ -323,7 +323,8 @@ class LiveScene:
         for k, body in enumerate(objects):
             # Surfaces of the same field have the same curves.
             if all(body.surface.field is not other.surface.field for other in objects[:k]):
-                curves += body.surface.field.boundary_curves
+                boundary = body.surface.field.boundary
+                curves += () if boundary is None else boundary.curves
         return {"surfaces": surfaces, "curves": [np.asarray(curve).tolist() for curve in curves]}
 
     def surfaces_at(self, controls: ControlState) -> list[StudioObject]:

@@ -131,7 +131,7 @@ def refine(
         fans = [np.stack([*ends, fan_centers], axis=1) for ends in ((a, b), (b, c), (c, a))]
         smaller_faces = split_faces(vertices, faces[~is_fan], new_vertex[marks.edges[~is_fan]])
         faces = np.concatenate([smaller_faces, *fans])
-    if function.field.has_variable_accuracy:
+    if function.field.variable_accuracy is not None:
         vertices = _converge_vertices(function, vertices, faces, tolerance, walls)
     return vertices, faces
 

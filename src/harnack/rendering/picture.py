@@ -130,7 +130,7 @@ def render(
     up: what is up, "x", "y", "z", "-x", ... or a direction in the surfaces' coordinates; by
         default z.
     boundary_radius: the radius, in the surfaces' coordinates, of a tube around the curves at which
-        surfaces end (`Field.boundary_curves`). boundary_material: its material, by default "gold".
+        surfaces end (`Field.boundary`). boundary_material: its material, by default "gold".
     section_material: what the faces of opaque solids on their `section` are made of.
     isolines: lines on the surfaces, of heights or of another function, where `show` is "path",
         "shaded" or "value": an `Isolines` or several.

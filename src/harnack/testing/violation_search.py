@@ -15,7 +15,7 @@ import numpy as np
 
 from harnack.backend import BoolArray, FloatArray, choose_backend, to_numpy, to_vector3
 from harnack.enclosures import BoundedLaplacian, HarmonicBall, SlopeRange
-from harnack.fields.capabilities import NO_FACET, JumpCrossing
+from harnack.fields.capabilities import NO_FACET, JumpCrossing, exactly_sampled
 
 if TYPE_CHECKING:
     from harnack.backend import Precision
@@ -175,24 +175,21 @@ def lift_along_rays(
 def accumulated_jumps(
     field: Field, start: FloatArray, direction: FloatArray, lengths: FloatArray
 ) -> FloatArray:
-    """An array (n, m): for each of n rays, the sums of the jumps of f across facets between the
-    ray's first point and each of its m points. The field's method `next_jump` reports the jumps one
-    after the other.
-
-    start, direction: (n, 3) the starts of the rays, and unit vectors.
-    lengths: (n, m) the points of a ray are start + t direction for each t of its row.
-    """
+    """(n, m) the sums of the jumps of f across facets between the first point and each other point
+    of a ray. The points are start + t direction for each t of `lengths` (n, m). The field's method
+    `Jumps.next_crossing` reports the jumps one after the other."""
     total = np.zeros_like(lengths)
-    if not field.has_jumps:
+    if field.jumps is None:
         return total
     backend = choose_backend("double")
-    prepared = field.prepare(backend)
+    jumps = field.prepare(backend).jumps
+    assert jumps is not None
     o, d = to_vector3(backend, start), to_vector3(backend, direction)
     # The crossing before the first one is at the start of the ray, on no facet.
     first, last = (backend.Float(np.ascontiguousarray(lengths[:, k])) for k in (0, -1))
     crossing = JumpCrossing(first, backend.UInt32(NO_FACET), backend.Float(0), d)
     while True:
-        crossing = prepared.next_jump(o, d, crossing, last, backend.Bool(True))
+        crossing = jumps.next_crossing(o, d, crossing, last, backend.Bool(True))
         t, jump = (_to_lanes(values, len(start)) for values in (crossing.t, crossing.jump))
         # Rays without another crossing have t = inf.
         is_ahead = np.isfinite(t)
@@ -234,7 +231,7 @@ def _sample(field: Field, points: FloatArray, precision: Precision, closely: boo
     """
     backend = choose_backend(precision)
     prepared = field.prepare(backend)
-    evaluator = prepared.exact(backend) if closely else prepared
+    evaluator = exactly_sampled(prepared, backend) if closely else prepared
     return evaluator.evaluate(to_vector3(backend, points, "points"))
 
 
@@ -399,7 +396,7 @@ class _ViolationSearch:
         """Whether the change of f between two points has to be followed along a path between them,
         because f jumps or is known modulo a period only. Otherwise it is the difference of the
         values."""
-        return self.field.period is not None or self.field.has_jumps
+        return self.field.period is not None or self.field.jumps is not None
 
     def pairs(self, p: FloatArray, w: FloatArray, samples: int = _PATH_SAMPLES) -> _Candidates:
         """Evaluate pairs of points: make the pairs of p (n, 3) and y = p + reach * w, where reach

@@ -160,12 +160,12 @@ class TracedSurface:
                 one level at once.
             NotImplementedError: the field is a union of patches, each with a function of its own.
         """
-        if self.field.has_patches:
+        if self.field.patches is not None:
             raise NotImplementedError(
                 f"{option} takes one function, and this {type(self.field).__name__} has one for "
                 "each patch: trace a patch by itself, such as mesh.face(0) of a polygon mesh"
             )
-        if self.field.has_jumps and len(self.levels) > 1:
+        if self.field.jumps is not None and len(self.levels) > 1:
             raise ValueError(
                 f"{option} takes one level of a field with jumps, such as this "
                 f"{type(self.field).__name__}, not {len(self.levels)}: trace each level by itself"
@@ -285,7 +285,7 @@ class TracedSurface:
         if crosses or self.require_crossing:
             region = intersection_of([self.field.domain, self.clip, self.section])
         field, known_volume = self.evaluator(backend), None
-        if field.has_unknown_branch and all(
+        if field.modulo_one is not None and all(
             abs(math.remainder(level, 1)) > _INTEGER_MARGIN for level in self.level_values
         ):
             # Outside the extent of the levels and of their remainders modulo 1, f is nearer to 0
@@ -342,11 +342,11 @@ def check_has_inside(surface: TracedSurface) -> None:
         return
     if field.period is not None:
         raise ValueError("an angle-valued field has no inside: side needs a real-valued one")
-    if field.has_patches:
+    if field.patches is not None:
         raise ValueError(
             f"a {type(field).__name__} is many surfaces and no closed solid: draw it without side"
         )
-    if field.has_jumps:
+    if field.jumps is not None:
         raise ValueError(
             "a field that jumps has no closed solid: values on one side may end at a facet, with "
             "no level there; draw its level set without side"

@@ -72,7 +72,7 @@ def solid(
     if len(bounds) != 1:
         raise ValueError("give exactly one of below=, above=, between=, around=")
     check_is_field(field)
-    if field.has_jumps:
+    if field.jumps is not None:
         raise ValueError(
             f"{type(field).__name__} jumps across sheets: values on both sides of a level may meet "
             "without any in between, so it bounds no solid"
