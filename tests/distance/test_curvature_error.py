@@ -12,7 +12,8 @@ import pytest
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.distance.surface_curvature import _Derivatives
-from harnack.fields.batched_fields import BatchedField, PointValues, SymmetricMatrix
+from harnack.fields.batched_fields import BatchedField
+from harnack.fmm.point_values import PointValues, SymmetricMatrix
 
 PRECISIONS = ("double", "single")
 

@@ -13,8 +13,8 @@ from harnack.backend import choose_backend
 from harnack.backend.arrays import upload_vectors
 from harnack.distance.cell_classification import taylor_remainder
 from harnack.distance.exclusion_ball import exclusion_radius
+from harnack.enclosures.samples import Sample
 from harnack.fields.analytic.waves import WaveBounds
-from harnack.fields.samples import Sample
 from tests.distance.test_distance import CURVED, surface_points
 
 DOUBLE = choose_backend("double")

@@ -14,7 +14,7 @@ import harnack as hk
 from harnack.backend import choose_backend
 from harnack.distance import cell_search
 from harnack.distance.cell_classification import taylor_remainder
-from harnack.fields.samples import Sample
+from harnack.enclosures.samples import Sample
 from harnack.geometry import example_curves, example_meshes
 from tests.distance.test_distance import CURVED, Bare, surface_points, true_distance, unit
 from tests.distance.test_mesh_distances import beside_faces, distance_to_closed_mesh

@@ -13,9 +13,9 @@ import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.enclosures import SlopeRange, choose_enclosures
 from harnack.enclosures.parabola import ParabolaEnclosure
+from harnack.enclosures.samples import Ray as RayPath
+from harnack.enclosures.samples import RaySample
 from harnack.fields import Field, Sample
-from harnack.fields.samples import Ray as RayPath
-from harnack.fields.samples import RaySample
 
 CENTERS = np.random.default_rng(5).uniform(-0.8, 0.8, (5, 3))
 WIDTH = 0.4

@@ -12,10 +12,10 @@ import pytest
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.enclosures import LevelGaps, choose_enclosures, longest_free_length
+from harnack.enclosures.samples import Ray
 from harnack.fields import Formula
 from harnack.fields.blobs.blob_sums import for_each_record, sum_along
 from harnack.fields.blobs.grid import CellLists
-from harnack.fields.samples import Ray
 from harnack.testing import check_field
 
 KERNELS = {

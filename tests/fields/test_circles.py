@@ -13,8 +13,8 @@ import harnack as hk
 from harnack.backend import backend_of, choose_backend, to_numpy, to_vector3
 from harnack.backend.arrays import upload_floats
 from harnack.enclosures import HarmonicBall
-from harnack.fields.solid_angles.circle_sums import UnitCircle
 from harnack.fields.solid_angles.planar import planar_region
+from harnack.fmm.circle_sums import UnitCircle
 from harnack.geometry import CurveError, example_curves
 from harnack.testing import check_field
 from tests.oracles.circle_oracle import MixedOracle, circle_values

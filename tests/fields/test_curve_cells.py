@@ -15,16 +15,16 @@ import pytest
 import harnack as hk
 from harnack.backend import Precision, choose_backend, to_numpy, to_vector3
 from harnack.backend.record_table import RecordTable
-from harnack.fields.solid_angles import curve_cell_builder
-from harnack.fields.solid_angles.edge_expansion import (
+from harnack.fmm import curve_cell_builder
+from harnack.fmm.edge_expansion import (
     _TERM_ROUNDING,  # pyright: ignore[reportPrivateUsage]
     COEFFICIENTS,
     DEGREE,
     EdgeExpansions,
     _rotated_coefficients,  # pyright: ignore[reportPrivateUsage]
 )
-from harnack.fields.solid_angles.edge_runs import CellEdges, EdgeRuns, VertexTable, subtract_runs
-from harnack.fields.solid_angles.local_expansion import (
+from harnack.fmm.edge_runs import CellEdges, EdgeRuns, VertexTable, subtract_runs
+from harnack.fmm.local_expansion import (
     _AbsoluteValues,  # pyright: ignore[reportPrivateUsage]
     coefficient_keys,
     evaluate_expansion,

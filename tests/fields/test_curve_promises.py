@@ -10,7 +10,7 @@ import pytest
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.enclosures import TaylorRemainder
-from harnack.fields.solid_angles.edges import LoopEdges, sum_over_edges
+from harnack.fmm.edges import LoopEdges, sum_over_edges
 from harnack.geometry import example_curves
 from tests.oracles.oracle import CurveOracle
 

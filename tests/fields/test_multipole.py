@@ -17,8 +17,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from harnack.backend import choose_backend, to_numpy
-from harnack.fields.solid_angles import multipole
-from harnack.fields.solid_angles.multipole import (
+from harnack.fmm import multipole
+from harnack.fmm.multipole import (
     NodeMoments,
     cartesian_coefficients,
     dipole_tree_moments,
@@ -27,8 +27,8 @@ from harnack.fields.solid_angles.multipole import (
     triangle_tree_moments,
     truncation_bounds,
 )
-from harnack.fields.solid_angles.treecode import multipole_terms, node_records
-from harnack.fields.source_sums import max_step_fraction
+from harnack.fmm.source_sums import max_step_fraction
+from harnack.fmm.treecode import multipole_terms, node_records
 from harnack.tree import BalancedTree, build_balanced_tree
 
 ORDERS = [0, 1, 2]

@@ -17,9 +17,10 @@ import pytest
 
 import harnack as hk
 from harnack.backend import Precision, choose_backend, to_numpy, to_vector3
-from harnack.fields.solid_angles import dipole, dipole_cells
-from harnack.fields.solid_angles.dipole_expansion import COEFFICIENTS, DEGREE
-from harnack.fields.solid_angles.local_expansion import (
+from harnack.fields.solid_angles import dipole
+from harnack.fmm import dipole_cells
+from harnack.fmm.dipole_expansion import COEFFICIENTS, DEGREE
+from harnack.fmm.local_expansion import (
     _AbsoluteValues,  # pyright: ignore[reportPrivateUsage]
     coefficient_keys,
     evaluate_expansion,
@@ -29,7 +30,7 @@ from harnack.fields.solid_angles.local_expansion import (
     rounding_tables,
     tail_factors,
 )
-from harnack.fields.solid_angles.multipole import dipole_moments, regular_harmonics
+from harnack.fmm.multipole import dipole_moments, regular_harmonics
 from harnack.geometry import example_curves
 from harnack.testing import check_field
 from tests.oracles.direct_sums import dipole_sum

@@ -13,20 +13,20 @@ from scipy.special import eval_legendre, spherical_in, spherical_kn
 import harnack as hk
 from harnack.backend import choose_backend, to_float, to_numpy, to_vector3
 from harnack.enclosures import HarmonicBall, TaylorRemainder
-from harnack.fields.solid_angles.radial_kernel import dipole_source
-from harnack.fields.solid_angles.radial_tree import (
-    TaylorMoments,
-    cluster_source,
-    coefficients,
-    taylor_tree_moments,
-)
 from harnack.fields.solid_angles.screened import (
     ScreenedWindingNumber,
     YukawaKernel,
     accepting_distance,
     thetas,
 )
-from harnack.fields.solid_angles.treecode import dipole_records
+from harnack.fmm.radial_kernel import dipole_source
+from harnack.fmm.radial_tree import (
+    TaylorMoments,
+    cluster_source,
+    coefficients,
+    taylor_tree_moments,
+)
+from harnack.fmm.treecode import dipole_records
 from harnack.geometry import example_meshes
 from harnack.geometry.clouds import CloudError
 from harnack.geometry.meshes import MeshError

@@ -16,9 +16,9 @@ from harnack.arithmetic.norms import blend_intersection, blend_union
 from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.backend.elementary import safe_norm
 from harnack.enclosures import LevelGaps, choose_enclosures
+from harnack.enclosures.samples import Ray, value_error_bound
 from harnack.enclosures.selection import longest_free_length
 from harnack.fields.formula import Formula
-from harnack.fields.samples import Ray, value_error_bound
 from harnack.fields.solids.fractal import CORNERS, lattice_vector
 from harnack.geometry import example_meshes
 from harnack.meshing.closed_mesh import from_manifold, to_manifold

@@ -13,7 +13,7 @@ import pytest
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.enclosures import choose_enclosures
-from harnack.fields.samples import Ray
+from harnack.enclosures.samples import Ray
 from harnack.geometry import example_curves, validate_loops
 from harnack.geometry.polygons import cancel_opposite_edges
 from tests.oracles.oracle import CurveOracle, first_crossings, gap_to_levels

@@ -12,9 +12,10 @@ import pytest
 
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
-from harnack.fields.solid_angles import dipole_cells, winding_number
-from harnack.fields.solid_angles.dipole_cells import DipoleCells
-from harnack.fields.solid_angles.dipole_expansion import triangle_sources
+from harnack.fields.solid_angles import winding_number
+from harnack.fmm import dipole_cells
+from harnack.fmm.dipole_cells import DipoleCells
+from harnack.fmm.dipole_expansion import triangle_sources
 from harnack.geometry.example_meshes import bumpy_sphere, icosphere, remove_faces
 from tests.fields.test_winding import (
     Mesh,

@@ -7,8 +7,8 @@ import numpy as np
 
 import harnack as hk
 from harnack.backend import choose_backend
-from harnack.fields.solid_angles.edge_lift import FACTOR_ROUNDINGS, LiftedProduct
-from harnack.fields.source_sums import SourceSums, SourceTerm
+from harnack.fmm.edge_lift import FACTOR_ROUNDINGS, LiftedProduct
+from harnack.fmm.source_sums import SourceSums, SourceTerm
 
 UNIT = 2.0**-24  # the largest relative error of one operation
 

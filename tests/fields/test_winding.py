@@ -17,8 +17,8 @@ import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.enclosures import HarmonicBall
 from harnack.fields.solid_angles import winding_rates
-from harnack.fields.solid_angles.trail_sums import TrailValues, closed_trails
 from harnack.fields.solid_angles.winding_number import WindingNumber
+from harnack.fmm.trail_sums import TrailValues, closed_trails
 from harnack.geometry import MeshError
 from harnack.geometry.example_meshes import (
     bumpy_sphere,

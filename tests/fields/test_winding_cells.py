@@ -12,8 +12,8 @@ import pytest
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.enclosures import Levels, Lipschitz, choose_enclosures
+from harnack.enclosures.samples import Ray
 from harnack.fields import Sample
-from harnack.fields.samples import Ray
 from harnack.geometry.example_meshes import bumpy_sphere, icosphere, remove_faces
 from harnack.tracer.branch_tracker import BranchTracker
 from tests.fields.test_winding import (

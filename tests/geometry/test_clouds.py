@@ -325,9 +325,7 @@ def test_a_moved_cloud_is_the_cloud_that_is_there(motion, monkeypatch):
         "turned": u[:, [1, 2, 0]],
         "shuffled": u[np.random.default_rng(1).permutation(len(u))],
     }[motion]
-    monkeypatch.setattr(
-        "harnack.fields.solid_angles.treecode.build_balanced_tree", None
-    )  # no sort again
+    monkeypatch.setattr("harnack.fmm.treecode.build_balanced_tree", None)  # no sort again
     moved = field.with_points(x, x, areas)
     points = np.random.default_rng(2).uniform(-1.5, 1.5, (800, 3))
     z = x - points[:, None]

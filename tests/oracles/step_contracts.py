@@ -26,8 +26,8 @@ from tests.oracles.mutated_enclosure import original_enclosure
 if TYPE_CHECKING:
     from harnack.backend import Precision
     from harnack.enclosures import Enclosure
+    from harnack.enclosures.samples import Sample
     from harnack.fields.field import Field
-    from harnack.fields.samples import Sample
 
 __all__ = ["check_steps"]
 

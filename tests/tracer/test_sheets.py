@@ -34,9 +34,9 @@ from harnack.enclosures import (
 )
 from harnack.enclosures.harmonic_ball import HarnackSlopeEnclosure, SphericalCapEnclosure
 from harnack.enclosures.parabola import TaylorEnclosure
+from harnack.enclosures.samples import Ray as RayPath
 from harnack.fields import Field, Sample
 from harnack.fields.capabilities import NO_FACET, JumpCrossing
-from harnack.fields.samples import Ray as RayPath
 from harnack.rendering.surface_hits import intersect_surface
 from harnack.testing.enclosure_contracts import PromiseCase
 from harnack.tracer import traced_surface

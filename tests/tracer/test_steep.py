@@ -17,7 +17,7 @@ import harnack as hk
 from harnack.arithmetic.operators import tally_of
 from harnack.backend import choose_backend, to_numpy
 from harnack.enclosures import LevelGaps, Levels, choose_enclosures
-from harnack.fields.samples import Ray
+from harnack.enclosures.samples import Ray
 from harnack.tracer.steep import SteepPlace
 
 if TYPE_CHECKING:

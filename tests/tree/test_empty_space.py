@@ -7,9 +7,9 @@ import pytest
 
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
-from harnack.fields.solid_angles.edge_lift import LiftedEdges, lifted_sums
-from harnack.fields.solid_angles.trail_sums import LiftedTrails, closed_trails
 from harnack.fields.solid_angles.winding_number import winding_box
+from harnack.fmm.edge_lift import LiftedEdges, lifted_sums
+from harnack.fmm.trail_sums import LiftedTrails, closed_trails
 from harnack.geometry.example_meshes import icosphere
 from harnack.tree.empty_space import OccupancyGrid, distance_to_occupied
 from harnack.tree.triangle_tree import RayFrame

@@ -10,7 +10,7 @@ import pytest
 
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
-from harnack.fields.solid_angles.multipole import dipole_tree_moments, truncation_bounds
+from harnack.fmm.multipole import dipole_tree_moments, truncation_bounds
 from harnack.geometry.boundary_edges import singular_edges
 from harnack.geometry.example_meshes import icosphere
 from harnack.tree import build_balanced_tree

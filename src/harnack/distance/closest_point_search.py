@@ -50,7 +50,7 @@ from harnack.fields.field import Field
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
     from harnack.enclosures import Levels
-    from harnack.fields.samples import Sample
+    from harnack.enclosures.samples import Sample
     from harnack.geometry import Volume
     from harnack.tracer import TracedSurface
 

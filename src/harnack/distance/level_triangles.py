@@ -19,9 +19,10 @@ import numpy as np
 from harnack.backend import BoolArray, FloatArray, choose_backend
 from harnack.distance.tangent_plane import in_batches
 from harnack.enclosures import Levels
-from harnack.fields.clearance import frame_parameters, level_distance_lower_bound, round_to_single
+from harnack.fields.clearance import level_distance_lower_bound
 from harnack.fields.field import EvaluateOnly
 from harnack.fields.solids.mesh_solid import MeshSolid
+from harnack.fmm.unit_frame import frame_parameters, round_to_single
 from harnack.tree import build_balanced_tree
 from harnack.tree.closest_triangles import initial_squared_distance, next_closest_triangle
 from harnack.tree.triangle_splitting import separates_levels, split_intersecting_faces

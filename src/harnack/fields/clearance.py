@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import abc
 import copy
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, Generic, TypeVar
 
 import drjit as dr
@@ -23,6 +22,7 @@ from harnack.enclosures import LevelGaps, Levels, SlopeRange, choose_enclosures,
 from harnack.fields.batched_fields import BatchedField, SumAtDetail, cached_prepare
 from harnack.fields.capabilities import VariableAccuracy
 from harnack.fields.field import Field
+from harnack.fmm.unit_frame import UnitFrame
 from harnack.tree.empty_space import (
     BoxCells,
     OccupancyGrid,
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from typing import Self
 
     from harnack.backend import Backend, Precision, Real, Vec3
-    from harnack.fields.samples import Sample
+    from harnack.enclosures.samples import Sample
     from harnack.geometry import ConvexHull, Volume
     from harnack.tree.empty_space import Clearance
 
@@ -197,21 +197,6 @@ def level_distance_lower_bound(
     return fmax(backend.Float(distance) - 2 * epsilon * size, 0)
 
 
-@dataclass(frozen=True)
-class UnitFrame:
-    """Data of a field on a backend (a Dr.Jit device and precision), in unit coordinates, in which
-    the data have a size of about 1. A point x in unit coordinates stands for the point p = center +
-    size * x of space. Subclasses add the data."""
-
-    backend: Backend
-    center: Vec3
-    size: Real
-
-    def to_unit(self, p: Vec3) -> Vec3:
-        """The point p of space in unit coordinates: (p - center) / size."""
-        return (self.backend.Array3f(p) - self.center) / self.size
-
-
 Uploaded = TypeVar("Uploaded", bound=UnitFrame)
 
 
@@ -309,31 +294,3 @@ class VariableAccuracyField(DeviceField[Uploaded], BatchedField):
         if self.has_separate_batch_data or device is None or device.backend is not backend:
             return super()._batch_data(backend)
         return device
-
-
-def round_to_single(center: FloatArray) -> FloatArray:
-    """The center (3,) rounded to numbers of single precision, so that subtracting it from nearby
-    points is exact, however far the origin is. Coordinates that are too large for single precision
-    are left as they are."""
-    with np.errstate(over="ignore"):
-        rounded = center.astype(np.float32).astype(np.float64)
-    return np.where(np.isfinite(rounded), rounded, center)
-
-
-def frame_parameters(
-    backend: Backend, center: FloatArray, size: float
-) -> tuple[Backend, Vec3, Real]:
-    """The three attributes of a `UnitFrame`, with center and size as kernel parameters, so that
-    other numbers use the same compiled kernel.
-
-    center: (3,) the point that becomes the origin.
-    size: the length that becomes 1.
-    """
-    opaque = (dr.opaque(backend.Float, float(c)) for c in center)
-    return backend, backend.Array3f(*opaque), dr.opaque(backend.Float, size)
-
-
-def coordinate_rounding(x: Vec3) -> Real:
-    """A bound of the rounding errors of the coordinates of x, a point in unit coordinates
-    (`UnitFrame`), and of the coordinates of data, whose absolute values are about 1."""
-    return float(dr.epsilon(x)) * (1 + dr.max(dr.abs(x)))

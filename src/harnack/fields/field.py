@@ -31,9 +31,9 @@ from harnack.backend.validation import (
 )
 from harnack.cluster.dask_arrays import accepts_dask_arrays
 from harnack.enclosures import BoundedLaplacian, HarmonicBall, Lipschitz, TaylorRemainder
+from harnack.enclosures.samples import Ray, RaySample, Sample, space_scaled, validate_samples
 from harnack.fields.batch_evaluation import accepts_numpy_points, evaluate_points
 from harnack.fields.parameters import Parametrized, record_call
-from harnack.fields.samples import Ray, RaySample, Sample, space_scaled, validate_samples
 from harnack.geometry.volume import check_volume
 
 if TYPE_CHECKING:

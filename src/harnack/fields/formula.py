@@ -34,8 +34,8 @@ from harnack.enclosures import Lipschitz, SlopeRange
 from harnack.enclosures.enclosure import PathPiece
 from harnack.enclosures.parabola import ConvexityEnclosure
 from harnack.enclosures.piecewise_taylor import PiecewiseTaylorEnclosure
+from harnack.enclosures.samples import Ray, RaySample, Sample
 from harnack.fields.field import Field
-from harnack.fields.samples import Ray, RaySample, Sample
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3

@@ -15,8 +15,8 @@ import numpy as np
 from harnack.cluster.serialization import TransientCache
 from harnack.fields.batched_fields import cached_prepare
 from harnack.fields.capabilities import PatchEntry, Patches
-from harnack.fields.clearance import UnitFrame, frame_parameters, round_to_single
 from harnack.fields.field import Field
+from harnack.fmm.unit_frame import UnitFrame, frame_parameters, round_to_single
 from harnack.geometry import Box
 from harnack.tree.closest_triangles import BoxTree
 

@@ -22,7 +22,7 @@ import drjit as dr
 from harnack.backend import Mask, Real, Vec3
 from harnack.backend.elementary import safe_norm as norm
 from harnack.backend.loops import compute_on_active, update_where_active
-from harnack.fields.samples import Sample
+from harnack.enclosures.samples import Sample
 from harnack.tracer import RayStatus
 
 if TYPE_CHECKING:

@@ -26,10 +26,10 @@ from harnack.enclosures import (
     choose_enclosures,
     longest_free_length,
 )
+from harnack.enclosures.samples import Ray
 from harnack.fields.analytic.riemann_surface import RiemannSurface
 from harnack.fields.batched_fields import BatchedField
 from harnack.fields.field import Field, check_is_field
-from harnack.fields.samples import Ray
 from harnack.testing.branch_contracts import check_branch_points
 from harnack.testing.derivative_contracts import check_derivatives
 from harnack.testing.violation_search import (

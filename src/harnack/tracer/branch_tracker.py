@@ -19,13 +19,13 @@ import drjit as dr
 from harnack.backend import backend_of
 from harnack.backend.elementary import fmax, max_norm, safe_norm
 from harnack.enclosures import LevelGaps, Levels, any_is_free
-from harnack.fields.samples import value_error_bound
+from harnack.enclosures.samples import value_error_bound
 from harnack.tracer.level_rule import LevelReading, read_plainly
 
 if TYPE_CHECKING:
     from harnack.backend import Mask, Real
+    from harnack.enclosures.samples import Ray, RaySample, Sample
     from harnack.fields.capabilities import ModuloOne, VariableAccuracy
-    from harnack.fields.samples import Ray, RaySample, Sample
     from harnack.geometry import Volume
     from harnack.tracer.march import MarchState
 

@@ -18,7 +18,7 @@ import drjit as dr
 
 from harnack.backend.elementary import fmax, safe_norm, safe_normalize
 from harnack.backend.loops import loop_while_active
-from harnack.fields.samples import value_error_bound
+from harnack.enclosures.samples import value_error_bound
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3

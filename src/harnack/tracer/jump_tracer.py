@@ -29,8 +29,8 @@ from harnack.tracer.march import March, MarchState
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
+    from harnack.enclosures.samples import Ray
     from harnack.fields.capabilities import Jumps
-    from harnack.fields.samples import Ray
 
 # Facets count as crossed at the same point if they are at most the first number of roundings of the
 # coordinates apart, and the cosine of the angle between them is larger than the second number. The

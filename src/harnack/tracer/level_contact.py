@@ -29,13 +29,13 @@ from harnack.backend.elementary import fmax, fmin, max_norm, safe_norm
 from harnack.backend.loops import loop_while_active
 from harnack.backend.validation import as_real
 from harnack.enclosures import LevelGaps, Levels
+from harnack.enclosures.samples import value_error_bound
 from harnack.fields.capabilities import NO_FACET, JumpCrossing
-from harnack.fields.samples import value_error_bound
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
+    from harnack.enclosures.samples import Ray
     from harnack.fields.field import Field
-    from harnack.fields.samples import Ray
 
 
 class RayStatus(enum.IntEnum):

@@ -15,13 +15,13 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
 from harnack.backend.elementary import fmax, safe_norm
-from harnack.fields.samples import value_error_bound
+from harnack.enclosures.samples import value_error_bound
 
 if TYPE_CHECKING:
     from harnack.backend import Mask, Real
     from harnack.enclosures import LevelGaps, Levels
+    from harnack.enclosures.samples import RaySample
     from harnack.fields.capabilities import VariableAccuracy
-    from harnack.fields.samples import RaySample
 
 
 @dataclass(frozen=True)

@@ -46,8 +46,8 @@ from harnack.tracer.steep import SteepPlace, beyond, down_or_up, largest_change
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
     from harnack.enclosures import LevelGaps, Levels
+    from harnack.enclosures.samples import Ray, RaySample, Sample
     from harnack.fields.field import Field
-    from harnack.fields.samples import Ray, RaySample, Sample
     from harnack.tracer.level_rule import LevelReading, LevelRule
     from harnack.tree.empty_space import EmptySpaceGrid
 

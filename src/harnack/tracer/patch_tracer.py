@@ -27,8 +27,8 @@ from harnack.tracer.march import March, MarchState
 
 if TYPE_CHECKING:
     from harnack.backend import Mask, Real, Vec3
+    from harnack.enclosures.samples import Ray
     from harnack.fields.capabilities import Patches
-    from harnack.fields.samples import Ray
 
 
 @dataclass(frozen=True)

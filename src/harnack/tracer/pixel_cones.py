@@ -24,7 +24,7 @@ import drjit as dr
 
 from harnack.backend.elementary import fmax, fmin, safe_norm
 from harnack.backend.loops import loop_while_active
-from harnack.fields.samples import Ray
+from harnack.enclosures.samples import Ray
 from harnack.tracer.level_contact import PreparedHitTolerance, RayStatus
 from harnack.tracer.level_rule import PlainLevels
 from harnack.tracer.march import March, MarchState

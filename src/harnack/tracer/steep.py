@@ -29,8 +29,8 @@ from harnack.fields.formula import without_alternatives
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
     from harnack.enclosures import LevelGaps, Levels
+    from harnack.enclosures.samples import Ray, Sample
     from harnack.fields.field import Field
-    from harnack.fields.samples import Ray, Sample
 
 # A level may be the value of f up to rounding if its gap is at most the first number times the
 # change of f by rounding on that side, and f changes on the other side by at most the second number

@@ -18,8 +18,8 @@ import drjit as dr
 
 from harnack.backend.elementary import fmax, fmin, max_norm
 from harnack.backend.loops import loop_with_queue
+from harnack.enclosures.samples import Ray
 from harnack.fields.capabilities import NO_FACET, NO_PATCH
-from harnack.fields.samples import Ray
 from harnack.tracer.branch_tracker import BranchTracker
 from harnack.tracer.jump_tracer import JumpTracer
 from harnack.tracer.level_contact import (

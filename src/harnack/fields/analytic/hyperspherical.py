@@ -20,6 +20,7 @@ from harnack.backend.validation import integer
 from harnack.enclosures import Lipschitz, SlopeRange, TaylorRemainder
 from harnack.enclosures.parabola import ParabolaEnclosure, SphereArcEnclosure
 from harnack.enclosures.piecewise_taylor import PiecewiseTaylorEnclosure
+from harnack.enclosures.samples import Ray, RaySample, Sample
 from harnack.fields.analytic.hyperspherical_basis import (
     LARGEST_DEGREE,
     HypersphereRange,
@@ -40,7 +41,6 @@ from harnack.fields.analytic.sphere_bounds import (
 )
 from harnack.fields.field import Field, validate_levels_in_range
 from harnack.fields.parameters import record_call
-from harnack.fields.samples import Ray, RaySample, Sample
 from harnack.geometry.clip_volumes import Ball
 from harnack.geometry.volume import check_volume
 

@@ -18,6 +18,7 @@ from harnack.backend.elementary import fmax, fmin, safe_norm
 from harnack.backend.validation import as_finite, as_positive, integer
 from harnack.enclosures import SlopeRange, TaylorRemainder
 from harnack.enclosures.parabola import ParabolaEnclosure
+from harnack.enclosures.samples import RaySample, space_scaled
 from harnack.fields.analytic.rounding import HarmonicRounding
 from harnack.fields.analytic.solid_harmonics import (
     LARGEST_DEGREE,
@@ -28,13 +29,12 @@ from harnack.fields.analytic.solid_harmonics import (
 from harnack.fields.analytic.sphere_bounds import BallRange, range_of_harmonic
 from harnack.fields.field import Field, Sample
 from harnack.fields.parameters import record_call
-from harnack.fields.samples import RaySample, space_scaled
 from harnack.geometry.clip_volumes import Ball
 from harnack.name_suggestions import is_one_of
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
-    from harnack.fields.samples import Ray
+    from harnack.enclosures.samples import Ray
     from harnack.geometry.volume import Volume
 
 __all__ = ["Lobes"]

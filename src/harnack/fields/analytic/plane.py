@@ -28,6 +28,7 @@ from harnack.backend import backend_of, choose_backend, to_numpy, to_vector3
 from harnack.backend.elementary import max_norm
 from harnack.backend.validation import as_finite
 from harnack.enclosures import HarmonicBall, TaylorRemainder
+from harnack.enclosures.samples import Sample
 from harnack.fields.analytic.branches import (
     ArcSine,
     Branches,
@@ -42,7 +43,6 @@ from harnack.fields.analytic.branches import (
 )
 from harnack.fields.field import Field
 from harnack.fields.formula import Formula, as_jet, probe_jets, warn_if_slow_to_compile
-from harnack.fields.samples import Sample
 from harnack.geometry.clip_volumes import Box, VolumeIntersection
 from harnack.geometry.volume import check_volume
 from harnack.name_suggestions import did_you_mean

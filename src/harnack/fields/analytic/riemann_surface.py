@@ -25,10 +25,10 @@ from harnack.enclosures import Enclosure, HarmonicBall, Lipschitz, SlopeRange, T
 from harnack.enclosures.extremum import BranchPointEnclosure, BranchSample, NearestBranchEnclosure
 from harnack.enclosures.parabola import ParabolaEnclosure
 from harnack.enclosures.piecewise_taylor import PiecewiseTaylorEnclosure
+from harnack.enclosures.samples import Ray, RaySample, Sample
 from harnack.fields.analytic.branches import Branches, Disk, PlaneSegment, complex_of, derivatives
 from harnack.fields.analytic.plane import copied_arguments, make_branches
 from harnack.fields.field import Field
-from harnack.fields.samples import Ray, RaySample, Sample
 from harnack.geometry.clip_volumes import Ball, Box, VolumeIntersection
 
 if TYPE_CHECKING:

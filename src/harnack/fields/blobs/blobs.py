@@ -32,6 +32,7 @@ from harnack.backend.validation import (
     format_vector,
 )
 from harnack.enclosures import Enclosure, LevelGaps, Lipschitz, SlopeRange
+from harnack.enclosures.samples import Ray, RaySample, Sample
 from harnack.fields.batched_fields import cached_prepare
 from harnack.fields.blobs.blob_sums import (
     PIECES,
@@ -57,7 +58,6 @@ from harnack.fields.blobs.group_maximum import (
 from harnack.fields.blobs.kernels import BlobKernel, GaussianKernel, choose_kernel
 from harnack.fields.formula import Formula, is_jet
 from harnack.fields.parameters import record_arguments
-from harnack.fields.samples import Ray, RaySample, Sample
 from harnack.files.molecules import Atoms, read_molecule
 from harnack.geometry import Box
 

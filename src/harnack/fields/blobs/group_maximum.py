@@ -32,9 +32,9 @@ if TYPE_CHECKING:
     from harnack.arithmetic import Jet
     from harnack.backend import Backend, Mask, Real, Vec3
     from harnack.backend.record_table import RecordTable
+    from harnack.enclosures.samples import Ray
     from harnack.fields.blobs.blob_sums import Term
     from harnack.fields.blobs.kernels import BlobKernel
-    from harnack.fields.samples import Ray
 
 
 @dataclass(frozen=True)

@@ -27,6 +27,7 @@ from harnack.backend.validation import (
 )
 from harnack.enclosures import Lipschitz, SlopeRange
 from harnack.enclosures.enclosure import PathPiece
+from harnack.enclosures.samples import Ray, RaySample, Sample
 from harnack.fields.batched_fields import cached_prepare
 from harnack.fields.blobs.blob_sums import (
     PIECES,
@@ -38,7 +39,6 @@ from harnack.fields.blobs.blob_sums import (
     sum_jets,
 )
 from harnack.fields.formula import Formula, is_jet
-from harnack.fields.samples import Ray, RaySample, Sample
 from harnack.geometry import Box
 from harnack.geometry.volume import check_volume
 

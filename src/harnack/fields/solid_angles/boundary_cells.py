@@ -27,13 +27,13 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend import to_numpy, to_vector3
-from harnack.fields.samples import Sample
-from harnack.fields.solid_angles.curve_cell_builder import build_curve_cells
-from harnack.fields.solid_angles.curve_cells import CurveCells
-from harnack.fields.solid_angles.curve_queries import lift_ball, remainder_promises
-from harnack.fields.solid_angles.edges import vertex_rounding
-from harnack.fields.solid_angles.trail_sums import RayLine, closed_trails, lipschitz_along
-from harnack.fields.source_sums import SLOPE_ROUNDINGS, SUM_MARGIN
+from harnack.enclosures.samples import Sample
+from harnack.fmm.curve_cell_builder import build_curve_cells
+from harnack.fmm.curve_cells import CurveCells
+from harnack.fmm.curve_queries import lift_ball, remainder_promises
+from harnack.fmm.edges import vertex_rounding
+from harnack.fmm.source_sums import SLOPE_ROUNDINGS, SUM_MARGIN
+from harnack.fmm.trail_sums import RayLine, closed_trails, lipschitz_along
 from harnack.tree.closest_triangles import distance_lower_bound, jump_sum_within
 from harnack.tree.triangle_tree import RayFrame
 

@@ -27,31 +27,26 @@ import numpy as np
 from harnack.backend import backend_of
 from harnack.backend.elementary import fmax
 from harnack.backend.validation import as_positive, as_real, no_derivatives
-from harnack.fields.batched_fields import PointValues, SymmetricMatrix, sharpened
 from harnack.fields.capabilities import Boundary
-from harnack.fields.clearance import (
-    UnitFrame,
-    VariableAccuracyField,
-    coordinate_rounding,
-    frame_parameters,
-    round_to_single,
-)
+from harnack.fields.clearance import VariableAccuracyField
 from harnack.fields.field import Sample, space_scaled
 from harnack.fields.parameters import record_arguments
 from harnack.fields.solid_angles.cell_options import FieldWithCells
 from harnack.fields.solid_angles.denoised_cloud import DenoisedCloud
-from harnack.fields.solid_angles.dipole_cells import DipoleCells, build_cells
-from harnack.fields.solid_angles.multipole import dipole_tree_moments
 from harnack.fields.solid_angles.oriented_points import OrientedPoints
 from harnack.fields.solid_angles.smoothed import SmoothedSum
-from harnack.fields.solid_angles.treecode import (
+from harnack.fmm.dipole_cells import DipoleCells, build_cells
+from harnack.fmm.multipole import dipole_tree_moments
+from harnack.fmm.point_values import PointValues, SymmetricMatrix, sharpened
+from harnack.fmm.source_sums import SourceSums, SourceTerm, dipole_rounding, final_rounding
+from harnack.fmm.treecode import (
     AddPrimitive,
     Treecode,
     dipole_hierarchy,
     dipole_records,
     records_in_slots,
 )
-from harnack.fields.source_sums import SourceSums, SourceTerm, dipole_rounding, final_rounding
+from harnack.fmm.unit_frame import UnitFrame, coordinate_rounding, frame_parameters, round_to_single
 from harnack.geometry import Box, CloudError, estimate_areas, estimate_normals, validate_cloud
 
 if TYPE_CHECKING:
@@ -59,7 +54,7 @@ if TYPE_CHECKING:
 
     from harnack.backend import Backend, FloatArray, Mask, Real, Vec3
     from harnack.backend.record_table import RecordTable
-    from harnack.fields.solid_angles.multipole import NodeMoments
+    from harnack.fmm.multipole import NodeMoments
     from harnack.geometry import Volume
     from harnack.tree import BalancedTree
 

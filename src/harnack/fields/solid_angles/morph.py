@@ -12,10 +12,11 @@ import numpy as np
 
 from harnack.backend import FloatArray, IntArray
 from harnack.backend.validation import as_positive, as_real
-from harnack.fields.batched_fields import BatchedField, PointValues
+from harnack.fields.batched_fields import BatchedField
 from harnack.fields.field import Field, Sample
 from harnack.fields.solid_angles.morph_slice import MorphSlice
 from harnack.fields.solid_angles.winding_number import WindingNumber
+from harnack.fmm.point_values import PointValues
 from harnack.geometry.meshes import MeshError, validate_mesh
 
 if TYPE_CHECKING:

@@ -28,26 +28,19 @@ from harnack.backend.elementary import fmax
 from harnack.cluster.serialization import TransientCache
 from harnack.enclosures import HarmonicBall
 from harnack.fields.batch_evaluation import evaluate_points
-from harnack.fields.batched_fields import PointValues
-from harnack.fields.clearance import (
-    UnitFrame,
-    VariableAccuracyField,
-    coordinate_rounding,
-    frame_parameters,
-    occupied_cells,
-    round_to_single,
-    tight_extent,
-)
+from harnack.fields.clearance import VariableAccuracyField, occupied_cells, tight_extent
 from harnack.fields.field import Sample
-from harnack.fields.solid_angles.radial_kernel import (
+from harnack.fmm.point_values import PointValues
+from harnack.fmm.radial_kernel import (
     BALL_FRACTION,
     KernelValues,
     RadialKernel,
     RadialSums,
 )
-from harnack.fields.solid_angles.radial_tree import ClusteredDipoles, RadialTreecode
-from harnack.fields.solid_angles.treecode import dipole_records
-from harnack.fields.source_sums import SLOPE_ROUNDINGS, SUM_MARGIN
+from harnack.fmm.radial_tree import ClusteredDipoles, RadialTreecode
+from harnack.fmm.source_sums import SLOPE_ROUNDINGS, SUM_MARGIN
+from harnack.fmm.treecode import dipole_records
+from harnack.fmm.unit_frame import UnitFrame, coordinate_rounding, frame_parameters, round_to_single
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

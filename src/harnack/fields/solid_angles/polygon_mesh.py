@@ -26,11 +26,11 @@ from harnack.backend.elementary import fmin
 from harnack.backend.record_table import RecordTable
 from harnack.cluster.serialization import TransientCache
 from harnack.enclosures import HarmonicBall, Lipschitz
-from harnack.fields.clearance import UnitFrame
 from harnack.fields.field import Field, Ray, RaySample, Sample, space_scaled
 from harnack.fields.patch_boxes import PatchBoxes, PatchField
-from harnack.fields.solid_angles.curve_queries import lift_ball, remainder_promises
-from harnack.fields.solid_angles.edges import (
+from harnack.fields.solid_angles.solid_angle import SolidAngle
+from harnack.fmm.curve_queries import lift_ball, remainder_promises
+from harnack.fmm.edges import (
     Edge,
     LoopEdges,
     inner_product,
@@ -38,9 +38,9 @@ from harnack.fields.solid_angles.edges import (
     sum_over_edges,
     vertex_rounding,
 )
-from harnack.fields.solid_angles.solid_angle import SolidAngle
-from harnack.fields.solid_angles.trail_sums import RayLine, line_rates, lipschitz_along
-from harnack.fields.source_sums import SUM_MARGIN
+from harnack.fmm.source_sums import SUM_MARGIN
+from harnack.fmm.trail_sums import RayLine, line_rates, lipschitz_along
+from harnack.fmm.unit_frame import UnitFrame
 from harnack.geometry.polygon_meshes import PolygonFaces, validate_polygons
 from harnack.tree.closest_triangles import MAX_BOXES
 

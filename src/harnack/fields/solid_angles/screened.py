@@ -23,31 +23,25 @@ from harnack.backend.elementary import fmax, fmin
 from harnack.backend.validation import as_positive
 from harnack.cluster.serialization import TransientCache
 from harnack.enclosures import HarmonicBall, TaylorRemainder
-from harnack.fields.batched_fields import PointValues
-from harnack.fields.clearance import (
-    UnitFrame,
-    VariableAccuracyField,
-    coordinate_rounding,
-    frame_parameters,
-    round_to_single,
-    tight_extent,
-)
+from harnack.fields.clearance import VariableAccuracyField, tight_extent
 from harnack.fields.field import Sample
 from harnack.fields.solid_angles.oriented_points import OrientedPoints
-from harnack.fields.solid_angles.radial_kernel import (
+from harnack.fmm.point_values import PointValues
+from harnack.fmm.radial_kernel import (
     BALL_FRACTION,
     KernelValues,
     RadialKernel,
     RadialSums,
 )
-from harnack.fields.solid_angles.radial_tree import (
+from harnack.fmm.radial_tree import (
     ClusteredDipoles,
     DirectSum,
     RadialSum,
     RadialTreecode,
 )
-from harnack.fields.solid_angles.treecode import dipole_records
-from harnack.fields.source_sums import SECOND_ROUNDINGS, SLOPE_ROUNDINGS, SUM_MARGIN, SourceSums
+from harnack.fmm.source_sums import SECOND_ROUNDINGS, SLOPE_ROUNDINGS, SUM_MARGIN, SourceSums
+from harnack.fmm.treecode import dipole_records
+from harnack.fmm.unit_frame import UnitFrame, coordinate_rounding, frame_parameters, round_to_single
 from harnack.geometry.clouds import estimate_areas, validate_cloud
 from harnack.geometry.meshes import validate_mesh
 from harnack.name_suggestions import did_you_mean

@@ -15,16 +15,16 @@ from typing import TYPE_CHECKING
 import drjit as dr
 
 from harnack.backend.elementary import fmax, fmin
-from harnack.fields.batched_fields import PointValues
-from harnack.fields.clearance import coordinate_rounding
 from harnack.fields.field import Sample
-from harnack.fields.solid_angles.radial_kernel import KernelValues, RadialKernel
-from harnack.fields.solid_angles.radial_tree import (
+from harnack.fmm.point_values import PointValues
+from harnack.fmm.radial_kernel import KernelValues, RadialKernel
+from harnack.fmm.radial_tree import (
     ClusteredDipoles,
     RadialTreecode,
     taylor_tree_moments,
 )
-from harnack.fields.source_sums import SLOPE_ROUNDINGS, SUM_MARGIN
+from harnack.fmm.source_sums import SLOPE_ROUNDINGS, SUM_MARGIN
+from harnack.fmm.unit_frame import coordinate_rounding
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, FloatArray, Real, Vec3

@@ -29,19 +29,14 @@ from harnack.cluster.serialization import TransientCache
 from harnack.enclosures import HarmonicBall, Lipschitz
 from harnack.fields.batch_evaluation import map_batches
 from harnack.fields.capabilities import Boundary, VariableAccuracy
-from harnack.fields.clearance import (
-    DeviceField,
-    UnitFrame,
-    coordinate_rounding,
-    frame_parameters,
-    tight_extent,
-)
+from harnack.fields.clearance import DeviceField, tight_extent
 from harnack.fields.field import Ray, RaySample, Sample, space_scaled
 from harnack.fields.solid_angles.cell_options import FieldWithCells
-from harnack.fields.solid_angles.circle_sums import CircleSet, CircleSums
-from harnack.fields.solid_angles.curve_cell_builder import build_curve_cells
-from harnack.fields.solid_angles.curve_cells import CurveCells, CurveCellSums
-from harnack.fields.solid_angles.curve_queries import (
+from harnack.fields.solid_angles.planar import PlanarRegion, planar_region
+from harnack.fmm.circle_sums import CircleSet, CircleSums
+from harnack.fmm.curve_cell_builder import build_curve_cells
+from harnack.fmm.curve_cells import CurveCells, CurveCellSums
+from harnack.fmm.curve_queries import (
     closest_on_segments,
     continuous_change,
     differentiable_angle,
@@ -50,16 +45,16 @@ from harnack.fields.solid_angles.curve_queries import (
     remainder_promises,
     segment_records,
 )
-from harnack.fields.solid_angles.edges import (
+from harnack.fmm.edges import (
     EdgeSums,
     LoopEdges,
     hessian_over_edges,
     sum_over_edges,
     vertex_rounding,
 )
-from harnack.fields.solid_angles.planar import PlanarRegion, planar_region
-from harnack.fields.solid_angles.trail_sums import RayLine, line_rates, lipschitz_along
-from harnack.fields.source_sums import SECOND_ROUNDINGS, SLOPE_ROUNDINGS, SUM_MARGIN
+from harnack.fmm.source_sums import SECOND_ROUNDINGS, SLOPE_ROUNDINGS, SUM_MARGIN
+from harnack.fmm.trail_sums import RayLine, line_rates, lipschitz_along
+from harnack.fmm.unit_frame import UnitFrame, coordinate_rounding, frame_parameters
 from harnack.geometry import Circle, ConvexHull, is_convex_position, total_length
 from harnack.geometry.curves import CurveError, Loops, cancel_opposite_circles, validate_curves
 from harnack.geometry.polygons import cancel_opposite_edges, remaining_edges

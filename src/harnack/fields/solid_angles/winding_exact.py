@@ -22,12 +22,12 @@ import drjit as dr
 
 from harnack.backend.elementary import fmax
 from harnack.enclosures import Lipschitz
-from harnack.fields.batched_fields import PointValues, SymmetricMatrix
-from harnack.fields.clearance import coordinate_rounding
 from harnack.fields.field import Sample
-from harnack.fields.solid_angles.edge_lift import LiftedEdges, lifted_sums
-from harnack.fields.solid_angles.edges import LoopEdges
-from harnack.fields.solid_angles.trail_sums import (
+from harnack.fmm.edge_lift import LiftedEdges, lifted_sums
+from harnack.fmm.edges import LoopEdges
+from harnack.fmm.point_values import PointValues, SymmetricMatrix
+from harnack.fmm.source_sums import SourceTerm, final_rounding
+from harnack.fmm.trail_sums import (
     LiftedTrails,
     RayLine,
     TrailValues,
@@ -35,7 +35,7 @@ from harnack.fields.solid_angles.trail_sums import (
     line_rates,
     lipschitz_along,
 )
-from harnack.fields.source_sums import SourceTerm, final_rounding
+from harnack.fmm.unit_frame import coordinate_rounding
 from harnack.tree.triangle_tree import RayFrame, TriangleTree
 
 if TYPE_CHECKING:

@@ -16,8 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import FloatArray, IntArray
-from harnack.fields.clearance import round_to_single
-from harnack.fields.solid_angles.multipole import NodeMoments, triangle_tree_moments
+from harnack.fmm.multipole import NodeMoments, triangle_tree_moments
+from harnack.fmm.unit_frame import round_to_single
 from harnack.geometry import MeshError, validate_mesh
 from harnack.geometry.welding import Welded, rounding_of
 from harnack.tree import BalancedTree, build_balanced_tree

@@ -33,7 +33,7 @@ from harnack.backend.elementary import fmax
 from harnack.backend.validation import as_integer_in_range, as_real, no_derivatives
 from harnack.cluster.serialization import TransientCache
 from harnack.enclosures import Lipschitz
-from harnack.fields.batched_fields import BatchedField, PointValues
+from harnack.fields.batched_fields import BatchedField
 from harnack.fields.capabilities import (
     NO_FACET,
     JumpCrossing,
@@ -42,14 +42,7 @@ from harnack.fields.capabilities import (
     NearestFacet,
     VariableAccuracy,
 )
-from harnack.fields.clearance import (
-    DeviceField,
-    UnitFrame,
-    coordinate_rounding,
-    frame_parameters,
-    occupied_cells,
-    tight_extent,
-)
+from harnack.fields.clearance import DeviceField, occupied_cells, tight_extent
 from harnack.fields.field import EvaluateOnly, Field, Sample, space_scaled
 from harnack.fields.solid_angles.boundary_cells import BoundaryCells
 from harnack.fields.solid_angles.cell_options import BuiltCells, FieldWithCells
@@ -58,6 +51,8 @@ from harnack.fields.solid_angles.winding_exact import ExactWinding
 from harnack.fields.solid_angles.winding_mesh import WindingMesh
 from harnack.fields.solid_angles.winding_rates import BoundaryRates, with_rates
 from harnack.fields.solid_angles.winding_tree import TreeWinding
+from harnack.fmm.point_values import PointValues
+from harnack.fmm.unit_frame import UnitFrame, coordinate_rounding, frame_parameters
 from harnack.geometry import Box
 from harnack.name_suggestions import did_you_mean, is_one_of
 from harnack.tree.closest_triangles import (

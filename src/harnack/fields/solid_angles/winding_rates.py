@@ -21,12 +21,12 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend import IntArray
-from harnack.fields.batched_fields import PointValues, SymmetricMatrix, sharpened
-from harnack.fields.clearance import coordinate_rounding
-from harnack.fields.solid_angles.edge_lift import LiftedEdges, edge_rates
-from harnack.fields.solid_angles.trail_sums import closed_trails
 from harnack.fields.solid_angles.winding_mesh import WindingMesh
 from harnack.fields.solid_angles.winding_tree import TreeWinding
+from harnack.fmm.edge_lift import LiftedEdges, edge_rates
+from harnack.fmm.point_values import PointValues, SymmetricMatrix, sharpened
+from harnack.fmm.trail_sums import closed_trails
+from harnack.fmm.unit_frame import coordinate_rounding
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3

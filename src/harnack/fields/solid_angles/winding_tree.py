@@ -33,13 +33,13 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend.elementary import fmax
-from harnack.fields.clearance import coordinate_rounding
-from harnack.fields.solid_angles.dipole_cells import DipoleCells, build_cells
-from harnack.fields.solid_angles.dipole_expansion import TRIANGLE_RATIO, triangle_sources
-from harnack.fields.solid_angles.edge_lift import LiftedEdge, LiftedProduct, LiftedSums
-from harnack.fields.solid_angles.trail_sums import RayLine, add_edge_rates, lipschitz_along
-from harnack.fields.solid_angles.treecode import Treecode
-from harnack.fields.source_sums import SourceSums, final_rounding
+from harnack.fmm.dipole_cells import DipoleCells, build_cells
+from harnack.fmm.dipole_expansion import TRIANGLE_RATIO, triangle_sources
+from harnack.fmm.edge_lift import LiftedEdge, LiftedProduct, LiftedSums
+from harnack.fmm.source_sums import SourceSums, final_rounding
+from harnack.fmm.trail_sums import RayLine, add_edge_rates, lipschitz_along
+from harnack.fmm.treecode import Treecode
+from harnack.fmm.unit_frame import coordinate_rounding
 from harnack.tree.triangle_tree import (
     INVERSE_SQUARES_COLUMN,
     NUMBER_COLUMN,
@@ -55,12 +55,12 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from harnack.backend import Backend, Mask, Real, Vec3
-    from harnack.fields.batched_fields import PointValues
     from harnack.fields.capabilities import JumpCrossing
     from harnack.fields.field import Sample
-    from harnack.fields.solid_angles.trail_sums import Rates
-    from harnack.fields.solid_angles.treecode import AddPrimitive
     from harnack.fields.solid_angles.winding_mesh import WindingMesh
+    from harnack.fmm.point_values import PointValues
+    from harnack.fmm.trail_sums import Rates
+    from harnack.fmm.treecode import AddPrimitive
 
 # The first of three columns that a record has after the columns of `tree.triangle_tree`. They hold
 # for each edge 1 if it is singular, else 0.

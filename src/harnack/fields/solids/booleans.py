@@ -24,10 +24,10 @@ from harnack.backend.elementary import fmax, fmin, max_norm, safe_norm
 from harnack.backend.validation import as_finite
 from harnack.enclosures import Enclosure, Lipschitz
 from harnack.enclosures.extremum import MaximumEnclosure, MaximumOperand, NegatedEnclosure
+from harnack.enclosures.samples import Ray, RaySample, Sample, value_error_bound
 from harnack.fields.capabilities import VariableAccuracy
 from harnack.fields.field import Field
 from harnack.fields.formula import prepare_value, probe_jets
-from harnack.fields.samples import Ray, RaySample, Sample, value_error_bound
 from harnack.fields.solids.solid import FormulaSolid, Solid, SolidOfField, not_a_solid
 from harnack.geometry import Box, VolumeIntersection
 

@@ -24,9 +24,9 @@ from harnack.backend.elementary import fmax, fmin
 from harnack.backend.validation import as_finite, as_positive
 from harnack.enclosures import Enclosure, LevelGaps, Lipschitz
 from harnack.enclosures.piecewise_taylor import PiecewiseTaylorEnclosure
+from harnack.enclosures.samples import Ray, RaySample, Sample
 from harnack.fields.batched_fields import cached_prepare
 from harnack.fields.formula import is_jet
-from harnack.fields.samples import Ray, RaySample, Sample
 from harnack.fields.solids.deformations import Taper, Twist
 from harnack.fields.solids.outline_distance import (
     OutlineEdges,

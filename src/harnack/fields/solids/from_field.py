@@ -21,9 +21,9 @@ from harnack.backend import backend_of
 from harnack.backend.elementary import fmax, fmin, max_norm, safe_norm
 from harnack.backend.validation import as_finite, no_derivatives
 from harnack.enclosures import Enclosure, LevelGaps
+from harnack.enclosures.samples import Ray, RaySample, Sample, value_error_bound
 from harnack.fields.field import Field, check_is_field
 from harnack.fields.formula import Formula, is_jet, prepare_value
-from harnack.fields.samples import Ray, RaySample, Sample, value_error_bound
 from harnack.fields.solids.booleans import Complement, OffsetSolid, lipschitz_of, negated_sample
 from harnack.fields.solids.mesh_solid import looks_like_mesh, solid_of_mesh
 from harnack.fields.solids.solid import Solid, SolidOfField

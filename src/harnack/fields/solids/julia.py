@@ -18,7 +18,7 @@ import drjit as dr
 from harnack.backend.elementary import clamp, fmax, fmin
 from harnack.backend.validation import as_finite, as_integer_in_range
 from harnack.enclosures import Lipschitz
-from harnack.fields.samples import Sample
+from harnack.enclosures.samples import Sample
 from harnack.fields.solids.solid import Solid, ball_around
 
 if TYPE_CHECKING:

@@ -32,13 +32,13 @@ from harnack.backend.elementary import fmin, max_norm
 from harnack.backend.record_table import RecordTable
 from harnack.backend.validation import format_vector
 from harnack.enclosures import Lipschitz
+from harnack.enclosures.samples import Ray as Ray
+from harnack.enclosures.samples import RaySample, Sample
 from harnack.fields.batched_fields import cached_prepare
-from harnack.fields.clearance import UnitFrame, frame_parameters, round_to_single
 from harnack.fields.formula import is_jet
-from harnack.fields.samples import Ray as Ray
-from harnack.fields.samples import RaySample, Sample
 from harnack.fields.solids.solid import Solid, box_around, set_frozen
 from harnack.files.geometry_files import GEOMETRY_SUFFIXES, LoadedMesh, read_geometry
+from harnack.fmm.unit_frame import UnitFrame, frame_parameters, round_to_single
 from harnack.geometry import MeshError, validate_mesh, zero_area_faces
 from harnack.geometry.orientability import is_nonorientable
 from harnack.geometry.welding import Welded

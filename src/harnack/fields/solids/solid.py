@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from harnack.backend import Backend, Real, Vec3
-    from harnack.fields.samples import Sample
+    from harnack.enclosures.samples import Sample
 
 # Extents are widened by this fraction of the coordinates, as the numbers of a shape are rounded to
 # the precision in which it is traced.

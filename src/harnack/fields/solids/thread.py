@@ -28,8 +28,8 @@ from harnack.backend.validation import (
 )
 from harnack.enclosures import Enclosure, LevelGaps, Lipschitz
 from harnack.enclosures.piecewise_taylor import PiecewiseTaylorEnclosure
+from harnack.enclosures.samples import Ray, RaySample, Sample
 from harnack.fields.formula import with_device_numbers
-from harnack.fields.samples import Ray, RaySample, Sample
 from harnack.fields.solids.extrusions import SolidOfRevolution
 from harnack.fields.solids.solid import Solid, set_frozen
 from harnack.name_suggestions import did_you_mean

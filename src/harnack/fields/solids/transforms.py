@@ -20,9 +20,9 @@ from harnack.backend.elementary import max_norm, safe_norm
 from harnack.backend.validation import check_no_derivatives
 from harnack.enclosures import Promise
 from harnack.enclosures.extremum import ScaledEnclosure
+from harnack.enclosures.samples import Ray, RaySample, Sample
 from harnack.fields.formula import as_jet, hessian_error, with_device_numbers
 from harnack.fields.parameters import Parametrized
-from harnack.fields.samples import Ray, RaySample, Sample
 from harnack.fields.solids.solid import FormulaSolid, Solid, SolidOfField
 from harnack.geometry import Ball, ConvexHull
 

@@ -32,10 +32,10 @@ from harnack.backend.validation import (
 )
 from harnack.enclosures import Enclosure, LevelGaps, Lipschitz, Promise, TaylorRemainder
 from harnack.enclosures.piecewise_taylor import PiecewiseTaylorEnclosure
+from harnack.enclosures.samples import Ray, RaySample, Sample
 from harnack.fields.batched_fields import cached_prepare
 from harnack.fields.field import Field
 from harnack.fields.patch_boxes import PatchBoxes, PatchField
-from harnack.fields.samples import Ray, RaySample, Sample
 from harnack.fields.solids.solid import Solid, box_around
 from harnack.geometry.beziers import flatten_bezier
 from harnack.tree.closest_triangles import MAX_BOXES

@@ -31,8 +31,8 @@ import drjit as dr
 
 from harnack.backend.elementary import fmin
 from harnack.enclosures import TaylorRemainder
-from harnack.fields.batched_fields import SymmetricMatrix
-from harnack.fields.source_sums import SUM_MARGIN, SourceSums, SourceTerm
+from harnack.fmm.point_values import SymmetricMatrix
+from harnack.fmm.source_sums import SUM_MARGIN, SourceSums, SourceTerm
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

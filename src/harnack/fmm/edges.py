@@ -27,7 +27,7 @@ import numpy as np
 from harnack.backend import FloatArray
 from harnack.backend.elementary import fmin
 from harnack.backend.record_table import RecordTable
-from harnack.fields.batched_fields import SymmetricMatrix
+from harnack.fmm.point_values import SymmetricMatrix
 from harnack.tree.closest_triangles import squared_distance_to_segment
 
 if TYPE_CHECKING:

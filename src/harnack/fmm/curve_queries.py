@@ -25,12 +25,12 @@ from harnack.backend.arrays import gather_vectors
 from harnack.backend.elementary import clamp
 from harnack.backend.record_table import RecordTable
 from harnack.enclosures import HarmonicBall, TaylorRemainder
-from harnack.fields.solid_angles.edges import inner_product, single_edges, spinor
-from harnack.fields.source_sums import SUM_MARGIN
+from harnack.fmm.edges import inner_product, single_edges, spinor
+from harnack.fmm.source_sums import SUM_MARGIN
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
-    from harnack.fields.solid_angles.edges import LoopEdges
+    from harnack.fmm.edges import LoopEdges
 
 __all__ = [
     "closest_on_segments",

@@ -40,7 +40,7 @@ import numpy.typing as npt
 from harnack.backend import FloatArray, choose_backend, to_numpy
 from harnack.backend.arrays import upload_floats, upload_integers
 from harnack.backend.elementary import fmax, fmin
-from harnack.fields.source_sums import max_step_fraction, remainder_factor
+from harnack.fmm.source_sums import max_step_fraction, remainder_factor
 from harnack.tree import NO_PRIMITIVE, BalancedTree
 
 if TYPE_CHECKING:

@@ -18,8 +18,8 @@ import drjit as dr
 
 from harnack.backend.elementary import fmax, fmin
 from harnack.enclosures import HarmonicBall, Lipschitz, TaylorRemainder
-from harnack.fields.batched_fields import PointValues, SymmetricMatrix
-from harnack.fields.field import Sample
+from harnack.enclosures.samples import Sample
+from harnack.fmm.point_values import PointValues, SymmetricMatrix
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3

@@ -32,20 +32,20 @@ import numpy as np
 from harnack.backend.elementary import clamp, fmax, fmin, max_norm
 from harnack.backend.record_table import RecordTable
 from harnack.enclosures import Lipschitz
-from harnack.fields.clearance import coordinate_rounding
-from harnack.fields.solid_angles.edge_lift import (
+from harnack.fmm.edge_lift import (
     FACTOR_ROUNDINGS,
     STEEP_ROUNDINGS,
     LiftedProduct,
     edge_factor_of_views,
     view_vertex,
 )
-from harnack.fields.solid_angles.edges import Edge, inverse_squares
-from harnack.fields.source_sums import SUM_MARGIN, SourceSums
+from harnack.fmm.edges import Edge, inverse_squares
+from harnack.fmm.source_sums import SUM_MARGIN, SourceSums
+from harnack.fmm.unit_frame import coordinate_rounding
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, FloatArray, IntArray, Mask, Real, Vec3
-    from harnack.fields.solid_angles.edges import LoopEdges
+    from harnack.fmm.edges import LoopEdges
     from harnack.tree.triangle_tree import RayFrame
 
 __all__ = ["LiftedTrails", "RayLine", "add_edge_rates", "line_rates", "lipschitz_along"]

@@ -38,20 +38,20 @@ from harnack.backend import BoolArray, FloatArray, to_numpy, to_vector3
 from harnack.backend.arrays import upload_integers
 from harnack.backend.elementary import fmax
 from harnack.backend.record_table import RecordTable
-from harnack.fields.clearance import coordinate_rounding
-from harnack.fields.solid_angles.dipole_expansion import (
+from harnack.fmm.dipole_expansion import (
     COEFFICIENTS,
     DEGREE,
     DipoleExpansions,
     PendingSources,
     source_tree,
 )
-from harnack.fields.solid_angles.local_expansion import (
+from harnack.fmm.local_expansion import (
     evaluate_expansion,
     local_to_local_matrices,
     rounding_tables,
 )
-from harnack.fields.source_sums import SUM_MARGIN, SourceSums
+from harnack.fmm.source_sums import SUM_MARGIN, SourceSums
+from harnack.fmm.unit_frame import coordinate_rounding
 from harnack.tree import NO_PRIMITIVE
 from harnack.tree.octree_lookup import (
     BALL_MARGIN,
@@ -65,8 +65,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from harnack.backend import Backend, IntArray, Mask, Real, Vec3
-    from harnack.fields.solid_angles.multipole import NodeMoments
-    from harnack.fields.solid_angles.treecode import AddPrimitive, Treecode
+    from harnack.fmm.multipole import NodeMoments
+    from harnack.fmm.treecode import AddPrimitive, Treecode
     from harnack.tree import BalancedTree, PackedTree
 
 # The factors k of `dipole_expansion`, by experiment: sources beyond k radii of a cell's ball from

@@ -27,13 +27,13 @@ import numpy as np
 
 from harnack.backend import FloatArray, IntArray, choose_backend, to_numpy
 from harnack.backend.elementary import fmin
-from harnack.fields.solid_angles.local_expansion import (
+from harnack.fmm.local_expansion import (
     coefficient_keys,
     irregular_harmonics,
     multipole_to_local,
     tail_factors,
 )
-from harnack.fields.solid_angles.multipole import (
+from harnack.fmm.multipole import (
     NodeMoments,
     sup_norm,
     triangle_tree_moments,

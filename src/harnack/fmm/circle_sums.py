@@ -22,11 +22,11 @@ import numpy as np
 
 from harnack.backend.elementary import clamp, fmax, fmin
 from harnack.backend.record_table import RecordTable
-from harnack.fields.batched_fields import SymmetricMatrix
+from harnack.fmm.point_values import SymmetricMatrix
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, FloatArray, Mask, Real, Vec3
-    from harnack.fields.solid_angles.trail_sums import RayLine
+    from harnack.fmm.trail_sums import RayLine
     from harnack.geometry.curves import Circle
 
 __all__ = ["CircleSet", "CircleSums", "UnitCircle"]

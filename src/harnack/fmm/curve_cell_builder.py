@@ -27,11 +27,11 @@ from harnack.backend import BoolArray, FloatArray, IntArray, choose_backend, to_
 from harnack.backend.arrays import upload_integers
 from harnack.backend.elementary import fmax, fmin
 from harnack.backend.record_table import RecordTable
-from harnack.fields.solid_angles.curve_cells import HEADER_SIZE, VERTICES_PER_RECORD, CurveCells
-from harnack.fields.solid_angles.edge_expansion import COEFFICIENTS, DEGREE, EdgeExpansions
-from harnack.fields.solid_angles.edge_runs import EdgeRuns, VertexTable, subtract_runs
-from harnack.fields.solid_angles.edges import Edge, LoopEdges, inverse_squares
-from harnack.fields.solid_angles.local_expansion import local_to_local_matrices, rounding_tables
+from harnack.fmm.curve_cells import HEADER_SIZE, VERTICES_PER_RECORD, CurveCells
+from harnack.fmm.edge_expansion import COEFFICIENTS, DEGREE, EdgeExpansions
+from harnack.fmm.edge_runs import EdgeRuns, VertexTable, subtract_runs
+from harnack.fmm.edges import Edge, LoopEdges, inverse_squares
+from harnack.fmm.local_expansion import local_to_local_matrices, rounding_tables
 from harnack.tree.closest_triangles import squared_distance_to_segment
 from harnack.tree.octree_lookup import (
     BALL_MARGIN,

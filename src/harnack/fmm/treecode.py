@@ -24,15 +24,15 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend.elementary import fmax
-from harnack.fields.batched_fields import SymmetricMatrix
-from harnack.fields.clearance import coordinate_rounding
-from harnack.fields.solid_angles.multipole import (
+from harnack.fmm.multipole import (
     NodeMoments,
     cartesian_coefficients,
     remainder_constants,
     truncation_bounds,
 )
-from harnack.fields.source_sums import SourceSums, SourceTerm, free_radius_fraction
+from harnack.fmm.point_values import SymmetricMatrix
+from harnack.fmm.source_sums import SourceSums, SourceTerm, free_radius_fraction
+from harnack.fmm.unit_frame import coordinate_rounding
 from harnack.tree import (
     NO_PRIMITIVE,
     PackedTree,
@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from harnack.backend import Backend, Mask, Real, Vec3
-    from harnack.fields.batched_fields import PointValues
+    from harnack.fmm.point_values import PointValues
     from harnack.tree import BalancedTree
     from harnack.tree.balanced_tree import FloatArray, PrimitiveBody
 

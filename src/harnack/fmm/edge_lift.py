@@ -28,10 +28,10 @@ import numpy as np
 
 from harnack.backend.elementary import fmax, fmin
 from harnack.backend.record_table import RecordTable
-from harnack.fields.batched_fields import SymmetricMatrix
-from harnack.fields.clearance import coordinate_rounding
-from harnack.fields.solid_angles.edges import Edge, edge_variation, single_edges
-from harnack.fields.source_sums import SourceSums, SourceTerm
+from harnack.fmm.edges import Edge, edge_variation, single_edges
+from harnack.fmm.point_values import SymmetricMatrix
+from harnack.fmm.source_sums import SourceSums, SourceTerm
+from harnack.fmm.unit_frame import coordinate_rounding
 from harnack.tree.triangle_tree import VerticalRayFrame, edge_function
 
 if TYPE_CHECKING:

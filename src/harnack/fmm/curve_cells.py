@@ -34,19 +34,19 @@ import numpy as np
 
 from harnack.backend import to_numpy
 from harnack.backend.elementary import fmin
-from harnack.fields.solid_angles.edge_expansion import COEFFICIENTS, DEGREE
-from harnack.fields.solid_angles.edge_lift import LiftedProduct, edge_factor_of_views, view_vertex
-from harnack.fields.solid_angles.edges import Edge, EdgeSums, inner_product, spinor
-from harnack.fields.solid_angles.local_expansion import evaluate_expansion
-from harnack.fields.solid_angles.trail_sums import add_edge_rates
-from harnack.fields.source_sums import SUM_MARGIN
+from harnack.fmm.edge_expansion import COEFFICIENTS, DEGREE
+from harnack.fmm.edge_lift import LiftedProduct, edge_factor_of_views, view_vertex
+from harnack.fmm.edges import Edge, EdgeSums, inner_product, spinor
+from harnack.fmm.local_expansion import evaluate_expansion
+from harnack.fmm.source_sums import SUM_MARGIN
+from harnack.fmm.trail_sums import add_edge_rates
 from harnack.tree.closest_triangles import squared_distance_to_segment
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, FloatArray, Mask, Real, Vec3
     from harnack.backend.record_table import RecordTable
-    from harnack.fields.solid_angles.edge_lift import VertexView
-    from harnack.fields.solid_angles.trail_sums import RayLine
+    from harnack.fmm.edge_lift import VertexView
+    from harnack.fmm.trail_sums import RayLine
     from harnack.tree.octree_lookup import OctreeLookup
     from harnack.tree.triangle_tree import RayFrame
 

@@ -34,13 +34,13 @@ import numpy as np
 from harnack.backend import FloatArray, to_numpy
 from harnack.backend.arrays import upload_integers
 from harnack.backend.elementary import fmin
-from harnack.fields.solid_angles.edges import inner_product, spinor
-from harnack.fields.solid_angles.local_expansion import coefficient_keys, irregular_harmonics
+from harnack.fmm.edges import inner_product, spinor
+from harnack.fmm.local_expansion import coefficient_keys, irregular_harmonics
 
 if TYPE_CHECKING:
     from harnack.backend import BoolArray, Mask, Real, Vec3
     from harnack.backend.record_table import RecordTable
-    from harnack.fields.solid_angles.edge_runs import CellEdges
+    from harnack.fmm.edge_runs import CellEdges
 
 
 DEGREE = 6

@@ -53,7 +53,7 @@ import numpy as np
 from harnack.backend import FloatArray
 from harnack.backend.elementary import fmax
 from harnack.backend.record_table import RecordTable
-from harnack.fields.solid_angles.radial_kernel import (
+from harnack.fmm.radial_kernel import (
     KernelBounds,
     RadialKernel,
     RadialSums,
@@ -62,7 +62,7 @@ from harnack.fields.solid_angles.radial_kernel import (
     combine_terms,
     dipole_source,
 )
-from harnack.fields.solid_angles.treecode import (
+from harnack.fmm.treecode import (
     ClusterView,
     dipole_hierarchy,
     empty_record,

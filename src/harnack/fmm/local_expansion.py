@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from harnack.backend import FloatArray
-from harnack.fields.solid_angles.multipole import Pairs, regular_harmonics
+from harnack.fmm.multipole import Pairs, regular_harmonics
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
