@@ -246,6 +246,7 @@ class CircleSet:
     ) -> CircleSet:
         """Upload circles to a backend, in unit coordinates: positions relative to `center` (3,),
         and all lengths divided by `size`."""
+        # The 0 at the end pads a record to eight numbers.
         rows = [
             [*(np.array(circle.center) - center) / size, circle.radius / size, *circle.normal, 0.0]
             for circle in circles

@@ -409,6 +409,7 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
         data = self._batch_data(backend_of(x))
         x = data.to_unit(x)
         sums, epsilon = data.dipoles.sums(x, closer, derivatives).sums, data.backend.machine_epsilon
+        # w is 1.0 times the sum. The last argument bounds the rounding of the last operations.
         values = sums.values(1.0, coordinate_rounding(x), 8 * epsilon * dr.abs(sums.value))
         cutoff, slope, second = self._cutoff_errors(data, sums, coordinate_rounding(x))
         values = dataclasses.replace(
@@ -518,6 +519,7 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
         if min_level < _SMALLEST_LEVEL:
             return None
         total = float(self._rows[:, 6].sum())
+        # At `high` there is no level, as screening only makes |w| smaller.
         low, high = 0.0, math.sqrt(total / min_level) * 1.001 + 1e-6
         for _ in range(60):
             distance = 0.5 * (low + high)
