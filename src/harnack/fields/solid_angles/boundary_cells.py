@@ -112,6 +112,7 @@ class BoundaryCells:
             loops,
             points.min(axis=0),
             points.max(axis=0),
+            # The rest is for w at the centers.
             int(_CELL_BYTES_FRACTION * most_bytes),
             near=_NEAR_FACTOR,
             shared=_SHARED_RADII,

@@ -206,6 +206,7 @@ def _plane_of(
     coordinates; the size of the curves, the longest side of their box; and two perpendicular unit
     vectors (2, 3) in the plane, right-handed together with the normal.
     """
+    # Four points of a circle determine its plane.
     points = np.concatenate([*loops, *(circle.polygon(4) for circle in circles)])
     lower, upper = points.min(axis=0), points.max(axis=0)
     size = float((upper - lower).max())
@@ -220,7 +221,7 @@ def _plane_of(
         origin = np.array(circles[0].center)
         x = (points - origin) / size
     else:
-        # The direction in which the points vary least.
+        # The direction in which the points vary least: the last right singular vector.
         normal = np.linalg.svd(x - x.mean(axis=0), full_matrices=False)[2][2]
         origin = points.mean(axis=0)
         x = (points - origin) / size

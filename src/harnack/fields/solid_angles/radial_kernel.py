@@ -342,6 +342,7 @@ def dipole_source(
     inverse = dr.rsqrt(squared)
     distance = squared * inverse
     u2 = inverse * inverse
+    # P_1 = m.z and its gradient, divided by D^2; its Hessian is 0.
     part = PolynomialTerm(dr.dot(m, z) * u2, m * u2)
     terms = combine_terms(
         [part], z, inverse, kernel.at(distance, inverse, 1 + derivatives), derivatives
