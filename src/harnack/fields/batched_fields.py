@@ -120,6 +120,7 @@ class PointValues:
         # Nearer than 4 the second error does not matter, so |x| counts as at least 4.
         inverse = dr.rcp(fmax(dr.norm(x), type(x.x)(4)))
         moment_error = _MOMENT_ROUNDING * weight * dr.square(inverse)
+        # Derivatives of 1/r^2 are 2/r^3 and 6/r^4; the factors 4 and 24 are larger, to spare.
         return dataclasses.replace(
             self,
             error=self.error + underflow + moment_error,
@@ -295,8 +296,8 @@ class BatchedField(Field):
             but no Hessians are asked for, the gradients are computed more accurately, by
             `sharp_values_at`."""
             del backend
-            sharp = derivatives == 1
-            return choose(self.sharp_values_at(x) if sharp else self.values_at(x, derivatives))
+            is_sharp = derivatives == 1
+            return choose(self.sharp_values_at(x) if is_sharp else self.values_at(x, derivatives))
 
         return evaluate_points(points, kernel, precision)
 
@@ -422,7 +423,8 @@ class FieldCache(Generic[Value]):
         value = make()
         if value is not field:
             if id(field) not in self._kept:
-                # Drop the value when the field is deleted.
+                # Drop the value when the field is deleted, if it is still there (None: no error if
+                # not), but not at the end of the program.
                 finalize(field, self._kept.pop, id(field), None).atexit = False
             self._kept[id(field)] = key, {**vars(field)}, value
         return value

@@ -174,6 +174,7 @@ class BoundaryCells:
         frame = RayFrame.along(backend, cell_sums.center, direction)
         change, is_certain = self.cells.change_from_center(cell_sums, frame, x, unit, inside)
         turns, is_clear = self.rays.signed_crossings_between(frame, distance, unit, inside)
+        # The sum of |jump| over the triangles within rounding of x; 0 if there are none.
         on_triangle = jump_sum_within(self.rays, x, _TRIANGLE_ROUNDINGS * unit, inside)
         estimate = (
             dr.gather(real, self.center_values, cell_sums.cell, inside)

@@ -132,6 +132,7 @@ class _PlanarLoop:
 
     def contains(self, point: FloatArray) -> bool:
         """Whether a point (2,) is inside the loop. The point must not lie on the loop."""
+        # A circle, of which `points` has only the center.
         if self.radius > 0:
             return bool(np.linalg.norm(point - self.points[0]) < self.radius)
         a, b = self.points - point, np.roll(self.points, -1, axis=0) - point
@@ -241,6 +242,7 @@ def _are_separated(first: _PlanarLoop, second: _PlanarLoop) -> bool:
     """Whether two loops of a plane, `first` and `second`, are nowhere nearer to each other than
     1e-6 of the size of all curves. One loop may lie inside the other."""
     if first.radius > 0 and second.radius > 0:
+        # Two circles, of which `points` has only the center.
         distance = float(np.linalg.norm(first.points[0] - second.points[0]))
         # They are beside each other, or one is inside the other.
         outer_gap = distance - (first.radius + second.radius)

@@ -425,6 +425,7 @@ class TrailValues:
         """
         backend = self.records.backend
         real, bits = backend.Float, _FloatFormat.of(backend)
+        # Minus the relative error of a product (`_multiplied_by_record`).
         slack = real(-_SIGN_ROUNDINGS * 0.5 * backend.machine_epsilon)
 
         def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:

@@ -691,6 +691,7 @@ class _TriangleJumps(Jumps):
         after: the squared distance and the index of the previous triangle.
         """
         data = self.data_for(p)
+        # data.rays is the tree of triangles.
         facet = next_closest_triangle(
             data.rays, data.to_unit(p), after, dr.square(limit / data.size), active
         )

@@ -95,6 +95,7 @@ class BoundaryRates:
                 real(0), real(0), dr.zeros(type(x), dr.width(x)), SymmetricMatrix.zero(real)
             )
         sums = edge_rates(self.summed, x, derivatives)
+        # real(0): there is no value to be rounded.
         return sums.values(1 / (4 * math.pi), coordinate_rounding(x), real(0))
 
     def sharp(self, x: Vec3) -> PointValues:
