@@ -212,7 +212,8 @@ class BoundaryCells:
         cell_sums, inside = self.cells.sums(x, active)
         sums, rounding = cell_sums.sums, _POINT_ROUNDINGS * unit
         # The solid angle f = 4 pi w. promises: bounds of f's second derivatives on balls around x;
-        # ball: a range of f on a ball.
+        # ball: a range of f on a ball. inverse_squares, inverse_cubes and inverse_fourths: the
+        # integrals of |dp|/D^2, |dp|/D^3 and |dp|/D^4 over the boundary.
         promises = remainder_promises(
             sums.inverse_cubes, sums.inverse_fourths, sums.distance * (1 - SUM_MARGIN) - rounding
         )

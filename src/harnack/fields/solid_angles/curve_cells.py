@@ -313,6 +313,7 @@ class CurveCells:
                 new_rates = add_edge_rates(line, edge, lengths, rates)
                 pairs = zip(new_rates, rates, strict=True)
                 rates = tuple(dr.select(inverse > 0, new, old) for new, old in pairs)
+                # The field is the number w times the vector c.
                 w, c = edge.biot_savart()
                 field = field + dr.select(inverse < 0, w * c, 0)
                 p = q

@@ -113,7 +113,8 @@ class DipoleTree:
         moments: (n, 3) their moments, which are area times normal.
         accuracy: the multipole moments of a node are used at points that are farther from its
             center than this many times its radius.
-        build: a function that builds cells; None for no cells.
+        build: a function that builds cells from the moments of the tree's nodes and the records of
+            the dipoles (in NumPy, and on the backend); None for no cells.
         """
         # Each dipole is a source with one position and one moment, and its own center.
         levels = dipole_tree_moments(tree, points[:, None], moments[:, None], points, points)
@@ -194,6 +195,7 @@ class DipoleTree:
         # Where the field of a single point dominates, shading uses that point's normal. It is
         # reversed, because gradients point inwards: f is larger inside.
         area = dr.norm(nearest_moment)
+        # singularity_distance: the distance of the nearest dipole.
         is_dominated = (
             sums.singularity_distance * sums.singularity_distance < _NEAR_SQUARE_PER_AREA * area
         ) & (area > 0)
@@ -400,6 +402,7 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
         self._center = round_to_single(0.5 * (low + high))
         extent = max(0.5 * float((high - low).max()), math.sqrt(float(self.areas.sum())) / 4)
         self._size = 2.0 ** math.ceil(math.log2(extent))
+        # The hierarchy of the tree of the field from which `with_points` made this one.
         self._given_hierarchy: BalancedTree | None = None
         self._smoothing = (
             0.0 if as_real(smoothing, "smoothing") == 0 else as_positive(smoothing, "smoothing")

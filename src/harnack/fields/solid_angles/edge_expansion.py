@@ -241,6 +241,7 @@ class _EdgePiece:
         stop = dr.select(step > 0, fmin(t + step, type(t)(1)), 1)
         # No short remainder is left for another piece.
         stop = dr.select(1 - stop < 0.3 * (stop - t), 1, stop)
+        # The middle of the piece, the vector along it, and the parameter of its end.
         return cls(dr.fma(vector(0.5 * (t + stop)), e, a), (stop - t) * e, stop)
 
     def sums(self, radius: Real) -> list[Real]:

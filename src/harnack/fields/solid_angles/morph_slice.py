@@ -502,13 +502,15 @@ class MorphSlice(VariableAccuracyField["_SliceBuffers"]):
             tuple of one entry."""
             data = self._batch_data(backend)
             x = data.to_unit(x)
-            # error: the bound of the quadrature's error of f, over both meshes.
+            # error: the bound of the quadrature's error of f, over both meshes. The ratios of a
+            # mesh bound |T| and the integral of |d|^2 of each group, divided by |m|.
             error, gradient = backend.Float(0), backend.Array3f(0)
             for cloud, piece, height in zip(data.clouds, self._pieces, self.heights, strict=True):
                 # With accuracy scale 1 and gradients.
                 sums = cloud.sums(x, 1.0, 1)
                 # q is at most this ratio, as D is at least the height. The kernel does not grow
-                # nearer to the dipoles: hence the factor 1.0.
+                # nearer to the dipoles: hence the factor 1.0. The remainder is the sum of
+                # |m| (3-2q)/((1-q)^2 D^4); q2_d3 is at least the sum of |m|/D^3.
                 ratio = piece.farthest / height
                 remainder = dr.inf
                 if ratio < 1:
@@ -603,6 +605,7 @@ class _SliceBuffers(UnitFrame):
         x = self.to_unit(p)
         radial = self.sums(x, detail, 1)
         sums = radial.sums
+        # Of the rounding of positions (s4 is a sum that bounds it), and of truncation.
         slope_error = dr.fma(
             SLOPE_ROUNDINGS * coordinate_rounding(x), sums.s4, sums.gradient_truncation
         )

@@ -188,8 +188,12 @@ class FaceSolidAngle(Field):
         face = self.face
         backend, x, rounding = face.backend, face.to_unit(p), face.rounding
         sums = sum_over_edges(face.edges, x)
+        # A lower bound, also after rounding. inverse_squares, inverse_cubes and inverse_fourths are
+        # the integrals of |dp|/D^2, |dp|/D^3 and |dp|/D^4 over the curve, with D the distance from
+        # x.
         distance = sums.distance * (1 - SUM_MARGIN) - rounding
         promises = remainder_promises(sums.inverse_cubes, sums.inverse_fourths, distance)
+        # A ball, and a range of the lift on it.
         lift = lift_ball(sums.angle, sums.gradient, sums.inverse_squares, promises)
         # In convex position the lift stays in (-6 pi, 6 pi) on the ball up to the curve.
         is_convex = face.signed_record_count < 0

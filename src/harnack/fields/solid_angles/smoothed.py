@@ -143,6 +143,7 @@ class SmoothedSum:
         """A sample of f at points x: value, gradient, errors and proved bounds of second
         derivatives near x. detail: the accuracy scale; larger is more accurate."""
         radial = self.dipoles.sums(x, detail, 1)
+        # radial: with sums for bounds near x. sums: value, gradient and errors.
         sums = radial.sums
         # The error of the gradient: of positions, and of truncation.
         slope_error = dr.fma(

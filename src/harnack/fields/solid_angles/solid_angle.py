@@ -404,6 +404,10 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
             return self._zero_sample(data, p)
         x = data.to_unit(p)
         sums, errors = data.at_detail(x, self._detail)
+        # errors.value and errors.slope bound the truncation errors of f and its gradient, and
+        # errors.rounding the rounding of f. sums.inverse_squares, inverse_cubes and inverse_fourths
+        # are the integrals of |dp|/D^2, |dp|/D^3 and |dp|/D^4 over the curve, with D the distance
+        # from x.
         epsilon = data.backend.machine_epsilon
         rounding = data.rounding
         # A lower bound of the distance to the curve, also after rounding.
@@ -533,9 +537,9 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         is_off_curve = (distance > 0) & (sums.distance > 2 * data.rounding)
         # By this factor |dp|/D^4 can grow if the distance D is reduced by its rounding.
         growth = dr.select(is_off_curve, dr.square(dr.square(sums.distance / distance)), dr.inf)
-        # With the integrals I3 and I4 of |dp|/D^3 and |dp|/D^4 the sums of `source_sums` are s4 =
-        # I3/4 and s5 = 3 I4/16 (`LiftedEdge.bounds`), and I4 <= I3/distance. The factors 1/3 and
-        # 1/4 in their places are a little larger.
+        # With the integrals I3 (`inverse_cubes`) and I4 of |dp|/D^3 and |dp|/D^4 the sums of
+        # `source_sums` are s4 = I3/4 and s5 = 3 I4/16 (`LiftedEdge.bounds`), and I4 <= I3/distance.
+        # The factors 1/3 and 1/4 in their places are a little larger.
         gradient_error = SLOPE_ROUNDINGS / 3 * unit * sums.inverse_cubes * growth / data.size
         second_error = 0.25 * SECOND_ROUNDINGS * unit * sums.inverse_cubes / sums.distance * growth
         return gradient_error, second_error / (data.size * data.size)
@@ -547,6 +551,7 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         if self._all_cancel:
             return 0 * p.x
         x, unit_radius = data.to_unit(p), radius / data.size + data.rounding
+        # inverse_cubes, inverse_fourths: the integrals of |dp|/D^3 and |dp|/D^4 over the curve.
         sums = data.sums(x)
         distance = sums.distance * (1 - SUM_MARGIN) - data.rounding
         return (
@@ -736,6 +741,7 @@ class _CurveData(UnitFrame):
         `detail` is at most 1, the sums over edges come from that cell. On all other lanes, and if
         there are no cells, all edges are summed. A larger accuracy scale is more accurate."""
         if self.cells is None or self.edges is None:
+            # No truncation errors: all edges are summed.
             return self.sums(x), CellErrors(0.0, 0.0, self.value_rounding)
         cell_sums, is_in_cell = self.cells.sums(x, detail <= 1)
         edge_sums = sum_over_edges(self.edges, x, ~is_in_cell)
