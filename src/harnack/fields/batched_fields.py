@@ -26,7 +26,126 @@ from harnack.fmm.point_values import PointValues, SymmetricMatrix
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Precision, Real, Vec3
+<<<<<<< HEAD
     from harnack.enclosures.samples import Sample
+=======
+    from harnack.fields.samples import Sample
+
+# A bound of the rounding of the sums of dipoles' moments, as a fraction of the total weight. The
+# sums are made in double precision.
+_MOMENT_ROUNDING = 32 * 2.0**-53
+
+
+@dataclass(frozen=True)
+class SymmetricMatrix:
+    """A symmetric 3 x 3 matrix in each lane, as a record of its six entries xx, yy, zz, xy, xz, yz.
+    Loops that add up such matrices (Hessians) keep it in their state."""
+
+    xx: Real
+    yy: Real
+    zz: Real
+    xy: Real
+    xz: Real
+    yz: Real
+
+    @classmethod
+    def zero(cls, real: Any) -> SymmetricMatrix:
+        """The matrix of zeros.
+
+        real: the type of its entries, such as a Dr.Jit Float.
+        """
+        return cls(*(real(0) for _ in range(6)))
+
+    def add_outer_product(self, u: Vec3, v: Vec3) -> SymmetricMatrix:
+        """This matrix plus the symmetric matrix (u v^T + v u^T)/2."""
+        half = 0.5 * v
+        return SymmetricMatrix(
+            dr.fma(u.x, v.x, self.xx),
+            dr.fma(u.y, v.y, self.yy),
+            dr.fma(u.z, v.z, self.zz),
+            self.xy + dr.fma(u.x, half.y, u.y * half.x),
+            self.xz + dr.fma(u.x, half.z, u.z * half.x),
+            self.yz + dr.fma(u.y, half.z, u.z * half.y),
+        )
+
+    def components(self) -> tuple[Real, ...]:
+        """The six entries in the order of the constructor, as a tuple for the state of a loop."""
+        return self.xx, self.yy, self.zz, self.xy, self.xz, self.yz
+
+    def rows(self, vector: Any) -> tuple[Vec3, Vec3, Vec3]:
+        """The three rows of the matrix.
+
+        vector: the type of a row, a Dr.Jit 3-vector.
+        """
+        return (
+            vector(self.xx, self.xy, self.xz),
+            vector(self.xy, self.yy, self.yz),
+            vector(self.xz, self.yz, self.zz),
+        )
+
+
+@dataclass(frozen=True)
+class PointValues:
+    """The value of a field's function f at points and, if requested, its gradient and Hessian, with
+    bounds of their truncation and rounding errors. All are Dr.Jit arrays, with one point per lane.
+
+    error: a bound of the error of `value`.
+    gradient, hessian: None if they were not requested.
+    gradient_error: a bound of the error of `gradient`, as a length.
+    hessian_error: a bound of the error of the second derivative along any line, which is the
+        spectral norm of the Hessian's error.
+    """
+
+    value: Real
+    error: Real
+    gradient: Vec3 | None = None
+    hessian: SymmetricMatrix | None = None
+    gradient_error: Real = 0.0
+    hessian_error: Real = 0.0
+
+    def with_far_field_errors(self, x: Vec3, terms: int, weight: float) -> PointValues:
+        """The same values, with error bounds that also hold at points far away from the field's
+        data. These values are a sum over dipoles.
+
+        x: the points, in coordinates in which the field's data have a size of about 1.
+        terms: the number of terms that were summed.
+        weight: the sum of the absolute weights of all dipoles (the factors of their values).
+
+        Two errors matter only far away. First, a term of a derivative is the product of a factor
+        that falls like |x|^-5 and one that grows like |x|^2, and the first may underflow. Second,
+        where dipoles nearly cancel, the rounding of their summed moments is proportional to the
+        weight of all dipoles, not to the small sum.
+        """
+        smallest = float(dr.smallest(type(x.x)))
+        underflow = 4 * smallest * terms * (1 + dr.squared_norm(x))
+        # Nearer than 4 the second error does not matter, so |x| counts as at least 4.
+        inverse = dr.rcp(fmax(dr.norm(x), type(x.x)(4)))
+        moment_error = _MOMENT_ROUNDING * weight * dr.square(inverse)
+        # Derivatives of 1/r^2 are 2/r^3 and 6/r^4; the factors 4 and 24 are larger, to spare.
+        return dataclasses.replace(
+            self,
+            error=self.error + underflow + moment_error,
+            gradient_error=self.gradient_error + underflow + 4 * moment_error * inverse,
+            hessian_error=self.hessian_error + underflow + 24 * moment_error * dr.square(inverse),
+        )
+
+    def rescaled(self, size: Real) -> PointValues:
+        """The values of the scaled function g(x) = f(x / size) at the points `size` times x, from
+        these values of f at x. Where a number has overflowed, its error is infinite."""
+        gradient, hessian, inverse = self.gradient, self.hessian, 1 / size
+        gradient_error, hessian_error = self.gradient_error, self.hessian_error
+        if gradient is not None:
+            gradient = gradient * inverse
+            is_finite = dr.isfinite(gradient.x) & dr.isfinite(gradient.y) & dr.isfinite(gradient.z)
+            # By the chain rule derivatives of order k are divided by size^k.
+            gradient_error = dr.select(is_finite, gradient_error * inverse, dr.inf)
+        if hessian is not None:
+            hessian = type(hessian)(*(inverse * inverse * entry for entry in hessian.components()))
+            is_finite = dr.isfinite(sum(hessian.components()))
+            hessian_error = dr.select(is_finite, hessian_error * (inverse * inverse), dr.inf)
+        error = dr.select(dr.isfinite(self.value), self.error, dr.inf)
+        return PointValues(self.value, error, gradient, hessian, gradient_error, hessian_error)
+>>>>>>> w-s1
 
 
 class BatchedField(Field):
@@ -179,8 +298,8 @@ class BatchedField(Field):
             but no Hessians are asked for, the gradients are computed more accurately, by
             `sharp_values_at`."""
             del backend
-            sharp = derivatives == 1
-            return choose(self.sharp_values_at(x) if sharp else self.values_at(x, derivatives))
+            is_sharp = derivatives == 1
+            return choose(self.sharp_values_at(x) if is_sharp else self.values_at(x, derivatives))
 
         return evaluate_points(points, kernel, precision)
 
@@ -251,7 +370,8 @@ class FieldCache(Generic[Value]):
         value = make()
         if value is not field:
             if id(field) not in self._kept:
-                # Drop the value when the field is deleted.
+                # Drop the value when the field is deleted, if it is still there (None: no error if
+                # not), but not at the end of the program.
                 finalize(field, self._kept.pop, id(field), None).atexit = False
             self._kept[id(field)] = key, {**vars(field)}, value
         return value

@@ -88,7 +88,8 @@ def tight_extent(
     The box is cut into cells, in several rounds. A cell is left out if its clearance (the proved
     lower bound of the distance from its center to the level sets) is larger than the radius of the
     ball around the cell. In each round the edges of the remaining cells are halved. The polytope
-    contains the cells that remain in the end. If none remains, it contains the whole box.
+    contains the cells that remain in the end. If none remains, it is the polytope around `points`,
+    or if there are no such points, around the whole box.
 
     lower, upper: (3,) corners of the box.
     max_cells: the largest number of cells tested in a round.
@@ -97,6 +98,7 @@ def tight_extent(
         them. Cells inside of it need no test, so they are not tested. None for no such points.
     """
     clearance = clearance_function(field, levels)
+    # The polytope is enlarged by this length, for rounding.
     margin = 1e-4 * float(np.linalg.norm(upper - lower))
     if points is not None:
         # Cells inside the polytope of the given points count as free of levels, since that polytope
@@ -107,7 +109,7 @@ def tight_extent(
         )
         return merge_kdops(given, cells.bounding_kdop(margin)) if len(cells.corners) else given
     cells = nonempty_cells(lower, upper, clearance, max_cells, finest)
-    if not len(cells.corners):  # no level anywhere: any box will do
+    if not len(cells.corners):  # no level anywhere: any volume will do
         cells = BoxCells(np.array(lower)[None], np.array(upper) - np.array(lower))
     return cells.bounding_kdop(margin)
 
@@ -123,7 +125,8 @@ def _clearance_outside(polytope: ConvexHull, clearance: Clearance) -> Clearance:
     """
 
     def clearance_outside(points: FloatArray) -> FloatArray:
-        """The clearances (n,) of points (n, 3) from the level sets outside the polytope."""
+        """The clearances (n,) of points (n, 3) from the part of the level sets that lies outside of
+        `polytope`. For points outside of it they are those from all level sets."""
         # The depth is positive inside.
         depth = (polytope.offsets - points @ polytope.normals.T).min(axis=1)
         outside = depth <= 0

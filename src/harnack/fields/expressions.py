@@ -245,7 +245,7 @@ def _check_call(text: str, node: ast.Call, parameters: Iterable[str], depth: int
         names = ", ".join(_FUNCTIONS)
         hint = did_you_mean(name, _FUNCTIONS)
         raise _formula_error(text, f"{name!r} is no known function, there are {names}{hint}")
-    # Most functions take one argument.
+    # Most functions take one argument. A largest number above 9 counts as no limit in the message.
     fewest, largest = _ARGUMENT_COUNTS.get(name, (1, 1))
     if node.keywords or not fewest <= len(node.args) <= largest:
         count = (

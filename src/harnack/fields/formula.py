@@ -217,9 +217,11 @@ class Formula(Field):
         promises: list[Lipschitz] = []
         for multiple in _RADII:
             radius = fmin(multiple * newton_length, _MAX_RADIUS)
+            # (`_jet` does not use its second argument.)
             jet = self._jet(Jet.over_ball(p, radius), p.x)
             slopes = (0 * p.x + derivative.max_abs for derivative in jet.first_derivatives)
-            # A bound of the length of the gradient, from bounds of its components.
+            # A bound of the length of the gradient, from bounds of its components, and enlarged for
+            # rounding.
             constant = safe_norm(type(p)(*slopes)) * (1 + 1e-5)
             is_known = dr.isfinite(constant) & (radius > 0)
             promises.append(
@@ -332,9 +334,11 @@ class Formula(Field):
             at = Interval.point(p[k])
             # The interval of all coordinates that round to p[k].
             at = at.widened(machine_epsilon(p[k])) if is_rounded else at
+            # A piece of length 0, without second derivatives.
             return Jet(at, (Interval.point(direction[k]),), (), piece_length=zero)
 
         x, y, z = (coordinate(k) for k in range(3))
+        # There is one variable, the length along the direction, and so one derivative.
         (slope,) = self._jet((x, y, z), p.x).first_derivatives
         return zero + slope.midpoint, zero + slope.radius
 

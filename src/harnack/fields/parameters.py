@@ -93,6 +93,7 @@ def record_call(
     except TypeError:
         return
     for name, parameter in signature.parameters.items():
+        # The entries of **kwargs are arguments of their own.
         if parameter.kind is inspect.Parameter.VAR_KEYWORD:
             arguments |= arguments.pop(name, {})
     vars(made)["_constructor_call"] = ConstructorCall.of(maker, arguments)
@@ -132,6 +133,8 @@ class Parametrized:
         parameters = _signature(type(self), call.maker).parameters
         found: dict[str, Any] = {}
         for name in dict.fromkeys((*parameters, *call.given)):
+            # A kept argument; else what the object stores; else a choice that was given, or the
+            # default.
             if name in call.kept:
                 value = call.kept[name]
             elif (value := _stored(self, name)) is _NOTHING and name in call.given:
@@ -185,6 +188,7 @@ class Parametrized:
                     "constructor_arguments()"
                 )
         make = getattr(type(self), call.maker) if call.maker else type(self)
+        # Names that the signature lacks are passed on by the constructor's **kwargs.
         extra = {name: given.pop(name) for name in [*given] if name not in signature.parameters}
         bound = inspect.BoundArguments(signature, cast("Any", given))
         return make(*bound.args, **bound.kwargs, **extra)
@@ -222,6 +226,7 @@ def _stored(made: object, name: str) -> Any:
     for attribute in (f"_{name}", name):
         if attribute in vars(made):
             return vars(made)[attribute]
+        # The class that defines the attribute; `object` if none does.
         kind = next((kind for kind in type(made).__mro__ if attribute in vars(kind)), object)
         if isinstance(vars(kind).get(attribute), property | cached_property):
             return getattr(made, attribute)
@@ -339,6 +344,7 @@ def _shape(value: Any) -> tuple[int, ...] | None:
         return ()
     if not isinstance(value, list | tuple) or not value:
         return None
+    # All entries must have the same shape: then the set holds one.
     shapes = {_shape(entry) for entry in cast("Any", value)}
     shape = shapes.pop()
     return None if shapes or shape is None else (len(cast("Any", value)), *shape)

@@ -246,6 +246,7 @@ class CircleSet:
     ) -> CircleSet:
         """Upload circles to a backend, in unit coordinates: positions relative to `center` (3,),
         and all lengths divided by `size`."""
+        # The 0 at the end pads a record to eight numbers.
         rows = [
             [*(np.array(circle.center) - center) / size, circle.radius / size, *circle.normal, 0.0]
             for circle in circles
@@ -267,7 +268,10 @@ class CircleSet:
             )
             relative = self._relative(row, x)
             circle, a = relative.circle, relative.a
-            # In units of the circle's radius, so that all numbers are of order one.
+            # circle: the unit circle as seen from x, in units of the radius a, so that all numbers
+            # are of order one. Its gradient is `across` times the vector from the axis to the
+            # point, and `axial` along the axis; `third` is the integral of |dp|/D^3.
+            # relative.outward: the vector from the axis to x.
             gradient = dr.fma(vector(circle.across / (a * a)), relative.outward, gradient)
             gradient = dr.fma(vector(circle.axial / a), relative.normal, gradient)
             nearest, farthest = circle.nearest, circle.farthest
@@ -309,6 +313,7 @@ class CircleSet:
             """Add the Hessian of the circle in the record `row` to the total, whose entries are the
             state. Returns the new state."""
             relative = self._relative(row, x)
+            # outward: the vector from the circle's axis to x.
             a, n, outward = relative.a, relative.normal, relative.outward
             f_zz, f_rz_over_r, f_tt = relative.circle.second_derivatives()
             inverse_square = dr.rcp(a * a)

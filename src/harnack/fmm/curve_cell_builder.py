@@ -170,8 +170,10 @@ class _CurveCellBuilder:
                 centers, radius, runs, far, is_last=depth == MAX_DEPTH
             )
             split = np.flatnonzero(~is_leaf)
+            # The index of the first cell of this depth that is not split, and of the first that is.
             self.nodes.append(encode_nodes(is_leaf, self.leaves - int(is_leaf.sum()), split_count))
             split_count += len(split)
+            # self.size: the number of bytes so far.
             if self.size > most_bytes or self.near_record_count >= _MAX_RECORDS:
                 return False
             if not len(split):
@@ -212,7 +214,8 @@ class _CurveCellBuilder:
         is_leaf = (near_count <= self.most_near) & (
             far_bounds.tail <= self.max_tail_ratio * far_bounds.total
         ) | is_last
-        # The runs of near edges, closed again; all other edges go into the expansion.
+        # The runs of near edges, closed again; all other edges go into the expansion. Cells that
+        # are split keep edges up to `parent_ratio` radii, for their octants.
         near_radius = np.where(is_leaf, _NEAR_RADII, self.parent_ratio) * radius
         near_runs, is_kept = runs.restrict_to_near(run, distance <= near_radius[cell])
         near_runs = near_runs.with_apexes(
@@ -257,7 +260,7 @@ class _CurveCellBuilder:
         """The number of bytes of all cells so far: their records, the records of their near edges,
         and the octree with its lookup grid."""
         number_size = np.dtype(self.backend.dtype).itemsize
-        # A record takes a multiple of eight numbers.
+        # A record takes a multiple of eight numbers. A vertex of near edges takes four.
         record = 8 * -(-(HEADER_SIZE + COEFFICIENTS) // 8)
         lookup = OctreeLookup.memory_bytes(sum(len(level) for level in self.nodes))
         return (
@@ -402,6 +405,7 @@ def near_records(
     run_ids = np.flatnonzero(is_leaf[runs.cell])
     first, count, is_open = runs.first[run_ids], runs.count[run_ids], ~runs.is_whole[run_ids]
     leaf_index = (np.cumsum(is_leaf) - 1)[runs.cell[run_ids]]
+    # An open run has two vertices more than its edges have: the apex, and the first vertex again.
     length = count + np.where(is_open, 3, 1)
     per_leaf = np.bincount(leaf_index, length, int(is_leaf.sum())).astype(np.int64)
     record_count = -(-per_leaf // VERTICES_PER_RECORD)

@@ -151,6 +151,9 @@ class CurveCells:
         cell, inside = self.lookup.find_leaf(x)
         active = active & inside
         row = self.records.read_record(cell, active)
+        # The columns of `records`. inverse: 1/radius of the cell's ball. far_least: the least
+        # distance of a far edge from the center. row[10:13]: the gradient of I3 at the center.
+        # row[13] and row[14]: the first record of near edges, and their number.
         inverse, error, slope_error, rounding, far_least, factor, inverse_cubes = row[3:10]
         center = vector(*row[:3])
         u = x - center
@@ -180,6 +183,7 @@ class CurveCells:
             near.inverse_cubes + far_i3,
             near.inverse_fourths + far_i3 / far_free,
         )
+        # The other attributes of `CurveCellSums`, in their order.
         details = (
             error,
             slope_error,
@@ -241,6 +245,7 @@ class CurveCells:
             for k in range(VERTICES_PER_RECORD):
                 q, inverse = vector(*row[4 * k : 4 * k + 3]), row[4 * k + 3]
                 b, b_center = view_vertex(q, frame, x), view_vertex(q, frame, center)
+                # (u, v): the coordinates of a vertex across the ray.
                 offset = dr.abs(b.u) + dr.abs(b.v)
                 is_certain &= offset > _SIDE_ROUNDINGS * unit  # off the vertex
                 slack = _SIDE_ROUNDINGS * unit * (offset + dr.abs(a.u) + dr.abs(a.v))
@@ -254,6 +259,7 @@ class CurveCells:
             return i + 1, p, is_certain, *at_x.parts(), *at_center.parts()
 
         identity = LiftedProduct.identity(real).parts()
+        # No edge leads to the first vertex: the vertex before it may be any.
         start = index(0), vector(0), self.backend.Bool(active), *identity, *identity
         _, _, is_certain, *products = dr.while_loop(start, runs, body, label="from the center")
         at_x, at_center = LiftedProduct(*products[:3]), LiftedProduct(*products[3:])
@@ -307,11 +313,13 @@ class CurveCells:
                 new_rates = add_edge_rates(line, edge, lengths, rates)
                 pairs = zip(new_rates, rates, strict=True)
                 rates = tuple(dr.select(inverse > 0, new, old) for new, old in pairs)
+                # The field is the number w times the vector c.
                 w, c = edge.biot_savart()
                 field = field + dr.select(inverse < 0, w * c, 0)
                 p = q
             return i + 1, p, field, *rates
 
+        # No edge leads to the first vertex: the vertex before it may be any.
         start = (self.backend.UInt32(0), vector(0), cell_sums.expansion_gradient)
         start = (*start, *(self.backend.Float(0) for _ in lengths))
         _, _, field, *rates = dr.while_loop(start, runs, body, label="near edges along")
@@ -418,6 +426,7 @@ def _with_edge(
     the factor's argument: the factor is farther than `slack` from the negative real axis, or there
     is no edge.
     """
+    # 1: all edges count as running from the lower index to the higher one.
     re, im = edge_factor_of_views(a, b, type(slack)(1))
     is_sure = ~is_edge | (dr.abs(im) > slack) | (re > slack)
     return product.times(dr.select(is_edge, re, 1), dr.select(is_edge, im, 0)), is_sure

@@ -79,6 +79,7 @@ def _loop_angle(backend: Backend, vertices: Vec3, x: Vec3) -> Real:
     b = gather_vectors(backend, vertices, next_vertex) - lane_x
     # The edge adds twice the argument of an inner product of spinors. The phase of a vertex's
     # spinor is arbitrary; it enters the two edges at the vertex with opposite signs.
+    # The result of `spinor` ends with the spinor.
     re, im = inner_product(spinor(a)[2], spinor(b)[2])
     return dr.block_sum(2 * dr.atan2(im, re), edge_count)
 
@@ -115,6 +116,7 @@ def closest_on_segments(segments: RecordTable, x: Vec3) -> Vec3:
         return dr.select(is_closer, square, nearest), dr.select(is_closer, point, closest)
 
     start = (segments.backend.Float(dr.inf), vector(0))
+    # The state is the squared distance and the point.
     return segments.for_each(add, start, "nearest edge")[1]
 
 

@@ -429,6 +429,7 @@ def _cell_records(
     # A cell without far primitives has an infinite distance, which must not enter products.
     least = np.minimum(sums.min_distance, 1e3) / margin
     bounds = (sums.error, slope, sums.tail, sums.tail_slope, rounding[:, 0], sums.s4)
+    # The index in two parts, since single precision does not hold large integers exactly.
     near_range = first % _INDEX_BASE, first // _INDEX_BASE, lengths
     head = [centers, inverse, *(bound * margin for bound in bounds), least, *near_range]
     return np.column_stack([*head, sums.coefficients])
@@ -481,8 +482,8 @@ def _octree(
     levels: list[_CellLevel] = []
     centers = np.zeros((1, 3))
     while len(centers):
-        side = half_side / 2 ** len(levels)
-        radius = math.sqrt(3) * side * BALL_MARGIN
+        cell_half_side = half_side / 2 ** len(levels)
+        radius = math.sqrt(3) * cell_half_side * BALL_MARGIN
         is_last = len(levels) == MAX_DEPTH
         # Counting stops above the limit; cells of the last depth need the exact number. With the
         # negative radius `none_stay`, near nodes are replaced by their primitives.
@@ -493,13 +494,16 @@ def _octree(
             root.subset(backend, np.zeros(len(centers), np.int64)),
             to_vector3(backend, centers),
         )
+        # None: primitives are counted, and not stored.
         counts = roots.primitives_of(packed, c, near, none_stay, None, far=False, count_limit=limit)
         count = to_numpy(counts).astype(np.int64)
         is_leaf = np.broadcast_to(count <= max_near, len(centers)) | is_last
         levels.append(_CellLevel(centers, radius, is_leaf, count))
         if is_too_large(levels):
             return None
-        centers = (centers[~is_leaf][:, None] + 0.5 * side * OCTANT_DIRECTIONS).reshape(-1, 3)
+        centers = (centers[~is_leaf][:, None] + 0.5 * cell_half_side * OCTANT_DIRECTIONS).reshape(
+            -1, 3
+        )
     return levels
 
 

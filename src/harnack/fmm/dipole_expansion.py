@@ -202,6 +202,7 @@ class DipoleExpansions:
         ratio = 0.5 * radius / self.min_distance  # 0 where there are no primitives
         error, slope = self.error + self.tail, self.slope + self.tail_slope
         far = self.s4 / (1 - ratio) ** 4, self.min_distance - 0.5 * radius
+        # In the order of the attributes: error, slope, tail, tail_slope, s4, min_distance.
         bounds = _ROUNDED_UP * error, _ROUNDED_UP * slope, 0 * error, 0 * slope, *far
         repeated = (np.repeat(bound, 8) for bound in bounds)
         return DipoleExpansions(shifted.reshape(-1, COEFFICIENTS), *repeated)
@@ -262,7 +263,12 @@ class DipoleExpansions:
                     expansion.tail,
                     expansion.tail_slope,
                 )
-                distance_terms = row[6] * _fourth(expansion.inverse), dr.rcp(expansion.inverse)
+                # expansion.inverse is 1/r, and row[6] the area. The last two numbers are area/r^4,
+                # a term of `s4`, and the distance r, of which the smallest is kept.
+                distance_terms = (
+                    row[6] * _fourth_power(expansion.inverse),
+                    dr.rcp(expansion.inverse),
+                )
                 return [*expansion.coefficients, *bounds, *distance_terms]
             size, error, slope_error, *norms = row[_DIPOLE_SIZE:_TRIANGLE_HEADER_SIZE]
             higher = dict(zip(_TRIANGLE_MOMENTS, row[_TRIANGLE_HEADER_SIZE:], strict=False))
@@ -294,6 +300,7 @@ class DipoleExpansions:
             new = [old + dr.select(active, values, 0) for old, values in pairs]
             return *new, dr.select(active, fmin(minimum, nearest), minimum)
 
+        # Five bounds are sums, and the last attribute is a minimum.
         start = (*([zero] * (COEFFICIENTS + 5)), zero + dr.inf)
         totals = for_each_entry(backend, lists, add, start)
         dr.eval(*totals)
@@ -305,7 +312,7 @@ class DipoleExpansions:
         return cls(coefficients, *bounds, min_distance=columns[-1] / _ROUNDED_UP)
 
 
-def _fourth(number: Any) -> Any:
+def _fourth_power(number: Any) -> Any:
     """Compute the fourth power of a number."""
     square = number * number
     return square * square
@@ -409,13 +416,20 @@ class _ClusterExpansion:
         # radius.
         distance = dr.rcp(self.inverse)
         inverse_gap = dr.rcp(distance - radius)
+        # power: 1/gap^(k+1) for the first degree k that is left out, one more than
+        # `_MULTIPOLE_DEGREE`.
         power = inverse_gap
         for _ in range(_MULTIPOLE_DEGREE + 1):
             power = power * inverse_gap
         error = self.rounding + left_out * power
         slope = self.rounding / radius + slope_left_out * power * inverse_gap
         min_distance = distance - size
-        bounds = self.tail, self.tail_slope, area * _fourth(dr.rcp(min_distance)), min_distance
+        bounds = (
+            self.tail,
+            self.tail_slope,
+            area * _fourth_power(dr.rcp(min_distance)),
+            min_distance,
+        )
         return [*self.coefficients, error, slope, *bounds]
 
 
@@ -550,11 +564,12 @@ class PendingSources:
             """
             square = dr.squared_norm(c - vector(*node.head[:3]))
             enters = square <= dr.square(far_radius + node.head[3])
-            # Only nodes whose ball comes near have near dipoles; the radius is increased a little
-            # against rounding.
+            # Only nodes whose ball comes near have near dipoles; the radius (head[4]) is increased
+            # a little against rounding.
             if are_points and not far:
                 enters &= square <= dr.square(far_radius + node.head[4] * (1 + 1e-9) + 1e-12)
             enters &= node.is_leaf | (node.head[4] > max_node_radius)
+            # Lanes that have counted enough stop.
             if count_limit is not None:
                 enters &= state[0] <= count_limit
 

@@ -126,9 +126,10 @@ class EdgeExpansions:
         Rounding. The value of an expansion at its ball's center is the solid angle there. Each
         edge's part of this angle has two errors (as in `LoopEdges.rounding`). The arithmetic makes
         one of less than 2^-46. The other comes from the ends: their coordinates are below 2^3 and
-        have a relative error of 2^-50, so that the angle changes by less than 2^-46 over the
-        distance of the edge. That distance is more than 2^-9, the radius of the smallest cells. So
-        `_ANGLE_ROUNDING`, counted once for each edge, bounds the sum of both errors.
+        have a relative error of 2^-50, so that the angle changes by less than 2^-46/D, where D is
+        the distance of the edge from the center. D is more than 2^-9, the radius of the smallest
+        cells, so that this is less than 2^-37. So `_ANGLE_ROUNDING`, counted once for each edge,
+        bounds the sum of both errors.
         """
         if not len(edges.cell):
             return cls.zero(n)
@@ -182,6 +183,7 @@ def _over_pieces(
         rows = (points.read_record(point_id, active) for point_id in point_ids)
         a, b = (vector(*row[:3]) - c for row in rows)
         piece = _EdgePiece.of(a, b, t, radius)
+        # The result of `spinor` ends with the spinor.
         re, im = inner_product(spinor(a)[2], spinor(b)[2])
         re, im = dr.fma(zr, re, -(zi * im)), dr.fma(zr, im, zi * re)
         # The product is scaled, as only its argument matters. A factor that makes it 0
@@ -196,8 +198,9 @@ def _over_pieces(
         return j, dr.select(is_last, 0, piece.stop), zr, zi, *new
 
     zero = real(0)
+    # Two bounds, and all coefficients but the first.
     state = (index(0), zero, real(1), zero, *([zero] * (COEFFICIENTS + 1)))
-    return dr.while_loop(state, runs, body, label="far edges")[2:]
+    return dr.while_loop(state, runs, body, label="far edges")[2:]  # without j and t
 
 
 @dataclass(frozen=True)
@@ -238,6 +241,7 @@ class _EdgePiece:
         stop = dr.select(step > 0, fmin(t + step, type(t)(1)), 1)
         # No short remainder is left for another piece.
         stop = dr.select(1 - stop < 0.3 * (stop - t), 1, stop)
+        # The middle of the piece, the vector along it, and the parameter of its end.
         return cls(dr.fma(vector(0.5 * (t + stop)), e, a), (stop - t) * e, stop)
 
     def sums(self, radius: Real) -> list[Real]:
@@ -256,6 +260,8 @@ class _EdgePiece:
         half = 0.5 * dr.norm(self.e)
         area = dr.norm(dr.cross(self.middle, self.e))
         error, slope = _quadrature_errors(dr.norm(self.middle) - radius, half, area, radius)
+        # The rule is for [-1, 1]: half of each weight makes means. |d x e| is `area` for all d on
+        # the piece.
         nodes, weights = np.polynomial.legendre.leggauss(_NODES)
         total: dict[Any, list[Any]] = {}
         for node, weight in zip(nodes.tolist(), (0.5 * weights).tolist(), strict=True):

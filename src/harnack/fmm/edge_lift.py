@@ -259,6 +259,7 @@ class LiftedSums:
         unit: a bound of the rounding of a coordinate.
         """
         (re, im), terms = edge.factor(), edge.terms(self.sums.derivatives, active)
+        # On other lanes the terms are 0.
         sums = self.sums.add_term(terms, True)
         rounding, s4, s5 = edge.bounds(unit)
         # On other lanes the product is multiplied by 1; scaling it again may round it.
@@ -322,6 +323,7 @@ def edge_rates(edges: LiftedEdges, x: Vec3, derivatives: int) -> SourceSums:
         record that is padding has the direction 0 and adds nothing. Returns the new state."""
         p, q, active = vector(*row[:3]), vector(*row[4:7]), row[3] != 0
         edge = LiftedEdge.between(p, q, row[3], row[7], VerticalRayFrame(x), x)
+        # On other lanes the terms are 0.
         sums = SourceSums.from_state(state).add_term(edge.terms(derivatives, active), True)
         _, s4, s5 = edge.bounds(unit)
         s4, s5 = (dr.select(active, bound, 0) for bound in (s4, s5))

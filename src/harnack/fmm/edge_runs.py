@@ -203,7 +203,8 @@ class EdgeRuns:
         to_last = _unit(table.points[self.first + self.count] - center)
         direction_sum = to_first + to_last
         difference = _unit(to_first - to_last)
-        # A vector perpendicular to the difference, on the side of the sum.
+        # A vector perpendicular to the difference, on the side of the sum, from the coordinate axis
+        # that is least parallel to the difference.
         axis = np.eye(3)[np.abs(difference).argmin(axis=1)]
         perpendicular = _unit(axis - (axis * difference).sum(axis=1, keepdims=True) * difference)
         perpendicular *= np.where(

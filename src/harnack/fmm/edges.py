@@ -217,6 +217,7 @@ def _loop_records(loop: FloatArray, run: int) -> FloatArray:
     padding = np.repeat(loop[:1], record_count * run + 1 - len(loop), axis=0)
     path = np.concatenate([loop, padding])  # back to the start, then edges of length 0
     inverse = inverse_squares(path[1:] - path[:-1])
+    # Each vertex with 1/length^2 of the edge that begins at it; no edge begins at the last one.
     rows = np.concatenate([path, np.append(inverse, 0.0)[:, None]], axis=1)
     # Consecutive records share a vertex: the last of one is the first of the next.
     index = np.arange(record_count)[:, None] * run + np.arange(run + 1)[None, :]
@@ -435,6 +436,7 @@ def sum_over_edges(edges: LoopEdges, x: Vec3, active: Mask = True) -> EdgeSums:
             lb, sb, cb = spinor(b)
             re, im = inner_product(ca, cb)
             zr, zi = dr.fma(zr, re, -(zi * im)), dr.fma(zr, im, zi * re)
+            # Only the argument of the product matters: it is scaled, so that it does not overflow.
             if k % _RENORMALIZE_EVERY == _RENORMALIZE_EVERY - 1:
                 scale = dr.rcp(dr.abs(zr) + dr.abs(zi))
                 zr, zi = zr * scale, zi * scale

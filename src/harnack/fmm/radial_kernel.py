@@ -151,7 +151,8 @@ class RadialSums:
             rounding of the sum.
         """
         tail, sums = source.tail, self.sums.add_term(source.terms, active)
-        # What the source adds to q2_d3, q2_d4, s4 and s5; then 0 on lanes that are not active.
+        # tail.second and tail.third are Q_2 and Q_3, tail.inverse and tail.cube 1/d and 1/d^3. What
+        # the source adds to q2_d3, q2_d4, s4 and s5; then 0 on lanes that are not active.
         q2_d3 = source.weight * tail.second * tail.cube
         q3_d4 = source.weight * tail.third * tail.cube * tail.inverse
         bounds = q2_d3, q2_d3 * tail.inverse, q3_d4, q3_d4 * tail.inverse
@@ -342,6 +343,7 @@ def dipole_source(
     inverse = dr.rsqrt(squared)
     distance = squared * inverse
     u2 = inverse * inverse
+    # P_1 = m.z and its gradient, divided by D^2; its Hessian is 0.
     part = PolynomialTerm(dr.dot(m, z) * u2, m * u2)
     terms = combine_terms(
         [part], z, inverse, kernel.at(distance, inverse, 1 + derivatives), derivatives

@@ -188,6 +188,7 @@ class RadialTreecode(RadialSum):
             """Add the cluster `node` to the sums, whose `parts` are the state, on lanes on which it
             is far. Returns the new state."""
             length = dr.sqrt(node.square)
+            # node.r leads from the center of the cluster to x; z leads back.
             cluster = cluster_source(
                 node.head, node.payload, -node.r, length, self.kernel, derivatives
             )
@@ -225,10 +226,11 @@ def cluster_source(
     bounds = kernel.bounds(nearest, 6)
     tail = KernelBounds.of(nearest, inverse_nearest, bounds)
     fourth, fifth, sixth = bounds[2:]
-    # The errors of the module. Let r = D and q = R/r, with the radius R. A dipole m_i at the offset
-    # d_i from the center has an error of at most Q_4 |m_i| |d_i|^3 (4-3q)/((1-q)^2 r^5) of the
-    # value, and similar ones of the derivatives. The sum of |m_i| |d_i|^3 is the third moment
-    # c[23], and 1/((1-q)^j r^(j+3)) is 1/r^3 times 1/nearest^j, as nearest = (1-q) r.
+    # bounds: Q_2 to Q_6 of the kernel. The errors of the module. Let r = D and q = R/r, with the
+    # radius R. A dipole m_i at the offset d_i from the center has an error of at most Q_4 |m_i|
+    # |d_i|^3 (4-3q)/((1-q)^2 r^5) of the value, and similar ones of the derivatives. The sum of
+    # |m_i| |d_i|^3 is the third moment c[23], and 1/((1-q)^j r^(j+3)) is 1/r^3 times 1/nearest^j,
+    # as nearest = (1-q) r.
     q = radius * inverse
     common = c[23] * inverse * inverse * inverse * inverse_nearest * inverse_nearest
     error = common * fourth * dr.fma(-3, q, 4)

@@ -418,7 +418,7 @@ class SourceSums:
         b: the largest ratio of t to the distance of a source from x.
         r: b times the distance to the nearest singular point, or less.
         """
-        return dr.fma(_chord_slope(b) * r, self.s5, 3 * self.s4)
+        return dr.fma(_chord_slope(b) * r, self.s5, 3 * self.s4)  # `_chord_slope(b)`: rise
 
 
 def _chord_slope(b: float) -> float:

@@ -183,14 +183,15 @@ def add_edge_rates(
     right angle. So the edge, seen along the line, runs from m to m + n, and the line is seen as the
     point 0: rho' is the distance of this segment from 0. Also c = v . (m x n). So c is small if m
     and n are, whatever the lengths of a and e: its error is at most 8 epsilon |m| |e| plus slack
-    |n|, where slack bounds the rounding of positions (`RayLine.slack`). Twice that is added.
+    |n|, where slack bounds the rounding of positions (`RayLine.slack`). To |c| the first part and
+    twice the second are added.
     """
     a, e, inverse, slack = edge.a, edge.e, edge.inverse_square_length, line.slack
     epsilon = float(dr.epsilon(type(inverse)))
     m, n = dr.cross(a, line.v), dr.cross(e, line.v)
     c = dr.abs(dr.dot(line.v, dr.cross(m, n)))
     quarter = 0.25 * dr.rcp(inverse)  # h^2
-    # Enlarged by twice its error.
+    # Enlarged by the bound of its error: 16 |m| h is 8 |m| |e|.
     c += 16 * epsilon * dr.norm(m) * dr.sqrt(quarter) + 2 * slack * dr.norm(n)
     square = dr.squared_norm(n)
     # rho': the point m + t n of the segment that is nearest to 0.
@@ -296,11 +297,12 @@ class _AngleProduct:
 
         The factor's argument lies in [-pi, pi]. So it moves theta at most one half plane forward,
         or, if the sign bit of y' is set, at most one back; and it does so exactly if the sign of y
-        changes. That holds for the computed y as well. Its sign differs from that of the exact
-        value only if the two terms of y cancel. Then the exact theta is close to the same multiple
-        of pi that the count of half turns has crossed: about +-pi for arguments of like signs and y
-        x' < 0, and about 0 for arguments of unlike signs. A term that underflows keeps its sign
-        bit.
+        changes.
+
+        Rounding. The computed y has another sign than the exact y only if the two terms of y nearly
+        cancel. Then the exact theta is near a multiple of pi, and just this multiple is what the
+        count of half turns crosses, or does not cross, wrongly. So theta is off by a rounding error
+        only. A term that underflows keeps its sign bit.
         """
         x = dr.fma(self.x, factor[0], -(self.y * factor[1]))
         y = dr.fma(self.x, factor[1], self.y * factor[0])
@@ -361,12 +363,12 @@ class TrailValues:
         """
         rows: list[FloatArray] = []
         for trail in closed_trails(edges):
-            count = len(trail) - 1
-            record_count = -(-count // _EDGES_PER_RECORD)
+            edge_count = len(trail) - 1
+            record_count = -(-edge_count // _EDGES_PER_RECORD)
             first = _EDGES_PER_RECORD * np.arange(record_count)[:, None]
             # The last record repeats the last vertex: its remaining edges have length 0.
-            index = np.minimum(first + np.arange(_EDGES_PER_RECORD + 1), count)
-            edge_counts = np.minimum(count - first, _EDGES_PER_RECORD)
+            index = np.minimum(first + np.arange(_EDGES_PER_RECORD + 1), edge_count)
+            edge_counts = np.minimum(edge_count - first, _EDGES_PER_RECORD)
             rows.append(
                 np.concatenate([vertices[trail[index]].reshape(record_count, -1), edge_counts], 1)
             )
@@ -423,6 +425,7 @@ class TrailValues:
         """
         backend = self.records.backend
         real, bits = backend.Float, _FloatFormat.of(backend)
+        # Minus the relative error of a product (`_multiplied_by_record`).
         slack = real(-_SIGN_ROUNDINGS * 0.5 * backend.machine_epsilon)
 
         def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
@@ -459,7 +462,8 @@ def _multiplied_by_record(
     zero, where rounding has the least effect.
     """
     z, margin = _AngleProduct(*state[:3]), state[3]
-    # Products shorter than this count as nearly underflowed.
+    # Products shorter than this count as nearly underflowed. Single precision has a mantissa of
+    # fewer than 50 bits.
     min_length = 2.0**-100 if bits.mantissa < 50 else 2.0**-800
     a = _relative_vertex(bits, row[0:3], x)
     record_product: _AngleProduct | None = None
@@ -575,7 +579,8 @@ class LiftedTrails:
         trails: arrays of indices of vertices; each ends with the vertex with which it begins
             (`closed_trails`).
         """
-        # The number of records, times a number proportional to the memory of one.
+        # run: the number of edges in a record. The key is the number of records, times a number
+        # proportional to the memory of one.
         run = min(
             _RECORD_SIZES,
             key=lambda run: sum(-(-(len(t) - 1) // run) for t in trails) * (run + 0.5),
@@ -688,9 +693,10 @@ def _trail_records(vertices: FloatArray, trail: IntArray, run: int) -> FloatArra
     trail: indices of vertices, the last equal to the first.
     run: the number of edges in a record.
     """
-    count = len(trail) - 1
-    record_count = -(-count // run)
-    index = np.minimum(run * np.arange(record_count)[:, None] + np.arange(run + 1), count)
+    edge_count = len(trail) - 1
+    record_count = -(-edge_count // run)
+    # For each record, the positions of its vertices in the trail. Consecutive records share one.
+    index = np.minimum(run * np.arange(record_count)[:, None] + np.arange(run + 1), edge_count)
     path = trail[index]
     start, end = path[:, :-1], path[:, 1:]
     inverse = inverse_squares((vertices[end] - vertices[start]).reshape(-1, 3)).reshape(

@@ -352,6 +352,7 @@ class Treecode:
         coarse_bounds = [
             truncation_bounds(level, coarse_ratio * level.radius, order) for level in levels
         ]
+        # Level 0 has the leaves, and the first bound is that of the value.
         error_ratio = _median_ratio(coarse_bounds[0][0], fine_bounds[0][0])
         nodes: list[FloatArray] = []
         # The largest ratios, over all nodes, of the error of the gradient and of second derivatives

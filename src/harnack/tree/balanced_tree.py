@@ -210,6 +210,7 @@ def _box_sizes(positions: FloatArray) -> FloatArray:
     coordinates of the w points of each node; NaN marks an empty slot."""
     if positions.shape[2] > _MAX_LOOPED_ROW:
         return np.fmax.reduce(positions, axis=2) - np.fmin.reduce(positions, axis=2)
+    # For short rows a loop over their places takes less time.
     low = high = positions[..., 0]
     for k in range(1, positions.shape[2]):
         low, high = np.fmin(low, positions[..., k]), np.fmax(high, positions[..., k])
@@ -363,6 +364,8 @@ def traverse(tree: PackedTree, visit: Visit, state: LoopValues, active: Mask = T
         """Visit node i. Returns the index of the node to visit next, which is its first child or
         the node after its subtree, and then the new state."""
         head = tree.head(i)
+        # head[6]: the node after the subtree. head[7]: the number of the leaf, or minus the index
+        # of the first child. The root is nobody's child, so that this is never -0.
         is_leaf, number = head[7] >= 0, index(dr.abs(head[7]))
         node = VisitedNode(tree, i, tuple(head[:6]), number, is_leaf)
         descend, state = visit(node, state)

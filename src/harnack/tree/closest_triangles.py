@@ -215,6 +215,7 @@ def initial_squared_distance(triangles: TriangleTree, x: Vec3) -> Real:
     """An upper bound of the squared distance from points x to the triangles of a tree. A search
     that starts with it skips most boxes at once. It is the squared distance to a corner of a
     triangle in a nearby leaf, rounded up."""
+    # Column 0: the first corner of a triangle.
     square, pad = (
         squared_distance_in_nearby_leaf(triangles.tree, x, 0),
         _distance_rounding(triangles, x),
@@ -248,6 +249,8 @@ def squared_distance_in_nearby_leaf(tree: PackedTree, x: Vec3, column: int) -> R
         head = tree.head(i)
         middle = 0.5 * (vector(*head[:3]) + vector(*head[3:6]))
         square = dr.squared_norm(middle - x)
+        # head[6]: the node after the subtree. head[7]: the number of the leaf, or minus the first
+        # child.
         is_nearer, following = square < best, index(head[6])
         best = dr.select(is_nearer, square, best)
         # The index of the leaf, or of the first child.
@@ -271,6 +274,7 @@ def squared_distance_in_nearby_leaf(tree: PackedTree, x: Vec3, column: int) -> R
     start = (
         index(0), index(tree.node_count), real(dr.inf), index(0), index(0), index(NO_TRIANGLE),
     )  # fmt: skip
+    # Entry 5 of the state is the leaf.
     leaf = dr.while_loop(start, is_running, body, label="to a leaf")[5]
 
     def add(slot: Any, square: Real) -> LoopValues:

@@ -4,7 +4,8 @@ face, it is divided by the plane of another triangle, a *knife*. A *lane* is one
 arrays, here a face.
 
 Two such triangles do not pass through each other: no edge of either crosses the other. Yet the
-winding number beside one triangle changes along the border of the other.
+winding number just above or below one triangle jumps where one crosses the border of the other
+triangle. So faces are cut at these borders.
 """
 
 from __future__ import annotations
@@ -124,12 +125,14 @@ def _candidates(corners: FloatArray, normals: FloatArray, heights: FloatArray) -
     """
     excess = np.abs(normals) - 0.3
     # The first coordinate larger than 0.3 in magnitude decides the orientation.
+    # The place of the first True, by `argmax`.
     deciding = np.take_along_axis(normals, (excess > 0).argmax(axis=1)[:, None], axis=1)
     normals = np.where(deciding < 0, -normals, normals)
     plane = np.column_stack([normals, np.einsum("ni,ni->n", normals, corners[:, 0])]) / _PLANE_CELL
     cell = np.floor(plane)
     in_cell = plane - cell
     wall_distance = np.minimum(in_cell, 1 - in_cell).min(axis=1) * _PLANE_CELL
+    # Four times the difference of the docstring; infinite, in effect, without a height.
     tolerance = 4 * (_IN_PLANE + _NORMAL_ROUNDING) / np.where(heights > 0, heights, 1e-300)
     is_sure = (wall_distance > tolerance) & (np.abs(excess).min(axis=1) > tolerance)
     # Each cell of R^4 is hashed to one number. If two cells get the same number, they count as one
@@ -240,6 +243,7 @@ def _in_plane(ours: tuple[Vec3, ...], theirs: tuple[Vec3, ...]) -> Mask:
     def lies_in(corners: tuple[Vec3, ...], plane: tuple[Vec3, ...]) -> Mask:
         """Whether three corners lie in the plane of the triangle with the corners `plane`; False if
         this triangle has no area."""
+        # A unit vector, or 0 if the triangle has no area.
         normal = _normal(plane)
         is_near = [dr.abs(dr.dot(normal, p - plane[0])) <= _IN_PLANE for p in corners]
         return is_near[0] & is_near[1] & is_near[2] & (dr.squared_norm(normal) > 0.5)

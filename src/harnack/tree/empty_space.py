@@ -449,6 +449,7 @@ class OccupancyGrid(GridData):
         # Margins are fractions of a cube: those of large cubes are larger than needed, never
         # smaller.
         roots = roots.subset(~roots.is_proved_empty(clearance, _MARGIN))
+        # The largest integer: no limit of the number of cells.
         cells = refine_cells(roots, clearance, np.iinfo(np.int64).max, _ROUNDS, _MARGIN).occupied
         nx, ny, nz = (count << _ROUNDS for count in (nx, ny, nz))
         is_empty = np.ones((nz, ny, nx), np.bool_)

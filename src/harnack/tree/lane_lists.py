@@ -137,6 +137,8 @@ def traverse_subtrees(
         entry = dr.gather(index, lists.entries, lists.first + k, begins & (k < lists.count))
         i = dr.select(begins, entry, i)
         head = tree.head(i)
+        # head[6]: the node after the subtree. head[7]: the number of the leaf, or minus the first
+        # child.
         after, is_leaf, number = index(head[6]), head[7] >= 0, index(dr.abs(head[7]))
         end = dr.select(begins, after, end)
         descend, state = visit(VisitedNode(tree, i, tuple(head[:6]), number, is_leaf), state)
@@ -148,6 +150,7 @@ def traverse_subtrees(
         return k < lists.count
 
     start = (index(0), index(0), index(0), *state)
+    # Without k, i and `end`.
     return dr.while_loop(start, is_running, body, label="subtrees")[3:]
 
 

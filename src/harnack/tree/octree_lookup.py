@@ -114,7 +114,7 @@ class OctreeLookup:
         # Integer coordinates in cells of the greatest depth. Their upper bits give the cell of the
         # uniform grid, the other `down` bits one octant for each further depth.
         down = MAX_DEPTH - _TOP_DEPTH
-        first = (((ix >> down) << _TOP_DEPTH | (iy >> down)) << _TOP_DEPTH) | (iz >> down)
+        grid_index = (((ix >> down) << _TOP_DEPTH | (iy >> down)) << _TOP_DEPTH) | (iz >> down)
 
         def is_inner(node: Any, *_: Any) -> Mask:
             """Whether a lane has not yet reached a leaf: the encoded `node` is an inner node."""
@@ -127,9 +127,9 @@ class OctreeLookup:
             octant = ((ix >> bit) & 1) * 4 + ((iy >> bit) & 1) * 2 + ((iz >> bit) & 1)
             return dr.gather(integer, self.encoded_nodes, index(node) + octant), bit - 1
 
-        node = dr.gather(integer, self.top_grid, first)
-        # The first bit below the uniform grid; 0 * ix makes it an array with an entry for each
-        # lane.
+        node = dr.gather(integer, self.top_grid, grid_index)
+        # down - 1: the first bit below the uniform grid; 0 * ix makes it an array with an entry for
+        # each lane.
         node, _ = dr.while_loop((node, index(down - 1) + 0 * ix), is_inner, step, label="cell")
         return index(-1 - node), is_inside
 

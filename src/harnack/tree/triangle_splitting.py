@@ -129,6 +129,7 @@ def windings_of_sides(
     normal = np.where(length > 0, normal / np.where(length > 0, length, 1), [0.0, 0.0, 1.0])
     points = shares[0] * a + shares[1] * b + shares[2] * c
     frame = RayFrame.along(backend, to_vector3(backend, points), to_vector3(backend, normal))
+    # t: the positions on the ray of the points in front of the triangle and behind it.
     front, back = (
         to_numpy(tree.signed_crossings_ahead(frame, backend.Float(dr.opaque(backend.Float, t))))
         for t in (_COINCIDENT, -_COINCIDENT)
@@ -191,6 +192,7 @@ def _crossings_of_edges(
     # In each round, find the next crossing of each edge of `searching`, as a ray from its first
     # end, after the crossing (after_t, after_n).
     searching = np.flatnonzero(length > 0)
+    # The searches begin a little before t = 0, so that crossings at the first end count.
     after_t, after_n = np.full(len(edges), -_COINCIDENT), np.full(len(edges), NO_TRIANGLE, np.int64)
     batches: list[tuple[IntArray, IntArray]] = []
     while len(searching):
@@ -232,6 +234,7 @@ def _next_foreign_crossing(
         """Go to the next crossing, (t, number n of the crossed face). The lane stays active while
         an end of its edge is a corner of the crossed face: such crossings are skipped. Returns the
         new t, n and mask of active lanes."""
+        # A face counts as crossed also if its border is within `_COINCIDENT` of the edge.
         t, n, _, _ = tree.next_crossing(frame, (t, n), t_max, active, _COINCIDENT)
         is_found = active & (n != NO_TRIANGLE)
         corners = [dr.gather(index, column, n, is_found) for column in face_columns]

@@ -581,6 +581,7 @@ def _crossing_depth(
         is_on_edge = (area * area <= close_square * square) & (position > 0) & (position < 1)
         t = dr.select(is_on_edge, edge_depth, t)
     for u, v, depth in corners:
+        # A vertex counts within twice the length `close`.
         t = dr.select(dr.fma(u, u, v * v) <= 4 * close_square, depth, t)
     return t
 

@@ -112,6 +112,7 @@ class BoundaryCells:
             loops,
             points.min(axis=0),
             points.max(axis=0),
+            # The rest is for w at the centers.
             int(_CELL_BYTES_FRACTION * most_bytes),
             near=_NEAR_FACTOR,
             shared=_SHARED_RADII,
@@ -173,6 +174,7 @@ class BoundaryCells:
         frame = RayFrame.along(backend, cell_sums.center, direction)
         change, is_certain = self.cells.change_from_center(cell_sums, frame, x, unit, inside)
         turns, is_clear = self.rays.signed_crossings_between(frame, distance, unit, inside)
+        # The sum of |jump| over the triangles within rounding of x; 0 if there are none.
         on_triangle = jump_sum_within(self.rays, x, _TRIANGLE_ROUNDINGS * unit, inside)
         estimate = (
             dr.gather(real, self.center_values, cell_sums.cell, inside)
@@ -210,7 +212,8 @@ class BoundaryCells:
         cell_sums, inside = self.cells.sums(x, active)
         sums, rounding = cell_sums.sums, _POINT_ROUNDINGS * unit
         # The solid angle f = 4 pi w. promises: bounds of f's second derivatives on balls around x;
-        # ball: a range of f on a ball.
+        # ball: a range of f on a ball. inverse_squares, inverse_cubes and inverse_fourths: the
+        # integrals of |dp|/D^2, |dp|/D^3 and |dp|/D^4 over the boundary.
         promises = remainder_promises(
             sums.inverse_cubes, sums.inverse_fourths, sums.distance * (1 - SUM_MARGIN) - rounding
         )

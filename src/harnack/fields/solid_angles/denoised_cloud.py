@@ -91,6 +91,7 @@ class DenoisedCloud:
                 None if known_normals is None else np.delete(known_normals, outliers, axis=0)
             )
             tree = build_point_tree(x)
+            # stacklevel=4: the warning names the line that makes the field.
             warnings.warn(
                 f"{len(outliers):,} of {total:,} points are far from all others and were left out",
                 stacklevel=4,

@@ -108,7 +108,8 @@ class DipoleTree:
         moments: (n, 3) their moments, which are area times normal.
         accuracy: the multipole moments of a node are used at points that are farther from its
             center than this many times its radius.
-        build: a function that builds cells; None for no cells.
+        build: a function that builds cells from the moments of the tree's nodes and the records of
+            the dipoles (in NumPy, and on the backend); None for no cells.
         """
         # Each dipole is a source with one position and one moment, and its own center.
         levels = dipole_tree_moments(tree, points[:, None], moments[:, None], points, points)
@@ -189,6 +190,7 @@ class DipoleTree:
         # Where the field of a single point dominates, shading uses that point's normal. It is
         # reversed, because gradients point inwards: f is larger inside.
         area = dr.norm(nearest_moment)
+        # singularity_distance: the distance of the nearest dipole.
         is_dominated = (
             sums.singularity_distance * sums.singularity_distance < _NEAR_SQUARE_PER_AREA * area
         ) & (area > 0)
@@ -390,11 +392,12 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
         self.configure_cells(cells)
         self._box = low, high = self.points.min(axis=0), self.points.max(axis=0)
         # Unit coordinates: relative to the center, over a power of two as size, so that the
-        # division does not round. The size is no smaller than a length that belongs to the total
-        # area, for clouds whose areas are large for their box.
+        # division does not round. The size is no smaller than a quarter of the root of the total
+        # area: some clouds have areas that are large for their box.
         self._center = round_to_single(0.5 * (low + high))
         extent = max(0.5 * float((high - low).max()), math.sqrt(float(self.areas.sum())) / 4)
         self._size = 2.0 ** math.ceil(math.log2(extent))
+        # The hierarchy of the tree of the field from which `with_points` made this one.
         self._given_hierarchy: BalancedTree | None = None
         self._smoothing = (
             0.0 if as_real(smoothing, "smoothing") == 0 else as_positive(smoothing, "smoothing")
@@ -462,6 +465,7 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
         values = np.asarray(self.value(samples, precision="double"))
         level = float(np.median(values))
         # Areas from the user may stand for other things than a surface.
+        # is_estimated[1]: whether the areas are estimated.
         min_level = _MIN_LEVEL_FRACTION * 2 * math.pi if self.is_estimated[1] else _MIN_LEVEL
         if not abs(level) >= min_level:
             raise CloudError(
@@ -482,11 +486,13 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
         values: (n,) f minus the level, at the points.
         """
         gradients = self.rough_value_and_gradient(points, precision="double")[1]
-        # The distance that nine tenths of the points do not exceed.
+        # The distance that nine tenths of the points do not exceed; 1e-300 prevents a division by
+        # 0.
         norms = np.linalg.norm(gradients, axis=1)
         far = float(np.quantile(np.abs(values) / np.maximum(norms, 1e-300), 0.9))
         longest = float((self._box[1] - self._box[0]).max())
         if far > _FAR_OF_SIZE * longest:
+            # stacklevel=4: the warning names the line that makes the field.
             warnings.warn(
                 f"smoothing={self.smoothing:g} may be too long: a tenth of the points are farther "
                 f"than {far:.2g} from the smoothed surface, and the cloud is {longest:.3g} long. "
@@ -538,6 +544,7 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
         x = data.to_unit(x)
         # The sum of the areas, in unit coordinates.
         weight = float(self.areas.sum()) / self._size**2
+        # 64 terms: far away, where this matters, a point sums only a few nodes of the tree.
         return (
             data.tree.values(x, derivatives, closer)
             .with_far_field_errors(x, 64, weight)
@@ -566,18 +573,18 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
             tracing is more accurate.
         """
         accuracy = self.accuracy or (_TRACING_ACCURACY if traced else _VALUES_ACCURACY)
-        unit = (self.points - self._center) / self._size
+        unit_points = (self.points - self._center) / self._size
         # Areas scale with the square of lengths; the potential is invariant under scaling.
         moments = (self.areas / self._size**2)[:, None] * self.normals
         if self.smoothing:
             # height: the smoothing length in unit coordinates.
-            height, rows = self.smoothing / self._size, dipole_records(unit, moments)
+            height, rows = self.smoothing / self._size, dipole_records(unit_points, moments)
             tree = SmoothedSum.of(backend, self._hierarchy, rows, height, accuracy)
         else:
             build = None
             if self.cells and (traced or self.cells_for_values):
-                build = self._cell_builder(backend, self._half_side(unit))
-            tree = DipoleTree.of(backend, self._hierarchy, unit, moments, accuracy, build)
+                build = self._cell_builder(backend, self._half_side(unit_points))
+            tree = DipoleTree.of(backend, self._hierarchy, unit_points, moments, accuracy, build)
         return _DipoleData(*frame_parameters(backend, self._center, self._size), tree)
 
     def _cell_builder(self, backend: Backend, half: float) -> BuildCells:
@@ -654,6 +661,7 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
         for the smoothed sum as well: with q = h^2/rho^2 each of its terms is the plain one times
         (1 + 5 q/2)/(1 + q)^(5/2), which is at most 1 by Bernoulli's inequality.
         """
+        # The least rho of the proof, a little larger for rounding.
         margin = 1.0001 * math.sqrt(float(self.areas.sum()) / min(abs(level) for level in levels))
         low, high = self._box
         return Box(low - margin, high + margin)

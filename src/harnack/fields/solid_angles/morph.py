@@ -103,6 +103,7 @@ class Morph(BatchedField):
                 corners, w=self.w, gap=self.gap, spacing=spacing, accuracy=accuracy
             )
         else:
+            # w is 0 or `gap`: the index is 0 for mesh a, 1 for mesh b.
             self._slice = WindingNumber(*meshes[int(w > 0)])
 
     def quadrature_displacement(

@@ -173,7 +173,11 @@ def moment_polynomial(n: int, degree: int) -> tuple[float, ...]:
     t, weight = 0.5 * (t + 1), 0.5 * weight
 
     def moment(x: FloatArray) -> FloatArray:
-        """Compute the values of i_n at x = 2c - 1. x: (k,) numbers in [-1, 1]."""
+        """Compute the values of i_n at x = 2c - 1. x: (k,) numbers in [-1, 1].
+
+        With c = cos phi, i_n is phi/sin phi times the integral over t in [0, 1] of
+        (sin(phi t)/sin phi)^(2n-2).
+        """
         phi = np.arccos(0.5 * (x + 1))[:, None]
         ratio = np.sin(phi * t) / np.sin(phi)
         return phi[:, 0] / np.sin(phi[:, 0]) * (ratio ** (2 * n - 2) @ weight)
@@ -457,7 +461,8 @@ class MorphSlice(VariableAccuracyField["_SliceBuffers"]):
         buffers = self._batch_data(backend_of(x))
         x = buffers.to_unit(x)
         sums = buffers.sums(x, closer, derivatives).sums
-        # rounding: of the last operations. weight: the sum of the lengths of all moments.
+        # rounding: of the last operations. weight: the sum of the lengths of all moments. f is 1.0
+        # times the sum. 64 terms: far away a point sums only a few clusters.
         rounding = 8 * buffers.backend.machine_epsilon * dr.abs(sums.value)
         values = sums.values(1.0, coordinate_rounding(x), rounding)
         weight = sum(float(dipoles.rows[:, 6].sum()) for dipoles in self._dipoles)
@@ -490,11 +495,15 @@ class MorphSlice(VariableAccuracyField["_SliceBuffers"]):
             tuple of one entry."""
             data = self._batch_data(backend)
             x = data.to_unit(x)
-            # error: the bound of the quadrature's error of f, over both meshes.
+            # error: the bound of the quadrature's error of f, over both meshes. The ratios of a
+            # mesh bound |T| and the integral of |d|^2 of each group, divided by |m|.
             error, gradient = backend.Float(0), backend.Array3f(0)
             for cloud, piece, height in zip(data.clouds, self._pieces, self.heights, strict=True):
+                # With accuracy scale 1 and gradients.
                 sums = cloud.sums(x, 1.0, 1)
-                # q is at most this ratio, as D is at least the height.
+                # q is at most this ratio, as D is at least the height. The kernel does not grow
+                # nearer to the dipoles: hence the factor 1.0. The remainder is the sum of
+                # |m| (3-2q)/((1-q)^2 D^4); q2_d3 is at least the sum of |m|/D^3.
                 ratio = piece.farthest / height
                 remainder = dr.inf
                 if ratio < 1:
@@ -589,6 +598,7 @@ class _SliceBuffers(UnitFrame):
         x = self.to_unit(p)
         radial = self.sums(x, detail, 1)
         sums = radial.sums
+        # Of the rounding of positions (s4 is a sum that bounds it), and of truncation.
         slope_error = dr.fma(
             SLOPE_ROUNDINGS * coordinate_rounding(x), sums.s4, sums.gradient_truncation
         )
@@ -597,6 +607,7 @@ class _SliceBuffers(UnitFrame):
         nearest = sums.singularity_distance * (1 - SUM_MARGIN) - 8 * self.backend.machine_epsilon
         nearest = fmax(nearest, 0)
         r = BALL_FRACTION * nearest
+        # 1.0: the bounds of this kernel do not grow if distances shrink (`SlicedKernel.growth`).
         change = radial.variation(r, 1.0)
         ball = HarmonicBall(r * self.size, sums.value - change, sums.value + change, dimension=4)
         return Sample(

@@ -132,6 +132,7 @@ class _PlanarLoop:
 
     def contains(self, point: FloatArray) -> bool:
         """Whether a point (2,) is inside the loop. The point must not lie on the loop."""
+        # A circle, of which `points` has only the center.
         if self.radius > 0:
             return bool(np.linalg.norm(point - self.points[0]) < self.radius)
         a, b = self.points - point, np.roll(self.points, -1, axis=0) - point
@@ -206,6 +207,7 @@ def _plane_of(
     coordinates; the size of the curves, the longest side of their box; and two perpendicular unit
     vectors (2, 3) in the plane, right-handed together with the normal.
     """
+    # Four points of a circle determine its plane.
     points = np.concatenate([*loops, *(circle.polygon(4) for circle in circles)])
     lower, upper = points.min(axis=0), points.max(axis=0)
     size = float((upper - lower).max())
@@ -220,7 +222,7 @@ def _plane_of(
         origin = np.array(circles[0].center)
         x = (points - origin) / size
     else:
-        # The direction in which the points vary least.
+        # The direction in which the points vary least: the last right singular vector.
         normal = np.linalg.svd(x - x.mean(axis=0), full_matrices=False)[2][2]
         origin = points.mean(axis=0)
         x = (points - origin) / size
@@ -240,6 +242,7 @@ def _are_separated(first: _PlanarLoop, second: _PlanarLoop) -> bool:
     """Whether two loops of a plane, `first` and `second`, are nowhere nearer to each other than
     1e-6 of the size of all curves. One loop may lie inside the other."""
     if first.radius > 0 and second.radius > 0:
+        # Two circles, of which `points` has only the center.
         distance = float(np.linalg.norm(first.points[0] - second.points[0]))
         # They are beside each other, or one is inside the other.
         outer_gap = distance - (first.radius + second.radius)

@@ -100,6 +100,7 @@ class FaceLoops:
                 f"{len(x):,} corners of faces are too many: cut the mesh into parts, and give "
                 "them as a list to draw"
             )
+        # A negative number marks a face in convex position.
         signed_counts = np.where(faces.in_convex_position, -counts, counts)
         edges = LoopEdges.upload(backend, loops, EDGES_PER_RECORD)
         # A point has a few roundings of size 1 in unit coordinates, and was rounded once before, at
@@ -119,7 +120,8 @@ class FaceLoops:
         row = self.heads.read_record(index)
         backend = self.heads.backend
         integer = backend.UInt32
-        # The index of the first record, and the number of records without its sign.
+        # The columns of `upload`: center, size, index of the first record, signed number of
+        # records, and the roundings of a point and of the value.
         edges = self.edges.records_of(integer(row[4]), integer(dr.abs(row[5])))
         return FaceSolidAngle(FaceData(backend, backend.Array3f(*row[:3]), row[3], edges, *row[5:]))
 
@@ -186,8 +188,12 @@ class FaceSolidAngle(Field):
         face = self.face
         backend, x, rounding = face.backend, face.to_unit(p), face.rounding
         sums = sum_over_edges(face.edges, x)
+        # A lower bound, also after rounding. inverse_squares, inverse_cubes and inverse_fourths are
+        # the integrals of |dp|/D^2, |dp|/D^3 and |dp|/D^4 over the curve, with D the distance from
+        # x.
         distance = sums.distance * (1 - SUM_MARGIN) - rounding
         promises = remainder_promises(sums.inverse_cubes, sums.inverse_fourths, distance)
+        # A ball, and a range of the lift on it.
         lift = lift_ball(sums.angle, sums.gradient, sums.inverse_squares, promises)
         # In convex position the lift stays in (-6 pi, 6 pi) on the ball up to the curve.
         is_convex = face.signed_record_count < 0
@@ -203,7 +209,7 @@ class FaceSolidAngle(Field):
         gradient = dr.select(is_on_curve, steep_gradient, sums.gradient)
         error = vertex_rounding(backend.machine_epsilon, x, sums.inverse_squares)
         error = dr.select(is_on_curve, 0, error) + face.value_rounding
-        error = dr.select(is_on_curve, 8 * PERIOD, error)
+        error = dr.select(is_on_curve, 8 * PERIOD, error)  # the steep gradient times 2 rounding
         ray_promises: tuple[Lipschitz, ...] = ()
         if direction is not None:
             line = RayLine(x, backend.Array3f(direction), rounding)
@@ -290,9 +296,10 @@ def _carve_boxes(
     for round_index in range(_ROUNDS):
         is_split = cells.depth < _MIN_DEPTH
         if round_index >= _MIN_DEPTH:
-            # For each cell, the place of its face among the faces `carved`.
+            # Only cells at the sides of the box. place: that of each cell's face in `carved`.
             place = np.searchsorted(carved, cells.face)
             is_split = cells.touch(low[place], high[place], box_sizes) & (cells.depth < _MAX_DEPTH)
+        # The number of pairs of an octant and a corner: the work so far.
         pair_count += 8 * int(corner_counts[cells.face[is_split]].sum())
         if not is_split.any() or pair_count > _MAX_PAIRS:
             break
@@ -342,6 +349,7 @@ class _FaceCells:
         sides: (m, 3) the side lengths of the original boxes of all faces.
         """
         size = self.sizes(sides)
+        # `corner` is the lower corner of a cell.
         at_low = self.corner < low + 0.25 * size
         at_high: BoolArray = self.corner > high - 1.25 * size
         return np.logical_or.reduce(at_low | at_high, axis=1)
@@ -410,6 +418,8 @@ def _are_empty(
         """
         zr, zi, gradient, nearest, change, second = state
         edge = Edge.between(p, q, inverse, x)
+        # The factor is the inner product of the spinors of both ends; the result of `spinor` ends
+        # with the spinor.
         re, im = inner_product(spinor(edge.a)[2], spinor(edge.b)[2])
         zr, zi = dr.fma(zr, re, -(zi * im)), dr.fma(zr, im, zi * re)
         # Only the argument of the product matters: it is scaled to a length of about 1.
@@ -432,6 +442,7 @@ def _are_empty(
     # The distance from f to the nearest level, modulo the period.
     level_gap = np.full(len(f), math.inf)
     for level in levels:
+        # Between minus and plus half a period.
         offset = np.remainder(f - level + 0.5 * PERIOD, PERIOD) - 0.5 * PERIOD
         level_gap = np.minimum(level_gap, np.abs(offset))
     return is_off_curve & (level_gap > max_change * (1 + 1e-9) + 1e-9)

@@ -403,6 +403,7 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
         data = self._batch_data(backend_of(x))
         x = data.to_unit(x)
         sums, epsilon = data.dipoles.sums(x, closer, derivatives).sums, data.backend.machine_epsilon
+        # w is 1.0 times the sum. The last argument bounds the rounding of the last operations.
         values = sums.values(1.0, coordinate_rounding(x), 8 * epsilon * dr.abs(sums.value))
         cutoff, slope, second = self._cutoff_errors(data, sums, coordinate_rounding(x))
         values = dataclasses.replace(
@@ -413,7 +414,9 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
         )
         # The sum of the dipoles' weights in unit coordinates.
         weight = float(self.areas.sum()) / (4 * math.pi * self._size**2)
-        return values.with_far_field_errors(x, 64, weight).rescaled(data.size)
+        # Far away a tree sums fewer than 64 nodes; the direct sum always has all terms.
+        terms = 64 if self.method == "tree" else len(self.points)
+        return values.with_far_field_errors(x, max(terms, 64), weight).rescaled(data.size)
 
     def _cutoff_errors(
         self, data: _ScreenedBuffers, sums: SourceSums, unit: Real
@@ -512,6 +515,7 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
         if min_level < _SMALLEST_LEVEL:
             return None
         total = float(self._rows[:, 6].sum())
+        # At `high` there is no level, as screening only makes |w| smaller.
         low, high = 0.0, math.sqrt(total / min_level) * 1.001 + 1e-6
         for _ in range(60):
             distance = 0.5 * (low + high)

@@ -84,7 +84,7 @@ class SmoothedKernel(RadialKernel):
         """The numbers Q_2, ..., Q_last, which bound derivatives of the kernel: Q_m = 1 + q
         (m+1)(m+2)/4 with q = h^2/D^2. They hold at all distances D of at least 0.55
         (`_BOUND_FRACTION`) times `distance`. last: the largest index m."""
-        # h/D at the least of these distances; its square is q.
+        # h/D at the least of these distances; its square is q. D is at least h, so that q <= 1.
         ratio = dr.sqrt(self.height_square) / (_BOUND_FRACTION * fmax(distance, 1e-30))
         q = fmin(ratio * ratio, 1)
         return [dr.fma(0.25 * (m + 1) * (m + 2), q, 1) for m in range(2, last + 1)]
@@ -143,6 +143,7 @@ class SmoothedSum:
         """A sample of f at points x: value, gradient, errors and proved bounds of second
         derivatives near x. detail: the accuracy scale; larger is more accurate."""
         radial = self.dipoles.sums(x, detail, 1)
+        # radial: with sums for bounds near x. sums: value, gradient and errors.
         sums = radial.sums
         # The error of the gradient: of positions, and of truncation.
         slope_error = dr.fma(

@@ -167,6 +167,7 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         self.convex_position = is_circle or (
             not self._net_circles and is_convex_position(self._net_loops)
         )
+        # The region of a plane that the curve bounds; None if there is none.
         self._region: PlanarRegion | None = None
         if not self._all_cancel:
             self._region = planar_region(self._net_loops, self._net_circles)
@@ -184,6 +185,7 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
                 "NumPy arrays, or no cells"
             )
         self._has_cells = bool(cells) and bool(self._net_loops)
+        # The accuracy scale of samples.
         self._detail: Real = 1.0
 
     @property
@@ -282,8 +284,8 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
                 "choose units nearer to 1"
             )
         center = self._center.astype(dtype).astype(np.float64)
-        unit = tuple((loop - center) / self._size for loop in self._net_loops)
-        edges = LoopEdges.upload(backend, unit) if unit else None
+        unit_loops = tuple((loop - center) / self._size for loop in self._net_loops)
+        edges = LoopEdges.upload(backend, unit_loops) if unit_loops else None
         circles = None
         if self._net_circles:
             circles = CircleSet.upload(backend, self._net_circles, center, self._size)
@@ -295,15 +297,19 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
             plane = tuple(dr.opaque(backend.Float, number) for number in numbers)
         # The largest coordinate in units of the curve's size: by it positions are rounded.
         magnitude = float(np.abs(self._points_around()).max() / self._size)
-        records = (
-            0 if edges is None else sum(-(-len(loop) // edges.edges_per_record) for loop in unit)
+        record_count = (
+            0
+            if edges is None
+            else sum(-(-len(loop) // edges.edges_per_record) for loop in unit_loops)
         )
         # For circles alone: the last operations, as in `LoopEdges.rounding`.
-        value_rounding = 16 * backend.machine_epsilon if edges is None else edges.rounding(records)
+        value_rounding = (
+            16 * backend.machine_epsilon if edges is None else edges.rounding(record_count)
+        )
         cells = None
         if self._has_cells and traced:
             low, high = self._box(center)
-            cells = build_curve_cells(backend, unit, low, high, self.max_bytes())
+            cells = build_curve_cells(backend, unit_loops, low, high, self.max_bytes())
         # The number of roundings of a position: `_CurveData.rounding` lists them.
         return _CurveData(
             *frame_parameters(backend, center, self._size),
@@ -393,6 +399,10 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
             return self._zero_sample(data, p)
         x = data.to_unit(p)
         sums, errors = data.at_detail(x, self._detail)
+        # errors.value and errors.slope bound the truncation errors of f and its gradient, and
+        # errors.rounding the rounding of f. sums.inverse_squares, inverse_cubes and inverse_fourths
+        # are the integrals of |dp|/D^2, |dp|/D^3 and |dp|/D^4 over the curve, with D the distance
+        # from x.
         epsilon = data.backend.machine_epsilon
         rounding = data.rounding
         # A lower bound of the distance to the curve, also after rounding.
@@ -418,9 +428,10 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         error = truncation + dr.select(is_on_curve, errors.rounding, value_rounding)
         if sums.circles is not None:
             circles = sums.circles
-            # Measured: 15 units in the last place of a circle's angle and 60 of its gradient (near
-            # it, 10 elsewhere). Its position is rounded by a few units too.
+            # Measured errors: 15 units in the last place of a circle's angle, and 60 of its
+            # gradient near the circle (10 elsewhere). Its position is rounded by a few units too.
             point_error = epsilon * (4 + 4 * dr.max(dr.abs(x)))
+            # `value` is the bound for the angle.
             value = 16 * epsilon * len(self._net_circles) + point_error * circles.inverse_squares
             error = error + dr.select(is_on_curve, 0, value)
             circle_gradient_error = (
@@ -430,6 +441,7 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         gradient_error = dr.select(is_on_curve, 0, gradient_error)
         error = dr.select(is_on_curve, 8 * _PERIOD, error)  # the steep gradient times 2 rounding
         ray_promises = _line_bounds(data, x, sums, errors, direction)
+        # "paper" promises nothing but the range on the ball.
         if self.lift_bound_option == "paper":
             promises = (ball,)
         value = dr.select(is_on_curve, 0, sums.angle)
@@ -520,9 +532,9 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         is_off_curve = (distance > 0) & (sums.distance > 2 * data.rounding)
         # By this factor |dp|/D^4 can grow if the distance D is reduced by its rounding.
         growth = dr.select(is_off_curve, dr.square(dr.square(sums.distance / distance)), dr.inf)
-        # With the integrals I3 and I4 of |dp|/D^3 and |dp|/D^4 the sums of `source_sums` are s4 =
-        # I3/4 and s5 = 3 I4/16 (`LiftedEdge.bounds`), and I4 <= I3/distance. The factors 1/3 and
-        # 1/4 in their places are a little larger.
+        # With the integrals I3 (`inverse_cubes`) and I4 of |dp|/D^3 and |dp|/D^4 the sums of
+        # `source_sums` are s4 = I3/4 and s5 = 3 I4/16 (`LiftedEdge.bounds`), and I4 <= I3/distance.
+        # The factors 1/3 and 1/4 in their places are a little larger.
         gradient_error = SLOPE_ROUNDINGS / 3 * unit * sums.inverse_cubes * growth / data.size
         second_error = 0.25 * SECOND_ROUNDINGS * unit * sums.inverse_cubes / sums.distance * growth
         return gradient_error, second_error / (data.size * data.size)
@@ -534,6 +546,7 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         if self._all_cancel:
             return 0 * p.x
         x, unit_radius = data.to_unit(p), radius / data.size + data.rounding
+        # inverse_cubes, inverse_fourths: the integrals of |dp|/D^3 and |dp|/D^4 over the curve.
         sums = data.sums(x)
         distance = sums.distance * (1 - SUM_MARGIN) - data.rounding
         return (
@@ -585,6 +598,7 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         """The change (n,) of the solid angle along the segments from points p (n, 3) to q (n, 3),
         followed continuously, so that it may exceed 4 pi. It is for curves without circles."""
         backend = choose_backend("double")
+        # The point 0 only tells the backend.
         data = self._without_cells.prepare(backend)._data_for(backend.Array3f(0))
         if data.edges is None:
             return np.zeros(len(p))
@@ -642,7 +656,8 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         if self._all_cancel:
             return ConvexHull.from_points(points)  # there is no surface: any volume is right
         # Curves whose vertices may move share kernels: their extent is always computed the same
-        # way.
+        # way. No number is farther than 2 pi from all multiples of 4 pi: if `nearest` is 2 pi, all
+        # levels are 2 pi modulo 4 pi.
         is_in_hull = self.convex_position and nearest > 2 * math.pi * (1 - 1e-9)
         if is_in_hull and self._has_cells:  # some half-spaces of the hull: all of it lies in them
             hull = ConvexHull.from_points(points).padded(1e-4 * self._size)
@@ -652,11 +667,14 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
             return ConvexHull.from_points(points).padded(1e-4 * self._size)
         length = sum(circle.length for circle in self._net_circles)
         length += total_length(self._net_loops) if self._net_loops else 0.0
-        # The bound rho of `extent`.
+        # The bound rho of `extent`, a little larger for rounding.
         margin = 1.0001 * length / math.sqrt(nearest * (_PERIOD - nearest))
         lower, upper = points.min(axis=0) - margin, points.max(axis=0) + margin
         loops = [*self._net_loops, *self._net_circles]
+        # The range of "paper" is no proof: then the field of the default bound proves cells empty.
         proved = self._without_cells if self.lift_bound_option != "paper" else SolidAngle(loops)
+        # A circle counts as three vertices. At least eight cells are allowed: the octants of the
+        # box.
         vertices = sum(map(len, self._net_loops)) + 3 * len(self._net_circles)
         return tight_extent(proved, levels, lower, upper, max(8, _MAX_PAIRS // vertices))
 
@@ -718,10 +736,12 @@ class _CurveData(UnitFrame):
         `detail` is at most 1, the sums over edges come from that cell. On all other lanes, and if
         there are no cells, all edges are summed. A larger accuracy scale is more accurate."""
         if self.cells is None or self.edges is None:
+            # No truncation errors: all edges are summed.
             return self.sums(x), CellErrors(0.0, 0.0, self.value_rounding)
         cell_sums, is_in_cell = self.cells.sums(x, detail <= 1)
         edge_sums = sum_over_edges(self.edges, x, ~is_in_cell)
-        # Both objects have the same attributes, in the order of the parameters of `CurveSums`.
+        # Both objects have the same attributes, in the order of the parameters of `CurveSums`. The
+        # first ones are taken in cells, the second ones elsewhere.
         pairs = zip(vars(cell_sums.sums).values(), vars(edge_sums).values(), strict=True)
         sums = CurveSums(*(dr.select(is_in_cell, inner, outer) for inner, outer in pairs))
         errors = CellErrors(
@@ -865,6 +885,7 @@ def _convex_ball(angle: Real, distance: Real, error: Real) -> HarmonicBall:
         dr.select(principal < 0, possible_shift, 0),
         dr.select(principal > 0, possible_shift, 0),
     )
+    # 1.5 periods are 6 pi.
     return HarmonicBall(
         distance, branch - 1.5 * _PERIOD - shift_below, branch + 1.5 * _PERIOD + shift_above
     )

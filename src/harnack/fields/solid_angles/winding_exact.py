@@ -79,6 +79,7 @@ class ExactWinding:
         traced: whether `sample_interval` will be called, for tracing, which needs further data.
         """
         if not len(mesh.singular_edges):
+            # No edges, in none of the forms below.
             return cls(backend, rays, None, None, None, None, final_rounding(backend))
         vertices, edges = mesh.unit_vertices, mesh.singular_edges
         # The same edges in three forms: for values, fast values, and samples along rays.
@@ -136,6 +137,7 @@ class ExactWinding:
         real = self.backend.Float
         turns = self.rays.signed_crossings_vertical(x, real(1))
         if self.edges is None:
+            # Value and its error, gradient, Hessian, and the errors of both.
             zeros = self.backend.Array3f(0), SymmetricMatrix.zero(real)
             return PointValues(turns, real(self.rounding), *zeros, real(0), real(0))
         sums, unit = lifted_sums(self.edges, x, derivatives).total(), coordinate_rounding(x)
@@ -174,6 +176,7 @@ class ExactWinding:
         sums = self.ray_trails.sum(frame, x, active)
         sums = sums.add_term(SourceTerm(4 * math.pi * turns), True)
         unit = fmax(coordinate_rounding(frame.o), coordinate_rounding(x))
+        # 8 * unit bounds the rounding of points of the line.
         line, loops = RayLine(x, frame.d, 8 * unit), self.loops
 
         def rates(lengths: tuple[Real, ...], lanes: Mask) -> tuple[Real, ...]:

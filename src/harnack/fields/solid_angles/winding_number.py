@@ -183,17 +183,16 @@ def winding_box(mesh: WindingMesh, levels: tuple[float, ...]) -> Box:
     size. By (a), the level sets reach at most a certain length beyond the mesh. By (b), off the
     triangles they reach at most another length beyond the singular edges.
 
-    (a) At distance rho from a mesh of this area |w| <= area/(4 pi rho^2). So a level lies within
-    rho = sqrt(area/(4 pi |level|)) of the mesh. (b) Off the triangles 4 pi w is, modulo 4 pi, the
+    (a) At distance rho from a mesh whose area is A, |w| <= A/(4 pi rho^2). So a level lies within
+    rho = sqrt(A/(4 pi |level|)) of the mesh. (b) Off the triangles 4 pi w is, modulo 4 pi, the
     solid angle of the singular edges. A level of this angle at distance l from the multiples of 4
     pi lies within L/sqrt(l (4 pi - l)) of edges of total length L (isoperimetry on the sphere: see
     `SolidAngle.extent`).
     """
     low, high = mesh.box
     slack = 1e-4 * float((high - low).max())  # for the rounding of the box
-    # The numbers 1e-12 below only prevent a division by zero.
+    # The numbers 1e-12 prevent divisions by 0: margins are huge for levels that have no bound.
     min_level = min(abs(level) for level in levels)
-    # 1e-12 prevents divisions by 0: margins are huge for levels that have no bound.
     area_margin = math.sqrt(mesh.area / (4 * math.pi * max(min_level, 1e-12)))
     level_gap = min(abs(math.remainder(level, 1.0)) for level in levels) * 4 * math.pi  # l
     edge_margin = mesh.boundary_length / math.sqrt(
@@ -336,6 +335,7 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         """
         field = copy.copy(self)
         field._mesh = self.mesh.with_vertices(vertices)
+        # What was computed from the old positions is dropped.
         field._batches, field._device, field._rates = TransientCache(), None, TransientCache()
         field._extents, field._occupied = TransientCache(), TransientCache()
         field._own_levels = TransientCache()
@@ -398,6 +398,7 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         if not isinstance(winding, TreeWinding) or self.accuracy is not None:
             return self.values_at(x, 1)
         x = data.to_unit(x)
+        # So that the kernels below read x, and do not compute it again.
         dr.eval(x)
         rates = self._boundary_rates(data, winding)
         values = rates.sharp(x)
@@ -437,6 +438,7 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         # The sum of the weights of all triangles as dipoles: the area in unit coordinates, over
         # 4 pi.
         weight = self.mesh.area / (4 * math.pi * self.mesh.size**2)
+        # Far away a point sums all singular edges, and few other terms.
         return values.with_far_field_errors(x, 64 + len(self.mesh.singular_edges), weight).rescaled(
             data.size
         )
@@ -461,8 +463,9 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
 
     def _add_cells(self, data: _WindingData, *, traced: bool) -> _WindingData:
         """Return `data` with FMM cells, or unchanged if they would take too much memory. For a soup
-        these are cells of triangles. Otherwise, and if a soup's cells take too much memory, they
-        are cells of singular edges, which are built for tracing only.
+        (triangles that have few edges in common) these are cells of triangles. Otherwise, and if a
+        soup's cells take too much memory, they are cells of singular edges, which are built for
+        tracing only.
 
         data: the mesh on a backend.
         traced: whether the data are for tracing rays, and not for values at points.
@@ -472,8 +475,8 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         assert extent is not None  # for the type: there always is an extent
         low, high = extent.bounds()
         if self._is_soup and isinstance(winding, TreeWinding):
-            # Half the edge of the cube around the origin of the unit coordinates that contains the
-            # extent.
+            # Half the side of the cube around the origin of the unit coordinates that contains the
+            # extent. The cells fill a cube of the whole side, enlarged by 0.1 % (`_CUBE_FACTOR`).
             reach = float(np.maximum(high - mesh.center, mesh.center - low).max()) / mesh.size
             cells = self.build_cached(
                 data.backend, lambda: winding.build_cells(mesh, _CUBE_FACTOR * reach, most_bytes)
@@ -516,7 +519,8 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
 
     def cells_pay_from(self) -> float:
         """The smallest number of rays for which FMM cells save more time than it takes to build
-        them; infinite if they never do."""
+        them; infinite if they never do. A soup (`_is_soup`) has cells of triangles, another mesh
+        cells of singular edges."""
         edges, triangles = len(self.mesh.singular_edges), len(self.mesh.triangles)
         if self._is_soup:
             is_small = triangles <= _MOST_OF_SOUP
@@ -554,6 +558,7 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         detail = data.backend.Float(detail)
         if data.cells is None:
             return _sample_at_start(data, frame, data.backend.Float(0), detail)
+        # None: no direction of a ray. The last argument is the mask of the lanes to compute.
         from_cells, is_in_cell = data.cells.sample(
             frame.o, None, coordinate_rounding(frame.o), detail <= 0
         )
@@ -635,7 +640,8 @@ class _TriangleJumps(Jumps):
         self, o: Vec3, d: Vec3, after: JumpCrossing, t_max: Real, active: Mask
     ) -> JumpCrossing:
         """The next crossing of each ray o + t d with a triangle, after the crossing `after` and up
-        to t = t_max, with the jump of w there along the ray."""
+        to t = t_max, with the jump of w there along the ray. active: the mask of the lanes to
+        compute."""
         data = self.data_for(o)
         frame = RayFrame.along(data.backend, data.to_unit(o), d)
         behind = (after.t / data.size, after.facet)
@@ -680,6 +686,7 @@ class _TriangleJumps(Jumps):
         after: the squared distance and the index of the previous triangle.
         """
         data = self.data_for(p)
+        # data.rays is the tree of triangles.
         facet = next_closest_triangle(
             data.rays, data.to_unit(p), after, dr.square(limit / data.size), active
         )

@@ -90,10 +90,12 @@ class BoundaryRates:
             return self.summed.values(x, derivatives, closer)
         real = cast("Any", type(x.x))
         if self.summed is None:
+            # Value and its error, gradient, Hessian: all are 0 for a closed mesh.
             return PointValues(
                 real(0), real(0), dr.zeros(type(x), dr.width(x)), SymmetricMatrix.zero(real)
             )
         sums = edge_rates(self.summed, x, derivatives)
+        # real(0): there is no value to be rounded.
         return sums.values(1 / (4 * math.pi), coordinate_rounding(x), real(0))
 
     def sharp(self, x: Vec3) -> PointValues:
@@ -126,6 +128,7 @@ def caps_of(mesh: WindingMesh) -> WindingMesh:
         for k, loop in enumerate(loops)
     ]
     faces = np.concatenate(fans)
+    # Every face occurs once, and no vertices are joined.
     ones, ids = np.ones(len(faces), np.int64), np.arange(len(faces))
     welded = np.arange(len(vertices))
     return WindingMesh(

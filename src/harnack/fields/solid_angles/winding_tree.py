@@ -101,7 +101,8 @@ class NearEdge:
         than `reach` times its size, and the same proof holds. Far nodes are even farther.
         """
         square, inverse = self.edge.edge.squared_distance, self.edge.edge.inverse_square_length
-        # square * inverse is (distance/L)^2.
+        # self.edge.edge has the positions of the ends relative to x. square * inverse is
+        # (distance/L)^2.
         is_closed = ~self.is_singular & (square * inverse < dr.square(0.5 * (reach - 1)))
         return (inverse > 0) & ~is_closed
 
@@ -335,6 +336,7 @@ class TreeWinding:
             return ~((t < behind.t) | ((t == behind.t) & (number <= behind.facet)))
 
         sums = self._sums(frame, x, detail, unit, is_ahead, 1, active)
+        # 8 * unit bounds the rounding of points of the line.
         line = RayLine(x, frame.d, 8 * unit)
         bounds_along = lipschitz_along(
             line, sums.gradient, sums.singularity_distance, self._rates(line, active)
@@ -376,7 +378,7 @@ class TreeWinding:
                 return add
 
             start = tuple(self.backend.Float(0) for _ in lengths)
-            # VariableAccuracy scale 0: the coarsest sums are enough for bounds.
+            # Accuracy scale 0: the coarsest sums are enough for bounds.
             far_sums, edge_rates = self._near_sums(
                 line.x, self.backend.Float(0), adder, start, active
             )
