@@ -4,11 +4,10 @@ that no third face has; they agree in orientation if they run it in opposite dir
 
 from __future__ import annotations
 
-from typing import Any, cast
-
 import numpy as np
 
 from harnack.backend.validation import IntArray
+from harnack.geometry.welding import connected_groups
 
 __all__ = ["is_nonorientable", "orientation_components"]
 
@@ -32,10 +31,6 @@ def orientation_components(faces: IntArray) -> IntArray:
     component of face k is non-orientable. (The labels are the components of the orientation double
     cover.)
     """
-    import scipy.sparse  # imported here, as it takes half a second and few programs need it
-    import scipy.sparse.csgraph as csgraph_module
-
-    sparse, csgraph = cast("Any", scipy.sparse), cast("Any", csgraph_module)
     face_count = len(faces)
     pairs, edge_of, use_count = _face_edges(faces)
     order = np.argsort(edge_of, kind="stable")
@@ -50,10 +45,7 @@ def orientation_components(faces: IntArray) -> IntArray:
     columns = np.concatenate(
         [second + face_count * is_reversed, second + face_count * (1 - is_reversed)]
     )
-    adjacency = sparse.coo_matrix(
-        (np.ones(len(rows)), (rows, columns)), shape=(2 * face_count, 2 * face_count)
-    )
-    return np.asarray(csgraph.connected_components(adjacency, directed=False)[1], np.int64)
+    return connected_groups(np.column_stack([rows, columns]), 2 * face_count)
 
 
 def _face_edges(faces: IntArray) -> tuple[IntArray, IntArray, IntArray]:

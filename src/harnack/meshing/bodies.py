@@ -10,12 +10,13 @@ from __future__ import annotations
 
 import itertools
 import math
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from harnack.backend import FloatArray
 from harnack.geometry import MeshError
+from harnack.geometry.welding import connected_groups
 from harnack.meshing.checks import SelfIntersectionError, check_manifold, intersecting_faces
 from harnack.meshing.clipping import winding_around
 from harnack.meshing.closed_mesh import grown, to_manifold
@@ -78,14 +79,7 @@ def _connected_groups(x: FloatArray, faces: IntArray) -> list[IntArray]:
 
     x: (n, 3) the vertices.
     """
-    import scipy.sparse  # imported here: it takes half a second
-    import scipy.sparse.csgraph as csgraph_module
-
-    sparse, csgraph = cast("Any", scipy.sparse), cast("Any", csgraph_module)
-    m = len(faces)
-    first, second = neighbors(x, faces).T % m
-    graph = sparse.coo_matrix((np.ones(len(first)), (first, second)), shape=(m, m))
-    group = np.asarray(csgraph.connected_components(graph, directed=False)[1], np.int64)
+    group = connected_groups(neighbors(x, faces) % len(faces), len(faces))
     order = np.argsort(group, kind="stable")
     return np.split(order, np.flatnonzero(np.diff(group[order])) + 1)
 

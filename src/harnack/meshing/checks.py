@@ -19,12 +19,13 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Generator
-from typing import TYPE_CHECKING, Any, Never, cast
+from typing import TYPE_CHECKING, Any, Never
 
 import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import BoolArray, FloatArray
+from harnack.geometry.welding import connected_groups
 from harnack.meshing.broad_phase import ROUNDING, near_pairs
 from harnack.meshing.edges import (
     Edges,
@@ -647,7 +648,8 @@ def check_manifold(faces: IntArray, vertices: FloatArray | None = None) -> None:
             np.unique(pairs[((uses == 2) & (net != 0))[index]]),
         )
     # A manifold has one fan of faces at each vertex that is used.
-    if _vertex_fans(faces, edges)[0] > np.count_nonzero(np.bincount(faces.ravel())):
+    fan_count = int(_vertex_fans(faces, edges).max(initial=-1)) + 1
+    if fan_count > np.count_nonzero(np.bincount(faces.ravel())):
         fail(
             "sheets of the mesh touch in a point: cells are too large for this level set; choose a "
             "smaller `cell_size`, or another level",
@@ -811,7 +813,7 @@ def nonmanifold_vertices(faces: IntArray) -> IntArray:
     pairs, count = half_edges(faces), int(faces.max(initial=-1)) + 1
     edges = Edges.of(pairs)
     overused = np.unique(pairs[edges.multiplicity[edges.edge_of_pair] > 2])
-    _, fan = _vertex_fans(faces, edges)
+    fan = _vertex_fans(faces, edges)
     # Each fan once, at its vertex.
     vertex = np.empty(int(fan.max(initial=-1)) + 1, np.int64)
     vertex[fan] = faces.ravel()
@@ -819,20 +821,16 @@ def nonmanifold_vertices(faces: IntArray) -> IntArray:
     return np.union1d(overused, np.flatnonzero(fans > 1))
 
 
-def _vertex_fans(faces: IntArray, edges: Edges) -> tuple[int, IntArray]:
+def _vertex_fans(faces: IntArray, edges: Edges) -> IntArray:
     """Group the corners of faces (m, 3) into fans. A fan is a largest set of faces around a vertex
     that are joined to each other by edges at that vertex; each face of it takes part with its
     corner at the vertex.
 
     edges: the `Edges` of `half_edges(faces)`.
 
-    Returns the number of fans of all vertices together, and (3m,) for each corner the index of its
-    fan; entry 3 i + k is for corner k of face i.
+    Returns (3m,) for each corner the index of its fan, counted from 0 over all vertices together;
+    entry 3 i + k is for corner k of face i.
     """
-    import scipy.sparse  # imported here: it takes half a second
-    import scipy.sparse.csgraph as csgraph_module
-
-    sparse, csgraph = cast("Any", scipy.sparse), cast("Any", csgraph_module)
     m = len(faces)
     corner = np.arange(3 * m).reshape(m, 3)
     # Corners at both ends of the edge k of a face, in the order of `half_edges`.
@@ -842,6 +840,4 @@ def _vertex_fans(faces: IntArray, edges: Edges) -> tuple[int, IntArray]:
     # Across an edge, the corners at its one end belong together, and those at its other end.
     rows = np.concatenate([first[forward], second[forward]])
     columns = np.concatenate([second[backward], first[backward]])
-    joined = sparse.coo_matrix((np.ones(len(rows)), (rows, columns)), shape=(3 * m, 3 * m))
-    number, fan = csgraph.connected_components(joined, directed=False)
-    return int(number), np.asarray(fan, np.int64)
+    return connected_groups(np.column_stack([rows, columns]), 3 * m)

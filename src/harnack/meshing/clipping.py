@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -16,6 +16,7 @@ import numpy.typing as npt
 from harnack.backend import FloatArray
 from harnack.geometry import Ball, Box, ConvexHull, HalfSpace, Volume, VolumeIntersection
 from harnack.geometry.meshes import solid_angles
+from harnack.geometry.welding import connected_groups
 from harnack.meshing.checks import MeshingError
 from harnack.meshing.edges import IntArray, area_normals, boundary_edges, edge_keys, row_dots
 from harnack.meshing.lattice_meshing import TriangleMesh
@@ -198,14 +199,9 @@ class Shells:
 def _component_of_faces(surface: TriangleMesh) -> IntArray:
     """(m,) for each face, the index of its connected component. Faces are connected by common
     vertices."""
-    import scipy.sparse  # imported here: it takes half a second
-    import scipy.sparse.csgraph as csgraph_module
-
-    sparse, csgraph = cast("Any", scipy.sparse), cast("Any", csgraph_module)
-    faces, n = surface.faces, len(surface.vertices)
-    rows, columns = np.concatenate([faces[:, :2], faces[:, 1:]]).T
-    joined = sparse.coo_matrix((np.ones(len(rows)), (rows, columns)), shape=(n, n))
-    return np.asarray(csgraph.connected_components(joined, directed=False)[1])[faces[:, 0]]
+    faces = surface.faces
+    pairs = np.concatenate([faces[:, :2], faces[:, 1:]])
+    return connected_groups(pairs, len(surface.vertices))[faces[:, 0]]
 
 
 def winding_around(corner: FloatArray, point: FloatArray) -> float:

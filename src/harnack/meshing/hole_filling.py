@@ -31,6 +31,7 @@ from typing import Any, cast
 import numpy as np
 
 from harnack.backend import BoolArray, FloatArray
+from harnack.geometry.welding import connected_groups
 from harnack.meshing.checks import intersecting_faces
 from harnack.meshing.edges import (
     Edges,
@@ -711,14 +712,8 @@ def _loop_of_faces(new: IntArray, loops: list[IntArray], count: int) -> IntArray
     loops: the indices of the vertices of each loop.
     count: the number of vertices.
     """
-    import scipy.sparse  # imported here: it takes half a second
-    import scipy.sparse.csgraph as csgraph_module
-
-    sparse, csgraph = cast("Any", scipy.sparse), cast("Any", csgraph_module)
     edges = Edges.of(half_edges(new))
-    first, second = edges.paired_half_edges().T % len(new)
-    joined = sparse.coo_matrix((np.ones(len(first)), (first, second)), shape=(len(new), len(new)))
-    part = np.asarray(csgraph.connected_components(joined, directed=False)[1])
+    part = connected_groups(edges.paired_half_edges() % len(new), len(new))
     loop_at = np.full(int(part.max()) + 1, -1, np.int64)
     keys = edge_keys(edges.vertices, count)
     # For each edge, one of its faces.

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, cast
 
 import numpy as np
 
@@ -343,13 +342,7 @@ def _pieces(edges: Edges, count: int) -> IntArray:
     faces.
 
     edges: the edges of the mesh, made from its `half_edges`. count: m, the number of faces."""
-    import scipy.sparse  # imported here: it takes half a second
-    import scipy.sparse.csgraph as csgraph_module
-
-    sparse, csgraph = cast("Any", scipy.sparse), cast("Any", csgraph_module)
-    first, second = edges.paired_half_edges().T % count
-    adjacency = sparse.coo_matrix((np.ones(len(first)), (first, second)), shape=(count, count))
-    return np.asarray(csgraph.connected_components(adjacency, directed=False)[1], np.int64)
+    return connected_groups(edges.paired_half_edges() % count, count)
 
 
 def against_neighbors(x: FloatArray, faces: IntArray) -> BoolArray:

@@ -15,11 +15,11 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, cast
 
 import numpy as np
 
 from harnack.backend import BoolArray, FloatArray
+from harnack.geometry.welding import connected_groups
 from harnack.meshing.checks import (
     SelfIntersectionError,
     check_no_self_intersection,
@@ -119,18 +119,12 @@ def _regions(
     Yields: For each neighborhood the indices of its faces; and the indices of the vertices that may
     be removed, which are the corners of near faces. If only these are removed, the new faces lie
     within the bounding box, so they cross no face outside of the neighborhood."""
-    import scipy.sparse  # imported here: it takes half a second
-    import scipy.sparse.csgraph as csgraph_module
-
-    sparse, csgraph = cast("Any", scipy.sparse), cast("Any", csgraph_module)
     corner = vertices[faces]
     lower, upper = corner.min(axis=1), corner.max(axis=1)
     # Two rings of faces around the crossing ones. Each connected part begins a neighborhood.
     near = _faces_at_corners(faces, faces[crossing])
     second_ring = _faces_at_corners(faces, faces[near])
-    edges = half_edges(faces[second_ring])
-    adjacency = sparse.coo_matrix((np.ones(len(edges)), edges.T), shape=(len(vertices),) * 2)
-    component_of_vertex = csgraph.connected_components(adjacency, directed=False)[1]
+    component_of_vertex = connected_groups(half_edges(faces[second_ring]), len(vertices))
     neighborhoods: list[IntArray] = []
     for component in np.unique(component_of_vertex[faces[second_ring, 0]]):
         rows = second_ring[component_of_vertex[faces[second_ring, 0]] == component]
