@@ -21,7 +21,14 @@ from harnack.meshing.checks import SelfIntersectionError, check_manifold, inters
 from harnack.meshing.clipping import winding_around
 from harnack.meshing.closed_mesh import grown, to_manifold
 from harnack.meshing.csg_meshing import apart_of
-from harnack.meshing.edges import IntArray, area_normals, half_edges, row_dots, row_norms
+from harnack.meshing.edges import (
+    IntArray,
+    area_normals,
+    half_edges,
+    row_dots,
+    row_norms,
+    unit_normals,
+)
 from harnack.meshing.joined_pieces import boundary_of_solid, neighbors, passes_itself
 from harnack.meshing.lattice_meshing import TriangleMesh
 
@@ -116,7 +123,7 @@ def nested(x: FloatArray, parts: list[IntArray]) -> list[list[int]]:
     for i, (low, high) in enumerate(boxes):
         depth = _TEST_DEPTH * float((high - low).max())
         sample = parts[i][:: max(1, len(parts[i]) // _TEST_POINTS)]
-        normals = _unit_normals(x[sample])
+        normals = unit_normals(x[sample])
         # Against the normals, or along them if the component is inside out.
         points = x[sample].mean(axis=1) - math.copysign(depth, volumes[i]) * normals
         # A container has a box that holds this box, a larger volume, and winds around all test
@@ -199,7 +206,7 @@ def _make_overlap(parts: list[TriangleMesh]) -> list[TriangleMesh]:
     """
     corners = [shell.vertices[shell.faces] for shell in parts]
     size = float(np.ptp(np.concatenate(corners), axis=(0, 1)).max())
-    normals_of_part = [_unit_normals(corner) for corner in corners]
+    normals_of_part = [unit_normals(corner) for corner in corners]
     lows = [corner.min(axis=1) - _CONTACT_DISTANCE * size for corner in corners]
     highs = [corner.max(axis=1) + _CONTACT_DISTANCE * size for corner in corners]
     moved = [parts[0]]
@@ -227,13 +234,6 @@ def _make_overlap(parts: list[TriangleMesh]) -> list[TriangleMesh]:
                     x[faces[face]] = parts[k].vertices[faces[face]] + _OVERLAP * size * normal
         moved.append(TriangleMesh(x, faces))
     return moved
-
-
-def _unit_normals(corner: FloatArray) -> FloatArray:
-    """Unit normals (m, 3) of triangles with corners `corner` (m, 3, 3), by the right-hand rule; 0
-    for triangles without an area."""
-    normal = area_normals(corner)
-    return normal / np.maximum(row_norms(normal), 1e-300)[:, None]
 
 
 def _union_of_components(components: list[TriangleMesh], within: float) -> TriangleMesh:

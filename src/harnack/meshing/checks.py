@@ -33,8 +33,11 @@ from harnack.meshing.edges import (
     area_normals,
     boundary_edges,
     half_edges,
+    longest_edges,
+    normals_at_vertices,
     row_dots,
     row_norms,
+    unit_rows,
 )
 from harnack.meshing.level_function import LevelFunction
 
@@ -638,14 +641,12 @@ def check_manifold(faces: IntArray, vertices: FloatArray | None = None) -> None:
             "itself, or cells are too large for it; choose a smaller `cell_size`, or another level",
             np.unique(pairs[uses[index] > 2]),
         )
-    # For each edge, how often it is run toward the larger index minus how often the other way: 0
-    # for two faces that agree.
-    net = np.bincount(index, np.where(pairs[:, 0] < pairs[:, 1], 1, -1), minlength=len(uses))
-    if ((uses == 2) & (net != 0)).any():
+    is_run_alike = edges.run_twice_alike(pairs)
+    if is_run_alike.any():
         fail(
             "neighboring faces of the mesh do not agree on its two sides: cells are too large for "
             "this level set; choose a smaller `cell_size`",
-            np.unique(pairs[((uses == 2) & (net != 0))[index]]),
+            np.unique(pairs[is_run_alike[index]]),
         )
     # A manifold has one fan of faces at each vertex that is used.
     fan_count = int(_vertex_fans(faces, edges).max(initial=-1)) + 1
@@ -755,20 +756,14 @@ def points_off_level(
     Returns these points (k, 3), and the number of points that were tested.
     """
     corner = vertices[faces]
-    normal = area_normals(corner)
-    longest = np.stack([row_norms(corner[:, k] - corner[:, k - 1]) for k in range(3)]).max(axis=0)
-    large = longest > 0.5 * tolerance
+    large = longest_edges(corner) > 0.5 * tolerance
     is_checked = np.ones(len(vertices), np.bool_)
     # Level sets of fields with a period may end at a curve, on which the field has no value.
     if function.period is not None:
         is_checked[boundary_edges(faces)] = False
-    # The sum of the normals of the faces around each vertex.
-    mean = np.zeros_like(vertices)
-    for k in range(3):
-        np.add.at(mean, faces[:, k], normal)
     points = np.concatenate([vertices[is_checked], corner[large].mean(axis=1)])
-    directions = np.concatenate([mean[is_checked], normal[large]])
-    directions /= np.maximum(row_norms(directions), 1e-300)[:, None]
+    mean = normals_at_vertices(vertices, faces)
+    directions = unit_rows(np.concatenate([mean[is_checked], area_normals(corner[large])]))
     # Not `>`: a distance that is not a number fails too.
     rows = np.flatnonzero(~(function.sample(points).distance <= tolerance))
     # Nearer points are tried as well: where the solid is thin, the farther ones may lie beyond it.

@@ -18,7 +18,14 @@ from harnack.geometry import Ball, Box, ConvexHull, HalfSpace, Volume, VolumeInt
 from harnack.geometry.meshes import solid_angles
 from harnack.geometry.welding import connected_groups
 from harnack.meshing.checks import MeshingError
-from harnack.meshing.edges import IntArray, area_normals, boundary_edges, edge_keys, row_dots
+from harnack.meshing.edges import (
+    IntArray,
+    area_normals,
+    boundary_edges,
+    edge_keys,
+    normals_at_vertices,
+    row_dots,
+)
 from harnack.meshing.lattice_meshing import TriangleMesh
 
 __all__ = [
@@ -295,11 +302,9 @@ def _snap_to_boundary(
     x, faces = surface.vertices, surface.faces
     corner = x[faces]
     shortest_of_face = np.linalg.norm(corner - np.roll(corner, 1, axis=1), axis=2).min(axis=1)
-    normals = area_normals(corner)
-    shortest_edge, vertex_normals = np.full(len(x), np.inf), np.zeros_like(x)
+    shortest_edge, vertex_normals = np.full(len(x), np.inf), normals_at_vertices(x, faces)
     for k in range(3):
         np.minimum.at(shortest_edge, faces[:, k], shortest_of_face)
-        np.add.at(vertex_normals, faces[:, k], normals)
     vertex_normals /= np.maximum(np.linalg.norm(vertex_normals, axis=1), 1e-300)[:, None]
     heights = boundary.heights(x)
     moved = x

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from harnack.backend import BoolArray, FloatArray
-from harnack.meshing.edges import IntArray, row_dots, row_norms
+from harnack.meshing.edges import IntArray, limited_rows, row_dots, row_norms
 from harnack.meshing.level_function import LevelFunction, LevelSamples
 from harnack.tree.empty_space import BoxCells, RefinedCells, refine_cells
 
@@ -390,7 +390,7 @@ def newton_to_level(
             length = row_norms(move)
         lost = ~np.isfinite(length)
         move[lost], length[lost] = 0.0, 0.0
-        moved = current + move * np.minimum(1, max_step[rows] / np.maximum(length, 1e-300))[:, None]
+        moved = current + limited_rows(move, max_step[rows])
         x[rows] = moved if walls is None else np.clip(moved, *walls)
         rows = rows[length > _CONVERGED * max_step[rows]]
         if k == steps - 1 or not len(rows):

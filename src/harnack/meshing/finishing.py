@@ -16,14 +16,14 @@ from harnack.meshing.checks import MeshingError, euler_characteristic, intersect
 from harnack.meshing.closed_mesh import from_manifold, to_manifold, without_short_edges
 from harnack.meshing.edges import (
     Edges,
-    IntArray,
     area_normals,
     boundary_edges,
     edge_keys,
     half_edges,
+    normals_at_vertices,
     row_dots,
-    row_norms,
     sorted_unique,
+    unit_normals,
 )
 from harnack.meshing.lattice_meshing import TriangleMesh
 from harnack.meshing.level_function import LevelFunction
@@ -218,11 +218,7 @@ def vertex_normals(function: LevelFunction, surface: TriangleMesh) -> FloatArray
 
     function: the field minus its level.
     """
-    corner = surface.vertices[surface.faces]
-    normal = area_normals(corner)
-    mean = np.zeros_like(surface.vertices)
-    for k in range(3):
-        np.add.at(mean, surface.faces[:, k], normal)
+    mean = normals_at_vertices(surface.vertices, surface.faces)
     mean /= np.maximum(np.linalg.norm(mean, axis=1), 1e-300)[:, None]
     slope = function.sample(surface.vertices).gradient
     steep: FloatArray = np.linalg.norm(slope, axis=1)
@@ -309,13 +305,6 @@ def _crease_count(surface: TriangleMesh, edges: Edges) -> int:
 
     edges: the `Edges` of the `half_edges` of the surface's faces.
     """
-    normals = _unit_normals(surface.vertices, surface.faces)
+    normals = unit_normals(surface.vertices[surface.faces])
     pairs = edges.paired_half_edges() % len(surface.faces)
     return int((row_dots(normals[pairs[:, 0]], normals[pairs[:, 1]]) < _CREASE_COSINE).sum())
-
-
-def _unit_normals(vertices: FloatArray, faces: IntArray) -> FloatArray:
-    """Unit normals (m, 3) of faces (m, 3); 0 for faces without an area."""
-    corner = vertices[faces]
-    cross = area_normals(corner)
-    return cross / np.maximum(row_norms(cross), 1e-300)[:, None]

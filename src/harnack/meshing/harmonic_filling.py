@@ -231,10 +231,7 @@ def checked_boundary_edges(faces: IntArray) -> IntArray:
             f"{a} and {b}: such a mesh has no two sides there, and where all faces are kept none "
             "are left out"
         )
-    # For each edge, how often it is run toward the larger index minus how often the other way: 0
-    # for two faces that agree.
-    sign = np.bincount(index, np.where(pairs[:, 0] < pairs[:, 1], 1, -1), minlength=len(uses))
-    turned = np.flatnonzero((uses == 2) & (sign != 0))
+    turned = np.flatnonzero(edges.run_twice_alike(pairs))
     if len(turned):
         a, b = edges.vertices[turned[0]].tolist()
         raise MeshError(

@@ -39,6 +39,7 @@ from harnack.meshing.edges import (
     area_normals,
     edge_keys,
     half_edges,
+    normals_at_vertices,
     row_dots,
     row_norms,
 )
@@ -197,9 +198,7 @@ def hole_loops(vertices: FloatArray, faces: IntArray, edges: IntArray) -> list[I
     for a, b in edges.tolist():
         leaving[a].append(b)
         arriving[b].append(a)
-    normals = np.zeros_like(vertices)
-    for k in range(3):
-        np.add.at(normals, faces[:, k], area_normals(vertices[faces]))
+    normals = normals_at_vertices(vertices, faces)
     # following[a, b] = c: after the edge from a to b, the loop goes on to c.
     following: dict[tuple[int, int], int] = {}
     for v, starts in arriving.items():

@@ -37,7 +37,7 @@ from harnack.meshing.delaunay_points import (
     newton_to_level,
     to_multiple_roots,
 )
-from harnack.meshing.edges import IntArray, row_norms, sorted_unique, unique_with_inverse
+from harnack.meshing.edges import IntArray, row_norms, sorted_unique, unique_with_inverse, unit_rows
 from harnack.meshing.isotopy import IsotopyCoverage, isotopy_of
 from harnack.meshing.level_function import LevelFunction, LevelSamples
 from harnack.meshing.marching_tetrahedra import (
@@ -210,7 +210,7 @@ def _thickness(function: LevelFunction, x: FloatArray, size: float) -> FloatArra
     both sides of the point at the smallest distance: the region is thinner than that. It is inf if
     the sign does not change again."""
     gradient = function.sample(x).gradient
-    direction = gradient / np.maximum(row_norms(gradient), 1e-300)[:, None]
+    direction = unit_rows(gradient)
     distances = size * 2.0 ** np.arange(round(math.log2(_MIN_THICKNESS)), 1)
     nearest_is_above: list[BoolArray] = []
     thickness = np.full(len(x), np.inf)
@@ -268,7 +268,7 @@ def _check_passes_level(function: LevelFunction, points: FloatArray, size: float
         -1, 3, 3
     )
     steepest = gradients[np.arange(len(x)), (gradients**2).sum(axis=2).argmax(axis=1)]
-    direction = steepest / np.maximum(row_norms(steepest), 1e-300)[:, None]
+    direction = unit_rows(steepest)
 
     def along(s: FloatArray) -> FloatArray:
         """(k,) the function's values on the segments at the signed distances s (k,) from the points

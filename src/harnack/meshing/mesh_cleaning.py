@@ -221,14 +221,7 @@ class _WorkingMesh:
         oriented = np.where(is_reversed[:, None], working.faces[:, ::-1], working.faces)
         pairs = half_edges(oriented)
         edges = Edges.of(pairs)
-        sign = np.where(pairs[:, 0] < pairs[:, 1], 1, -1)
-        # Two faces that agree run their common edge in opposite directions, so the sum is 0.
-        direction_sum = np.bincount(edges.edge_of_pair, sign, minlength=len(edges.multiplicity))
-        is_one_sided = (
-            ((edges.multiplicity == 2) & (direction_sum != 0))[edges.edge_of_pair]
-            .reshape(3, -1)
-            .any(axis=0)
-        )
+        is_one_sided = edges.run_twice_alike(pairs)[edges.edge_of_pair].reshape(3, -1).any(axis=0)
         working = _WorkingMesh(
             working.vertices,
             oriented,

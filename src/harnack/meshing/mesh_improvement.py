@@ -33,6 +33,7 @@ from harnack.meshing.edges import (
     row_dots,
     row_norms,
     sorted_unique,
+    unit_rows,
 )
 from harnack.meshing.level_function import LevelFunction
 
@@ -360,8 +361,7 @@ def _best_places(
         (k,) around the vertex there, in radians.
     """
     center, a, b = (vertices[stars.corners[:, k]] for k in range(3))
-    normal = np.cross(a - center, b - center)
-    normal /= np.maximum(row_norms(normal), 1e-300)[:, None]
+    normal = unit_rows(np.cross(a - center, b - center))
     middle = 0.5 * (a + b)
     # The position at which the triangle over the opposite edge has equal sides.
     apex = middle + np.sqrt(0.75) * np.cross(normal, b - a)

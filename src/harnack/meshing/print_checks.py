@@ -28,7 +28,7 @@ from harnack.meshing.checks import (
     touching_pairs,
 )
 from harnack.meshing.clipping import Shells
-from harnack.meshing.edges import Edges, IntArray, half_edges, row_norms
+from harnack.meshing.edges import Edges, IntArray, half_edges, longest_edges
 from harnack.meshing.lattice_meshing import TriangleMesh
 from harnack.meshing.thickness import wall_thickness
 
@@ -250,12 +250,6 @@ def _topology(x: FloatArray, faces: IntArray) -> list[PrintProblem]:
     pairs = half_edges(proper_faces)
     edges = Edges.of(pairs)
     middle = x[edges.vertices].mean(axis=1)
-    # Two faces that agree run their common edge in opposite directions, so the sum is 0.
-    direction_sum = np.bincount(
-        edges.edge_of_pair,
-        np.where(pairs[:, 0] < pairs[:, 1], 1, -1),
-        minlength=len(edges.multiplicity),
-    )
     _, first, use_count = np.unique(
         np.sort(proper_faces, axis=1), axis=0, return_index=True, return_counts=True
     )
@@ -272,7 +266,7 @@ def _topology(x: FloatArray, faces: IntArray) -> list[PrintProblem]:
         ),
         _problem(
             "sides that disagree",
-            middle[(edges.multiplicity == 2) & (direction_sum != 0)],
+            middle[edges.run_twice_alike(pairs)],
             "at {} {edge|edges} neighboring faces do not agree on what is inside",
         ),
         _problem(
@@ -404,8 +398,7 @@ def _coarse_faces(x: FloatArray, faces: IntArray, wall: float) -> PrintProblem:
     length: thickness is measured at the centers of faces, so thin places beside these may be
     missed."""
     corner = x[faces]
-    longest = np.stack([row_norms(corner[:, k] - corner[:, k - 1]) for k in range(3)]).max(axis=0)
-    centers = corner[longest > _COARSE * wall].mean(axis=1)
+    centers = corner[longest_edges(corner) > _COARSE * wall].mean(axis=1)
     text = f"{{}} {{triangle is|triangles are}} longer than {_COARSE:g} walls, and thickness is "
     text += "measured at centers"
     return _problem("walls measured coarsely", centers, text, is_fatal=False)

@@ -26,8 +26,11 @@ from harnack.meshing.edges import (
     area_normals,
     boundary_edges,
     half_edges,
+    limited_rows,
+    longest_edges,
     row_dots,
     row_norms,
+    unit_rows,
 )
 from harnack.meshing.level_function import LevelFunction, LevelSamples
 from harnack.meshing.mesh_improvement import collapse_slivers, flip_edges, relax_vertices
@@ -190,11 +193,8 @@ def _project_to_creases(
     does not pass the level, or passes it too near to an end of the edge."""
     used, vertex_rows = np.unique(ends, return_inverse=True)
     gradient = function.sample(vertices[used]).gradient
-    end_normals = (gradient / np.maximum(row_norms(gradient), 1e-300)[:, None])[
-        vertex_rows.reshape(-1, 2)
-    ]
-    midpoint_normal = function.sample(moved).gradient
-    midpoint_normal = midpoint_normal / np.maximum(row_norms(midpoint_normal), 1e-300)[:, None]
+    end_normals = unit_rows(gradient)[vertex_rows.reshape(-1, 2)]
+    midpoint_normal = unit_rows(function.sample(moved).gradient)
     n_a, n_b = end_normals[:, 0], end_normals[:, 1]
     cosine = row_dots(n_a, n_b)
     angle_to_end = np.arccos(
@@ -236,12 +236,9 @@ def _crease_corners(
     walls: None, or the lower and the upper corner (3,) of a box to which points are confined."""
     corner = vertices[faces]
     center = corner.mean(axis=1)
-    longest_edge = np.stack([row_norms(corner[:, k] - corner[:, k - 1]) for k in range(3)]).max(
-        axis=0
-    )
+    longest_edge = longest_edges(corner)
     moved = newton_to_level(function, center, function.sample(center), 0.5 * longest_edge, walls)
-    gradient = function.sample(corner.reshape(-1, 3)).gradient
-    normal = (gradient / np.maximum(row_norms(gradient), 1e-300)[:, None]).reshape(-1, 3, 3)
+    normal = unit_rows(function.sample(corner.reshape(-1, 3)).gradient).reshape(-1, 3, 3)
     rows = np.flatnonzero(np.abs(np.linalg.det(normal)) > _INDEPENDENT)
     # The planes n_k . p = offset_k, with p relative to the center.
     offsets = (normal * (corner - center[:, None])).sum(axis=2)
@@ -268,7 +265,7 @@ def _level_along(
         The first crossing (k, 3) of the level on each segment; and the mask (k,) of the segments
         that cross the level. If a segment does not cross it, its point has no meaning.
     """
-    along = along * np.minimum(1, limit / np.maximum(row_norms(along), 1e-300))[:, None]
+    along = limited_rows(along, limit)
     low, high = np.zeros(len(start)), np.full(len(start), _SEARCH_LENGTH)
     is_found = np.ones(len(start), np.bool_)
     fractions = np.linspace(0, 1, _SAMPLES)
@@ -381,8 +378,7 @@ def _normals_turn(function: LevelFunction, corner: FloatArray) -> BoolArray:
     at two corners differ by more than 20 degrees.
 
     corner: (k, 3, 3) the corners of the faces."""
-    gradient = function.sample(corner.reshape(-1, 3)).gradient
-    normal = (gradient / np.maximum(row_norms(gradient), 1e-300)[:, None]).reshape(-1, 3, 3)
+    normal = unit_rows(function.sample(corner.reshape(-1, 3)).gradient).reshape(-1, 3, 3)
     cosines = [row_dots(normal[:, k], normal[:, k - 1]) for k in range(3)]
     return np.min(cosines, axis=0) < math.cos(_CREASE)
 

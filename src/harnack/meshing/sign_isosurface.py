@@ -41,8 +41,11 @@ from harnack.meshing.edges import (
     area_normals,
     boundary_edges,
     half_edges,
+    limited_rows,
+    longest_edges,
     row_dots,
     row_norms,
+    unit_normals,
 )
 from harnack.meshing.lattice_meshing import TriangleMesh
 from harnack.meshing.level_function import LevelSamples
@@ -670,7 +673,7 @@ def _level_along(
         (k,) of the segments that have such a point: the function has different signs at the two
         ends of the search. For other segments, point and normal have no meaning.
     """
-    along = along * np.minimum(1, limit / np.maximum(row_norms(along), 1e-300))[:, None]
+    along = limited_rows(along, limit)
     begin, end = start - _BEFORE * along, start + _AFTER * along
     is_positive = function.values(begin) > 0
     changes_sign = is_positive != (function.values(end) > 0)
@@ -709,12 +712,13 @@ def _crease_corners(
     independent = np.flatnonzero(np.abs(det(normal)) > _INDEPENDENT)
     rows, corner, normal = rows[independent], corner[independent], normal[independent]
     center = corner.mean(axis=1)
-    longest = np.stack([row_norms(corner[:, k] - corner[:, k - 1]) for k in range(3)]).max(axis=0)
     # The common point p of the planes n_k . (p - corner_k) = 0, relative to the center.
     offsets = np.einsum("kij,kij->ki", normal, corner - center[:, None])
     solve: Any = np.linalg.solve
     direction: FloatArray = solve(normal, offsets[:, :, None])[:, :, 0]
-    points, new_normals, is_found = _level_along(function, center, direction, _OFFSET * longest)
+    points, new_normals, is_found = _level_along(
+        function, center, direction, _OFFSET * longest_edges(corner)
+    )
     return points[is_found], new_normals[is_found], rows[is_found]
 
 
@@ -774,8 +778,7 @@ def _folded_faces(x: FloatArray, faces: IntArray, among: BoolArray) -> IntArray:
     """The indices of the faces that are folded onto a neighbor (a face with a common edge), up to
     rounding: the normals of both are opposite. A pair of neighbors is tested if the mask `among`
     (m,) is set for at least one of the two."""
-    normal = area_normals(x[faces])
-    normal /= np.maximum(row_norms(normal), 1e-300)[:, None]
+    normal = unit_normals(x[faces])
     pairs = Edges.of(half_edges(faces)).paired_half_edges() % len(faces)
     first, second = pairs.T
     is_folded = (row_dots(normal[first], normal[second]) < _FOLDED) & (among[first] | among[second])
