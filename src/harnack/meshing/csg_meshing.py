@@ -23,7 +23,7 @@ import dataclasses
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TypeAlias, cast
+from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias, cast
 
 import numpy as np
 
@@ -184,48 +184,34 @@ class CsgMesher:
         Raises:
             MeshingError: the solid or one of its operands cannot be meshed.
         """
-        from manifold3d import Manifold
-
-        if isinstance(solid, BooleanSolid):
-            apart = factor_common_operands(solid, level) if solid.is_union else None
-            if apart is not None:
-                return self.mesh_sublevel(apart, 0.0)
-            reduced = drop_cancelled_operands(flatten_csg(solid), level)
-            return Manifold() if reduced is None else self._mesh_boolean(reduced, level)
-        if isinstance(solid, Complement):  # -f <= c where f >= -c
-            return self._whole_box() - self.mesh_sublevel(solid.field, -level)
-        # f - distance <= c where f <= c + distance.
-        if isinstance(solid, OffsetSolid):
-            return self.mesh_sublevel(solid.field, level + solid.distance)
-        if isinstance(solid, BandSolid):
-            return self._mesh_wall(solid, level)
-        if isinstance(solid, SublevelSolid) and isinstance(solid.field, Solid):
-            return self.mesh_sublevel(solid.field, level)
-        if isinstance(solid, TransformedSolid) and not is_single_level_set(solid.field):
-            return self._mesh_transformed(solid, level)
-        # A box shrunk by -level keeps its sharp edges; a box that grows gets round ones.
-        if isinstance(solid, Cuboid) and solid.radius == 0 and level <= 0:
-            half = 0.5 * np.array(solid.sides) + level
-            return box_manifold(-half, half) if (half > 0).all() else Manifold()
-        if isinstance(solid, Extrusion) and level == 0:
-            return extruded_manifold(
-                solid.loops, solid.height, solid.twist, solid.taper, self.tolerance
-            )
-        if isinstance(solid, SolidOfRevolution) and level == 0:
-            return revolved_manifold(solid.loops, self.tolerance)
-        if isinstance(solid, Thread) and level == 0:
-            low, high = float(self.lower[2]), float(self.upper[2])
-            return thread_manifold(solid, low, high, self.tolerance)
-        if isinstance(solid, Tube):
-            return tube_manifold(solid, level, self.tolerance)
-        if isinstance(solid, MeshSolid):
-            return (mesh_manifold(solid) if level == 0 else None) or self._mesh_offset(solid, level)
-        if isinstance(solid, Plane):
-            x, y, z = solid.normal
-            return self._whole_box().trim_by_plane((-x, -y, -z), -(solid.distance + level))
+        for kind, method in self.methods.items():
+            manifold = method(self, solid, level) if isinstance(solid, kind) else None
+            if manifold is not None:
+                return manifold
         return to_manifold(self.mesh_smooth_level(solid, level)[0])
 
     def _mesh_boolean(self, solid: BooleanSolid, level: float) -> Manifold:
+        """Mesh the set {solid <= level} for a union or an intersection, after common operands were
+        factored out and operands that cancel were dropped."""
+        from manifold3d import Manifold
+
+        apart = factor_common_operands(solid, level) if solid.is_union else None
+        if apart is not None:
+            return self.mesh_sublevel(apart, 0.0)
+        reduced = drop_cancelled_operands(flatten_csg(solid), level)
+        return Manifold() if reduced is None else self._combine_operands(reduced, level)
+
+    def _mesh_box(self, box: Cuboid, level: float) -> Manifold | None:
+        """Mesh the set {box <= level} if its edges are sharp; None if they are round. A box shrunk
+        by -level keeps its sharp edges; a box that grows gets round ones."""
+        from manifold3d import Manifold
+
+        if box.radius != 0 or level > 0:
+            return None
+        half = 0.5 * np.array(box.sides) + level
+        return box_manifold(-half, half) if (half > 0).all() else Manifold()
+
+    def _combine_operands(self, solid: BooleanSolid, level: float) -> Manifold:
         """Mesh the set {solid <= level} for a union or an intersection: its operands are meshed and
         combined by manifold3d. An operand of an intersection that is a complement is not meshed:
         the solid that it is the complement of is meshed and cut away. If all operands are
@@ -471,10 +457,13 @@ class CsgMesher:
         self.evaluations += function.evaluations
         return to_manifold(surface)
 
-    def _mesh_transformed(self, solid: TransformedSolid, level: float) -> Manifold:
-        """Mesh the set {solid <= level} for a solid under an affine map. The original solid is
-        meshed in the box around the preimage of this box, with a smaller tolerance if the map
-        stretches; its mesh is then mapped."""
+    def _mesh_transformed(self, solid: TransformedSolid, level: float) -> Manifold | None:
+        """Mesh the set {solid <= level} for a solid under an affine map; None if the original solid
+        is meshed as one level set, since then the mapped solid can be. The original solid is meshed
+        in the box around the preimage of this box, with a smaller tolerance if the map stretches;
+        its mesh is then mapped."""
+        if is_single_level_set(solid.field):
+            return None
         matrix, offset = np.array(solid.map.matrix), np.array(solid.map.translation_vector)
         ends = np.stack([self.lower, self.upper])
         corners = np.stack(np.meshgrid(*ends.T, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -499,6 +488,46 @@ class CsgMesher:
         self.smallest_cell = min(self.smallest_cell, local.smallest_cell * scale)
         return manifold.transform(np.column_stack([matrix, offset]))
 
+    # How solids of each class are meshed if not as one level set. A method returns None if it does
+    # not apply to the given solid and level; then the solid is meshed as one level set after all.
+    methods: ClassVar[dict[type[Solid], Callable[[CsgMesher, Any, float], Manifold | None]]] = {
+        BooleanSolid: _mesh_boolean,
+        # -f <= c where f >= -c.
+        Complement: lambda self, solid, level: (
+            self._whole_box() - self.mesh_sublevel(solid.field, -level)
+        ),
+        # f - distance <= c where f <= c + distance.
+        OffsetSolid: lambda self, solid, level: self.mesh_sublevel(
+            solid.field, level + solid.distance
+        ),
+        BandSolid: _mesh_wall,
+        SublevelSolid: lambda self, solid, level: (
+            self.mesh_sublevel(solid.field, level) if isinstance(solid.field, Solid) else None
+        ),
+        TransformedSolid: _mesh_transformed,
+        Cuboid: _mesh_box,
+        Extrusion: lambda self, solid, level: (
+            extruded_manifold(solid.loops, solid.height, solid.twist, solid.taper, self.tolerance)
+            if level == 0
+            else None
+        ),
+        SolidOfRevolution: lambda self, solid, level: (
+            revolved_manifold(solid.loops, self.tolerance) if level == 0 else None
+        ),
+        Thread: lambda self, solid, level: (
+            thread_manifold(solid, float(self.lower[2]), float(self.upper[2]), self.tolerance)
+            if level == 0
+            else None
+        ),
+        Tube: lambda self, solid, level: tube_manifold(solid, level, self.tolerance),
+        MeshSolid: lambda self, solid, level: (
+            (mesh_manifold(solid) if level == 0 else None) or self._mesh_offset(solid, level)
+        ),
+        Plane: lambda self, solid, level: self._whole_box().trim_by_plane(
+            tuple(-component for component in solid.normal), -(solid.distance + level)
+        ),
+    }
+
 
 def _is_complement_free(solid: Solid) -> bool:
     """Whether neither a solid nor any of its operands is a complement or a wall. (A wall counts
@@ -517,8 +546,7 @@ def is_single_level_set(solid: Solid) -> bool:
         return not isinstance(solid.field, Solid) or is_single_level_set(solid.field)
     if isinstance(solid, TransformedSolid):
         return is_single_level_set(solid.field)
-    with_edges = Cuboid | Plane | Extrusion | SolidOfRevolution | Thread | Tube | MeshSolid
-    return not isinstance(solid, BooleanSolid | Complement | OffsetSolid | BandSolid | with_edges)
+    return not isinstance(solid, tuple(CsgMesher.methods))
 
 
 def _sublevel_bounds(solid: MeshSolid, level: float) -> tuple[FloatArray, FloatArray]:
