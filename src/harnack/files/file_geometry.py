@@ -117,14 +117,6 @@ class FileGeometry:
     polylines: PolygonList = NO_POLYGONS
 
 
-def ranks_in_lists(sizes: IntArray) -> IntArray:
-    """Return the position of each entry within its own list (0, 1, ..., size - 1), for lists that
-    are stored one after the other in one array. sizes: (m,) the lengths of the lists."""
-    ranks = np.arange(int(sizes.sum()), dtype=np.int64)
-    ranks -= np.repeat(np.cumsum(sizes) - sizes, sizes)
-    return ranks
-
-
 def triangles_as_polygons(path: Path, corners: IntArray) -> PolygonList:
     """Return triangles as a `PolygonList`. corners: (m, 3) their vertex indices, which were read
     from the file `path`."""

@@ -15,19 +15,16 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend.validation import (
-    TRANSPOSE_ADVICE,
     BoolArray,
     FloatArray,
     IntArray,
     as_real_array,
-    check_coordinate_size,
-    check_finite,
-    check_vectors,
     others_suffix,
 )
 from harnack.geometry.boundary_edges import boundary_edges, join_edges
 from harnack.geometry.convex_position import is_convex_position
-from harnack.geometry.meshes import MAX_FACES, MAX_VERTICES, MeshError
+from harnack.geometry.flat_lists import next_in_lists
+from harnack.geometry.meshes import MAX_FACES, MeshError, checked_vertices
 
 __all__ = ["PolygonFaces", "cluster_into_polygons", "validate_polygons"]
 
@@ -77,9 +74,7 @@ class PolygonFaces:
     @property
     def next_corner(self) -> IntArray:
         """(k,) the index in `corners` of the next corner of the same loop."""
-        following = np.arange(1, len(self.corners) + 1, dtype=np.int64)
-        following[self.loop_starts + self.loop_sizes - 1] = self.loop_starts
-        return following
+        return next_in_lists(self.loop_sizes)
 
     @property
     def edges(self) -> IntArray:
@@ -170,7 +165,8 @@ def validate_polygons(vertices: Any, faces: Any) -> PolygonFaces:
             that visits a vertex twice; an edge of length zero, or run twice by its face; a face
             whose vertices lie on a line.
     """
-    x = _checked_vertices(vertices)
+    ragged = "must all have 3 coordinates"
+    x = checked_vertices(as_real_array(vertices, "the vertices", MeshError, ragged=ragged))
     corners, sizes, face_of_loop = _flatten_faces(faces)
     bad = np.flatnonzero((corners < 0) | (corners >= len(x)))
     face = np.repeat(face_of_loop, sizes)
@@ -190,22 +186,6 @@ def validate_polygons(vertices: Any, faces: Any) -> PolygonFaces:
     for array in (x, corners, sizes, face_of_loop):
         array.setflags(write=False)
     return polygons
-
-
-def _checked_vertices(vertices: Any) -> FloatArray:
-    """Convert vertices to a new float64 array (n, 3) of finite numbers. Raises MeshError if that is
-    not possible."""
-    array = as_real_array(vertices, "the vertices", MeshError, ragged="must all have 3 coordinates")
-    if array.size == 0:
-        raise MeshError("there are no vertices: give an array (n, 3)")
-    check_vectors(array, "the vertices", MeshError, transposed=TRANSPOSE_ADVICE)
-    if len(array) > MAX_VERTICES:
-        raise MeshError(f"{len(array):,} vertices are too many: at most {MAX_VERTICES:,}")
-    x = np.array(array, dtype=np.float64, order="C")
-    advice = "coordinates must be finite; remove it and the faces that use it"
-    check_finite(x, "vertex {}", MeshError, advice)
-    check_coordinate_size(x, MeshError)
-    return x
 
 
 def _flatten_faces(faces: Any) -> tuple[IntArray, IntArray, IntArray]:

@@ -19,6 +19,7 @@ import numpy as np
 
 from harnack.backend import BoolArray, FloatArray, choose_backend
 from harnack.geometry.boundary_edges import singular_edges
+from harnack.geometry.flat_lists import ranks_in_lists
 from harnack.geometry.meshes import without_zero_area_faces
 from harnack.geometry.welding import connected_groups, pairs_within
 from harnack.meshing.checks import MeshingError, touching_pairs
@@ -164,8 +165,7 @@ class _Cut:
             np.searchsorted(self.owner[order], covered, side=side) for side in ("left", "right")
         )
         count = end - start
-        offset = np.cumsum(count) - count
-        rows = order[np.arange(int(count.sum())) + np.repeat(start - offset, count)]
+        rows = order[np.repeat(start, count) + ranks_in_lists(count)]
         triangle = self.unit[self.faces[np.repeat(covering, count)]]
         piece_center, normal = self.pieces[rows].mean(axis=1), area_normals(triangle)
         is_within = np.ones(len(rows), np.bool_)
