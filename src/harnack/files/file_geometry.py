@@ -124,6 +124,24 @@ def triangles_as_polygons(path: Path, corners: IntArray) -> PolygonList:
     return PolygonList(corners.ravel(), sizes, FileLocations(path, "triangle", range(len(corners))))
 
 
+def placed_mesh(geometry: Any, matrix: FloatArray) -> tuple[FloatArray, IntArray]:
+    """Return the vertices (n, 3) of a mesh or of points that trimesh read, moved by the transform
+    `matrix` (4, 4); and the faces (m, 3), reversed if the transform makes a mirror image."""
+    x = np.asarray(geometry.vertices, np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
+    faces = np.asarray(getattr(geometry, "faces", np.zeros((0, 3))), np.int64)
+    return x, faces[:, ::-1] if np.linalg.det(matrix[:3, :3]) < 0 else faces
+
+
+def joined_meshes(path: Path, meshes: list[tuple[FloatArray, IntArray]]) -> FileGeometry:
+    """Return meshes, given by vertices (n, 3) and faces (m, 3), as the geometry of the file `path`
+    from which they were read."""
+    import trimesh  # here, since it takes half a second
+
+    append_faces: Any = trimesh.util.append_faces
+    x, faces = append_faces(*zip(*meshes, strict=True))
+    return FileGeometry(path, x, faces=triangles_as_polygons(path, faces))
+
+
 def check_finite(coordinates: FloatArray, places: FileLocations) -> None:
     """Raise a FileFormatError if a number in an array `coordinates` (n, k) is not finite. The
     message names the location of the first such row. places: the locations of the rows."""
