@@ -9,6 +9,7 @@ import errno
 import os
 import secrets
 import tempfile
+import warnings
 from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -122,6 +123,21 @@ def triangles_as_polygons(path: Path, corners: IntArray) -> PolygonList:
     from the file `path`."""
     sizes = np.full(len(corners), 3, dtype=np.int64)
     return PolygonList(corners.ravel(), sizes, FileLocations(path, "triangle", range(len(corners))))
+
+
+@contextlib.contextmanager
+def errors_of_trimesh(place: FileLocation, kind: str) -> Generator[None, None, None]:
+    """A context in which any error, such as trimesh raises for malformed files, becomes a
+    FileFormatError that says that `place` is no sound file of this kind; warnings are silenced."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    except FileFormatError:
+        raise
+    except Exception as error:
+        reason = str(error).strip().splitlines()[:1] or [type(error).__name__]
+        raise place.error(f"it is no sound {kind} file ({reason[0][:120]})") from None
 
 
 def placed_mesh(geometry: Any, matrix: FloatArray) -> tuple[FloatArray, IntArray]:

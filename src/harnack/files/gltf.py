@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import json
 import math
-import warnings
 from io import BytesIO
 from pathlib import Path
 from typing import Any, cast
@@ -23,9 +22,9 @@ import numpy as np
 from harnack.backend import FloatArray, IntArray
 from harnack.files.file_geometry import (
     MAX_BYTES,
-    FileFormatError,
     FileGeometry,
     FileLocation,
+    errors_of_trimesh,
     joined_meshes,
     placed_mesh,
     read_bytes,
@@ -59,25 +58,18 @@ def read_gltf(path: Path, data: bytes) -> FileGeometry:
 
     place = FileLocation(path)
     header = _header(place, data)
-    try:
+    with errors_of_trimesh(place, "glTF"):
         files = _buffer_files(path, header)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            _check_header(place, header, len(data) + sum(map(len, files.values())))
-            scene: Any = trimesh.load(
-                BytesIO(data),
-                file_type=path.suffix.lower()[1:],
-                resolver=files,
-                force="scene",
-                process=False,
-                skip_materials=True,
-            )
-            return _contents(place, scene)
-    except FileFormatError:
-        raise
-    except Exception as error:  # trimesh raises any error for malformed files
-        reason = str(error).strip().splitlines()[:1] or [type(error).__name__]
-        raise place.error(f"it is no sound glTF file ({reason[0][:120]})") from None
+        _check_header(place, header, len(data) + sum(map(len, files.values())))
+        scene: Any = trimesh.load(
+            BytesIO(data),
+            file_type=path.suffix.lower()[1:],
+            resolver=files,
+            force="scene",
+            process=False,
+            skip_materials=True,
+        )
+        return _contents(place, scene)
 
 
 def _header(place: FileLocation, data: bytes) -> dict[str, Any]:

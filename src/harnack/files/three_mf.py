@@ -4,7 +4,6 @@ millimeters."""
 from __future__ import annotations
 
 import importlib.util
-import warnings
 import zipfile
 from io import BytesIO
 from pathlib import Path
@@ -15,12 +14,12 @@ import numpy as np
 from harnack.backend import FloatArray, IntArray
 from harnack.files.file_geometry import (
     MAX_BYTES,
-    FileFormatError,
     FileGeometry,
     FileLocation,
     FileLocations,
     check_finite,
     check_indices,
+    errors_of_trimesh,
     joined_meshes,
     placed_mesh,
     triangles_as_polygons,
@@ -61,16 +60,9 @@ def read_3mf(path: Path, data: bytes) -> FileGeometry:
         raise place.error("this is no .3mf file: it is no zip archive") from None
     if size > MAX_BYTES:
         raise place.error(f"it has {size:,} bytes when unpacked: at most {MAX_BYTES:,} are read")
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            scene: Any = trimesh.load(BytesIO(data), file_type="3mf", force="scene", process=False)
-            return _contents(place, scene)
-    except FileFormatError:
-        raise
-    except Exception as error:  # trimesh raises any error for malformed files
-        reason = str(error).strip().splitlines()[:1] or [type(error).__name__]
-        raise place.error(f"it is no sound 3MF file ({reason[0][:120]})") from None
+    with errors_of_trimesh(place, "3MF"):
+        scene: Any = trimesh.load(BytesIO(data), file_type="3mf", force="scene", process=False)
+        return _contents(place, scene)
 
 
 def _contents(place: FileLocation, scene: Any) -> FileGeometry:
