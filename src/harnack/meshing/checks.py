@@ -455,6 +455,13 @@ def _edge_pierces(
     return pierces
 
 
+def _projection_axes(triangle: FloatArray) -> IntArray:
+    """The two coordinates (k, 2) that a projection along the coordinate axis nearest to the normal
+    of each of the triangles (k, 3, 3) keeps."""
+    nearest = np.abs(area_normals(triangle)).argmax(axis=1)
+    return np.array([[1, 2], [2, 0], [0, 1]])[nearest]
+
+
 def _share_area(first: FloatArray, second: FloatArray) -> BoolArray:
     """(k,) whether two triangles in one plane have an area in common. They do unless the line of an
     edge separates them (separating axes). For the test they are projected to two dimensions, along
@@ -462,10 +469,8 @@ def _share_area(first: FloatArray, second: FloatArray) -> BoolArray:
 
     first, second: (k, 3, 3) the corners of the triangles of each pair.
     """
-    normal = np.abs(area_normals(first))
-    # The two coordinates that the projection keeps.
-    axes = np.array([[1, 2], [2, 0], [0, 1]])[normal.argmax(axis=1)]
-    flat = [np.take_along_axis(t, axes[:, None].repeat(3, axis=1), axis=2) for t in (first, second)]
+    axes = _projection_axes(first)[:, None]
+    flat = [np.take_along_axis(t, axes, axis=2) for t in (first, second)]
     overlaps = np.ones(len(first), np.bool_)
     for a, b in (flat, flat[::-1]):
         # 1 if the projected triangle runs counter-clockwise; then its inside is left of its edges.
@@ -484,10 +489,8 @@ def _segments_meet(triangle: FloatArray, p: FloatArray, q: FloatArray) -> BoolAr
     triangle: (k, 3, 3) the corners of the triangles.
     p, q: (k, 3) the ends of the segments; if they are equal, the segment is a point.
     """
-    normal = np.abs(area_normals(triangle))
-    # The two coordinates that a projection along the nearest axis keeps.
-    axes = np.array([[1, 2], [2, 0], [0, 1]])[normal.argmax(axis=1)]
-    a = np.take_along_axis(triangle, axes[:, None].repeat(3, axis=1), axis=2)
+    axes = _projection_axes(triangle)
+    a = np.take_along_axis(triangle, axes[:, None], axis=2)
     p, q = (np.take_along_axis(end, axes, axis=1) for end in (p, q))
     # 1 if the projected triangle runs counter-clockwise; then its inside is left of its edges.
     sign = orient2d(a[:, 0], a[:, 1], a[:, 2])
@@ -506,10 +509,8 @@ def _is_in_angle(triangle: FloatArray, p: FloatArray) -> BoolArray:
     triangle: (k, 3, 3) the corners of the triangles.
     p: (k, 3) the points, each in the plane of its triangle.
     """
-    normal = np.abs(area_normals(triangle))
-    # The two coordinates that a projection along the nearest axis keeps.
-    axes = np.array([[1, 2], [2, 0], [0, 1]])[normal.argmax(axis=1)]
-    a = np.take_along_axis(triangle, axes[:, None].repeat(3, axis=1), axis=2)
+    axes = _projection_axes(triangle)
+    a = np.take_along_axis(triangle, axes[:, None], axis=2)
     p = np.take_along_axis(p, axes, axis=1)
     sign = orient2d(a[:, 0], a[:, 1], a[:, 2])
     first_side = sign * orient2d(a[:, 0], a[:, 1], p)

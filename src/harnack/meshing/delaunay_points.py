@@ -29,7 +29,10 @@ __all__ = [
     "RefinementBalls",
     "TetrahedronPoints",
     "box_cells",
+    "newton_to_level",
     "sample_delaunay_points",
+    "snap_to_level",
+    "to_multiple_roots",
 ]
 
 # All relative to the size of a cell, by experiment.
@@ -344,17 +347,40 @@ def _move_onto_level(
     set.
     """
     near = np.flatnonzero(samples.distance < _SNAP_DISTANCE * size)
-    moved = newton_to_level(function, points[near], samples.select(near), 0.25 * size[near], walls)
+    size = size[near]
+    moved, new_samples, is_moved = snap_to_level(
+        function, points[near], samples.select(near), size,
+        0.25 * size, 1.5 * _SNAP_DISTANCE * size, walls,
+    )  # fmt: skip
+    is_moved &= _is_far(moved, free[near], boundary)
+    rows = near[is_moved]
+    points, is_on = points.copy(), np.zeros(len(points), np.bool_)
+    points[rows], is_on[rows] = moved[is_moved], True
+    return points, samples.replaced(rows, new_samples.select(is_moved)), is_on
+
+
+def snap_to_level(
+    function: LevelFunction,
+    points: FloatArray,
+    samples: LevelSamples,
+    size: FloatArray | float,
+    max_step: FloatArray,
+    max_distance: FloatArray | float,
+    walls: tuple[FloatArray, FloatArray] | None,
+    steps: int = 5,
+) -> tuple[FloatArray, LevelSamples, BoolArray]:
+    """Move points onto the level set by Newton's method (`newton_to_level`). Returns the moved
+    points (n, 3); their samples; and a mask (n,) of those that may be used: the method converged,
+    and moved the point by less than `max_distance` (n,).
+
+    size: (n,) the size of cells at the points, to which distances from the level set are compared.
+    """
+    moved = newton_to_level(function, points, samples, max_step, walls, steps)
     new_samples = function.sample(moved)
-    apart = row_norms(moved - points[near])
     slope = row_norms(new_samples.gradient)
     # |f| / |grad f|, an estimate of the distance, is tiny compared with the cell.
-    converged = np.abs(new_samples.value) < 1e-9 * np.maximum(slope * size[near], 1e-300)
-    converged &= (apart < 1.5 * _SNAP_DISTANCE * size[near]) & _is_far(moved, free[near], boundary)
-    rows = near[converged]
-    points, is_on = points.copy(), np.zeros(len(points), np.bool_)
-    points[rows], is_on[rows] = moved[converged], True
-    return points, samples.replaced(rows, new_samples.select(converged)), is_on
+    is_on_level = np.abs(new_samples.value) < 1e-9 * np.maximum(slope * size, 1e-300)
+    return moved, new_samples, is_on_level & (row_norms(moved - points) < max_distance)
 
 
 def newton_to_level(

@@ -35,6 +35,7 @@ from harnack.meshing.delaunay_points import (
     BoundaryCurve,
     TetrahedronPoints,
     newton_to_level,
+    snap_to_level,
     to_multiple_roots,
 )
 from harnack.meshing.edges import IntArray, row_norms, sorted_unique, unique_with_inverse, unit_rows
@@ -921,12 +922,10 @@ def _snap_points(
     size = float(lattice.size.min())
     near = np.flatnonzero((samples.distance < _SNAP_DISTANCE * size) & ~is_fixed)
     max_step = np.full(len(near), 0.5 * _SNAP_DISTANCE * size)
-    moved = newton_to_level(function, points[near], samples.select(near), max_step, walls, steps=4)
-    new_samples = function.sample(moved)
-    move = row_norms(moved - points[near])
-    gradient_length = row_norms(new_samples.gradient)
-    is_moved = np.abs(new_samples.value) < 1e-9 * np.maximum(gradient_length * size, 1e-300)
-    is_moved &= move < 1.2 * _SNAP_DISTANCE * size
+    moved, new_samples, is_moved = snap_to_level(
+        function, points[near], samples.select(near), size,
+        max_step, 1.2 * _SNAP_DISTANCE * size, walls, steps=4,
+    )  # fmt: skip
     rows = near[is_moved]
     # A point with a value of exactly 0 counts as on the level unmoved, so that all other points
     # have a sign.
