@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from harnack.geometry.example_meshes import icosphere
+from harnack.geometry.mesh_edges import boundary_edges
 from harnack.meshing.checks import (
     SelfIntersectionError,
     check_manifold,
     check_no_self_intersection,
     intersecting_faces,
 )
-from harnack.meshing.edges import boundary_edges
 from harnack.meshing.lattice_meshing import TriangleMesh
 from harnack.meshing.self_intersection_repair import (
     resolve_local_intersections,

@@ -43,6 +43,7 @@ from harnack.geometry.boundary_edges import (
 from harnack.geometry.clouds import CloudError, as_cloud_points, as_unit_normals
 from harnack.geometry.curves import CurveError, validate_loops
 from harnack.geometry.flat_lists import next_in_lists
+from harnack.geometry.mesh_edges import area_normals
 from harnack.geometry.meshes import MeshError, without_zero_area_faces, zero_area_faces
 from harnack.geometry.polygons import triangulate
 from harnack.geometry.welding import Welded
@@ -457,7 +458,7 @@ def _mesh_to_cloud(mesh: LoadedMesh) -> LoadedCloud:
     """Return a cloud of points that stands for the triangles of a mesh: their centers, with their
     normals and areas."""
     corners = mesh.vertices[mesh.faces]
-    area_normal = 0.5 * np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area_normal = 0.5 * area_normals(corners)
     area = np.linalg.norm(area_normal, axis=1)
     summary = f"{len(area):,} triangles, each taken as a point with its normal and area, as asked"
     return LoadedCloud(corners.mean(axis=1), area_normal / area[:, None], area, summary)

@@ -24,6 +24,7 @@ from harnack.backend.validation import (
 from harnack.geometry.boundary_edges import boundary_edges, join_edges
 from harnack.geometry.convex_position import is_convex_position
 from harnack.geometry.flat_lists import next_in_lists
+from harnack.geometry.mesh_edges import area_normals
 from harnack.geometry.meshes import MAX_FACES, MeshError, checked_vertices
 
 __all__ = ["PolygonFaces", "cluster_into_polygons", "validate_polygons"]
@@ -416,7 +417,7 @@ def _clusters(
 
     spatial: Any = scipy.spatial
     corners = vertices[faces]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal = area_normals(corners)
     area = np.linalg.norm(normal, axis=1)
     points = np.hstack([corners.mean(axis=1), _NORMAL_WEIGHT * normal / area[:, None]])
     probability = area / area.sum()

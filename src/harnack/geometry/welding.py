@@ -13,6 +13,7 @@ import numpy as np
 
 from harnack.backend.validation import FloatArray, IntArray
 from harnack.geometry.boundary_edges import NetFaces, net_faces, singular_edges, weld_vertices
+from harnack.geometry.mesh_edges import shortest_edges_at_vertices
 from harnack.geometry.meshes import zero_area_faces
 
 __all__ = ["Welded", "connected_groups", "pairs_within", "rounding_of"]
@@ -100,11 +101,7 @@ def _joined_by_rounding(positions: FloatArray, faces: IntArray, candidates: IntA
     representative = np.arange(len(positions))
     pairs = candidates[pairs_within(positions[candidates], rounding_of(positions[faces]))]
     distance = np.linalg.norm(positions[pairs[:, 0]] - positions[pairs[:, 1]], axis=1)
-    corners = positions[faces]
-    shortest_edge = np.full(len(positions), np.inf)
-    shortest_of_face = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).min(axis=1)
-    for k in range(3):
-        np.minimum.at(shortest_edge, faces[:, k], shortest_of_face)
+    shortest_edge = shortest_edges_at_vertices(positions, faces)
     pairs = pairs[distance <= _MAX_EDGE_FRACTION * shortest_edge[pairs].min(axis=1)]
     while len(pairs):
         group = connected_groups(pairs, len(positions))

@@ -14,21 +14,20 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from harnack.backend import FloatArray
+from harnack.backend import FloatArray, IntArray
 from harnack.geometry import MeshError
-from harnack.geometry.welding import connected_groups
-from harnack.meshing.checks import SelfIntersectionError, check_manifold, intersecting_faces
-from harnack.meshing.clipping import winding_around
-from harnack.meshing.closed_mesh import grown, to_manifold
-from harnack.meshing.csg_meshing import apart_of
-from harnack.meshing.edges import (
-    IntArray,
+from harnack.geometry.mesh_edges import (
     area_normals,
     half_edges,
     row_dots,
     row_norms,
     unit_normals,
 )
+from harnack.geometry.welding import connected_groups
+from harnack.meshing.checks import SelfIntersectionError, check_manifold, intersecting_faces
+from harnack.meshing.clipping import winding_around
+from harnack.meshing.closed_mesh import grown, to_manifold
+from harnack.meshing.csg_meshing import apart_of
 from harnack.meshing.joined_pieces import boundary_of_solid, neighbors, passes_itself
 from harnack.meshing.lattice_meshing import TriangleMesh
 

@@ -18,9 +18,8 @@ from typing import TYPE_CHECKING, Any, cast
 import drjit as dr
 import numpy as np
 
-from harnack.backend import BoolArray, FloatArray, choose_backend, to_numpy
+from harnack.backend import BoolArray, FloatArray, IntArray, choose_backend, to_numpy
 from harnack.backend.record_table import RecordTable
-from harnack.meshing.edges import IntArray
 from harnack.tree.balanced_tree import (
     NO_PRIMITIVE,
     LoopValues,

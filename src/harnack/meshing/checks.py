@@ -24,12 +24,9 @@ from typing import TYPE_CHECKING, Any, Never
 import numpy as np
 import numpy.typing as npt
 
-from harnack.backend import BoolArray, FloatArray
-from harnack.geometry.welding import connected_groups
-from harnack.meshing.broad_phase import ROUNDING, near_pairs
-from harnack.meshing.edges import (
+from harnack.backend import BoolArray, FloatArray, IntArray
+from harnack.geometry.mesh_edges import (
     Edges,
-    IntArray,
     area_normals,
     boundary_edges,
     half_edges,
@@ -39,6 +36,8 @@ from harnack.meshing.edges import (
     row_norms,
     unit_rows,
 )
+from harnack.geometry.welding import connected_groups
+from harnack.meshing.broad_phase import ROUNDING, near_pairs
 from harnack.meshing.level_function import LevelFunction
 
 if TYPE_CHECKING:

@@ -13,19 +13,19 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from harnack.backend import FloatArray
+from harnack.backend import FloatArray, IntArray
 from harnack.geometry import Ball, Box, ConvexHull, HalfSpace, Volume, VolumeIntersection
-from harnack.geometry.meshes import solid_angles
-from harnack.geometry.welding import connected_groups
-from harnack.meshing.checks import MeshingError
-from harnack.meshing.edges import (
-    IntArray,
+from harnack.geometry.mesh_edges import (
     area_normals,
     boundary_edges,
     edge_keys,
     normals_at_vertices,
     row_dots,
+    shortest_edges_at_vertices,
 )
+from harnack.geometry.meshes import solid_angles
+from harnack.geometry.welding import connected_groups
+from harnack.meshing.checks import MeshingError
 from harnack.meshing.lattice_meshing import TriangleMesh
 
 __all__ = [
@@ -300,11 +300,8 @@ def _snap_to_boundary(
     Returns the vertices (n, 3), and their signed distances (n,) from the plane or sphere.
     """
     x, faces = surface.vertices, surface.faces
-    corner = x[faces]
-    shortest_of_face = np.linalg.norm(corner - np.roll(corner, 1, axis=1), axis=2).min(axis=1)
-    shortest_edge, vertex_normals = np.full(len(x), np.inf), normals_at_vertices(x, faces)
-    for k in range(3):
-        np.minimum.at(shortest_edge, faces[:, k], shortest_of_face)
+    shortest_edge = shortest_edges_at_vertices(x, faces)
+    vertex_normals = normals_at_vertices(x, faces)
     vertex_normals /= np.maximum(np.linalg.norm(vertex_normals, axis=1), 1e-300)[:, None]
     heights = boundary.heights(x)
     moved = x

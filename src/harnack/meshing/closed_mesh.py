@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 import trimesh
 
-from harnack.backend import BoolArray, FloatArray
+from harnack.backend import BoolArray, FloatArray, IntArray
 from harnack.geometry import Ball, Box, ConvexHull, HalfSpace, VolumeIntersection
+from harnack.geometry.mesh_edges import row_dots, unique_with_inverse
 from harnack.geometry.outline_loops import Outline, scale_for_clipper
 from harnack.meshing.checks import (
     LocalizedMeshingError,
@@ -21,7 +22,6 @@ from harnack.meshing.checks import (
     check_manifold,
     intersecting_faces,
 )
-from harnack.meshing.edges import IntArray, row_dots, unique_with_inverse
 from harnack.meshing.lattice_meshing import TriangleMesh
 from harnack.meshing.self_intersection_repair import resolve_self_intersections
 

@@ -17,8 +17,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from harnack.backend import FloatArray
+from harnack.backend import FloatArray, IntArray
 from harnack.fields.solid_angles.solid_angle import SolidAngle
+from harnack.geometry.mesh_edges import boundary_edges, edge_keys
 from harnack.geometry.polygons import cancel_opposite_edges
 from harnack.meshing.checks import (
     LocalizedMeshingError,
@@ -35,7 +36,6 @@ from harnack.meshing.delaunay_points import (
     newton_to_level,
     sample_delaunay_points,
 )
-from harnack.meshing.edges import IntArray, boundary_edges, edge_keys
 from harnack.meshing.isotopy import IsotopyCoverage, isotopy_of
 from harnack.meshing.lattice_meshing import check_estimated_triangles
 from harnack.meshing.level_function import LevelFunction

@@ -19,8 +19,8 @@ from typing import Any
 
 import numpy as np
 
-from harnack.backend import BoolArray, FloatArray
-from harnack.meshing.edges import IntArray, limited_rows, row_dots, row_norms
+from harnack.backend import BoolArray, FloatArray, IntArray
+from harnack.geometry.mesh_edges import limited_rows, row_dots, row_norms
 from harnack.meshing.level_function import LevelFunction, LevelSamples
 from harnack.tree.empty_space import BoxCells, RefinedCells, refine_cells
 

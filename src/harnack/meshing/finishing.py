@@ -12,9 +12,7 @@ import numpy as np
 
 from harnack.backend import FloatArray
 from harnack.backend.validation import as_integer_in_range, as_real
-from harnack.meshing.checks import MeshingError, euler_characteristic, intersecting_faces
-from harnack.meshing.closed_mesh import from_manifold, to_manifold, without_short_edges
-from harnack.meshing.edges import (
+from harnack.geometry.mesh_edges import (
     Edges,
     area_normals,
     boundary_edges,
@@ -25,6 +23,8 @@ from harnack.meshing.edges import (
     sorted_unique,
     unit_normals,
 )
+from harnack.meshing.checks import MeshingError, euler_characteristic, intersecting_faces
+from harnack.meshing.closed_mesh import from_manifold, to_manifold, without_short_edges
 from harnack.meshing.lattice_meshing import TriangleMesh
 from harnack.meshing.level_function import LevelFunction
 from harnack.meshing.self_intersection_repair import resolve_self_intersections

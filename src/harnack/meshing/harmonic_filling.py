@@ -21,10 +21,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from harnack.backend import IntArray
 from harnack.fields.solid_angles.solid_angle import SolidAngle
 from harnack.fields.solid_angles.winding_number import WindingNumber
 from harnack.geometry import MeshError
 from harnack.geometry.boundary_edges import singular_loops
+from harnack.geometry.mesh_edges import Edges, area_normals, half_edges
 from harnack.meshing.checks import (
     LocalizedMeshingError,
     MeshingError,
@@ -40,7 +42,6 @@ from harnack.meshing.delaunay_points import (
     box_cells,
     sample_delaunay_points,
 )
-from harnack.meshing.edges import Edges, IntArray, area_normals, half_edges
 from harnack.meshing.level_function import LevelFunction
 from harnack.meshing.marching_tetrahedra import count_crossings, delaunay, extract_triangles
 from harnack.meshing.refinement import improve, refine, smooth, unrefined_midpoints

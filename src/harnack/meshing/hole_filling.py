@@ -30,12 +30,9 @@ from typing import Any, cast
 
 import numpy as np
 
-from harnack.backend import BoolArray, FloatArray
-from harnack.geometry.welding import connected_groups
-from harnack.meshing.checks import intersecting_faces
-from harnack.meshing.edges import (
+from harnack.backend import BoolArray, FloatArray, IntArray
+from harnack.geometry.mesh_edges import (
     Edges,
-    IntArray,
     area_normals,
     edge_keys,
     half_edges,
@@ -43,6 +40,8 @@ from harnack.meshing.edges import (
     row_dots,
     row_norms,
 )
+from harnack.geometry.welding import connected_groups
+from harnack.meshing.checks import intersecting_faces
 from harnack.meshing.refinement import split_faces
 
 __all__ = ["HoleFilling", "fill_holes", "hole_loops"]

@@ -19,18 +19,17 @@ from typing import Any
 
 import numpy as np
 
-from harnack.backend import BoolArray, FloatArray
+from harnack.backend import BoolArray, FloatArray, IntArray
 from harnack.fields.solid_angles.winding_number import WindingNumber
 from harnack.geometry import MeshError, validate_mesh, without_zero_area_faces
-from harnack.geometry.welding import Welded
-from harnack.meshing.bodies import closed_parts, nested, volume_of
-from harnack.meshing.edges import (
-    IntArray,
+from harnack.geometry.mesh_edges import (
     area_normals,
     distance_from_triangles,
     row_dots,
     row_norms,
 )
+from harnack.geometry.welding import Welded
+from harnack.meshing.bodies import closed_parts, nested, volume_of
 from harnack.meshing.lattice_meshing import TriangleMesh
 from harnack.meshing.mesh_cleaning import against_neighbors
 

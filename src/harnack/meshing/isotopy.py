@@ -58,9 +58,8 @@ from typing import Any
 
 import numpy as np
 
-from harnack.backend import BoolArray, FloatArray
+from harnack.backend import BoolArray, FloatArray, IntArray
 from harnack.meshing.delaunay_points import BoundaryCurve, TetrahedronPoints
-from harnack.meshing.edges import IntArray
 from harnack.meshing.level_function import LevelFunction
 
 __all__ = ["IsotopyCoverage", "isotopy_of"]

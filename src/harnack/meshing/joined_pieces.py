@@ -17,13 +17,19 @@ from typing import Any
 
 import numpy as np
 
-from harnack.backend import BoolArray, FloatArray, choose_backend
+from harnack.backend import BoolArray, FloatArray, IntArray, choose_backend
 from harnack.geometry.boundary_edges import singular_edges
 from harnack.geometry.flat_lists import ranks_in_lists
+from harnack.geometry.mesh_edges import (
+    Edges,
+    area_normals,
+    half_edges,
+    row_dots,
+    row_norms,
+)
 from harnack.geometry.meshes import without_zero_area_faces
 from harnack.geometry.welding import connected_groups, pairs_within
 from harnack.meshing.checks import MeshingError, touching_pairs
-from harnack.meshing.edges import Edges, IntArray, area_normals, half_edges, row_dots, row_norms
 from harnack.meshing.lattice_meshing import TriangleMesh
 from harnack.tree import build_balanced_tree
 from harnack.tree.coplanar import overlapping_faces

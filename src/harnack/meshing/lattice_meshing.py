@@ -22,7 +22,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from harnack.backend import BoolArray, FloatArray
+from harnack.backend import BoolArray, FloatArray, IntArray
+from harnack.geometry.mesh_edges import (
+    row_norms,
+    sorted_unique,
+    unique_with_inverse,
+    unit_rows,
+)
 from harnack.geometry.welding import connected_groups, pairs_within
 from harnack.meshing.bcc_lattice import BccLattice, distinct_rows
 from harnack.meshing.checks import (
@@ -38,7 +44,6 @@ from harnack.meshing.delaunay_points import (
     snap_to_level,
     to_multiple_roots,
 )
-from harnack.meshing.edges import IntArray, row_norms, sorted_unique, unique_with_inverse, unit_rows
 from harnack.meshing.isotopy import IsotopyCoverage, isotopy_of
 from harnack.meshing.level_function import LevelFunction, LevelSamples
 from harnack.meshing.marching_tetrahedra import (

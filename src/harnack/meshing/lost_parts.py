@@ -23,14 +23,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from harnack.backend import BoolArray, FloatArray
+from harnack.backend import BoolArray, FloatArray, IntArray
 from harnack.fields.blobs.blobs import Blobs
 from harnack.fields.blobs.hrbf import HRBF
 from harnack.fields.solid_angles.dipole import DipolePotential
 from harnack.fields.solid_angles.oriented_points import OrientedPoints
 from harnack.fields.solid_angles.winding_number import WindingNumber
+from harnack.geometry.mesh_edges import area_normals, distances_from_triangles, row_norms
 from harnack.meshing.checks import point_text
-from harnack.meshing.edges import IntArray, area_normals, distances_from_triangles, row_norms
 from harnack.meshing.lattice_meshing import TriangleMesh
 from harnack.meshing.sign_function import SignFunction
 

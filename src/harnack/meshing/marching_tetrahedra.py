@@ -24,11 +24,17 @@ from typing import Any, TypeAlias, cast
 
 import numpy as np
 
-from harnack.backend import BoolArray, FloatArray
+from harnack.backend import BoolArray, FloatArray, IntArray
 from harnack.fields import Field
+from harnack.geometry.mesh_edges import (
+    Edges,
+    area_normals,
+    edge_keys,
+    row_dots,
+    row_norms,
+)
 from harnack.meshing.checks import LocalizedMeshingError, MeshingError
 from harnack.meshing.delaunay_points import TetrahedronPoints
-from harnack.meshing.edges import Edges, IntArray, area_normals, edge_keys, row_dots, row_norms
 from harnack.meshing.level_function import LevelFunction
 
 __all__ = [

@@ -15,9 +15,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from harnack.backend import BoolArray, FloatArray
+from harnack.backend import BoolArray, FloatArray, IntArray
 from harnack.fields.solid_angles.winding_number import WindingNumber
 from harnack.geometry.boundary_edges import weld_vertices
+from harnack.geometry.mesh_edges import (
+    Edges,
+    area_normals,
+    boundary_edges,
+    half_edges,
+    row_norms,
+)
 from harnack.geometry.orientability import orientation_components
 from harnack.geometry.welding import connected_groups, pairs_within
 from harnack.meshing.checks import (
@@ -27,14 +34,6 @@ from harnack.meshing.checks import (
     nonmanifold_vertices,
 )
 from harnack.meshing.clipping import Shells, faces_to_flip
-from harnack.meshing.edges import (
-    Edges,
-    IntArray,
-    area_normals,
-    boundary_edges,
-    half_edges,
-    row_norms,
-)
 from harnack.meshing.hole_filling import fill_holes, hole_loops
 from harnack.meshing.joined_pieces import passes_itself
 from harnack.meshing.lattice_meshing import TriangleMesh

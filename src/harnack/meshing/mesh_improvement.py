@@ -22,10 +22,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from harnack.backend import BoolArray, FloatArray
-from harnack.meshing.delaunay_points import newton_to_level
-from harnack.meshing.edges import (
-    IntArray,
+from harnack.backend import BoolArray, FloatArray, IntArray
+from harnack.geometry.mesh_edges import (
     area_normals,
     boundary_edges,
     edge_keys,
@@ -35,6 +33,7 @@ from harnack.meshing.edges import (
     sorted_unique,
     unit_rows,
 )
+from harnack.meshing.delaunay_points import newton_to_level
 from harnack.meshing.level_function import LevelFunction
 
 __all__ = ["collapse_slivers", "flip_edges", "least_angles", "relax_vertices"]

@@ -15,11 +15,12 @@ from typing import Any, cast
 
 import numpy as np
 
-from harnack.backend import FloatArray
+from harnack.backend import FloatArray, IntArray
 from harnack.backend.validation import as_positive
 from harnack.fields.solids.mesh_solid import MeshSolid
 from harnack.files.geometry_files import LoadedMesh, read_geometry
 from harnack.geometry import MeshError, validate_mesh, zero_area_faces
+from harnack.geometry.mesh_edges import Edges, half_edges, longest_edges
 from harnack.geometry.welding import Welded
 from harnack.meshing.checks import (
     intersecting_faces,
@@ -28,7 +29,6 @@ from harnack.meshing.checks import (
     touching_pairs,
 )
 from harnack.meshing.clipping import Shells
-from harnack.meshing.edges import Edges, IntArray, half_edges, longest_edges
 from harnack.meshing.lattice_meshing import TriangleMesh
 from harnack.meshing.thickness import wall_thickness
 

@@ -17,12 +17,9 @@ from typing import Any
 
 import numpy as np
 
-from harnack.backend import BoolArray, FloatArray
-from harnack.meshing.checks import check_triangle_limit
-from harnack.meshing.delaunay_points import newton_to_level
-from harnack.meshing.edges import (
+from harnack.backend import BoolArray, FloatArray, IntArray
+from harnack.geometry.mesh_edges import (
     Edges,
-    IntArray,
     area_normals,
     boundary_edges,
     half_edges,
@@ -32,6 +29,8 @@ from harnack.meshing.edges import (
     row_norms,
     unit_rows,
 )
+from harnack.meshing.checks import check_triangle_limit
+from harnack.meshing.delaunay_points import newton_to_level
 from harnack.meshing.level_function import LevelFunction, LevelSamples
 from harnack.meshing.mesh_improvement import collapse_slivers, flip_edges, relax_vertices
 

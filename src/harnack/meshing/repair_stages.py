@@ -28,6 +28,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from harnack.backend import IntArray
 from harnack.backend.validation import flag
 from harnack.fields.solid_angles.winding_number import WindingNumber
 from harnack.fields.solids.mesh_solid import MeshSolid
@@ -44,7 +45,6 @@ from harnack.meshing.checks import (
     nonmanifold_vertices,
 )
 from harnack.meshing.clipping import Shells, component_facts, largest_body
-from harnack.meshing.edges import IntArray
 from harnack.meshing.finishing import check_options
 from harnack.meshing.harmonic_filling import (
     HarmonicFilling,

@@ -18,15 +18,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from harnack.backend import BoolArray, FloatArray
-from harnack.geometry.welding import connected_groups
-from harnack.meshing.checks import (
-    SelfIntersectionError,
-    check_no_self_intersection,
-    intersecting_faces,
-)
-from harnack.meshing.edges import (
-    IntArray,
+from harnack.backend import BoolArray, FloatArray, IntArray
+from harnack.geometry.mesh_edges import (
     area_normals,
     distance_from_triangles,
     edge_keys,
@@ -34,6 +27,12 @@ from harnack.meshing.edges import (
     row_dots,
     row_norms,
     sorted_unique,
+)
+from harnack.geometry.welding import connected_groups
+from harnack.meshing.checks import (
+    SelfIntersectionError,
+    check_no_self_intersection,
+    intersecting_faces,
 )
 from harnack.meshing.lattice_meshing import TriangleMesh
 

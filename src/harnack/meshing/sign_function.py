@@ -33,8 +33,8 @@ from harnack.fields.solid_angles.dipole import DipolePotential
 from harnack.fields.solid_angles.winding_number import WindingModuloOne, WindingNumber
 from harnack.geometry.clouds import build_point_tree
 from harnack.geometry.denoising import outlier_indices
+from harnack.geometry.mesh_edges import row_dots, row_norms, unit_rows
 from harnack.meshing.checks import MeshingError
-from harnack.meshing.edges import row_dots, row_norms, unit_rows
 from harnack.meshing.level_function import LevelFunction, LevelSamples
 
 if TYPE_CHECKING:

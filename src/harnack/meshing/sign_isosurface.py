@@ -23,7 +23,18 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from harnack.backend import BoolArray, FloatArray
+from harnack.backend import BoolArray, FloatArray, IntArray
+from harnack.geometry.mesh_edges import (
+    Edges,
+    area_normals,
+    boundary_edges,
+    half_edges,
+    limited_rows,
+    longest_edges,
+    row_dots,
+    row_norms,
+    unit_normals,
+)
 from harnack.meshing.bcc_lattice import BccLattice, distinct_rows
 from harnack.meshing.checks import (
     EmptySurfaceError,
@@ -35,18 +46,6 @@ from harnack.meshing.checks import (
 )
 from harnack.meshing.closed_mesh import from_manifold, to_manifold, without_short_edges
 from harnack.meshing.delaunay_points import TetrahedronPoints
-from harnack.meshing.edges import (
-    Edges,
-    IntArray,
-    area_normals,
-    boundary_edges,
-    half_edges,
-    limited_rows,
-    longest_edges,
-    row_dots,
-    row_norms,
-    unit_normals,
-)
 from harnack.meshing.lattice_meshing import TriangleMesh
 from harnack.meshing.level_function import LevelSamples
 from harnack.meshing.lost_parts import LostParts, PointsOnLevel

@@ -15,9 +15,9 @@ import numpy as np
 
 from harnack.backend import FloatArray, IntArray
 from harnack.fields.solids.tube import Tube
+from harnack.geometry.mesh_edges import row_norms
 from harnack.meshing.checks import MeshingError, intersecting_faces
 from harnack.meshing.closed_mesh import to_manifold
-from harnack.meshing.edges import row_norms
 from harnack.meshing.lattice_meshing import TriangleMesh
 
 if TYPE_CHECKING:

@@ -11,13 +11,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-from harnack.backend import BoolArray, FloatArray
+from harnack.backend import BoolArray, FloatArray, IntArray
 
 __all__ = [
     "Edges",
-    "IntArray",
     "area_normals",
     "boundary_edges",
     "distance_from_triangles",
@@ -29,14 +27,13 @@ __all__ = [
     "normals_at_vertices",
     "row_dots",
     "row_norms",
+    "shortest_edges_at_vertices",
     "sorted_unique",
     "unique_with_inverse",
     "unit_normals",
     "unit_rows",
 ]
 
-
-IntArray = npt.NDArray[np.int64]
 # Divisors are at least this, so that nothing is divided by 0.
 _TINY = 1e-300
 
@@ -79,6 +76,16 @@ def normals_at_vertices(vertices: FloatArray, faces: IntArray) -> FloatArray:
     for k in range(3):
         np.add.at(sums, faces[:, k], normals)
     return sums
+
+
+def shortest_edges_at_vertices(vertices: FloatArray, faces: IntArray) -> FloatArray:
+    """For each of the vertices (n, 3) the length (n,) of the shortest edge of the faces there; inf
+    for vertices without a face."""
+    corners, lengths = vertices[faces], np.full(len(vertices), np.inf)
+    shortest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).min(axis=1)
+    for k in range(3):
+        np.minimum.at(lengths, faces[:, k], shortest)
+    return lengths
 
 
 def longest_edges(corners: FloatArray) -> FloatArray:
