@@ -8,7 +8,7 @@ import numpy as np
 
 from harnack.backend.validation import IntArray
 from harnack.geometry.mesh_edges import Edges, boundary_edges, half_edges
-from harnack.geometry.welding import connected_groups
+from harnack.geometry.neighborhoods import connected_groups
 
 __all__ = ["is_nonorientable", "orientation_components"]
 

@@ -26,6 +26,7 @@ from harnack.geometry.convex_position import is_convex_position
 from harnack.geometry.flat_lists import next_in_lists
 from harnack.geometry.mesh_edges import area_normals
 from harnack.geometry.meshes import MAX_FACES, MeshError, checked_vertices
+from harnack.geometry.neighborhoods import kd_tree
 
 __all__ = ["PolygonFaces", "cluster_into_polygons", "validate_polygons"]
 
@@ -413,9 +414,6 @@ def _clusters(
     iterations: the number of Lloyd's steps.
     seed: the seed of the random initial centers.
     """
-    import scipy.spatial  # imported here: it takes half a second, and few programs need it
-
-    spatial: Any = scipy.spatial
     corners = vertices[faces]
     normal = area_normals(corners)
     area = np.linalg.norm(normal, axis=1)
@@ -425,11 +423,11 @@ def _clusters(
     centers = points[rng.choice(len(points), count, p=probability, replace=False)]
     cluster_of = np.zeros(len(faces), dtype=np.int64)
     for _ in range(iterations):
-        cluster_of = spatial.KDTree(centers).query(points)[1]
+        cluster_of = kd_tree(centers).query(points)[1]
         weight = np.bincount(cluster_of, area, count)
         for axis in range(points.shape[1]):
             moment = np.bincount(cluster_of, area * points[:, axis], count)
             centers[:, axis] = np.where(weight > 0, moment / np.maximum(weight, 1e-300), np.inf)
         centers = centers[weight > 0]
         count = len(centers)
-    return spatial.KDTree(centers).query(points)[1]
+    return kd_tree(centers).query(points)[1]

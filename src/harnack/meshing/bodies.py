@@ -23,7 +23,7 @@ from harnack.geometry.mesh_edges import (
     row_norms,
     unit_normals,
 )
-from harnack.geometry.welding import connected_groups
+from harnack.geometry.neighborhoods import connected_groups
 from harnack.meshing.checks import SelfIntersectionError, check_manifold, intersecting_faces
 from harnack.meshing.clipping import winding_around
 from harnack.meshing.closed_mesh import grown, to_manifold

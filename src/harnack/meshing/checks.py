@@ -36,7 +36,7 @@ from harnack.geometry.mesh_edges import (
     row_norms,
     unit_rows,
 )
-from harnack.geometry.welding import connected_groups
+from harnack.geometry.neighborhoods import connected_groups, kd_tree
 from harnack.meshing.broad_phase import ROUNDING, near_pairs
 from harnack.meshing.level_function import LevelFunction
 
@@ -336,9 +336,6 @@ def _near_pairs(corner: FloatArray, among: BoolArray | None) -> IntArray:
     no farther apart than the sum of the largest radii in both groups. So a large triangle is
     compared only with the small triangles near it.
     """
-    import scipy.spatial  # imported here: it takes half a second
-
-    searching: Any = scipy.spatial
     lower, upper = corner.min(axis=1), corner.max(axis=1)
     chosen = np.ones(len(corner), np.bool_) if among is None else among
     if not chosen.any():
@@ -352,7 +349,7 @@ def _near_pairs(corner: FloatArray, among: BoolArray | None) -> IntArray:
     groups = [
         np.flatnonzero(near & (log2_radius == value)) for value in np.unique(log2_radius[near])
     ]
-    trees = [searching.cKDTree(center[rows]) for rows in groups]
+    trees = [kd_tree(center[rows]) for rows in groups]
     batches: list[IntArray] = []
 
     def add_if_overlapping(first: IntArray, second: IntArray) -> None:
@@ -373,7 +370,7 @@ def _near_pairs(corner: FloatArray, among: BoolArray | None) -> IntArray:
         step = max(1, _PAIRS_AT_ONCE // 64)  # for about 64 pairs of each triangle
         for start in range(0, len(queries), step):
             rows = queries[start : start + step]
-            query_tree = searching.cKDTree(center[rows])
+            query_tree = kd_tree(center[rows])
             table = query_tree.sparse_distance_matrix(trees[j], max_distance, output_type="ndarray")
             first, second = rows[table["i"]], groups[j][table["j"]]
             is_new = (first < second) | ~chosen[second]  # two chosen triangles are listed once

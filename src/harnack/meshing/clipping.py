@@ -24,7 +24,7 @@ from harnack.geometry.mesh_edges import (
     shortest_edges_at_vertices,
 )
 from harnack.geometry.meshes import solid_angles
-from harnack.geometry.welding import connected_groups
+from harnack.geometry.neighborhoods import connected_groups
 from harnack.meshing.checks import MeshingError
 from harnack.meshing.lattice_meshing import TriangleMesh
 

@@ -15,12 +15,12 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from harnack.backend import BoolArray, FloatArray, IntArray
 from harnack.geometry.mesh_edges import limited_rows, row_dots, row_norms
+from harnack.geometry.neighborhoods import kd_tree
 from harnack.meshing.level_function import LevelFunction, LevelSamples
 from harnack.tree.empty_space import BoxCells, RefinedCells, refine_cells
 
@@ -68,10 +68,7 @@ class RefinementBalls:
         """
         if not len(centers):
             return np.zeros(0, np.bool_)
-        import scipy.spatial  # imported here: it takes half a second
-
-        searching: Any = scipy.spatial
-        distance: FloatArray = searching.cKDTree(self.points).query(centers)[0]
+        distance: FloatArray = kd_tree(self.points).query(centers)[0]
         return distance < self.radius + radii
 
 
@@ -286,9 +283,6 @@ def _is_far(points: FloatArray, free: FloatArray, boundary: BoundaryCurve) -> Bo
     """
     if not len(boundary.edges):
         return np.ones(len(points), np.bool_)
-    import scipy.spatial  # imported here: it takes half a second
-
-    searching: Any = scipy.spatial
     a, b = (boundary.points[boundary.edges[:, k]] for k in (0, 1))
     middle, half = 0.5 * (a + b), 0.5 * row_norms(b - a)
     distance = np.full(len(points), np.inf)
@@ -299,7 +293,7 @@ def _is_far(points: FloatArray, free: FloatArray, boundary: BoundaryCurve) -> Bo
     for exponent in np.unique(log2_half):
         rows = np.flatnonzero(log2_half == exponent)
         neighbor_count = min(8, len(rows))
-        nearest: IntArray = searching.cKDTree(middle[rows]).query(points, k=neighbor_count)[1]
+        nearest: IntArray = kd_tree(middle[rows]).query(points, k=neighbor_count)[1]
         index = rows[nearest.reshape(len(points), neighbor_count)]
         edge_vectors, offset = (b - a)[index], points[:, None] - a[index]
         fraction = np.clip(

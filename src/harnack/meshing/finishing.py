@@ -23,6 +23,7 @@ from harnack.geometry.mesh_edges import (
     sorted_unique,
     unit_normals,
 )
+from harnack.geometry.neighborhoods import kd_tree
 from harnack.meshing.checks import MeshingError, euler_characteristic, intersecting_faces
 from harnack.meshing.closed_mesh import from_manifold, to_manifold, without_short_edges
 from harnack.meshing.lattice_meshing import TriangleMesh
@@ -128,13 +129,10 @@ def _why_too_thick(surface: TriangleMesh, normals: FloatArray, thickness: float)
     normals: (n, 3) unit normals at the vertices.
     thickness: a length.
     """
-    import scipy.spatial  # imported here: it takes half a second
-
-    searching: Any = scipy.spatial
     half = 0.5 * thickness
     face_normals = area_normals(surface.vertices[surface.faces])
     areas = np.linalg.norm(face_normals, axis=1)
-    tree = searching.cKDTree(surface.vertices)
+    tree = kd_tree(surface.vertices)
     vertex_ids = np.arange(len(surface.vertices))
     neighbor_count = min(16, len(vertex_ids))
     edges_of_mesh = sorted_unique(edge_keys(half_edges(surface.faces), len(vertex_ids)))

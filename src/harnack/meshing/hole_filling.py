@@ -40,7 +40,7 @@ from harnack.geometry.mesh_edges import (
     row_dots,
     row_norms,
 )
-from harnack.geometry.welding import connected_groups
+from harnack.geometry.neighborhoods import connected_groups
 from harnack.meshing.checks import intersecting_faces
 from harnack.meshing.refinement import split_faces
 

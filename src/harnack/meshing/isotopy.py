@@ -54,11 +54,11 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from harnack.backend import BoolArray, FloatArray, IntArray
+from harnack.geometry.neighborhoods import kd_tree
 from harnack.meshing.delaunay_points import BoundaryCurve, TetrahedronPoints
 from harnack.meshing.level_function import LevelFunction
 
@@ -467,11 +467,8 @@ def _regular_on_walls(
 def _distances(points: FloatArray, boundary: BoundaryCurve) -> FloatArray:
     """Distances (n,) of points (n, 3) from the curve, measured to nine points of each of its edges.
     They are too large by at most a sixteenth of the longest edge."""
-    import scipy.spatial  # imported here: it takes half a second
-
-    searching: Any = scipy.spatial
     a, b = (boundary.points[boundary.edges[:, k]] for k in (0, 1))
     fraction = np.linspace(0, 1, 9)[:, None, None]
     curve_points: FloatArray = (a + fraction * (b - a)).reshape(-1, 3)
-    distances: FloatArray = searching.cKDTree(curve_points).query(points)[0]
+    distances: FloatArray = kd_tree(curve_points).query(points)[0]
     return distances

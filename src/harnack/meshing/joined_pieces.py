@@ -28,7 +28,7 @@ from harnack.geometry.mesh_edges import (
     row_norms,
 )
 from harnack.geometry.meshes import without_zero_area_faces
-from harnack.geometry.welding import connected_groups, pairs_within
+from harnack.geometry.neighborhoods import connected_groups, kd_tree, pairs_within
 from harnack.meshing.checks import MeshingError, touching_pairs
 from harnack.meshing.lattice_meshing import TriangleMesh
 from harnack.tree import build_balanced_tree
@@ -239,14 +239,11 @@ def _corners_on(x: FloatArray, edges: IntArray) -> tuple[IntArray, BoolArray]:
         The indices (k,) of these vertices, 0 for an edge without one; and a mask (k,) of the edges
         that have one.
     """
-    import scipy.spatial  # imported here: it takes half a second
-
-    searching: Any = scipy.spatial
     corners = np.unique(edges)
     p, q = x[edges[:, 0]], x[edges[:, 1]]
     half_length = 0.5 * row_norms(q - p)
     # Candidates lie in the ball that has the edge as its diameter.
-    nearby = searching.cKDTree(x[corners]).query_ball_point(0.5 * (p + q), half_length)
+    nearby = kd_tree(x[corners]).query_ball_point(0.5 * (p + q), half_length)
     count = np.array([len(group) for group in nearby])
     edge_row = np.repeat(np.arange(len(edges)), count)
     candidate = corners[

@@ -18,7 +18,7 @@ import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -29,7 +29,7 @@ from harnack.geometry.mesh_edges import (
     unique_with_inverse,
     unit_rows,
 )
-from harnack.geometry.welding import connected_groups, pairs_within
+from harnack.geometry.neighborhoods import connected_groups, kd_tree, pairs_within
 from harnack.meshing.bcc_lattice import BccLattice, distinct_rows
 from harnack.meshing.checks import (
     MeshingError,
@@ -159,9 +159,6 @@ def check_no_missed_parts(
         MissedPartsError: parts are missed; it has points of the longest part.
         UnrefinableError: the function equals its level in a volume, or touches it along a surface.
     """
-    import scipy.spatial  # imported here: it takes half a second
-
-    searching: Any = scipy.spatial
     rows = np.flatnonzero(~is_beside & (samples.distance < _MAX_SEED_DISTANCE * size))
     if not len(rows):
         return
@@ -187,7 +184,7 @@ def check_no_missed_parts(
     # Keep the points that are far from the mesh: near them, triangles are missing.
     if len(faces) and len(x):
         mesh_points = np.concatenate([vertices[np.unique(faces)], vertices[faces].mean(axis=1)])
-        x = x[searching.cKDTree(mesh_points).query(x)[0] > _MIN_MESH_DISTANCE * size]
+        x = x[kd_tree(mesh_points).query(x)[0] > _MIN_MESH_DISTANCE * size]
     if elsewhere is not None and len(x):
         x = x[elsewhere(x) <= 0]
     part = _longest_part(x, _CLUSTER_DISTANCE * size)

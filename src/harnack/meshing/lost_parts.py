@@ -30,6 +30,7 @@ from harnack.fields.solid_angles.dipole import DipolePotential
 from harnack.fields.solid_angles.oriented_points import OrientedPoints
 from harnack.fields.solid_angles.winding_number import WindingNumber
 from harnack.geometry.mesh_edges import area_normals, distances_from_triangles, row_norms
+from harnack.geometry.neighborhoods import kd_tree
 from harnack.meshing.checks import point_text
 from harnack.meshing.lattice_meshing import TriangleMesh
 from harnack.meshing.sign_function import SignFunction
@@ -320,13 +321,10 @@ def _bound_of_distances(points: FloatArray, triangles: FloatArray) -> float:
     """An upper bound of the distances of all points (n, 3) from triangles (m, 3, 3): the largest
     distance of a point from the nearest corner or center of a triangle. It is inf if there are no
     triangles."""
-    import scipy.spatial  # imported here: it takes half a second
-
-    searching: Any = scipy.spatial
     if not len(triangles):
         return math.inf
     mesh_points = np.concatenate([triangles.reshape(-1, 3), triangles.mean(axis=1)])
-    tree = searching.cKDTree(mesh_points, compact_nodes=False, balanced_tree=False)
+    tree = kd_tree(mesh_points, is_balanced=False)
     return float(tree.query(points)[0].max())
 
 
@@ -339,9 +337,6 @@ def _are_farther(points: FloatArray, corner: FloatArray, distance: float) -> Boo
     point, where r is the largest distance of the triangle's corners from its center. Only such
     triangles are measured. Triangles whose r differ by less than a factor of 2 are searched
     together, with the larger r."""
-    import scipy.spatial  # imported here: it takes half a second
-
-    searching: Any = scipy.spatial
     is_far = np.ones(len(points), np.bool_)
     if not len(points):
         return is_far
@@ -351,7 +346,7 @@ def _are_farther(points: FloatArray, corner: FloatArray, distance: float) -> Boo
     exponent = np.ceil(np.log2(np.maximum(radius, distance))).astype(np.int64)
     for k in np.unique(exponent).tolist():
         remaining, rows = np.flatnonzero(is_far), np.flatnonzero(exponent == k)
-        tree = searching.cKDTree(center[rows], compact_nodes=False, balanced_tree=False)
+        tree = kd_tree(center[rows], is_balanced=False)
         nearby_faces = tree.query_ball_point(points[remaining], 2.0**k + distance)
         counts = np.array([len(indices) for indices in nearby_faces], np.int64)
         if not counts.sum():

@@ -25,8 +25,8 @@ from harnack.geometry.mesh_edges import (
     half_edges,
     row_norms,
 )
+from harnack.geometry.neighborhoods import connected_groups, pairs_within
 from harnack.geometry.orientability import orientation_components
-from harnack.geometry.welding import connected_groups, pairs_within
 from harnack.meshing.checks import (
     MeshingError,
     check_manifold,

@@ -28,7 +28,7 @@ from harnack.geometry.mesh_edges import (
     row_norms,
     sorted_unique,
 )
-from harnack.geometry.welding import connected_groups
+from harnack.geometry.neighborhoods import connected_groups
 from harnack.meshing.checks import (
     SelfIntersectionError,
     check_no_self_intersection,

@@ -35,6 +35,7 @@ from harnack.geometry.mesh_edges import (
     row_norms,
     unit_normals,
 )
+from harnack.geometry.neighborhoods import kd_tree
 from harnack.meshing.bcc_lattice import BccLattice, distinct_rows
 from harnack.meshing.checks import (
     EmptySurfaceError,
@@ -423,15 +424,12 @@ def _collapse_slivers(
         was checked that no triangles intersect. (Triangles of an unchanged mesh do not intersect,
         up to rounding, since they lie in different tetrahedra.)
     """
-    import scipy.spatial  # imported here: it takes half a second
-
-    searching: Any = scipy.spatial
     x, faces = raw.vertices, raw.faces
     if len(boundary_edges(faces)):
         return x, faces, raw.normals, False
     simplified = from_manifold(without_short_edges(to_manifold(TriangleMesh(x, faces)), tolerance))
     # Vertices are only removed, never moved: each is one of the given ones, with its normal.
-    distances, nearest = searching.cKDTree(x).query(simplified.vertices)
+    distances, nearest = kd_tree(x).query(simplified.vertices)
     if not len(simplified.faces) or distances.any():
         return x, faces, raw.normals, False
     if len(intersecting_faces(simplified.vertices, simplified.faces)):
