@@ -8,7 +8,7 @@ import pytest
 from harnack.geometry.example_meshes import icosphere
 from harnack.meshing import broad_phase, checks
 from harnack.meshing.broad_phase import near_pairs
-from harnack.meshing.checks import intersecting_faces
+from harnack.meshing.self_intersection import intersecting_faces
 from tests.oracles.triangle_pairs import intersecting_pairs
 
 Mesh = tuple[np.ndarray, np.ndarray]

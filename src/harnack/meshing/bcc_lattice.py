@@ -28,7 +28,7 @@ import numpy as np
 
 from harnack.backend import BoolArray, FloatArray, IntArray
 from harnack.geometry.mesh_edges import sorted_unique
-from harnack.meshing.checks import MeshingError, TriangleLimitError
+from harnack.meshing.meshing_errors import MeshingError, TriangleLimitError
 from harnack.tree.empty_space import BoxCells, Clearance, refine_cells
 
 __all__ = ["BccLattice", "distinct_rows"]

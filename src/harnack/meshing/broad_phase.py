@@ -6,7 +6,7 @@ face count. A lane is one of the many runs of a kernel on the device, each for o
 A tree of bounding boxes is searched for each face, and the pairs whose boxes overlap are listed:
 about eight for each face. The listed pairs are then tested in parallel, one pair in each lane.
 Nearly all pairs are proved apart by the sign of a determinant that rounding cannot change. The
-remaining pairs are decided by exact arithmetic (`checks.intersecting_faces`).
+remaining pairs are decided by exact arithmetic (`self_intersection.intersecting_faces`).
 """
 
 from __future__ import annotations

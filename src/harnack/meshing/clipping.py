@@ -25,8 +25,8 @@ from harnack.geometry.mesh_edges import (
 )
 from harnack.geometry.meshes import solid_angles
 from harnack.geometry.neighborhoods import connected_groups
-from harnack.meshing.checks import MeshingError
 from harnack.meshing.lattice_meshing import TriangleMesh
+from harnack.meshing.meshing_errors import MeshingError
 
 __all__ = [
     "Shells",

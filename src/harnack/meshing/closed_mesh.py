@@ -15,14 +15,14 @@ from harnack.backend import BoolArray, FloatArray, IntArray
 from harnack.geometry import Ball, Box, ConvexHull, HalfSpace, VolumeIntersection
 from harnack.geometry.mesh_edges import row_dots, unique_with_inverse
 from harnack.geometry.outline_loops import Outline, scale_for_clipper
-from harnack.meshing.checks import (
+from harnack.meshing.checks import check_manifold
+from harnack.meshing.lattice_meshing import TriangleMesh
+from harnack.meshing.meshing_errors import (
     LocalizedMeshingError,
     MeshingError,
     SelfIntersectionError,
-    check_manifold,
-    intersecting_faces,
 )
-from harnack.meshing.lattice_meshing import TriangleMesh
+from harnack.meshing.self_intersection import intersecting_faces
 from harnack.meshing.self_intersection_repair import resolve_self_intersections
 
 if TYPE_CHECKING:

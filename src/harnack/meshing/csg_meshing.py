@@ -42,15 +42,7 @@ from harnack.fields.solids.transforms import TransformedSolid
 from harnack.fields.solids.tube import Tube
 from harnack.geometry import Ball, Box, Volume, VolumeIntersection
 from harnack.meshing.bcc_lattice import BccLattice
-from harnack.meshing.checks import (
-    LocalizedMeshingError,
-    MeshingError,
-    OffLevelError,
-    SelfIntersectionError,
-    TriangleLimitError,
-    check_manifold,
-    is_retry_promising,
-)
+from harnack.meshing.checks import check_manifold
 from harnack.meshing.clipping import drop_degenerate_components
 from harnack.meshing.closed_mesh import (
     box_manifold,
@@ -75,6 +67,15 @@ from harnack.meshing.level_function import (
     EvaluatorCache,
     LevelFunction,
     LevelSamples,
+)
+from harnack.meshing.meshing_errors import (
+    CELL_SIZE_RATIO,
+    LocalizedMeshingError,
+    MeshingError,
+    OffLevelError,
+    SelfIntersectionError,
+    TriangleLimitError,
+    is_retry_promising,
 )
 from harnack.meshing.outlier_projection import project_outliers
 from harnack.meshing.self_intersection_repair import resolve_self_intersections
@@ -628,9 +629,8 @@ class _DomainExtendedFunction(LevelFunction):
 
 # The number of cells across a solid, unless a spacing is given.
 _CELLS_ACROSS = 24
-# How many sizes of cells are tried, and the ratio of each size to the one before.
+# How many sizes of cells are tried.
 _MAX_ATTEMPTS = 3
-_CELL_SIZE_RATIO = 0.6
 # Where operands were cut by each other, slivers (thin triangles) may pass through their neighbors
 # by rounding. They are removed by moving the surface by up to the first length, in tolerances; if
 # that fails, by up to the next.
@@ -763,10 +763,10 @@ def mesh_solid(
             raise first from too_large  # the first error is the cause
         except (MissedPartsError, LocalizedMeshingError) as failure:
             attempts, first = attempts - 1, first or failure
-            if not attempts or not is_retry_promising(failure, before, _CELL_SIZE_RATIO**attempts):
+            if not attempts or not is_retry_promising(failure, before, CELL_SIZE_RATIO**attempts):
                 raise
             before = failure
-            cell_size *= _CELL_SIZE_RATIO
+            cell_size *= CELL_SIZE_RATIO
             # More cells along a wave in proportion, as these may limit the size of cells.
             per_wave = CELLS_PER_WAVE * size / (_CELLS_ACROSS * cell_size)
             if isinstance(failure, LocalizedMeshingError):

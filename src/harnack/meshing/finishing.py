@@ -24,10 +24,12 @@ from harnack.geometry.mesh_edges import (
     unit_normals,
 )
 from harnack.geometry.neighborhoods import kd_tree
-from harnack.meshing.checks import MeshingError, euler_characteristic, intersecting_faces
+from harnack.meshing.checks import euler_characteristic
 from harnack.meshing.closed_mesh import from_manifold, to_manifold, without_short_edges
 from harnack.meshing.lattice_meshing import TriangleMesh
 from harnack.meshing.level_function import LevelFunction
+from harnack.meshing.meshing_errors import MeshingError
+from harnack.meshing.self_intersection import intersecting_faces
 from harnack.meshing.self_intersection_repair import resolve_self_intersections
 
 if TYPE_CHECKING:

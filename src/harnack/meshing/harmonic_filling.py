@@ -27,15 +27,7 @@ from harnack.fields.solid_angles.winding_number import WindingNumber
 from harnack.geometry import MeshError
 from harnack.geometry.boundary_edges import singular_loops
 from harnack.geometry.mesh_edges import Edges, area_normals, half_edges
-from harnack.meshing.checks import (
-    LocalizedMeshingError,
-    MeshingError,
-    TriangleLimitError,
-    check_manifold,
-    intersecting_faces,
-    is_retry_promising,
-    nonmanifold_vertices,
-)
+from harnack.meshing.checks import check_manifold, nonmanifold_vertices
 from harnack.meshing.delaunay_points import (
     BoundaryCurve,
     RefinementBalls,
@@ -44,7 +36,14 @@ from harnack.meshing.delaunay_points import (
 )
 from harnack.meshing.level_function import LevelFunction
 from harnack.meshing.marching_tetrahedra import count_crossings, delaunay, extract_triangles
+from harnack.meshing.meshing_errors import (
+    LocalizedMeshingError,
+    MeshingError,
+    TriangleLimitError,
+    is_retry_promising,
+)
 from harnack.meshing.refinement import improve, refine, smooth, unrefined_midpoints
+from harnack.meshing.self_intersection import intersecting_faces
 
 if TYPE_CHECKING:
     from harnack.backend import FloatArray

@@ -41,8 +41,8 @@ from harnack.geometry.mesh_edges import (
     row_norms,
 )
 from harnack.geometry.neighborhoods import connected_groups
-from harnack.meshing.checks import intersecting_faces
 from harnack.meshing.refinement import split_faces
+from harnack.meshing.self_intersection import intersecting_faces
 
 __all__ = ["HoleFilling", "fill_holes", "hole_loops"]
 

@@ -46,8 +46,9 @@ for all y in the ball around T with center c and radius R. So (b) holds if grad 
 its longest edge, a few times: grad F is the same in both halves, and (a) or (b) may hold in each.
 
 Near the curve nothing is proved. The proof is about the first triangles, before they are refined.
-It is checked that the refined triangles do not meet (`checks.intersecting_faces`) and that they
-face along the gradient. It is not checked that they were moved without meeting on the way.
+It is checked that the refined triangles do not meet (`self_intersection.intersecting_faces`) and
+that they face along the gradient. It is not checked that they were moved without meeting on the
+way.
 """
 
 from __future__ import annotations

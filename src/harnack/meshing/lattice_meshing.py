@@ -31,12 +31,7 @@ from harnack.geometry.mesh_edges import (
 )
 from harnack.geometry.neighborhoods import connected_groups, kd_tree, pairs_within
 from harnack.meshing.bcc_lattice import BccLattice, distinct_rows
-from harnack.meshing.checks import (
-    MeshingError,
-    TriangleLimitError,
-    UnrefinableError,
-    nonmanifold_vertices,
-)
+from harnack.meshing.checks import nonmanifold_vertices
 from harnack.meshing.delaunay_points import (
     BoundaryCurve,
     TetrahedronPoints,
@@ -52,6 +47,7 @@ from harnack.meshing.marching_tetrahedra import (
     count_crossings,
     extract_triangles,
 )
+from harnack.meshing.meshing_errors import MeshingError, TriangleLimitError, UnrefinableError
 from harnack.meshing.refinement import refine, smooth, smooth_within_tolerance
 
 if TYPE_CHECKING:

@@ -33,9 +33,9 @@ from harnack.geometry.mesh_edges import (
     row_dots,
     row_norms,
 )
-from harnack.meshing.checks import LocalizedMeshingError, MeshingError
 from harnack.meshing.delaunay_points import TetrahedronPoints
 from harnack.meshing.level_function import LevelFunction
+from harnack.meshing.meshing_errors import LocalizedMeshingError, MeshingError
 
 __all__ = [
     "OUTSIDE_VALUE",

@@ -37,13 +37,7 @@ from harnack.geometry.boundary_edges import singular_edges, weld_vertices
 from harnack.geometry.meshes import without_zero_area_faces
 from harnack.geometry.orientability import is_nonorientable
 from harnack.meshing.bodies import mended_by_cuts, united_parts
-from harnack.meshing.checks import (
-    MeshingError,
-    TriangleLimitError,
-    euler_characteristic,
-    intersecting_faces,
-    nonmanifold_vertices,
-)
+from harnack.meshing.checks import euler_characteristic, nonmanifold_vertices
 from harnack.meshing.clipping import Shells, component_facts, largest_body
 from harnack.meshing.finishing import check_options
 from harnack.meshing.harmonic_filling import (
@@ -59,6 +53,8 @@ from harnack.meshing.lattice_meshing import TriangleMesh
 from harnack.meshing.mesh_cleaning import CleanedMesh, clean_and_fill, weld_near_corners
 from harnack.meshing.mesh_pipeline import mesh as mesh_of
 from harnack.meshing.mesh_tolerance import MeshTolerance
+from harnack.meshing.meshing_errors import MeshingError, TriangleLimitError
+from harnack.meshing.self_intersection import intersecting_faces
 from harnack.name_suggestions import is_one_of
 from harnack.progress import teller
 from harnack.tracer.trace_options import trace_options

@@ -29,12 +29,10 @@ from harnack.geometry.mesh_edges import (
     sorted_unique,
 )
 from harnack.geometry.neighborhoods import connected_groups
-from harnack.meshing.checks import (
-    SelfIntersectionError,
-    check_no_self_intersection,
-    intersecting_faces,
-)
+from harnack.meshing.checks import check_no_self_intersection
 from harnack.meshing.lattice_meshing import TriangleMesh
+from harnack.meshing.meshing_errors import SelfIntersectionError
+from harnack.meshing.self_intersection import intersecting_faces
 
 __all__ = ["resolve_local_intersections", "resolve_self_intersections"]
 

@@ -34,8 +34,8 @@ from harnack.fields.solid_angles.winding_number import WindingModuloOne, Winding
 from harnack.geometry.clouds import build_point_tree
 from harnack.geometry.denoising import outlier_indices
 from harnack.geometry.mesh_edges import row_dots, row_norms, unit_rows
-from harnack.meshing.checks import MeshingError
 from harnack.meshing.level_function import LevelFunction, LevelSamples
+from harnack.meshing.meshing_errors import MeshingError
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Precision, Real, Vec3

@@ -37,28 +37,27 @@ from harnack.geometry.mesh_edges import (
 )
 from harnack.geometry.neighborhoods import kd_tree
 from harnack.meshing.bcc_lattice import BccLattice, distinct_rows
-from harnack.meshing.checks import (
-    EmptySurfaceError,
-    LocalizedMeshingError,
-    MeshingError,
-    check_triangle_limit,
-    intersecting_faces,
-    points_off_level,
-)
+from harnack.meshing.checks import check_triangle_limit, points_off_level
 from harnack.meshing.closed_mesh import from_manifold, to_manifold, without_short_edges
 from harnack.meshing.delaunay_points import TetrahedronPoints
 from harnack.meshing.lattice_meshing import TriangleMesh
 from harnack.meshing.level_function import LevelSamples
 from harnack.meshing.lost_parts import LostParts, PointsOnLevel
 from harnack.meshing.marching_tetrahedra import Tetrahedra, count_crossings, extract_triangles
+from harnack.meshing.meshing_errors import (
+    CELL_SIZE_RATIO,
+    EmptySurfaceError,
+    LocalizedMeshingError,
+    MeshingError,
+)
 from harnack.meshing.refinement import split_faces
+from harnack.meshing.self_intersection import intersecting_faces
 from harnack.meshing.sign_function import SignFunction
 
 if TYPE_CHECKING:
     from harnack.geometry import Volume
 
 __all__ = [
-    "CELL_REFINEMENT_FACTOR",
     "MAX_OFF_LEVEL_FRACTION",
     "SignIsosurface",
     "extract_from_signs",
@@ -95,8 +94,8 @@ _BEFORE, _AFTER, _OFFSET = 0.3, 1.3, 1.0
 # second.
 _MIN_SQUARE, _INDEPENDENT = 1e-4, 0.1
 # The largest fraction of vertices and centers that may be beyond the tolerance before cells are
-# made smaller; and the ratio of smaller cells to the cells before.
-MAX_OFF_LEVEL_FRACTION, CELL_REFINEMENT_FACTOR = 0.01, 0.6
+# made smaller.
+MAX_OFF_LEVEL_FRACTION = 0.01
 # The largest distance from the level, in cells, that is measured.
 _MAX_DISTANCE_CELLS = 4.0
 # The largest number of triangles at whose corners and centers distances are measured.
@@ -189,14 +188,14 @@ def mesh_from_signs(
         lost = LostParts.of(function, level_points, mesh.surface, tolerance, spacing)
         attempts -= 1
         may_help = far_count > MAX_OFF_LEVEL_FRACTION * measured_count or (
-            lost.matter and lost.are_mended_by(CELL_REFINEMENT_FACTOR)
+            lost.matter and lost.are_mended_by(CELL_SIZE_RATIO)
         )
         if attempts <= 0 or not may_help or len(mesh.surface.faces) > _MOST_REMADE:
             break
         report(f"{far_count:,} of {measured_count:,} vertices and centers are beyond the tolerance")
         if lost.matter:
             report(str(lost))
-        spacing *= CELL_REFINEMENT_FACTOR
+        spacing *= CELL_SIZE_RATIO
     facts = {
         "made_by": "signs",
         "spacing": spacing,

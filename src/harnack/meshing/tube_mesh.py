@@ -16,9 +16,10 @@ import numpy as np
 from harnack.backend import FloatArray, IntArray
 from harnack.fields.solids.tube import Tube
 from harnack.geometry.mesh_edges import row_norms
-from harnack.meshing.checks import MeshingError, intersecting_faces
 from harnack.meshing.closed_mesh import to_manifold
 from harnack.meshing.lattice_meshing import TriangleMesh
+from harnack.meshing.meshing_errors import MeshingError
+from harnack.meshing.self_intersection import intersecting_faces
 
 if TYPE_CHECKING:
     from manifold3d import Manifold
