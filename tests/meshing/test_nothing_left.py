@@ -9,7 +9,7 @@ import pytest
 import trimesh
 
 import harnack as hk
-from harnack.meshing.clipping import drop_degenerate_components
+from harnack.meshing.components import drop_degenerate_components
 from harnack.meshing.lattice_meshing import TriangleMesh
 
 BALL = trimesh.creation.icosphere(2)

@@ -6,7 +6,8 @@ the vertices.
 Every mesh that `mesh` returns has passed checks: vertices and centers of triangles are tested by
 samples of the field, faces that pass through each other are found by exact predicates, and the
 number of triangles has a limit. The largest body is chosen by signed volumes and by the nesting of
-shells (`clipping`). Files hold single precision; vertices are rounded to it before the last check.
+shells (`components`). Files hold single precision; vertices are rounded to it before the last
+check.
 """
 
 from __future__ import annotations

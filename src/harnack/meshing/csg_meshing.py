@@ -43,17 +43,7 @@ from harnack.fields.solids.tube import Tube
 from harnack.geometry import Ball, Box, Volume, VolumeIntersection
 from harnack.meshing.bcc_lattice import BccLattice
 from harnack.meshing.checks import check_manifold
-from harnack.meshing.clipping import drop_degenerate_components
-from harnack.meshing.closed_mesh import (
-    box_manifold,
-    extruded_manifold,
-    from_manifold,
-    mesh_manifold,
-    revolved_manifold,
-    to_manifold,
-    volume_manifold,
-    without_short_edges,
-)
+from harnack.meshing.components import drop_degenerate_components
 from harnack.meshing.csg_rewrite import drop_cancelled_operands, factor_common_operands, flatten_csg
 from harnack.meshing.lattice_meshing import (
     IrrelevantRegion,
@@ -67,6 +57,16 @@ from harnack.meshing.level_function import (
     EvaluatorCache,
     LevelFunction,
     LevelSamples,
+)
+from harnack.meshing.manifold_conversion import (
+    box_manifold,
+    extruded_manifold,
+    from_manifold,
+    mesh_manifold,
+    revolved_manifold,
+    to_manifold,
+    volume_manifold,
+    without_short_edges,
 )
 from harnack.meshing.meshing_errors import (
     CELL_SIZE_RATIO,

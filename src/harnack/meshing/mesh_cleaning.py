@@ -28,7 +28,7 @@ from harnack.geometry.mesh_edges import (
 from harnack.geometry.neighborhoods import connected_groups, pairs_within
 from harnack.geometry.orientability import orientation_components
 from harnack.meshing.checks import check_manifold, nonmanifold_vertices
-from harnack.meshing.clipping import Shells, faces_to_flip
+from harnack.meshing.components import Shells, faces_to_flip
 from harnack.meshing.hole_filling import fill_holes, hole_loops
 from harnack.meshing.joined_pieces import passes_itself
 from harnack.meshing.lattice_meshing import TriangleMesh

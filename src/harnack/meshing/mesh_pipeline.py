@@ -28,8 +28,8 @@ from harnack.meshing.checks import (
     check_near_level,
     check_no_self_intersection,
 )
-from harnack.meshing.clipping import clip_to_volume, largest_body, largest_component
-from harnack.meshing.closed_mesh import box_manifold, from_manifold, to_manifold, volume_manifold
+from harnack.meshing.clipping import clip_to_volume
+from harnack.meshing.components import largest_body, largest_component
 from harnack.meshing.csg_meshing import (
     AngleMesher,
     mesh_solid,
@@ -37,16 +37,16 @@ from harnack.meshing.csg_meshing import (
     solid_value_range,
 )
 from harnack.meshing.curve_spanning import mesh_spanning_curve
-from harnack.meshing.finishing import (
-    check_options,
-    simplify_mesh,
-    thicken,
-    to_trimesh,
-    vertex_normals,
-)
+from harnack.meshing.finishing import check_options, simplify_mesh, to_trimesh, vertex_normals
 from harnack.meshing.lattice_meshing import TriangleMesh, mesh_open_surface
 from harnack.meshing.level_function import CELLS_PER_WAVE, MOST_FACES, LevelFunction
 from harnack.meshing.lost_parts import LostParts
+from harnack.meshing.manifold_conversion import (
+    box_manifold,
+    from_manifold,
+    to_manifold,
+    volume_manifold,
+)
 from harnack.meshing.mesh_tolerance import MeshTolerance
 from harnack.meshing.meshing_errors import (
     CELL_SIZE_RATIO,
@@ -65,6 +65,7 @@ from harnack.meshing.sign_isosurface import (
     MAX_OFF_LEVEL_FRACTION,
     mesh_from_signs,
 )
+from harnack.meshing.thickening import thicken
 from harnack.progress import teller
 from harnack.tracer import Surface
 from harnack.tracer.surface import intersection_of

@@ -23,7 +23,7 @@ from harnack.geometry import MeshError, validate_mesh, zero_area_faces
 from harnack.geometry.mesh_edges import Edges, half_edges, longest_edges
 from harnack.geometry.welding import Welded
 from harnack.meshing.checks import nonmanifold_vertices
-from harnack.meshing.clipping import Shells
+from harnack.meshing.components import Shells
 from harnack.meshing.lattice_meshing import TriangleMesh
 from harnack.meshing.meshing_errors import point_text
 from harnack.meshing.self_intersection import intersecting_faces, touching_pairs

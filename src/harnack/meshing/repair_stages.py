@@ -38,7 +38,7 @@ from harnack.geometry.meshes import without_zero_area_faces
 from harnack.geometry.orientability import is_nonorientable
 from harnack.meshing.bodies import mended_by_cuts, united_parts
 from harnack.meshing.checks import euler_characteristic, nonmanifold_vertices
-from harnack.meshing.clipping import Shells, component_facts, largest_body
+from harnack.meshing.components import Shells, component_facts, largest_body
 from harnack.meshing.finishing import check_options
 from harnack.meshing.harmonic_filling import (
     HarmonicFilling,

@@ -13,8 +13,8 @@ import numpy as np
 
 from harnack.backend import FloatArray, IntArray
 from harnack.fields.solids.thread import Thread
-from harnack.meshing.closed_mesh import to_manifold
 from harnack.meshing.lattice_meshing import TriangleMesh
+from harnack.meshing.manifold_conversion import to_manifold
 from harnack.meshing.meshing_errors import MeshingError
 
 if TYPE_CHECKING:

@@ -16,8 +16,8 @@ import numpy as np
 from harnack.backend import FloatArray, IntArray
 from harnack.fields.solids.tube import Tube
 from harnack.geometry.mesh_edges import row_norms
-from harnack.meshing.closed_mesh import to_manifold
 from harnack.meshing.lattice_meshing import TriangleMesh
+from harnack.meshing.manifold_conversion import to_manifold
 from harnack.meshing.meshing_errors import MeshingError
 from harnack.meshing.self_intersection import intersecting_faces
 
