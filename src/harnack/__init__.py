@@ -54,8 +54,8 @@ def __dir__() -> list[str]:
 
 
 def _namespace_of(name: str) -> str | None:
-    """The namespace (a module of the package) that has the public name `name`; None if there is
-    none."""
+    """Return the namespace (a module of the package) that has the public name `name`; None if there
+    is none."""
     if name.startswith("_"):
         return None
     for namespace in _NAMESPACES:

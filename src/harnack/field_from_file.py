@@ -122,7 +122,8 @@ def field_from_file(
 
 
 def _default_up_axis(path: Path, *, is_curve: bool) -> tuple[Axis, str]:
-    """The axis that points up in a file, as far as its suffix tells, and the reason in words.
+    """Return the axis that points up in a file, as far as the suffix of its name tells, and the
+    reason in words.
 
     is_curve: whether the file holds curves.
     """
@@ -135,8 +136,8 @@ def _default_up_axis(path: Path, *, is_curve: bool) -> tuple[Axis, str]:
 
 
 def _read(path: Path, read_as: ReadAs | None, boundary: bool) -> LoadedGeometry:
-    """The geometry in a file: what `read_as` says, or what `read_geometry` finds; or the curves
-    that bound its faces, if `boundary` is True."""
+    """Return the geometry in a file: the curves that bound its faces if `boundary` is True;
+    otherwise what `read_as` says or, if that is None, what `read_geometry` finds."""
     # For these formats `read_loops` finds the boundary itself.
     if boundary and path.suffix.lower() in _LOOP_FILES:
         loops = tuple(read_loops(path, boundary=True))
@@ -152,7 +153,7 @@ def _field(
     smoothing: float | Literal["auto"],
     rotation: FloatArray,
 ) -> Field:
-    """The field of some geometry, rotated by a matrix.
+    """Return the field of some geometry, rotated by a matrix.
 
     surface: the geometry that was read from a file.
     normals: "estimate" to estimate the normals of a point cloud, otherwise None.

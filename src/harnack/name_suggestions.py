@@ -13,13 +13,13 @@ _COMMON_PREFIX_BONUS = 0.02
 
 
 def is_one_of(name: object, names: Iterable[str]) -> bool:
-    """Whether a value is a string and one of the known names."""
+    """Return whether a value is a string and one of the known names."""
     return isinstance(name, str) and name in names
 
 
 def did_you_mean(misspelled: object, candidates: Iterable[str]) -> str:
-    """The end of an error message about a misspelled name: '; did you mean "gold"?' for the most
-    similar candidate; '' if no candidate is similar, or the name is not a string."""
+    """Return the end of an error message about a misspelled name: '; did you mean "gold"?' for the
+    most similar candidate; '' if no candidate is similar, or the name is not a string."""
     if not isinstance(misspelled, str):
         return ""
     word = misspelled[:100].lower()
@@ -29,8 +29,8 @@ def did_you_mean(misspelled: object, candidates: Iterable[str]) -> str:
 
 
 def _likeness(a: str, b: str) -> float:
-    """The similarity of two strings: difflib's ratio (0 to 1), and a bonus for each letter of their
-    common prefix."""
+    """Return the similarity of two strings: difflib's ratio (0 to 1), and a bonus for each letter
+    of their common prefix."""
     alike = (x == y for x, y in zip(a, b, strict=False))
     prefix = sum(itertools.takewhile(bool, alike))
     return difflib.SequenceMatcher(None, a, b).ratio() + _COMMON_PREFIX_BONUS * prefix

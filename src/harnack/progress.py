@@ -21,8 +21,8 @@ _INSTANT_SECONDS = 0.5
 
 
 def teller(progress: Callable[[str], None] | None) -> Callable[[str], None]:
-    """The function to which messages about progress are passed: `progress` itself, or one that
-    ignores them if `progress` is None.
+    """Return the function to which messages about progress are passed: `progress` itself, or one
+    that ignores them if `progress` is None.
 
     Raises:
         TypeError: progress is neither a function nor None.

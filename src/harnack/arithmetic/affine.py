@@ -237,8 +237,8 @@ def _entries(x: AffineForm) -> tuple[Real, Real, Real]:
 def _smaller_error(
     first: tuple[Real, Real, Real], second: tuple[Real, Real, Real]
 ) -> tuple[Real, Real, Real]:
-    """Of two lines, each given by (center, slope, error), the line with the smaller error. If one
-    line has a number that is not finite, it is the other line."""
+    """The line with the smaller error of the lines `first` and `second`, each given by (center,
+    slope, error). If one of the two has a number that is not finite, it is the other line."""
     is_first_finite = dr.isfinite(first[0]) & dr.isfinite(first[1]) & dr.isfinite(first[2])
     is_second_finite = dr.isfinite(second[0]) & dr.isfinite(second[1]) & dr.isfinite(second[2])
     use_first = is_first_finite & ((first[2] <= second[2]) | ~is_second_finite)

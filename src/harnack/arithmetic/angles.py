@@ -32,7 +32,7 @@ def atan2(y: Any, x: Any) -> Any:
 
     y, x: numbers of any kind: of an arithmetic, Dr.Jit or NumPy arrays or Python numbers.
 
-    The angle jumps along the negative x axis, where nothing is proved: a ray stops there. If you
+    The angle jumps along the negative x axis. Nothing is proved there, so that a ray stops. If you
     need only its cosine or sine, x / norm(x, y) and y / norm(x, y) have no such cut.
     """
     if isinstance(y, FormulaNumber):
@@ -59,16 +59,16 @@ def angle_range(y: Interval, x: Interval) -> tuple[Interval, Mask]:
 
     y, x: intervals whose ends are numbers of the backend.
 
-    On a box that meets the cut the range is [-pi, pi]. But a box that is a single point of the cut
-    other than the origin has the angle pi.
+    On a box that meets the cut the range is [-pi, pi]. Exception: for a box that is a single point
+    of the cut other than the origin, it is the angle pi.
 
-    Proof. Along an edge of the box the angle is monotone, because its derivative there has one
-    sign: it is (y'x - x'y)/(x^2 + y^2). It has no extremum inside. So the ends of the range are at
-    corners. The angle falls with x where y > 0 and rises with y where x > 0, which tells the
-    corner. If a coordinate of the corner is infinite, the angle is the limit. Both cannot be: if
-    the corner of the largest angle has x = -infinity, y > 0 on the box (else it would meet the
-    cut), and the corner has the lower y; if it has x = infinity, y <= 0 on the box, and the corner
-    has the upper y.
+    Proof. Along an edge of the box the angle is monotone, because its derivative (y'x - x'y)/(x^2 +
+    y^2) has one sign there. Inside of the box the angle has no extremum. So the ends of the range
+    are at corners. The angle falls with x where y > 0 and rises with y where x > 0, which tells the
+    corner. If a coordinate of the corner is infinite, the angle is the limit. Its two coordinates
+    cannot both be infinite: if the corner of the largest angle has x = -infinity, y > 0 on the box
+    (else it would meet the cut), and the corner has the lower y; if it has x = infinity, y <= 0 on
+    the box, and the corner has the upper y.
     """
     meets_cut = meets_branch_cut(y, x)
     is_point = x.lower is x.upper and y.lower is y.upper
@@ -91,8 +91,8 @@ def angle_range(y: Interval, x: Interval) -> tuple[Interval, Mask]:
 
 
 def _largest_angle(y: Interval, x: Interval) -> Real:
-    """The largest polar angle on the box of all points (x, y), which does not meet the cut. It is
-    that at a corner (`angle_range`)."""
+    """The largest polar angle on the box of all points (x, y), if the box does not meet the cut. It
+    is the angle of a corner (`angle_range`)."""
     corner_x = dr.select(y.upper > 0, x.lower, x.upper)
     corner_y = dr.select(corner_x > 0, y.upper, y.lower)
     # At an infinite corner the angle is that of the axis on which it lies.
@@ -105,8 +105,8 @@ def _largest_angle(y: Interval, x: Interval) -> Real:
 
 
 def _widened(low: Real, high: Real) -> tuple[Real, Real]:
-    """The interval [low, high] of computed angles, with its ends moved outwards by the error of
-    atan2."""
+    """The lower and the upper end of the interval [low, high] of computed angles, both moved
+    outwards by the error of the backend's atan2."""
     tiny = float(dr.smallest(cast("Any", type(low))))
     wide = Interval(low, high).widened(_MAX_ULP_ERROR * machine_epsilon(low), tiny)
     return wide.lower, wide.upper

@@ -46,8 +46,8 @@ class ElementaryFunction:
     on_drjit: evaluates the function for Dr.Jit numbers.
     on_numpy: evaluates the function for NumPy arrays and Python numbers.
     domain: the smallest and the largest number at which the function has a value.
-    is_steep: whether the function's slope is unbounded near a point: at a pole or a vertical
-        tangent.
+    is_steep: whether there is a point near which the function's slope is unbounded: a pole or a
+        vertical tangent.
     has_pole: whether there is a point at which the function is not continuous.
     """
 
@@ -95,9 +95,8 @@ def _twice(x: Interval) -> Interval:
 
 
 def _unbounded_unless_defined(defined: Mask, ranges: DerivativeRanges) -> DerivativeRanges:
-    """The three ranges of a function and of its derivatives. On lanes where `defined` is False, the
-    ranges of the derivatives are replaced by all numbers, because the function has a pole or no
-    value somewhere in the interval.
+    """The three `ranges`; on lanes where `defined` is False, those of the derivatives are replaced
+    by all numbers, because the function has a pole or no value somewhere in the interval.
 
     ranges: of the function, of its derivative and of its second derivative.
     """
@@ -124,13 +123,13 @@ def _exponential_range(f: Callable[[Any], Any], x: Interval) -> Interval:
     """The range, on the interval x, of an increasing function f that is computed by exp.
 
     exp is computed as 2^y with a rounded exponent y: on CUDA the error is larger by |x| units in
-    the last place. A result that overflows is known to be large: the end is then a large number, so
-    that 1/(1 + exp(x)) is known to be small.
+    the last place. If f overflows at the lower end of x, the lower end of the range is a large
+    number rather than infinity, so that 1/(1 + exp(x)) is known to be small.
     """
     large = _SAFE_FRACTION * float(dr.largest(type(x.lower)))
 
     def end(v: Real, sign: int) -> Real:
-        """A bound of f(v): from above for sign 1, from below for sign -1."""
+        """A bound of f(v): an upper bound for sign 1, a lower bound for sign -1."""
         result = f(v)
         error = machine_epsilon(v) * (_MAX_ULP_ERROR + dr.abs(v))
         moved = dr.fma(dr.abs(result), sign * error, result) + sign * _smallest_normal(x)
@@ -153,8 +152,8 @@ def _sqrt(x: Interval) -> DerivativeRanges:
     """The ranges of the square root, of its derivative and of its second derivative on the interval
     x.
 
-    The range of the square root is that for the numbers >= 0 of x; NaN if there are none. If x
-    contains a number below 0, the ranges of the derivatives are all numbers.
+    Numbers of x below 0 have no square root: the range is that of the other numbers of x, NaN if
+    there are none. If x contains a number below 0, the ranges of the derivatives are all numbers.
     """
     # The part of x with numbers >= 0.
     low = fmax(x.lower, 0)
@@ -190,8 +189,8 @@ def _positive_reciprocal(x: Interval) -> Interval:
 
 
 def _reciprocal(x: Interval) -> DerivativeRanges:
-    """The ranges of 1/x, of its derivative and of its second derivative on the interval x; all
-    numbers if x contains 0."""
+    """The ranges of 1/x, of its derivative and of its second derivative on the interval x. All
+    three are all numbers if x contains 0."""
     inverse = x.reciprocal()
     slope = -inverse.square()
     return _unbounded_unless_defined(
@@ -216,11 +215,11 @@ def _sine_and_cosine(x: Interval) -> tuple[Interval, Interval]:
 
     Proof. Both are monotone between the points at which they are 1 or -1, which are multiples of
     pi/2. So the range is given by the values at the ends and by such points inside the interval.
-    The test for a point inside is made on an interval that is wider by the rounding of the test; a
-    point that is counted although it is outside is within that rounding of an end. Beyond
-    `max_sincos_argument` sines are not known. There the range is [-1, 1] on intervals. At a single
-    point it is all numbers: the value at a point is taken half way between the ends, and 0 would
-    look like a value.
+    Whether such a point is inside is tested on an interval that is wider by the rounding of the
+    test; a point that is counted although it is outside is within that rounding of an end. For
+    arguments beyond `max_sincos_argument` sines are not known. There the range is [-1, 1] on
+    intervals. At a single point it is all numbers: the value at a point is taken half way between
+    the ends of its range, and from [-1, 1] it would be 0, which looks like a value.
     """
     epsilon, max_argument = machine_epsilon(x.lower), max_sincos_argument(type(x.lower))
     sine_lower, cosine_lower = sincos(x.lower)
@@ -250,7 +249,7 @@ def _sine_and_cosine(x: Interval) -> tuple[Interval, Interval]:
     def range_between(a: Real, b: Real, top: float, bottom: float) -> Interval:
         """The range of a sine or cosine on the interval.
 
-        a, b: its values at the ends of the interval.
+        a, b: its computed values at the ends of the interval x.
         top, bottom: the phases, as fractions of a full turn, at which it is 1 and -1.
         """
         plain = Interval(fmin(a, b), fmax(a, b)).widened(4 * epsilon, 4 * epsilon)
@@ -263,7 +262,7 @@ def _sine_and_cosine(x: Interval) -> tuple[Interval, Interval]:
 
 
 def _clip_to_unit(x: Interval, wide: Mask) -> Interval:
-    """The interval x, clipped to [-1, 1]; [-1, 1] itself on lanes where `wide` is set."""
+    """The interval x, clipped to [-1, 1]; [-1, 1] itself on lanes where the mask `wide` is True."""
     return Interval(
         dr.select(wide, -1, fmax(x.lower, -1)),
         dr.select(wide, 1, fmin(x.upper, 1)),
@@ -272,7 +271,7 @@ def _clip_to_unit(x: Interval, wide: Mask) -> Interval:
 
 def _tan(x: Interval) -> DerivativeRanges:
     """The ranges of tan, of its derivative and of its second derivative on the interval x; all
-    numbers if a pole may lie in it."""
+    three are all numbers if a pole may lie in x."""
     sine_range, cosine_range = _sine_and_cosine(x)
     tangent = sine_range * cosine_range.reciprocal()
     # tan increases where the cosine has no zero: its values at the ends are then the range.
@@ -326,8 +325,8 @@ def _atan(x: Interval) -> DerivativeRanges:
 
 def _asin(x: Interval) -> DerivativeRanges:
     """The ranges of the arc sine, of its derivative and of its second derivative on the interval x.
-    If x is not within [-1, 1], the range is that on the part inside, and the ranges of the
-    derivatives are all numbers."""
+    If x is not within [-1, 1], the range of the arc sine is that on the part of x in [-1, 1], and
+    the ranges of the derivatives are all numbers."""
     inside = Interval(fmax(x.lower, -1), fmin(x.upper, 1))
     # 1/sqrt(1 - x^2) and x/sqrt(1 - x^2)^3
     slope = _positive_reciprocal(_sqrt(ONE - inside.square())[0])
@@ -503,7 +502,7 @@ def _real_power(x: Interval, n: float) -> Interval:
     )
 
     def end(v: Real, sign: int) -> Real:
-        """A bound of v^n: from above for sign 1, from below for sign -1."""
+        """A bound of v^n: an upper bound for sign 1, a lower bound for sign -1."""
         result = dr.power(v, n)
         error = machine_epsilon(v) * (_MAX_ULP_ERROR + abs(n) * (4 + 2 * dr.abs(dr.log2(v))))
         return result + sign * (error * result + _smallest_normal(x))

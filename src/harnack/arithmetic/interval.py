@@ -57,9 +57,9 @@ class Interval:
 
     @classmethod
     def enclosing(cls, x: float, like: Any) -> Interval:
-        """The narrowest interval around the Python number x whose ends are exact in the precision
-        of the number type `like`: in single precision they are rounded outwards. The ends are
-        Python floats."""
+        """The narrowest interval that contains the Python number x and whose ends are numbers of
+        the precision of `like`, a Dr.Jit number: in single precision they are rounded outwards. The
+        ends are Python floats."""
         if dr.is_array_v(like) and dr.type_v(like) == dr.VarType.Float32:
             return cls(*_outward_single(float(x), float(x)), is_single=True)
         return cls(float(x), float(x))
@@ -111,8 +111,8 @@ class Interval:
         return Interval(low, high, self.is_single or other.is_single)
 
     def intersect(self, other: Interval) -> Interval:
-        """The intersection with an interval that is known to overlap this one. If an end is NaN
-        (unknown), the other interval's end is taken instead."""
+        """The intersection with an interval that is known to overlap this one. If an end of one of
+        the two is NaN (unknown), the end of the other one is taken."""
         return Interval(
             _maximum_ignoring_nan(self.lower, other.lower),
             _minimum_ignoring_nan(self.upper, other.upper),
@@ -124,7 +124,8 @@ class Interval:
         return self + Interval(x, x)
 
     def __neg__(self) -> Interval:
-        """The interval of all -x for x in the interval. A point interval stays one."""
+        """The interval of all -x for x in the interval. The result for a point interval is a point
+        interval."""
         if self.lower is self.upper:
             low = -self.lower
             return Interval(low, low, self.is_single)
@@ -220,8 +221,8 @@ class Interval:
         """The interval [low, high], whose ends were computed with rounding, with its ends moved
         outwards by that rounding.
 
-        other: the second operand of the operation, if there is one. If it or this interval is of
-            single precision, so is the result.
+        other: the second operand of the operation, if there is one. If this interval or `other` is
+            of single precision (`is_single`), so is the result.
         """
         single = self.is_single or (other is not None and other.is_single)
         low, high = _round_down(low), _round_up(high)
@@ -230,8 +231,9 @@ class Interval:
         return Interval(low, high, single)
 
     def widened(self, relative: float, absolute: float = 0.0) -> Interval:
-        """The interval with each end x moved outwards by relative * |x| + absolute. So it contains
-        the results of a function of the backend that has these relative and absolute errors."""
+        """The interval with each end x moved outwards by relative * |x| + absolute. If the ends
+        were computed by a function of the backend with these relative and absolute errors, the
+        result contains the exact ends."""
         low, high = self.lower, self.upper
         return Interval(
             _round_down(low - relative * _absolute(low) - absolute),
@@ -258,12 +260,12 @@ def typed_select(condition: Mask, a: Real, b: Real, like: Real) -> Real:
 
 
 def _round_down(x: Real, units: float = 1.0) -> Real:
-    """x moved down by `units` units in the last place of x, or a little more."""
+    """x minus at least `units` units in the last place of x."""
     return dr.fma(dr.abs(x), -units * machine_epsilon(x), x)
 
 
 def _round_up(x: Real, units: float = 1.0) -> Real:
-    """x moved up by `units` units in the last place of x, or a little more."""
+    """x plus at least `units` units in the last place of x."""
     return dr.fma(dr.abs(x), units * machine_epsilon(x), x)
 
 

@@ -40,16 +40,15 @@ class Jet(FormulaNumber):
     value: the range of the function.
     first_derivatives: (n,) the ranges of the partial derivatives.
     second_derivatives: (n (n+1) / 2,) the ranges of the second derivatives, the rows of the upper
-        triangle of the Hessian; empty if they are not needed. They are derivatives of
-        distributions: if the first derivative jumps, at a kink, the range has no upper or no lower
-        end.
-    jet_at_start: with n = 1, the jet at the start of the piece of the path, from which ranges on
-        the piece are narrowed; None for the jet at a point.
+        triangle of the Hessian; empty if they are not needed. At a kink, where the first derivative
+        jumps up, the range has no upper end; where it jumps down, no lower end.
+    jet_at_start: for a piece of a path, the jet at its start, from which ranges on the piece are
+        narrowed; None otherwise.
     piece_length: the length of the piece; 0 at a point. It is a number of the backend, and tells
         the precision if all ranges are Python numbers.
     roots: functions such that this function is the sum of their squares; empty if none are known.
         The square root of a sum of squares is a norm, whose slopes are bounded. By the chain rule
-        they would be unbounded where all squares are 0.
+        of the square root they would be unbounded where all squares are 0.
     """
 
     value: Interval
@@ -125,7 +124,7 @@ class Jet(FormulaNumber):
         return self._constant(Interval.enclosing(float(x), type(self.backend_number())))
 
     def _constant(self, value: Interval) -> Jet:
-        """A constant in the range `value` as a function of the same variables."""
+        """A constant that lies in the interval `value`, as a function of the same variables."""
         zeros = (ZERO,) * len(self.first_derivatives), (ZERO,) * len(self.second_derivatives)
         start = (
             None
@@ -200,9 +199,9 @@ class Jet(FormulaNumber):
         return dataclasses.replace(jet, roots=roots) if roots else jet
 
     def _scaled_roots(self, factor: Interval) -> tuple[Jet, ...]:
-        """The functions whose squares add up to the product of this function with a constant; none
-        if they are not known, or if the constant is not known to be positive. Each is a root of
-        this function (see `Jet`) times the square root of the constant.
+        """The functions whose squares add up to the product of this function with a constant; an
+        empty tuple if they are not known, or if the constant is not known to be positive. Each is
+        one of the attribute `roots` times the square root of the constant.
 
         factor: the range of the constant.
         """
@@ -246,10 +245,10 @@ class Jet(FormulaNumber):
     # Functions.
 
     def apply(self, function: ElementaryFunction) -> Jet:
-        """The composition f(g) of an elementary function f with this function g.
+        """The composition f(g) of an elementary function f, `function`, with this function g.
 
-        Its derivatives are f(g)' = f' g' and f(g)'' = f'' g' g' + f' g''. The square root of a
-        known sum of squares is computed as a norm.
+        Its derivatives are f(g)' = f' g' and f(g)'' = f'' g' g' + f' g'', with f' and f'' on the
+        range of g. The square root of a known sum of squares is computed as a norm.
         """
         # The square root of a sum of squares.
         if function is sqrt and self.roots:
@@ -287,9 +286,12 @@ class Jet(FormulaNumber):
         is_x_larger, is_y_larger = x.lower > y.upper, y.lower > x.upper
 
         def chosen(u: Interval, v: Interval, *, kink: bool) -> Interval:
-            """The range u (of x or a derivative) or v (of y or its derivative) of the larger
-            function. Where neither is known to be larger, it is the hull of both, without an upper
-            end if the derivative may have a kink there."""
+            """The range of the larger function, or of one of its derivatives. u is that range for
+            x, and v for y. Where neither is known to be larger, the result is the hull of u and v.
+
+            kink: whether u and v are ranges of a second derivative by the same variable twice,
+                which has no upper bound where x and y cross; then the hull has no upper end.
+            """
             if u.is_literal and v.is_literal and u == v and not kink:
                 return u
             hull = u.hull(v)
@@ -463,9 +465,10 @@ def wronskian_range(x: Jet, y: Jet, u: Interval, v: Interval, i: int) -> Interva
     i: the index of the variable.
 
     On a piece of a path the variable i is the length s. Then w has the derivative x y_ii - y x_ii,
-    as the terms x_i y_i cancel. So w is also within its value at the start of the piece plus the
-    length times the range of this derivative, and the two ranges are intersected. Coordinates are
-    linear in s; for them the derivative is 0, and w is its value at the start.
+    as the terms x_i y_i cancel. So w also lies in a second range: its value at the start of the
+    piece, plus lengths up to that of the piece times the range of this derivative. The result is
+    the intersection of the two ranges. For coordinates, which are linear in s, the derivative is 0,
+    and w is its value at the start.
     """
     w = u * y.first_derivatives[i] - v * x.first_derivatives[i]
     if x.jet_at_start is None or y.jet_at_start is None:
@@ -483,9 +486,9 @@ def range_times_length(slope: Interval, width: Real) -> Interval:
 
     width: a length >= 0, a number of the backend.
 
-    If the product at the lower end overflows to +infinity, or at the upper end to -infinity,
-    rounding outwards makes that end NaN. The end is 0 in this case, since s t = 0 at s = 0, and
-    fmin and fmax return 0 rather than NaN.
+    If the product for the lower end of `slope` overflows to +infinity, or that for the upper end to
+    -infinity, rounding outwards makes it NaN. The end of the result is then 0, as it should be,
+    since s t = 0 at s = 0: fmin and fmax with 0 return 0 rather than NaN.
     """
     if slope.is_zero:
         return ZERO
@@ -494,8 +497,8 @@ def range_times_length(slope: Interval, width: Real) -> Interval:
 
 
 def _moved(base: Interval, rate: Interval, s: Real) -> Interval:
-    """The range of base + rate s for numbers of the intervals `base` and `rate` and a single number
-    s."""
+    """The range of b + r s for all numbers b of the interval `base` and r of the interval `rate`; s
+    is a single number."""
     if isinstance(s, float) and s == 0.0:
         return base
     return base + rate * Interval.point(s)
@@ -510,8 +513,8 @@ class Dual(FormulaNumber):
     plain numbers without ranges. So nothing is proved with it.
 
     At a tie, such as in max(x, 0) at x = 0, the ranges of a `Jet` contain all slopes nearby. A dual
-    number has the slope of one of the two sides there, since each comparison is decided by the
-    values.
+    number has the slope of one of the two sides there, since maxima and minima compare the values
+    alone.
     """
 
     value: Real
@@ -592,8 +595,8 @@ class Dual(FormulaNumber):
 
 
 def _map_partials(function: Callable[..., Any], *partials: _Partials) -> _Partials:
-    """Apply `function` three times: to the derivatives by x of one or several functions, to those
-    by y and to those by z. Returns the three results.
+    """Apply `function` three times: to the derivatives of one or several functions by x, to their
+    derivatives by y, and to those by z. Returns the three results.
 
     partials: for each function its three partial derivatives.
     """

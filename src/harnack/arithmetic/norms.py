@@ -145,7 +145,7 @@ def _jet_norm(xs: list[Jet], p: float) -> Jet:
     infinity. `norm` has the proof of its ranges.
 
     In the code `inverse_norm` is the range of 1/N, `ratios` are the ranges of x_i/N, and `pulls`
-    are the ranges of sign(x_i) |x_i/N|^(p-1).
+    are those of sign(x_i) |x_i/N|^(p-1), the derivatives of N by the x_i.
     """
     number = next((f.value.lower for f in xs if not f.value.is_literal), None)
     number = xs[0].backend_number() if number is None else number
@@ -194,7 +194,8 @@ def _wronskian_term(
     of functions x_k. It is the part of N's second derivative by the variables i and j that the
     first derivatives of the functions contribute (`norm` has the proof).
 
-    w_km,i is the function x_k x_m' - x_m x_k' with derivatives by the variable i.
+    w_km,i is the function x_k x_m,i - x_m x_k,i, where ",i" denotes the derivative by the variable
+    i.
 
     xs: the functions x_k.
     values: the ranges of their values.
@@ -220,7 +221,7 @@ def _norm_range(values: list[Interval], p: float) -> Interval:
 
 
 def _norm_of_magnitudes(sizes: list[Any], p: float) -> Interval:
-    """The range of the p-norm of numbers >= 0, which contains its rounding.
+    """The p-norm of numbers >= 0, as an interval that contains the exact norm in spite of rounding.
 
     sizes: the numbers.
     """
@@ -243,7 +244,7 @@ def _signed_power(x: Interval, q: float) -> Interval:
     the range follows from the ends."""
 
     def at(v: Any) -> Interval:
-        """The range at a single number v, which contains the rounding."""
+        """An interval that contains sign(v) |v|^q in spite of rounding."""
         size = power(q).ranges(Interval.point(dr.abs(v)))[0]
         return Interval(
             dr.select(v >= 0, size.lower, -size.upper), dr.select(v >= 0, size.upper, -size.lower)
@@ -293,8 +294,8 @@ def as_backend_interval(x: Interval, like: Any) -> Interval:
 
 def blend_union(a: Any, b: Any, radius: Any, power: float = 2.0) -> Any:
     """The function of a union with a rounded edge, from the functions a and b of two sets {a <= 0}
-    and {b <= 0}. It is <= 0 in both sets, and in the inner edge between them, which a superellipse
-    fills.
+    and {b <= 0}. It is <= 0 in both sets, and also in a fillet along the inner edge at which their
+    surfaces meet; the cross-section of the fillet is an arc of a superellipse.
 
     a, b: numbers of any kind, such as signed distances.
     radius: the blend changes the union where both a and b are less than this.

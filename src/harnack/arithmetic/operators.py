@@ -5,8 +5,8 @@ such as `harnack.math.sin`. An arithmetic is a kind of numbers, such as interval
 number stands for a function of the variables, such as a part of the formula.
 
 `tally_of` estimates, before Dr.Jit records code for a formula, how long that code will be. It also
-tells whether the formula may jump, have a vertical tangent, or turn within the rounding of
-coordinates.
+tells whether the formula may jump, have a vertical tangent, or turn sharply (be flat, steep and
+flat again) within the rounding of coordinates.
 """
 
 from __future__ import annotations
@@ -102,8 +102,8 @@ class FormulaNumber(abc.ABC):
         return self.apply(sqrt if p == 2.0 else power(1 / p))
 
     def _coerce_or_none(self, other: Any) -> Self | None:
-        """The operand `other` as a number of this arithmetic: itself if it is one already, else a
-        constant; None if it is not a number."""
+        """The operand `other` as a number of this arithmetic: `other` itself if it is one already,
+        else a constant; None if `other` is not a number."""
         if isinstance(other, type(self)):
             return other
         # An array of depth 1 holds numbers, not vectors.
@@ -230,7 +230,12 @@ class FormulaNumber(abc.ABC):
         return self.coerce(y).polar_angle(self)
 
     def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **settings: Any) -> Any:
-        """Apply one of NumPy's functions or operators to these numbers, as NumPy's protocol asks.
+        """Apply one of NumPy's functions or operators to numbers of this arithmetic. NumPy calls
+        this method, with the parameters of its protocol.
+
+        ufunc: the function, such as numpy.sin.
+        method: how it is applied; only "__call__", a plain call, is supported.
+        inputs, settings: the operands; and keyword arguments, which are not supported.
 
         Raises:
             TypeError: this function has no proved ranges, or an operand is no number.
@@ -313,7 +318,7 @@ class Tally:
     absolute value, or a function that is no power: it may then turn sharply, that is, be flat,
     steep, and flat again.
 
-    operations: about how many operations of Dr.Jit their ranges take.
+    operations: about how many operations of Dr.Jit it takes to compute the ranges of all numbers.
     may_jump: whether a function was used that is not continuous everywhere.
     is_steep: whether the slope may have no bound in a bounded box, as with roots, powers below 1,
         quotients or logarithms.
@@ -330,17 +335,17 @@ class Tally:
     farthest: float = 0.0
 
     def turns_within(self, finest: float) -> bool:
-        """Whether the formula may change by far more within the rounding of coordinates than its
-        slopes on both sides say.
+        """Whether the formula may turn so sharply that a change of the coordinates by their
+        rounding changes it by far more than its slopes nearby say.
 
         max(-1, min(1, 1e9 y)) is an example: flat, steep, and flat again.
 
-        finest: the smallest change within which a bent number may turn, such as the attribute
-            `finest`.
+        finest: the smallest change of a bent number within which the formula may turn; for example
+            the attribute `finest`.
 
         This is an estimate from the numbers of the formula, and no proof. Sums and products of
-        coordinates alone do not get flat again. A function of 1e9 y does, such as tanh, and so does
-        a maximum with 1e-9.
+        coordinates alone do not turn in this way. A function of 1e9 y, such as tanh, may turn, and
+        so may a maximum with 1e-9.
         """
         return self.steepest * max(self.farthest / _FAR, 1.0) >= _ABRUPT * finest
 
@@ -356,8 +361,9 @@ class OperationCounter(FormulaNumber):
     is_square: whether it is a sum of squares. The root of such a sum has no vertical tangent: f =
         sqrt(u^2 + v^2) has |grad f| <= |grad u| + |grad v|.
     size, rate: estimated bounds of the number and of its slope, for coordinates up to 1
-        (`Tally.turns_within`). A function that has a pole or grows faster than a power counts as
-        about 1, and as no steeper than its argument. A constant that is an array counts as 1.
+        (`Tally.turns_within`). The result of a function that has a pole or grows faster than a
+        power counts as about 1, and as no steeper than the argument of the function. A constant
+        that is an array counts as 1.
     """
 
     tally: Tally
@@ -367,8 +373,9 @@ class OperationCounter(FormulaNumber):
     rate: float = 1.0
 
     def constant(self, x: Any) -> OperationCounter:
-        """The constant x. Its absolute value is recorded in the tally as a size within which
-        numbers may turn."""
+        """The constant x. A formula may turn where one of its numbers changes by about |x|, as
+        max(y, 0.01) does for x = 0.01. So the smallest |x| > 0 is kept as the tally's `finest`. An
+        x that is an array counts as 1."""
         is_number = isinstance(x, int | float)
         size = min(abs(float(x)), _MAX_SIZE) if is_number else 1.0
         if size > 0.0:
@@ -379,8 +386,8 @@ class OperationCounter(FormulaNumber):
         )
 
     def sum(self, other: OperationCounter) -> OperationCounter:
-        """The sum of this number and another one. The absolute value of a constant that is added is
-        recorded in the tally."""
+        """The sum of this number and another one. The largest absolute value of a constant that is
+        added is kept as the tally's `farthest`."""
         for number in (self, other):
             if number.is_constant:
                 self.tally.farthest = max(self.tally.farthest, number.size)
@@ -388,8 +395,9 @@ class OperationCounter(FormulaNumber):
         return self._after(_SUM, other, *total, is_square=self.is_square and other.is_square)
 
     def product(self, other: OperationCounter) -> OperationCounter:
-        """The product of this number and another one. It is a sum of squares if it is a square, or
-        a sum of squares times a positive constant."""
+        """The product of this number and another one. The result counts as a sum of squares if both
+        factors are the same number, or if one is a sum of squares and the other a positive
+        constant."""
         is_scaled = self.is_constant or other.is_constant
         is_square = other is self or (is_scaled and self.is_square and other.is_square)
         size, rate = self.size * other.size, self.size * other.rate + other.size * self.rate
@@ -399,7 +407,7 @@ class OperationCounter(FormulaNumber):
         return self._after(0, self, self.size, self.rate)
 
     def __pow__(self, exponent: Any) -> OperationCounter:
-        """This number to a power, as an operation in the tally."""
+        """This number to a power; the operation is added to the tally."""
         if isinstance(exponent, OperationCounter):  # exp(exponent log(x))
             self._note(log)
             rate = self.rate + exponent.rate
@@ -422,8 +430,8 @@ class OperationCounter(FormulaNumber):
         return self._bent(_FUNCTION, self, size, self.rate)
 
     def pointwise_maximum(self, other: OperationCounter) -> OperationCounter:
-        """The larger of this number and another one, an operation that may bend both. Its size and
-        its slope count as the larger ones of the two."""
+        """The larger of this number and another one, an operation that may bend both. The size and
+        the slope of the result count as the larger sizes and slopes of the two."""
         rate = max(self.rate, other.rate)
         return self._bent(_FUNCTION, other, max(self.size, other.size), rate)
 
@@ -435,8 +443,8 @@ class OperationCounter(FormulaNumber):
         return self._bent(_FUNCTION + _PRODUCT, x, 1.0, self.rate + x.rate)
 
     def norm_of_powers(self, p: float) -> OperationCounter:
-        """The p-norm of some numbers, where this number is the sum of their powers. The root may
-        bend the sum, but it is not steep."""
+        """The p-norm of some numbers, where this number is the sum of their p-th powers. The p-th
+        root may bend the sum, but the norm is not steep."""
         # The derivative of x^(1/p) is 1/(p size^(p-1)), with size = x^(1/p).
         size = max(self.size, 1.0) ** (1 / p)
         return self._bent(_FUNCTION, self, size, self.rate / (p * size ** (p - 1)))
@@ -456,7 +464,7 @@ class OperationCounter(FormulaNumber):
         both sides of a place and steep between. The slopes of both numbers are recorded in the
         tally.
 
-        operations: the number of Dr.Jit operations.
+        operations: the number of Dr.Jit operations that the operation takes.
         size, rate: estimates of the size and of the slope of the result.
         """
         if not (self.is_constant and other.is_constant):
@@ -494,9 +502,9 @@ def tally_of(formula: Callable[[Any, Any, Any], Any]) -> Tally:
 
     formula: a function of three coordinates.
 
-    A formula that does not accept numbers of this kind gets a tally with no operations and with
-    `may_jump` set. Such a formula accepts only ranges of derivatives, as the formulas of the
-    library's shapes do, and these are bounded.
+    A formula that does not accept an `OperationCounter` gets a tally with no operations, in which
+    `may_jump` is True. Such a formula accepts only jets, as the formulas of the library's shapes
+    do, and their slopes are bounded.
     """
     tally = Tally()
     x, y, z = (

@@ -100,8 +100,9 @@ class ParabolaBounds(FormulaNumber):
     def _new(
         self, value: Interval, lower: Quadratic, upper: Quadratic, polynomial: int | None = None
     ) -> ParabolaBounds:
-        """A function on the same path, with this value at s = 0 and these bounds. If `bound_degree`
-        is 1, the bounds are replaced by lines that bound them, unless the function is a polynomial.
+        """A function on the same path, with the range `value` at s = 0 and the bounds `lower` and
+        `upper`. If `bound_degree` is 1, the bounds are replaced by lines that bound them, unless
+        the function is a polynomial.
 
         polynomial: the degree of the function if it is a polynomial; else None.
         """
@@ -476,7 +477,7 @@ class ParabolaBounds(FormulaNumber):
         function: the function t -> max(t, 0)^n.
 
         f = v + a s + b s^2 is known up to rounding: v, a and b below are the middles of narrow
-        ranges with the half widths rv, ra and rb. `value_error` bounds |f - (v + a s + b s^2)| on
+        ranges, whose half widths are rv, ra and rb. `value_error` bounds |f - (v + a s + b s^2)| on
         [0, h], and also the rounding of this sum.
 
         Proof. If f is concave, f > 0 on at most one interval [s0, s1] of [0, h] (`start`, `end`).
@@ -736,8 +737,9 @@ def _common_lower_bound(parabolas: list[Quadratic], length: Real) -> Quadratic:
 
 
 def _tighter_bound(first: Quadratic, second: Quadratic, length: Real, sign: int) -> Quadratic:
-    """The tighter of two bounds on the same side, compared at one point of [0, length]; if one
-    bound is NaN, the other bound. A bound is a parabola (a, b) for a s + b s^2.
+    """The tighter of the bounds `first` and `second`, which are on the same side, compared at one
+    point of [0, length]. If one bound is NaN, it is the other bound. A bound is a parabola (a, b)
+    for a s + b s^2.
 
     sign: 1 for upper bounds, -1 for lower bounds.
     """
@@ -764,7 +766,8 @@ def _maximum_on_piece(q: Quadratic, length: Real) -> Real:
 
 
 def _sum(first: Quadratic, second: Quadratic, sign: int) -> Quadratic:
-    """The sum of two parabolas (a, b), rounded upwards (sign 1) or downwards (sign -1)."""
+    """The sum of the parabolas `first` and `second`, each a pair (a, b), rounded upwards (sign 1)
+    or downwards (sign -1)."""
 
     def plus(x: Real, y: Real) -> Real:
         """The sum of two coefficients, rounded to the side of `sign`; exact if one is the Python

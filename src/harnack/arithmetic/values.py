@@ -1,8 +1,8 @@
 """`Values`: the range of a formula on a box of its variables, and whether the formula is continuous
 there. A range is an interval that is proved to contain all values. A formula has no value where it
-takes, for example, the root of a negative number; it may jump where it has a pole or the cut of a
-polar angle. A range is lost if an end is infinite or NaN; it may still be known to be large, that
-is, beyond a large number on one side.
+takes, for example, the root of a negative number; it may jump at a pole or at the cut of a polar
+angle (the negative x axis). A range is lost if an end is infinite or NaN, unless it is known to be
+large, that is, if all of it is beyond a large number on one side of 0.
 
 Ranges of derivatives prove long steps where a formula is smooth. Near a vertical tangent, such as
 that of sqrt(|x|) at x = 0, they are unbounded, and where the formula has no value they prove
@@ -93,8 +93,8 @@ class Values(FormulaNumber):
         return self._with(self.value + other.value, other)
 
     def product(self, other: Values) -> Values:
-        """The product of this function and another one; of a function with itself it is the square,
-        whose range is sharper."""
+        """The product of this function and another one; the product of a function with itself is
+        its square, whose range is sharper."""
         if other is self:
             return self.apply(power(2))
         return self._with(self.value * other.value, other)
@@ -157,8 +157,8 @@ class Values(FormulaNumber):
 
     def _with(self, value: Interval, other: Values) -> Values:
         """A function with the range `value` that was computed from this function and another one.
-        It has no value at points where one of the two has none, and may jump where one of the two
-        may."""
+        It has no value at points where one of the two functions has none, and may jump where one of
+        them may jump."""
         return Values(
             value,
             self.nowhere | other.nowhere,
@@ -171,9 +171,9 @@ def _is_lost(x: Interval, large: float = _LARGE_EXPONENT) -> Mask:
     """A mask of the lanes on which a range has an infinite end or NaN, and is not known to be
     large.
 
-    large: the exponent e. The range is known to be large if all of it is beyond (largest number)^e,
-        on the positive or on the negative side. With e = 0.0, no range with an infinite end or NaN
-        is known to be large.
+    large: an exponent e. The range is known to be large if all of it is above L^e or below -L^e,
+        where L is the largest number of its precision. With e = 0.0, no range with an infinite end
+        or NaN counts as known to be large.
     """
     lost = ~(dr.isfinite(x.lower) & dr.isfinite(x.upper))
     if large == 0.0:

@@ -83,8 +83,8 @@ def _make_backend(name: BackendName, precision: Precision) -> Backend:
     suffix = "64" if precision == "double" else ""
 
     def type_named(stem: str) -> Any:
-        """The Dr.Jit type of this name in the right precision: Float becomes Float64 for double
-        precision."""
+        """Return the Dr.Jit type of this name in the right precision: for double precision, "Float"
+        becomes "Float64"."""
         return getattr(module, stem + suffix)
 
     backend = Backend(
@@ -352,8 +352,8 @@ def as_kernel_parameters(array: Any) -> Any:
 
 
 def _check_same_backend(backend: Backend, array: Any, name: str) -> None:
-    """Raise `TypeError` for a Dr.Jit array that does not live on the backend. name: what it is, for
-    messages."""
+    """Raise `TypeError` for a Dr.Jit array of another backend than the given one. name: what the
+    array is, for messages."""
     try:
         array_backend = backend_of(array)
     except TypeError as error:
@@ -416,8 +416,8 @@ def upload_integers(backend: Backend, values: npt.NDArray[Any]) -> Index:
 
 
 def _aligned(values: npt.NDArray[Any], dtype: np.dtype[Any]) -> npt.NDArray[Any]:
-    """Return a copy of a one-dimensional array that begins at a multiple of _ALIGNMENT bytes, with
-    at least _ALIGNMENT unused bytes after it.
+    """Return a copy of a one-dimensional array, converted to the type `dtype`, whose memory begins
+    at a multiple of _ALIGNMENT bytes and has at least _ALIGNMENT unused bytes after it.
 
     Dr.Jit uses the memory of a NumPy array in place, and NumPy's memory is aligned to the
     processor's vectors by chance only. Without alignment, Dr.Jit silently replaces packet gathers

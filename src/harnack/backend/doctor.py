@@ -69,8 +69,8 @@ def _package_finding(name: str) -> Finding:
 
 
 def _device_finding(name: str, kind: Any) -> Finding:
-    """Return the line that says whether Dr.Jit finds a usable device. kind: Dr.Jit's constant for
-    the backend."""
+    """Return the line that says whether Dr.Jit finds a usable device. name: of the backend, such as
+    "CUDA". kind: Dr.Jit's constant for it."""
     if dr.has_backend(kind):
         return Finding(name, "a usable device")
     return Finding(name, "no usable device (none is needed)")
@@ -150,7 +150,8 @@ def try_kernel(precision: str) -> None:
         return i < 8
 
     def add(i: Index, total: Real) -> tuple[Index, Real]:
-        """Do one step of the loop: add a term that is read from the table."""
+        """Do one step of the loop: add term i of the table to the sum `total`. Returns the next
+        index and the new sum."""
         term = dr.gather(backend.Float, table, i)
         return i + 1, total + dr.minimum(term, 4) * dr.sqrt(x)
 

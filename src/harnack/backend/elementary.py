@@ -111,8 +111,10 @@ def sincos(x: Any) -> tuple[Any, Any]:
     instruction, with an error of 2^-20.5 = 11u, and of 600u for an angle of 300 (PTX ISA,
     sin.approx). On LLVM they lose accuracy above 8192: the error is 16u at 10^5, and no digit is
     right at 10^6. So polynomials are used here. In double precision, Dr.Jit's functions are
-    accurate within 1.6u up to about 10^9, and are used for the reduced angle. The reduced angle is
-    rounded once for each part of pi/2, as the products are fused.
+    accurate within 1.6u up to about 10^9, and are used for the reduced angle. In both precisions,
+    pi/2 is the sum of a few floating-point numbers, its parts. The reduced angle x - k pi/2 is
+    computed by subtracting k times each part by a fused multiply-add, so it is rounded only once
+    for each part.
     """
     is_double = dr.type_v(type(x)) == dr.VarType.Float64
     # 0.6366... is 2/pi.

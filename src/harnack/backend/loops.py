@@ -248,6 +248,7 @@ def _run_queue(
     ray_indices: the indices in `start` of the rays in the queue.
     ray_count: the number of these rays; `ray_indices` may be longer.
     results: the arrays, one entry per ray, into which the results are written.
+    label: the name of the loop in Dr.Jit's output.
     """
     index_type = cast("Any", type(ray_indices))
     opaque_ray_count = dr.opaque(index_type, ray_count)
@@ -309,7 +310,7 @@ def _run_queue(
 def _begin_new_scope(array: Any) -> None:
     """Begin a new Dr.Jit scope, as a recorded loop does. Dr.Jit merges equal expressions within a
     scope only. So without this call, the code that follows would compile to another kernel if the
-    loop was skipped. array: of the backend on which the scope begins."""
+    loop was skipped. array: any array of the backend on which the scope begins."""
     dr.detail.new_scope(dr.backend_v(array))
 
 
@@ -327,7 +328,7 @@ def _evaluate_in_own_memory(compute: Callable[[], Any]) -> Any:
 
 
 def _broadcast(leaf: Any, width: int, index: Any) -> Any:
-    """Return a copy of an array with `width` lanes; an array of a single lane is repeated. index:
-    the Dr.Jit type of lane indices."""
+    """Return a copy of the array `leaf` with `width` lanes; an array of a single lane is repeated.
+    index: the Dr.Jit type of lane indices."""
     # All indices are 0 for an array of a single lane.
     return dr.gather(type(leaf), leaf, dr.arange(index, width) * (dr.width(leaf) > 1))

@@ -89,7 +89,7 @@ class RecordTable:
 
     def view(self, first: Any, trips: Any) -> RecordTable:
         """Return a part of the table: `trips` consecutive records, from record `first` on. Both
-        numbers may differ between lanes. The table must have one record per iteration.
+        numbers may differ between lanes. An iteration of `for_each` must read a single record.
 
         Raises:
             ValueError: an iteration reads several records.

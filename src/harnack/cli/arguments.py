@@ -2,8 +2,8 @@
 wrong arguments. Most options come from the table of all options (`rendering.option_table`), which
 says for each function of the library (such as `render` or `mesh`) what options it has. argparse,
 Python's library, does the parsing. A "source" is what a command draws or meshes: a scene of the
-gallery, a file or a formula.
-"""
+gallery, a file or a formula. `parser` is the parser of one command, and `commands` is the object of
+argparse to which parsers of commands are added."""
 
 from __future__ import annotations
 
@@ -65,7 +65,12 @@ class _Once(argparse.Action):
         values: Any,
         option_string: str | None = None,
     ) -> None:
-        """Store the value of the option. It is an error if it has one already."""
+        """Store the value of the option as an attribute of `namespace`. It is an error of the
+        command line if it has one already.
+
+        values: the value.
+        option_string: the option as it was written, such as "--level", for the message.
+        """
         if getattr(namespace, self.dest, None) is not None:
             parser.error(f"{option_string} is given twice")
         setattr(namespace, self.dest, values)

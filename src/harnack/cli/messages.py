@@ -38,8 +38,9 @@ class Interrupts:
     when: float = -_SAME
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
-        """Note the signal, and raise `KeyboardInterrupt`. A second signal within a second is
-        ignored: a terminal and a parent process may both pass on the same Ctrl-C."""
+        """Note the signal, and raise `KeyboardInterrupt`. The arguments, with which Python calls a
+        handler, are not used. A second signal within a second is ignored: a terminal and a parent
+        process may both pass on the same Ctrl-C."""
         del number, frame
         now = time.monotonic()
         if self.pressed and now - self.when < _SAME:
@@ -74,8 +75,9 @@ def print_warnings() -> Generator[None]:
         shown = warnings.showwarning
 
         def note(message: Any, category: type[Warning], *args: Any, **kwargs: Any) -> None:
-            """Print a warning that is meant for users; pass all other warnings to Python's own
-            function."""
+            """Print a warning if its category is one that is meant for users (UserWarning or
+            RuntimeWarning); pass all other warnings to Python's own function. The parameters are
+            those of `warnings.showwarning`."""
             if issubclass(category, UserWarning | RuntimeWarning):
                 print(f"note: {python_to_cli_terms(str(message))}", file=sys.stderr)
             else:
@@ -146,8 +148,9 @@ def _option(match: re.Match[str]) -> str:
 
 
 def level_text(level: float | None) -> str:
-    """Return a level as it is written on the command line, such as "2pi" or "0.5": as a multiple of
-    pi if it is a multiple of pi/2."""
+    """Return the text of a level on the command line, such as "2pi" or "0.5": a multiple of pi for
+    a nonzero multiple of pi/2, otherwise a plain number. level: the number; None raises a
+    TypeError."""
     ratio = (level or 0.0) / 3.141592653589793
     if ratio and abs(2 * ratio - round(2 * ratio)) < 1e-9:
         return f"{ratio:g}pi" if ratio != 1 else "pi"

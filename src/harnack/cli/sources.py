@@ -117,7 +117,7 @@ def load_content(
     where the fields come from, for scene files.
 
     path: the source as `source_path` returns it.
-    moved: further numbers for names in a formula, besides those of --parameter; by name.
+    moved: numbers for further names in a formula, which --parameter does not set; by name.
     """
     given_options = options_set(verb, arguments)
     if arguments.source in SCENES:
@@ -235,8 +235,8 @@ def load_single_surface(arguments: Any, path: Path) -> Field | Surface:
 
 
 def formula_field(arguments: Any, moved: Mapping[str, float] | None = None) -> Field:
-    """Return the field of the formula that is the source. moved: further numbers for names in the
-    formula, besides those of --parameter; by name."""
+    """Return the field of the formula that is the source. moved: numbers for further names in the
+    formula, which --parameter does not set; by name."""
     return expression(arguments.source, parameters={**dict(arguments.parameters), **(moved or {})})
 
 
@@ -248,7 +248,7 @@ def print_line(line: str) -> None:
 
 def _of_scene(scene: Scene, arguments: Any, given_options: dict[str, Any]) -> Content:
     """Return a scene of the gallery as content (surfaces, options, and where the fields come from).
-    The given options replace the scene's.
+    given_options: the options that were given, by name; they replace those of the scene.
 
     Raises:
         ValueError: a level or side was given, and the scene has several surfaces.
@@ -274,7 +274,8 @@ def _of_scene(scene: Scene, arguments: Any, given_options: dict[str, Any]) -> Co
 
 def _of_scene_file(scene: SceneFile, arguments: Any, given_options: dict[str, Any]) -> Content:
     """Return the scene that a scene file (.json) describes as content (surfaces, options, and where
-    the fields come from). The given options replace the file's.
+    the fields come from). given_options: the options that were given, by name; they replace those
+    of the file.
 
     Raises:
         ValueError: a level was given, and the scene has several surfaces.
@@ -295,7 +296,7 @@ def _of_scene_file(scene: SceneFile, arguments: Any, given_options: dict[str, An
 
 def _of_file(path: Path, arguments: Any, given_options: dict[str, Any]) -> Content:
     """Return a surface file as content (its field, options, and where the field comes from). What
-    the file was taken for is printed."""
+    the file was taken for is printed. given_options: the options that were given, by name."""
     given_options = {name: value for name, value in given_options.items() if name != "up"}
     opened = field_from_file(path, **_file_options(arguments))
     print_line(f"{path}: {python_to_cli_terms(opened.summary)}")
@@ -368,9 +369,13 @@ def _unpacked(surfaces: Any, settings: dict[str, Any]) -> tuple[Any, dict[str, A
 
 
 def _with_flat_options(settings: dict[str, Any], sliders: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the settings by name. If one of the sliders (by name) moves an option of traces, the
-    entry "options" (a `TraceOptions`) is replaced by two entries, its tolerance and its number of
-    steps, since a slider can only be the value of an entry."""
+    """Return the options of `page` or `view`, by name, in a form in which sliders can move them. If
+    a slider moves an option of traces, the entry "options" (a `TraceOptions`) is replaced by two
+    entries, "tolerance" and "max_steps": a slider can only be the value of an entry. Otherwise the
+    options are returned unchanged.
+
+    sliders: the sliders by the names of the options that they move.
+    """
     options = settings.get("options")
     if not isinstance(options, TraceOptions) or not any(name in TRACE_OPTIONS for name in sliders):
         return settings
@@ -385,8 +390,8 @@ def _camera_options(arguments: Any) -> dict[str, Any]:
 
 
 def _camera(arguments: Any, camera: Camera) -> dict[str, Any]:
-    """Return the entry {"camera": camera}, in which `camera` was changed by the given options; an
-    empty dictionary if no option of the camera was given."""
+    """Return the option {"camera": ...}: the given `camera`, changed by the options of the command
+    line. The dictionary is empty if none of these options was given."""
     given_options = _camera_options(arguments)
     if not given_options:
         return {}

@@ -103,7 +103,7 @@ class CheckpointFolder:
         return self._file(name).exists()
 
     def save(self, name: str, arrays: TaskResult) -> None:
-        """Store the result of the task with this name."""
+        """Store `arrays`, the result of the task with this name."""
         with write_atomically(self._file(name)) as partial:
             np.savez(partial, allow_pickle=False, **arrays)
 
@@ -127,9 +127,9 @@ class Executor:
 
     def split_range(self, count: int, max_size: int) -> list[tuple[int, int]]:
         """Split range(count) into intervals (start, stop) of at most `max_size` numbers each; each
-        interval is to be a task. With `chunks`, they are made shorter until there are about so many
-        tasks. Without it but with a client, until there are about six for each thread of its
-        workers."""
+        interval is to be a task. If `chunks` is set, the intervals are made shorter until there are
+        about so many of them. If it is not set but there is a client, they are made shorter until
+        there are about six for each thread of its workers."""
         size = max(1, min(max_size, count))
         if self.chunks is not None:
             size = max(1, min(size, -(-count // self.chunks)))
@@ -171,8 +171,8 @@ class Executor:
                     self.checkpoint.save(name, arrays)
 
     def _max_pending(self) -> int:
-        """Return the largest number of tasks that may be running or whose results wait to be
-        yielded: three for each thread of the workers, or one in this process."""
+        """Return the largest number of tasks that may be started ahead, that is before their
+        results are yielded: three for each thread of the workers, or one in this process."""
         return 1 if self.client is None else _PENDING_PER_THREAD * self._threads()
 
     def _threads(self) -> int:
@@ -343,8 +343,8 @@ def _ordered_results(
     arguments: the arguments of each task.
     folder: the folder in which results are looked up and stored; None for no folder.
     runner: runs the tasks.
-    max_pending: returns the largest number of tasks that may be running or whose results wait to be
-        yielded.
+    max_pending: returns the largest number of tasks that may be started ahead, that is before their
+        results are yielded.
     """
     results: dict[str, TaskResult] = {}
     pending: set[str] = set()

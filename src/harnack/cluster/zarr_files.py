@@ -138,8 +138,9 @@ def _open_or_create(zarr: Any, array: Any, target: Path) -> Any:
 
 
 def _chunk_path(file: Any, target: Path, index: tuple[int, ...]) -> Path:
-    """Return the path of the file of the chunk with this index. This file exists only if the chunk
-    is complete: Zarr writes it under another name first, and then renames it."""
+    """Return the path of the file of the chunk with this index in the Zarr array `file`, whose
+    folder is `target`. The path exists only if the chunk is complete: Zarr writes it under another
+    name first, and then renames it."""
     return target / file.metadata.encode_chunk_key(index)
 
 

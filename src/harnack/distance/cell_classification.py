@@ -59,12 +59,13 @@ _MIN_RELATIVE_STEP = 1e-8
 
 @dataclass(frozen=True)
 class ClipCurveDescent:
-    """Descent to the point of the clip curve that is closest to a query x. In the clip curve the
-    boundary of the field's domain cuts the level set. On this curve f = level and h = 0, where h is
-    the signed distance from the boundary of the domain. The boundary may have several smooth faces,
-    which meet at edges.
+    """Finds the point of the clip curve that is closest to a query x by descent. In the clip curve
+    the boundary of the field's domain (the volume in which the field is defined) cuts the level
+    set. On this curve f = level and h = 0, where h is the signed distance from the boundary of the
+    domain. The boundary may have several smooth faces, which meet at edges.
 
-    field, domain: prepared for the backend.
+    field, domain: the function f and its domain, prepared for the backend.
+    levels: the values of f on the surface; at a point the level nearest to f counts.
     """
 
     backend: Backend
@@ -73,9 +74,9 @@ class ClipCurveDescent:
     domain: Volume
 
     def closest(self, x: Vec3, start: Vec3) -> tuple[Vec3, Real]:
-        """Return a point y of the curve at which the distance from x has a local minimum, found by
-        descent from `start`; and the curvature of the curve there. Both are NaN where the curve is
-        not reached.
+        """Return a point y of the clip curve at which the distance from x has a local minimum,
+        found by descent from `start`; and the curvature of the curve at y. Both are NaN where the
+        curve is not reached.
 
         Let t be the curve's unit tangent at y, and y'' its second derivative by arc length, which
         follows from the second derivatives of f and h along t (differences of their gradients).
@@ -96,7 +97,8 @@ class ClipCurveDescent:
             face_normal: Vec3, face_offset: Real, corner: Any, factor: Real, tries: Any, k: Any,
             active: Mask,
         ) -> tuple[Any, ...]:  # fmt: skip
-            """Try the point y, and choose the next one.
+            """Try the point y, and choose the next one. Returns the new state: values in the order
+            of the parameters.
 
             best, nearest: the best point of the curve so far, and its distance from x; infinite if
                 there is none.
@@ -104,8 +106,8 @@ class ClipCurveDescent:
                 `best`.
             face_normal, face_offset: the plane of another face that ends steps; the normal is 0 if
                 there is none.
-            corner: 0, `_TURNING` or `_TURNED`: whether the search is about to turn into another
-                face at a corner, or has.
+            corner: 0 before the search has come to a corner; `_TURNING` if its next step leads into
+                the other face there; `_TURNED` after that step.
             factor: the fraction of Newton's step that is tried.
             tries: the number of corrections towards the curve since the last step.
             k: the number of points tried so far.
@@ -257,12 +259,13 @@ class _ClipCurveState:
     """The geometry at a point near the clip curve, in which the boundary of the field's domain cuts
     the level set.
 
-    is_on: whether the point is on the curve, to the tolerance `near`.
-    near: the length within which rounding leaves the level uncertain.
+    near: the length by which rounding may have moved the level set there.
+    is_on: whether the point is on the curve: within `near` of the level set, and within a few
+        roundings of the boundary.
     correction: the step back to the curve, to first order.
     tangent, second_derivative: unit tangent of the curve, and its second derivative by arc length.
     normal: the outward normal of the domain.
-    depth: the distance of the point inside the domain, less a margin.
+    depth: how far the point is inside the domain, less a margin.
     """
 
     is_on: Mask
@@ -291,10 +294,10 @@ _DIAGONALS = ((1.0, 1.0, 1.0), (1.0, 1.0, -1.0), (1.0, -1.0, 1.0), (-1.0, 1.0, 1
 
 def taylor_remainder(sample: Sample, radius: Real, degree: int = 1) -> Real:
     """Return a bound of the Taylor remainder |f(y) - T(y)| for |y - p| <= radius. p is the point of
-    the sample, and T the Taylor polynomial of f about p, of degree 1 or 2. The bound follows from
-    the sample's promises (proved bounds of f near p); it is infinite if these imply none. When the
-    radius decreases, the bound falls at least as fast as radius^(degree + 1), except for the errors
-    of value and gradient, which are included."""
+    the sample, and T the Taylor polynomial of f about p, of the degree `degree`, 1 or 2. The bound
+    follows from the sample's promises (proved bounds of f near p); it is infinite if these imply
+    none. When the radius decreases, the bound falls at least as fast as radius^(degree + 1), except
+    for the errors of value and gradient, which are included."""
     bound: Real = dr.inf
     for promise in sample.all_promises:
         bound = fmin(bound, promise.taylor_remainder_bound(sample.value, radius, degree))
@@ -305,7 +308,7 @@ def multiplicity(step: Real, last: Real) -> Real:
     """Estimate the multiplicity m of the root towards which Newton's method converges, from its
     last two steps.
 
-    step, last: the current step, and the length of the one before.
+    step, last: the current step (with its sign), and the length of the one before.
 
     Near a root of multiplicity m, each step is about 1 - 1/m times the one before, and a step m
     times as long as Newton's leads to the root. So the result is 1/(1 - |step|/last), if the ratio
@@ -352,8 +355,8 @@ class CellClassifier:
         center: (n, 3) centers of the cubes.
         half: (n,) half the length of their edges.
 
-        A cube is empty if the ball around it lies outside the domain. If the ball does not, but the
-        cube's center lies outside, the cube is returned without a slab.
+        A cube is left out if the ball around it lies outside the domain. If that ball meets the
+        domain, but the cube's center lies outside, the cube is returned without a slab.
         """
         is_inside = np.ones(len(center), np.bool_)
         if self._volume is not None and len(center):
@@ -410,7 +413,7 @@ class CellClassifier:
         """Evaluate a function of Dr.Jit vectors at points (n, 3). Returns its results as arrays,
         (n,) or (n, 3) each.
 
-        compute: the function.
+        compute: the function. Its arguments are a point and `values`.
         values: further arguments of `compute`: vectors (n, 3), or numbers (n,). A number is passed
             as a vector of three equal components.
         """
@@ -428,7 +431,7 @@ class CellClassifier:
             ] = FAR_SENTINEL
 
     def _distance_outside(self, p: Vec3) -> tuple[Real]:
-        """Return the signed distance of p from the domain, positive outside."""
+        """Return the signed distance of p from the domain, positive outside, as a tuple of one."""
         return (self._volume.signed_distance(p),)
 
     def _pulled_inside(self, p: Vec3) -> tuple[Real, Vec3]:
@@ -552,10 +555,11 @@ class CellClassifier:
         zero = dr.opaque(real, 0.0)  # keeps constant components of a gradient in the loop
 
         def body(y: Vec3, last: Real, k: Any) -> tuple[Any, ...]:
-            """Make one Newton step from y.
+            """Make one Newton step from y. Returns the new y, the length of this step, and the new
+            number of steps.
 
             last: the length of the step before.
-            k: the number of steps.
+            k: the number of steps so far.
             """
             sample = self._field.evaluate(y)
             gradient_norm = safe_norm(sample.gradient)
@@ -593,8 +597,8 @@ class CellClassifier:
         real, vector, count = self._backend.Float, self._backend.Array3f, self._backend.UInt32
 
         def body(point: Vec3, best: Real, k: Any) -> tuple[Any, ...]:
-            """Trace ray k, and keep its hit if that is nearer to p. best: the squared distance of
-            `point`."""
+            """Trace ray k, and keep its hit if that is nearer to p than `point`, the nearest hit so
+            far. Returns the new state. best: the squared distance from p to `point`."""
             # The direction of ray k.
             d = vector(*_DIAGONALS[0]) / 3**0.5
             for number, diagonal in enumerate(_DIAGONALS[1:], 1):

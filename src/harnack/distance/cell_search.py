@@ -78,10 +78,10 @@ class DescentMethods(Protocol):
 
     def newton_in_kernel(self, x: Vec3, start: Vec3, limit: Real) -> tuple[Vec3, Real, Mask]:
         """Iterate as part of another kernel, from points `start` near the surface, for the queries
-        x. Points farther from x than `limit` need not be found.
+        x. Closest points farther from x than the length `limit` need not be found.
 
-        Returns the closest points, the radii, and the mask of lanes for which `descend` has to be
-        called afterwards.
+        Returns the closest points, the radii of the balls about them, and the mask of lanes for
+        which `descend` has to be called afterwards, because the iteration did not converge.
         """
         ...
 
@@ -89,9 +89,9 @@ class DescentMethods(Protocol):
         self, points: FloatArray, start: FloatArray, limit: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """Iterate from points `start` (n, 3) near the surface, for the queries `points` (n, 3).
-        Points farther from the query than `limit` (n,) need not be found.
+        Closest points farther from the query than the lengths `limit` (n,) need not be found.
 
-        Returns the closest points (n, 3) and the radii (n,).
+        Returns the closest points (n, 3), and the radii (n,) of the balls about them.
         """
         ...
 
@@ -104,7 +104,7 @@ class DescentMethods(Protocol):
         aside: (n,) the distance from the curve, in the direction of the query, at which the surface
             is searched; the iteration starts there.
 
-        Returns the closest points (n, 3) and the radii (n,).
+        Returns the closest points (n, 3), and the radii (n,) of the balls about them.
         """
         ...
 
@@ -114,8 +114,9 @@ class InitialGuess:
     """What is known about the closest points of n queries before cells are searched.
 
     closest: (n, 3) for each query a point of the surface, or NaN.
-    estimate: (n,) first-order estimates of the distances.
-    on_boundary: whether the points `closest` lie on the curve at which the surface ends.
+    estimate: (n,) first-order estimates of the distances from the surface.
+    on_boundary: whether all points `closest` lie on the curve at which the surface ends; otherwise
+        none is known to.
     """
 
     closest: FloatArray
@@ -123,7 +124,7 @@ class InitialGuess:
     on_boundary: bool = True
 
     def some(self, rows: IntArray | slice) -> InitialGuess:
-        """Return the initial guess for the queries `rows`."""
+        """Return the initial guess for the queries with the indices `rows`."""
         return replace(self, closest=self.closest[rows], estimate=self.estimate[rows])
 
 
@@ -132,8 +133,8 @@ class StoppingRule:
     """The condition under which a search for closest points ends.
 
     length: an improvement of the distance by less than this length is not pursued.
-    prove: whether cells are subdivided until none of them may hold a point that is nearer than the
-        best one by more than `length`, or until there are too many cells.
+    prove: whether cells are subdivided until no cell may hold a point that is nearer than the best
+        one found by more than `length`, or until there are too many cells.
     """
 
     length: float
@@ -168,7 +169,7 @@ def search(
 
     known: what is already known about the closest points.
     descents: the iterations that lead from a point near the surface to a closest point.
-    tolerance: the condition under which the search ends.
+    tolerance: when the search ends.
     progress: called with a message before each stage.
 
     If no box is known to contain the surface, a cube around the queries is searched. Queries whose
@@ -280,6 +281,10 @@ def _split(
 ) -> tuple[SurfaceCells, SurfaceCells]:
     """Divide the cube `root` into cells that may hold the surface.
 
+    classifier: proves cells empty, and finds slabs that contain the surface.
+    min_cells: the number of cells at which the division ends.
+    progress: called with a message before each stage.
+
     Each iteration splits the larger half of the cells into eight, until there are at least
     `min_cells`. If the surface in a cell is in one piece and lies in a slab (between two parallel
     planes), then the cell counts as smaller than it is: its size is taken to be a quarter of the
@@ -309,8 +314,8 @@ def _split(
 def _subdivide(
     classifier: CellClassifier, cells: SurfaceCells, is_split: BoolArray
 ) -> SurfaceCells:
-    """Return the children of the cells selected by the mask `is_split` (n,), without those that are
-    proved empty. Each cell has eight children of half its size."""
+    """Return the children of the cells selected by the mask `is_split` (n,), without the children
+    that `classifier` proves empty. Each cell has eight children of half its size."""
     half = 0.5 * cells.half[is_split]
     center = cells.center[is_split, None] + half[:, None, None] * _CORNERS
     return classifier.nonempty_cells(center.reshape(-1, 3), np.repeat(half, 8))
@@ -345,9 +350,12 @@ class _CellSearch:
         tolerance: float,
         max_cells: int,
     ) -> None:
-        """Store the search's inputs. points: (n, 3) the queries. descents: the iterations that lead
-        from a point near the surface to a closest point. The other parameters are attributes of the
-        class."""
+        """Store the search's inputs.
+
+        points: (n, 3) the queries.
+        descents: the iterations that lead from a point near the surface to a closest point.
+        classifier, cells, trees, guess, tolerance, max_cells: as in the class docstring.
+        """
         self.trees = trees
         self.classifier, self.cells, self.points, self.descents = (
             classifier,
@@ -361,7 +369,8 @@ class _CellSearch:
         self.max_cells = max_cells
 
     def run(self, progress: Callable[[str], None]) -> SearchResult:
-        """Search, and return the closest points and the lower bounds of the distances."""
+        """Search, and return the closest points and the lower bounds of the distances. progress:
+        called with a message before each stage."""
         if not len(self.points):
             return SearchResult(self.closest, self.lower)
         has_jumps = self.classifier.surface.field.has_jumps
@@ -385,12 +394,13 @@ class _CellSearch:
         """Search the cells of both trees, and subdivide cells if proofs are wanted.
 
         coarse, tree: the tree of the coarse cells, and the tree of all cells.
-        has_jumps: whether f jumps at facets.
+        has_jumps: whether the surface's function f jumps at facets, such as triangles.
+        progress: called with a message before each stage.
 
         For each query the first descent begins at the surface point of the coarse cell with the
         smallest estimated distance. The next ones begin at surface points of a few cells that may
         hold a point nearer than its result. Then all cells that may hold a point nearer than the
-        best one are split and searched again, until there are none or too many.
+        best one are split and searched again, until no such cells remain or there are too many.
         """
         # A mark for each cell that may hold a nearer point, if cells are to be split.
         marks = dr.zeros(self.backend.Bool, len(self.cells)) if self.max_cells else None
@@ -423,10 +433,11 @@ class _CellSearch:
     def _search_in_kernel(
         self, coarse: CellTree, tree: CellTree, marks: Any
     ) -> tuple[IntArray, FloatArray]:
-        """Make the first searches for all queries in a single kernel: a descent from the surface
-        point of the coarse cell with the smallest estimated distance; then descents from the
-        surface points of a few cells that may hold a point nearer than its result. Queries for
-        which Newton's method does not converge in the kernel are finished by `_descend`.
+        """Make the first searches for all queries. In a single kernel, a descent starts from the
+        surface point of the coarse cell with the smallest estimated distance, and a few cells that
+        may hold a point nearer than its result are found. Then descents start from the surface
+        points of these cells. Queries for which Newton's method does not converge in the kernel are
+        finished by `_descend`.
 
         coarse, tree: the tree of the coarse cells, and the tree of all cells.
         marks: a Bool array with an entry for each cell, or None. The entries of cells that may hold
@@ -439,9 +450,13 @@ class _CellSearch:
         tolerance = dr.opaque(backend.Float, self.tolerance)
 
         def compute(x: Vec3, guess_point: Vec3) -> tuple[Real | Vec3, ...]:
-            """Return for a query x: the best point and the radius of its ball without nearer
-            points, the lower bound, the surface point where the descent began, the candidates for
-            the next round, and 1 where Newton's method did not converge."""
+            """Descend for a query x. Returns a tuple: the best point, NaN for none; the radius of a
+            ball about it in which no surface point is nearer to x; a lower bound of the distance;
+            the surface point where the descent began; several candidates, surface points for the
+            next descents; and 1 where Newton's method did not converge, else 0.
+
+            guess_point: the best point before, NaN for none.
+            """
             real, missing = backend.Float, backend.Array3f(FAR_SENTINEL)
             limit = safe_norm(guess_point - x)
             # Without a guess the limit is a huge number. `best_start` returns such coordinates for
@@ -503,8 +518,8 @@ class _CellSearch:
         return self.lower < self._distance(slice(None)) - self.tolerance
 
     def _distance(self, rows: IntArray | slice) -> FloatArray:
-        """Return the distances (k,) of the queries `rows` from their best points so far;
-        `FAR_SENTINEL` where there is none."""
+        """Return the distances (k,) of the queries with the indices `rows` from their best points
+        so far; `FAR_SENTINEL` where there is none."""
         distances = np.linalg.norm(self.points[rows] - self.closest[rows], axis=1)
         return np.where(np.isnan(distances), FAR_SENTINEL, distances)
 

@@ -59,8 +59,9 @@ class SurfaceCells:
     normal, offset, thickness: (n, 3), (n,), (n,) the slab: a surface point y in the ball around the
         cell has |normal . (y - center) - offset| <= thickness. Where no slab is known the thickness
         is FAR; where no plane approximates the surface the normal is zero.
-    plane_radius: (n,) within this radius about its surface point the surface is nearly that plane.
-    curvature: (n,) an upper bound of the surface's curvature there, or FAR.
+    plane_radius: (n,) within this radius about its surface point the surface is nearly a plane at
+        right angles to `normal`.
+    curvature: (n,) an upper bound of the surface's curvature at the surface point, or FAR.
     clip_point: (n, 3) a point of the clip curve, at which a domain cuts the surface, or FAR.
     clip_curvature: (n,) the curvature of the clip curve there.
     """
@@ -104,7 +105,7 @@ class SurfaceCells:
 
     @classmethod
     def concatenate(cls, parts: list[SurfaceCells]) -> SurfaceCells:
-        """Return the cells of all parts, in order."""
+        """Return the cells of all `parts`, one after the other."""
         columns = zip(*(vars(part).values() for part in parts), strict=True)
         return cls(*(np.concatenate(column) for column in columns))
 
@@ -140,8 +141,8 @@ class CellTree:
         """Build the tree of the cells. If a cell has a point of the clip curve (in which the
         boundary of the domain cuts the surface), the tree has a second record for that point.
 
-        Besides the numbers of `SurfaceCells` a record has an index, a slack by which the estimate
-        of a distance may be too large, and a separation (`_CellRecord`).
+        Besides the attributes of a cell (`SurfaceCells`) a record has an index, a bound of how much
+        too large its estimate of a distance may be, and a separation; `_CellRecord` explains them.
         """
         clip_rows = np.flatnonzero(cells.clip_point[:, 0] < FAR_SENTINEL)
         count, cell_of_record = len(cells), np.concatenate([np.arange(len(cells)), clip_rows])
@@ -192,8 +193,9 @@ class CellTree:
         vector = self.tree.backend.Array3f
 
         def visit_cell(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
-            """Keep the smallest estimated distance so far, and the surface point of its cell. row:
-            the cell's record. state: both so far."""
+            """Return the smallest estimated distance and the surface point of its cell, after a
+            visit of another cell. row: the cell's record. state: the two values before the
+            visit."""
             best, point = state
             cell = _CellRecord.of(vector, row)
             estimate = cell.estimate(x)
@@ -214,22 +216,24 @@ class CellTree:
         best: the surface point closest to x so far.
         points: surface points at which searches started already.
         tolerance: a length; cells that may hold a point nearer by less than this do not count.
-        marks: None, or a Bool array with one entry for each cell. An entry is set for every cell
-            whose lower bound is below best.distance - tolerance, whether its point is skipped or
-            not.
+        marks: None, or a Bool array with one entry for each cell. Here the entry of every cell
+            whose lower bound is below best.distance - tolerance is set to True, even if the cell's
+            surface point is skipped.
 
         Returns a lower bound of the distance from x to the surface, at most best.distance; and the
         surface points (`FAR_SENTINEL` for none) of the few cells with the smallest estimated
         distance, among those whose lower bound is below best.distance - tolerance. Points that are
-        not separated from `best`, from `points` or from each other (`_SEPARATION`) are skipped.
+        so close to `best`, to `points` or to each other that both lead to the same closest point
+        (`_SEPARATION`) are skipped.
         """
         backend = self.tree.backend
         vector, index = backend.Array3f, backend.UInt32
 
         def visit_cell(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
-            """Visit a cell: reduce the lower bound of the distance to that of the cell, if that is
-            smaller; mark the cell; and add its surface point to the list of candidates, if it
-            qualifies.
+            """Visit a cell, and return the new state. The lower bound of the distance is reduced to
+            the cell's own, if that is smaller. If the cell may hold a nearer point, it is marked;
+            and its surface point is added to the list of candidates, if a descent from it is worth
+            its time.
 
             row: the cell's record.
             state: the lower bound so far, then the list of candidates.
@@ -256,7 +260,7 @@ class CellTree:
             return lower, *update_where_active(is_listed, insert, (*listed,), "listed cells")
 
         def with_candidate(cell: _CellRecord, estimate: Real, state: LoopValues) -> LoopValues:
-            """Insert the surface point of a cell in the list of candidates. Returns the new list.
+            """Insert the surface point of `cell` in the list of candidates. Returns the new list.
 
             estimate: the estimated distance of the surface in the cell from the query.
             state: the list, of fixed length: alternately the estimate and the surface point of each
@@ -315,8 +319,9 @@ class CellTree:
         vector = self.tree.backend.Array3f
 
         def visit(node: VisitedNode, state: LoopValues) -> tuple[Mask, LoopValues]:
-            """Return whether a node's box is to be visited, and the state after its cells, if it is
-            a leaf."""
+            """Return a mask and the new state. The mask tells where the traversal enters the node:
+            where its box is near enough. If the node is a leaf, its cells are visited, which
+            changes the state."""
             low, high = vector(*node.head[:3]), vector(*node.head[3:6])
             offset = dr.select(x < low, low - x, dr.select(x > high, x - high, 0))
             is_near = (dr.squared_norm(offset) < limit(state)) & may_contain(low, high)
@@ -332,8 +337,8 @@ class _CellRecord:
     attributes are those of a cell in `SurfaceCells`; the others are:
 
     number: the index of the cell; -1 for a point of the clip curve.
-    spread: the radius about `surface_point` within which the surface is taken for a plane, or the
-        clip curve for a line.
+    spread: within this radius about `surface_point` the surface is taken for a plane, and the clip
+        curve for a line.
     estimate_slack: an upper bound of (estimate - distance) for the surface in the cell.
     separation: surface points that are closer than this to `surface_point` are taken to lead to the
         same closest point.
@@ -364,8 +369,9 @@ class _CellRecord:
         return self.number >= 0
 
     def lower_bound(self, x: Vec3) -> Real:
-        """Return a lower bound of the distance from x to the surface in the cell: the larger of the
-        distances from the cell's box and from its slab within the ball around the cell."""
+        """Return a lower bound of the distance from x to the surface in the cell. It is the larger
+        of two distances from x: to the cell's box, and to the part of its slab in the ball around
+        the cell."""
         vector = cast("Any", type(x))
         offset = x - self.center
         box_distance = dr.norm(vector(*(fmax(dr.abs(offset[k]) - self.half, 0) for k in range(3))))

@@ -74,10 +74,10 @@ class _DescentState:
         return self.y, self.gradient, self.level_uncertainty, self.smooth_radius
 
     def flat_after(self, is_flat: Mask, previous: _DescentState) -> _DescentState:
-        """Return this state, with changes in the lanes `is_flat`, in which both f - level and the
-        gradient are 0, so that the gradient has no direction. There it gets the gradient of the
-        previous state, and an uncertainty of the level that consists of the rounding of coordinates
-        only."""
+        """Return this state, changed in the lanes `is_flat`, in which both f - level and the
+        gradient are 0, so that the gradient has no direction. There the result has the gradient of
+        the state `previous`, and as its uncertainty of the level the rounding of coordinates
+        alone."""
         epsilon = float(dr.epsilon(type(self.level_uncertainty)))
         rounding = 4 * epsilon * lengths.max_norm(self.y)
         gradient = dr.select(is_flat, previous.gradient, self.gradient)
@@ -103,7 +103,7 @@ class ClosestPointDescent:
 
     field: the function f, prepared for the backend.
     levels: the values of f on the surface. At a point the level nearest to f counts.
-    has_hessian: whether f knows its second derivatives.
+    has_hessian: whether the field can compute second derivatives of f.
     """
 
     backend: Backend
@@ -121,9 +121,9 @@ class ClosestPointDescent:
         grad f(y), in one kernel, from a point `start` near the surface.
 
         x: the query.
-        limit: a closest point that is farther from x than this is not pursued.
+        limit: a length; a search whose closest point is farther from x than this stops early.
 
-        Returns four results. The last point y, to which `finish` adds the last step. The
+        Returns four results. The last point y; `finish` makes the last step from it. The
         first-order distance |f - level|/|grad f| of `start` from the level. The mask of lanes that
         failed: their last step was longer than half the radius of the ball in which f is smooth.
         The mask of lanes that stopped early: their closest point is farther from x than `limit`.
@@ -140,12 +140,13 @@ class ClosestPointDescent:
         def body(
             y: Vec3, first_step: Real, last: Real, is_lost: Mask, is_far: Mask, k: Any, active: Mask
         ) -> tuple[Any, ...]:
-            """Make one step from y.
+            """Make one step from y. Returns the new state: values in the order of the parameters.
 
             first_step: the first-order distance of the start from the level.
             last: the length of the step before.
-            is_lost, is_far: the lanes that failed, and those that stopped at the limit.
-            k: the number of steps.
+            is_lost, is_far: masks of the lanes that failed, and of those whose closest point is
+                farther than `limit`.
+            k: the number of steps so far.
             active: whether the search goes on.
             """
             # The rounding error of f is not needed here. Without it the compiler drops the code
@@ -193,10 +194,11 @@ class ClosestPointDescent:
         local minimum of the distance from x, up to rounding; and the radius of a ball about y in
         which no point of the surface is nearer to x, 0 on lanes on which the mask is False.
 
-        Proof that the step, of length s along grad f, ends on the level: it is Newton's step, so f
-        differs from the level at its end by at most the remainder, within s, of the Taylor
-        polynomial of degree 1. Over the step the normal turns by about s times the curvature, which
-        is less than the tangential part that `descend` allows.
+        Proof that the step ends on the level. Let s be its length along grad f. It is Newton's
+        step: the Taylor polynomial of degree 1 is the level at its end, so f differs from the level
+        there by at most the bound of the Taylor remainder within s. Over the step the normal turns
+        by about s times the curvature; the part of x - y along the surface that this causes is less
+        than what `descend` allows.
         """
         sample = self.field.evaluate(y)
         residual, state = self._state_at(y, sample)
@@ -228,12 +230,12 @@ class ClosestPointDescent:
         Let g = grad f(y), n = g/|g|, r = x - y, and t the part of r tangential to the surface; A is
         the Hessian of f, w a tangential vector. The surface near y is y + w - (w.Aw/(2|g|)) n + ..,
         and half the squared distance decreases by t.w - w.Bw/2 with B = 1 + (r.n) A/|g|. The step w
-        along the surface is Newton's for this function. If an eigenvalue of B is not positive, its
-        absolute value is used, so that the step still decreases the distance. If t vanishes as
-        well, y is a saddle or a maximum of the distance (x is farther than a center of curvature),
-        and the step goes along the eigenvector of the smaller eigenvalue. After the step Newton's
-        method leads back to the level. The step is accepted if the result is no farther from x;
-        otherwise a quarter of it is tried.
+        along the surface is Newton's step for this quadratic function of w. If an eigenvalue of B
+        is not positive, its absolute value is used, so that the step still decreases the distance.
+        If an eigenvalue is negative and t vanishes, y is a saddle or a maximum of the distance (x
+        is farther than a center of curvature), and the step goes along the eigenvector of the
+        smaller eigenvalue. After the step Newton's method leads back to the level. The step is
+        accepted if the result is no farther from x; otherwise a quarter of it is tried.
 
         y is accepted if |t| <= 4 sqrt(epsilon) |r| plus a few rounding errors: then, by the same
         formula, |r| exceeds the local minimum by a fraction of at most 8 epsilon/(smallest
@@ -247,13 +249,13 @@ class ClosestPointDescent:
             y: Vec3, g: Vec3, uncertainty: Real, radius: Real,
             factor: Real, on_level: Mask, accepted: Mask, iteration: Any, active: Mask,
         ) -> tuple[Any, ...]:  # fmt: skip
-            """Make one step along the surface and back to the level, accepted if it leads nearer to
-            x.
+            """Make one step along the surface and back to the level. It is accepted if it does not
+            lead farther from x. Returns the new state: values in the order of the parameters.
 
             y, g, uncertainty, radius: the parts of the state (`_DescentState`).
             factor: the fraction of Newton's step that is tried.
             on_level, accepted: whether the start led to a level; whether y is a closest point.
-            iteration: the number of steps.
+            iteration: the number of steps so far.
             active: whether the descent goes on.
             """
             current, is_first = _DescentState(y, g, uncertainty, radius), iteration == 0
@@ -304,23 +306,23 @@ class ClosestPointDescent:
         return dr.select(is_found, end.y, dr.nan)
 
     def noise(self, y: Vec3) -> Real:
-        """Return a bound of the length by which rounding and approximation may have moved the level
-        set at a point y of it."""
+        """Return a bound of the length by which rounding and approximation of f may have moved the
+        level set at its point y."""
         return self._evaluate(y)[1].level_uncertainty
 
     def last_step(self, x: Vec3, y: Vec3) -> Vec3:
         """Make the last step of a search for the point closest to x: move y onto the level along
-        the gradient. Returns the end of the step; NaN if the step is too long for the result to be
-        a closest point up to rounding."""
+        the gradient. Returns the end of the step; NaN if the step is so long that its end need not
+        be closest to x up to rounding."""
         residual, state = self._evaluate(y)
         end, is_short = self._step_to_level(x, residual, state)
         return dr.select(is_short & self._is_level_resolved(state), end, dr.nan)
 
     def _step_to_level(self, x: Vec3, residual: Real, state: _DescentState) -> tuple[Vec3, Mask]:
-        """Make one Newton step from the point of a state to the level, along the gradient. Returns
-        the end of the step; and a mask that is True where the step is short enough to end the
-        search: if x - y is along the gradient at the start y, the end of the step is closest to x
-        up to rounding.
+        """Make one Newton step from the point y of `state` to the level, along the gradient.
+        Returns the end of the step; and a mask that is True where the step is short enough to end
+        the search: if x - y is along the gradient at y, the end of the step is closest to x up to
+        rounding.
 
         residual: f - level at the start.
         """
@@ -368,8 +370,8 @@ class ClosestPointDescent:
 
     @staticmethod
     def _is_on_level(residual: Real, state: _DescentState) -> Mask:
-        """Return whether the point of a state is on the level, up to rounding. The mask is False in
-        lanes in which rounding errors are so large that nothing can be said.
+        """Return the mask of lanes on which the point of `state` is on the level, up to rounding.
+        It is False where rounding errors are so large that nothing can be said.
 
         residual: f - level there.
         """
@@ -380,9 +382,9 @@ class ClosestPointDescent:
 
     @staticmethod
     def _is_level_resolved(state: _DescentState) -> Mask:
-        """Return whether the position of the level set near the point of a state is known in spite
-        of rounding: its uncertainty is at most a sixteenth of the largest coordinate, or a
-        sixteenth of the radius of the ball on which f is smooth."""
+        """Return the mask of lanes on which the position of the level set near the point of `state`
+        is known in spite of rounding. There its uncertainty is at most a sixteenth of a length: of
+        the largest coordinate, or of the radius of the ball on which f is smooth."""
         size = lengths.max_norm(state.y)
         return state.level_uncertainty <= _MAX_RELATIVE_UNCERTAINTY * fmax(
             size, state.smooth_radius
@@ -408,14 +410,15 @@ class ClosestPointDescent:
             residual: Real, y: Vec3, g: Vec3, uncertainty: Real, radius: Real,
             last: Real, factor: Real, on_level: Mask, iteration: Any, active: Mask,
         ) -> tuple[Any, ...]:  # fmt: skip
-            """Make one Newton step towards the level, accepted if f is nearer to it.
+            """Make one Newton step towards the level. It is accepted if f at its end is nearer to
+            the level. Returns the new state: values in the order of the parameters.
 
             residual: f - level at y.
             y, g, uncertainty, radius: the parts of the state (`_DescentState`).
             last: the length of the step before.
             factor: the fraction of Newton's step that is tried.
             on_level: whether y is on the level.
-            iteration: the number of steps.
+            iteration: the number of steps so far.
             active: whether the search goes on.
             """
             current, gradient_norm, is_first = (
@@ -423,8 +426,8 @@ class ClosestPointDescent:
                 lengths.safe_norm(g),
                 iteration == 0,
             )
-            # Iteration 0 evaluates the start; later ones try a step from y. `step_factor` is the
-            # estimated multiplicity of the root.
+            # Iteration 0 evaluates the start; later ones try a step from y, made longer by the
+            # estimated multiplicity of the root (`step_factor`).
             step = -residual / gradient_norm
             step_factor = dr.select(iteration > _SIMPLE_ROOT_STEPS, multiplicity(step, last), 1)
             length = factor * clamp(step_factor * step, -radius, radius)
@@ -469,7 +472,8 @@ class ClosestPointDescent:
         the distance from x, up to rounding. (The formula is derived in `descend`.)
 
         state: the point y, and f there.
-        factor: the fraction of the largest permitted step that is used.
+        factor: the step is at most this fraction of the largest permitted length, the smaller of |x
+            - y| and the radius of the ball on which f is smooth.
         rows: the rows of the Hessian at y. If None, they are computed.
         """
         plane = TangentPlane.of(state.gradient)
@@ -520,8 +524,8 @@ class ClosestPointDescent:
         the two unit tangents of the plane.
 
         If the field has no Hessian, they are computed by central differences of the gradient with
-        the step sqrt(epsilon) times `length`. Errors of these differences make a descent slower,
-        but not wrong.
+        the step sqrt(epsilon) times `length`, where epsilon is the machine epsilon. Errors of these
+        differences make a descent slower, but not wrong.
         """
         if self.has_hessian:
             return plane.restrict_hessian(self.field.hessian(y))
@@ -529,8 +533,9 @@ class ClosestPointDescent:
         h = fmax(self.backend.machine_epsilon**0.5 * length, 1e-30)  # not 0, as it divides
 
         def body(along_u: Vec3, along_v: Vec3, k: Any) -> tuple[Any, ...]:
-            """Add the term of node k to the central differences. The four nodes are y + h u, y - h
-            u, y + h v and y - h v. An even node begins a difference, an odd node completes it.
+            """Add the term of node k to the central differences, and return the new state. The four
+            nodes are y + h u, y - h u, y + h v and y - h v. An even node begins a difference, an
+            odd node completes it.
 
             along_u, along_v: the derivatives of the gradient along u and v; in them the terms of
                 the nodes before k are summed.

@@ -95,8 +95,8 @@ class ClosestPoints:
     distance: (n,) the distances of the queries from these points; NaN where none was found.
     signed_value: (n,) f - level at the queries, for the level nearest in value.
     lower: (n,) proved lower bounds of the distance.
-    violates_promises: (n,) whether a surface point was found, and left out, that is nearer than the
-        field's promises (proved bounds of f near a point) allow.
+    violates_promises: (n,) whether a surface point was found, and left out, that is nearer than
+        `lower`, which follows from the field's promises (proved bounds of f near a point).
     """
 
     points: FloatArray
@@ -116,7 +116,8 @@ def find_closest(
     levels: the values of f on the surface, on the backend.
     points: (n, 3) the queries, in any order.
     progress: called with a message before each stage.
-    is_proved: whether cells are subdivided to make `lower` as large as they can prove.
+    is_proved: whether cells are subdivided, so that the lower bounds become as large as can be
+        proved.
 
     The result is in the order of `points`. The search itself sorts them along a Morton curve, so
     that neighboring lanes traverse a tree together.
@@ -139,8 +140,11 @@ def _find_sorted(
 
     A surface of triangles alone is searched by a tree of them. For others, points that are known at
     once (on triangles and other facets, and at boundaries) are the first guess of a search over
-    cells. A found point that is nearer than the proved lower bound, by more than rounding, is
-    refused.
+    cells. A point that is found nearer than the proved lower bound, by more than rounding, is
+    refused: the query then has no closest point.
+
+    progress: called with a message before each stage.
+    is_proved: whether cells are subdivided for larger lower bounds.
     """
     triangles = LevelTriangles.of(surface)
     if triangles is not None and triangles.is_complete:
@@ -190,14 +194,15 @@ def _search_smooth_part(
     progress: Callable[[str], None],
 ) -> SearchResult:
     """Search the part of a surface that does not lie on jump surfaces (the facets across which its
-    function f jumps, such as triangles). The result is merged with closest points on jump surfaces.
+    function f jumps, such as triangles). The result also takes account of the closest points on
+    jump surfaces.
 
     evaluator: evaluates f and runs descents.
     smooth: a function without jumps that differs from f by a constant between jump surfaces
         (`JumpSurface.without_jumps`).
     points: (n, 3) the query points.
     known: for each query, a point of the surface on a jump surface (NaN if none is known), and an
-        estimate of its distance from the surface.
+        estimate of the query's distance from the surface.
     tolerance: when the search ends.
     progress: called with a message before each stage.
 
@@ -255,8 +260,9 @@ def _with_singular_points(
     surface: TracedSurface, points: FloatArray, closest: FloatArray
 ) -> FloatArray:
     """Return the closest points of queries, each replaced by the nearest singular point of the
-    field if that is nearer. Beside a singular point the surface is a tiny loop, which descents
-    miss. Singular points outside the clip volume do not count.
+    field if that is nearer to the query. Singular points are those to which all level sets come
+    arbitrarily near; there the surface is a tiny loop, which descents miss. Singular points outside
+    the clip volume do not count.
 
     points, closest: (n, 3) the queries, and their closest points so far, NaN for none.
     """
@@ -274,16 +280,17 @@ def _with_singular_points(
 def _closest_on_mesh(
     backend: Backend, surface: TracedSurface, levels: Levels, mesh: LevelTriangles, points: Any
 ) -> ClosestPoints:
-    """Find the closest point to each query on a surface that consists of triangles only, with the
-    parameters and the result of `find_closest`. The lower bound is the distance less an allowance
-    for rounding.
+    """Find the closest point to each query on a surface that consists of triangles only. Parameters
+    and result are those of `find_closest`. The lower bound is the distance less an allowance for
+    rounding.
 
     mesh: the triangles of the surface.
     """
     prepared, nearest = surface.evaluator(backend), mesh.upload(backend)
 
     def compute(p: Vec3) -> tuple[Real | Vec3, ...]:
-        """Return the query, its nearest triangle point and the distance, and f - level."""
+        """Return four results for the query p: p as rounded, the nearest triangle point, the
+        distance from it, and f - level."""
         residual = -levels.offset_to_nearest(prepared.evaluate(p).value)
         offset = nearest(p)
         return p, p + offset, safe_norm(offset), residual
@@ -295,10 +302,10 @@ def _closest_on_mesh(
 
 
 def _with_mesh_points(points: FloatArray, guess: FloatArray, mesh: LevelTriangles) -> FloatArray:
-    """Return surface points near queries, each replaced by the nearest point of the triangles if
-    that is nearer.
+    """Return the surface points `guess`, each replaced by the nearest point of the triangles if
+    that is nearer to the query.
 
-    points, guess: (n, 3) the queries, and the surface points; NaN counts as infinitely far.
+    points, guess: (n, 3) the queries, and a surface point for each; NaN counts as infinitely far.
     mesh: the triangles, which belong to the surface.
     """
     backend = choose_backend("double")
@@ -315,11 +322,13 @@ class _QueryEvaluator:
     surface to closest points, for arrays of query points. Facets are the triangles or other pieces
     at which f may jump.
 
+    levels: the values of f on the surface, on the backend.
+
     The attributes with an underscore are made from the given ones:
 
     _field: f, prepared for the backend.
-    _descent, _exact_descent: the descent on the level set of f; and on the level set of f without
-        truncation errors (None if f has no such errors).
+    _descent, _exact_descent: the descent on the level set of f; and, if f is the approximation of a
+        sum with a truncation error, on the level set of the exact sum (else None).
     _domain, _clip: the field's domain; and the descent to the clip curve, in which the boundary of
         the domain cuts the surface (None without a domain).
     _tracer: for functions with jumps, the surface prepared for tracing rays in double precision.
@@ -330,7 +339,7 @@ class _QueryEvaluator:
     levels: Levels
 
     def __post_init__(self) -> None:
-        """Make the attributes with an underscore; `object.__setattr__`, as the dataclass is
+        """Make the attributes with an underscore. It uses `object.__setattr__`, as the dataclass is
         frozen."""
         backend, field = self.backend, self.surface.evaluator(self.backend)
         assign = object.__setattr__
@@ -417,9 +426,12 @@ class _QueryEvaluator:
         return guess
 
     def _nearest_face_points(self, points: FloatArray) -> FloatArray:
-        """Return the nearest points (n, 3) of the triangles across which f jumps. A point is kept
-        only if a level lies between the values of f right beside it, on both sides of the triangle;
-        else it is NaN."""
+        """Return the nearest points (n, 3) of the triangles across which f jumps. A point is part
+        of the surface, and is returned, only if a level lies between the values of f right beside
+        it, on the two sides of the triangle; else the row is NaN.
+
+        points: (n, 3) the queries.
+        """
         mesh, surface = self.surface.field.jump_mesh(), self._tracer
         closest = np.full_like(points, np.nan)
         if mesh is None or not len(points):
@@ -427,7 +439,8 @@ class _QueryEvaluator:
         real, index = surface.backend.Float, surface.backend.UInt32
 
         def nearest(p: Vec3) -> tuple[Vec3, Any, Vec3]:
-            """Return the point on a facet that is nearest to p, its index, and its normal."""
+            """Return the point of a facet that is nearest to p, the index of the facet, and the
+            facet's normal at the point."""
             no_key, always = (real(-1), index(NO_FACET)), surface.backend.Bool(True)
             facet = surface.field.nearest_facet(p, no_key, real(dr.inf), always)
             return p + facet.offset, facet.facet, facet.normal
@@ -477,8 +490,8 @@ class _QueryEvaluator:
         return np.where(np.isnan(closest), guess, closest)
 
     def _inside_domain_or_nan(self, points: FloatArray) -> FloatArray:
-        """Return the points (n, 3), with NaN for those outside the field's domain, which cuts the
-        surface."""
+        """Return the points (n, 3), with NaN in place of those outside the field's domain, as the
+        domain cuts the surface."""
         domain = self.surface.field.domain
         if domain is None or not len(points):
             return points
@@ -561,8 +574,9 @@ class _QueryEvaluator:
         """
 
         def arc_to_level(p: Vec3, b: Vec3, lengths: Vec3) -> tuple[Real]:
-            """Return the first-order distance of the level from the point that lies at the distance
-            lengths.x from b in the direction of p."""
+            """Return the first-order signed distance (level - f)/|grad f| of the level from the
+            point that lies at the distance lengths.x from b in the direction of p, as a tuple of
+            one."""
             to_query = p - b
             sample = self._field.evaluate(b + lengths.x / safe_norm(to_query) * to_query)
             return (
@@ -570,8 +584,8 @@ class _QueryEvaluator:
             )
 
         def near_edge(p: Vec3, b: Vec3, lengths: Vec3) -> tuple[Vec3]:
-            """Return the surface point to which Newton's method leads from the point that lies at
-            the distance lengths.x from b in the direction of p; NaN if the surface point is on the
+            """Run Newton's method to the surface, from the point at the distance lengths.x from b
+            in the direction of p. Returns the surface point, as a tuple of one; NaN if it is on the
             side of b away from p."""
             to_query = p - b
             y = self._descent.newton_to_level(b + lengths.x / safe_norm(to_query) * to_query)
@@ -624,8 +638,9 @@ class _QueryEvaluator:
         Returns five results. The closest point: NaN if the method does not converge, or converges
         to a point that is farther from p than the surface near `start`. The last iterate, from
         which `_descend` can continue. The radius of a ball about the closest point in which no
-        surface point is nearer to p. The mask of lanes in which the search has to continue. The
-        mask of lanes that stopped because their closest point is farther than `limit` from p.
+        surface point is nearer to p. The mask of lanes in which `_descend` has to continue the
+        search. The mask of lanes that stopped because their closest point is farther than `limit`
+        from p.
         """
         y, first_step, is_lost, is_far = self._descent.newton(p, start, self.backend.Float(limit))
         closest, is_converged, free = self._descent.finish(p, y)
@@ -641,10 +656,11 @@ class _QueryEvaluator:
     def _newton_with_float_masks(
         self, p: Vec3, start: Vec3, limit: Vec3
     ) -> tuple[Vec3, Vec3, Real, Real, Real]:
-        """Return the results of `_newton`, in a form that `in_batches` can pass on: the two masks
-        among them are returned as numbers, 1 for True and 0 for False.
+        """Return the five results of `_newton`, in a form that `in_batches` can pass on: the two
+        masks as numbers, 1 for True and 0 for False.
 
-        limit: the limit of `_newton`, three times as the components of a vector.
+        p, start: the parameters of `_newton`.
+        limit: its parameter `limit`, three times as the components of a vector.
         """
         one, zero = self.backend.Float(1), self.backend.Float(0)
         *results, is_unfinished, is_far = self._newton(p, start, limit.x)
@@ -660,8 +676,9 @@ class _QueryEvaluator:
         )
 
     def remove_truncation(self, points: FloatArray, closest: FloatArray) -> FloatArray:
-        """Move closest points onto the exact level set. They were found on the level set of an
-        approximation of f, a treecode with a truncation error; the exact function sums all terms.
+        """Move closest points onto the exact level set. The field's function is a sum over many
+        terms. The points were found on the level set of an approximation, a treecode with a
+        truncation error; the exact function sums all terms one by one.
 
         points, closest: (n, 3) the queries, and their closest points, NaN for none.
 
@@ -708,8 +725,8 @@ class _QueryEvaluator:
         approximate = self._descent
 
         def truncation(y: Vec3) -> tuple[Vec3, Vec3]:
-            """Return the truncation errors at y: of the value (as a vector of equal components),
-            and of the gradient."""
+            """Return the exact function minus the approximate one at y: the difference of the
+            values (as a vector of equal components), and that of the gradients."""
             full, sample = exact.field.evaluate(y), approximate.field.evaluate(y)
             vector = self.backend.Array3f
             return vector(full.value - sample.value), vector(full.gradient) - vector(
@@ -717,9 +734,9 @@ class _QueryEvaluator:
             )
 
         def newton(p: Vec3, y: Vec3, value: Vec3, gradient: Vec3) -> tuple[Vec3]:
-            """Return the closest point to p by Newton's method from y, for the approximate function
-            plus the linear function with this value and gradient at y; NaN if it does not converge.
-            """
+            """Return the closest point to p, as a tuple of one, by Newton's method from y; NaN if
+            it does not converge. The level set is that of the approximate function plus the linear
+            function that has at y the value value.x and the gradient `gradient`."""
             field = _LinearlyShiftedField(approximate.field, y, value.x, gradient)
             descent = replace(approximate, field=field)
             end, _, is_lost, _ = descent.newton(p, y, self.backend.Float(dr.inf))
@@ -745,8 +762,8 @@ class _QueryEvaluator:
         return closest
 
     def level_uncertainty(self, points: FloatArray) -> FloatArray:
-        """Return bounds (n,), lengths, of how far rounding and approximation may have moved the
-        level set at points (n, 3) that lie on it."""
+        """Return bounds (n,), which are lengths, of how far rounding and approximation of f may
+        have moved the level set at its `points` (n, 3)."""
         if not len(points):
             return np.zeros(0)
 
@@ -757,12 +774,12 @@ class _QueryEvaluator:
 
 
 class _LinearlyShiftedField(Field):
-    """The sum of a field and of the linear function value + slope . (p - anchor) of the point p,
-    one function for each lane.
+    """The sum of a field and of the linear function value + slope . (p - anchor) of the point p.
+    Each lane has a linear function of its own.
 
-    The linear function is the truncation error of the field at the anchor, with its gradient, so
-    the sum has hardly any truncation error near the anchor. Its stated error is the rounding error
-    of the field alone.
+    The linear function corrects the truncation error that the field has at the anchor, and the
+    gradient of that error. So the sum has hardly any truncation error near the anchor. The error
+    that the sum states is the rounding error of the field alone.
     """
 
     def __init__(self, field: Field, anchor: Vec3, value: Real, slope: Vec3) -> None:
@@ -795,8 +812,8 @@ def _length(vectors: FloatArray) -> FloatArray:
 
 def _size(surface: TracedSurface, points: FloatArray) -> float:
     """Return the size of a surface, a length: the diagonal of the box that is known to contain it.
-    If there is no finite one, it is the largest extent of the query points (n, 3) along an axis, at
-    least 1."""
+    If there is no finite box, it is the largest extent of the query points (n, 3) along an axis, or
+    1 if that is less."""
     if surface.volume is not None:
         lower, upper = surface.volume.bounds()
         if np.isfinite([lower, upper]).all():

@@ -109,7 +109,8 @@ def signed_distance(
     compute = _COMPUTE[method]
 
     def estimate(p: Vec3) -> tuple[Real | Vec3, ...]:
-        """Return the points as rounded, and the estimates or bounds of the chosen method."""
+        """Return two results for p: the point as rounded, and the estimate or bound of its distance
+        by the chosen method."""
         return p, compute(backend, prepared, levels, p)
 
     x, result = in_batches(backend, estimate, points)
@@ -314,7 +315,7 @@ def _check_domain(field: Field, points: FloatArray) -> None:
 
 def _first_order(backend: Backend, field: Field, levels: Levels, p: Vec3) -> Real:
     """Return the first-order estimate (f - level)/|grad f| of the signed distance of p from the
-    level set, for the level nearest in value."""
+    level set, for the level nearest in value. `backend` is not used."""
     del backend
     sample = field.evaluate(p)
     return first_order_distance(-levels.offset_to_nearest(sample.value), sample.gradient)
@@ -322,7 +323,7 @@ def _first_order(backend: Backend, field: Field, levels: Levels, p: Vec3) -> Rea
 
 def _second_order(backend: Backend, field: Field, levels: Levels, p: Vec3) -> Real:
     """Return the second-order estimate of the signed distance of p from the level set, with the
-    sign of f - level, for the level nearest in value."""
+    sign of f - level, for the level nearest in value. `backend` is not used."""
     del backend
     sample, rows = field.evaluate(p), field.hessian(p)
     return second_order_distance(-levels.offset_to_nearest(sample.value), sample.gradient, rows)

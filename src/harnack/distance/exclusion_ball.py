@@ -1,6 +1,5 @@
-"""A ball about the closest point y of a level set to a query x, which is proved to hold no point of
-the level set that is nearer to the query. f is the function of the level set.
-"""
+"""A proof about the point y of a level set that is closest to a query x: a ball about y holds no
+point of the level set that is nearer to x than y. f is the function of the level set."""
 
 from __future__ import annotations
 
@@ -37,12 +36,13 @@ def exclusion_radius(sample: Sample, rows: Rows | None, x: Vec3, y: Vec3) -> Rea
     rows: the rows of the Hessian of f at y; None if it is not known.
     x, y: a query, and a surface point such that x - y is normal to the surface at y.
 
-    Radii that are powers of two times the distance |x - y| are tried, the largest first.
+    Radii r that are powers of two times the distance |x - y| are tried, the largest first.
+
     Proof. Let g = grad f(y), n = g/|g| and x = y + d n with d >= 0; if x is on the side of smaller
     f, take -f for f. Let y + w be a point of the surface with |w| <= r. Let R1 be the bound of the
-    Taylor remainder of degree 1 within r. As it falls at least as the square of the radius,
-    |f(y + w) - f(y) - g . w| <= R1 |w|^2/r^2, so |n . w| <= c |w|^2 with c = R1/(|g| r^2). Hence
-    |x - y - w|^2 = d^2 - 2 d n . w + |w|^2 >= d^2 + |w|^2 (1 - 2 d c).
+    Taylor remainder of degree 1 (`taylor_remainder`) within r. As it falls at least as the square
+    of the radius, |f(y + w) - f(y) - g . w| <= R1 |w|^2/r^2, so |n . w| <= c |w|^2 with c = R1/(|g|
+    r^2). Hence |x - y - w|^2 = d^2 - 2 d n . w + |w|^2 >= d^2 + |w|^2 (1 - 2 d c).
 
     With second derivatives H, and R2 the bound of the remainder of degree 2: -n . w |g| is w.Hw/2
     plus a remainder of at most R2 |w|^3/r^3. Let t be the part of w along the tangent plane, k the
@@ -81,10 +81,11 @@ class _HessianBounds:
     """Bounds of the Hessian H of a function f at a point y of its level set. The sign of f is
     chosen such that the gradient g = |g| n points toward the query x.
 
-    least_tangential: the smallest eigenvalue in the tangent plane, or 0 if that is positive.
+    least_tangential: the smallest eigenvalue of H restricted to the tangent plane, or 0 if that is
+        positive.
     across: |Hn - (n.Hn) n|.
     along: |n.Hn|.
-    half_norm: an upper bound of half the spectral norm.
+    half_norm: an upper bound of half the spectral norm of H.
     """
 
     least_tangential: Real

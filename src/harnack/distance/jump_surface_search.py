@@ -1,6 +1,8 @@
-"""Closest points of surfaces of functions f with jumps, such as the winding number of a mesh: on
-the facets at which f jumps, and by rays. The surface consists of the points at which f takes a
-given value, the level, and of facets.
+"""Closest points of surfaces whose function f jumps, such as the winding number of a mesh. f jumps
+at facets, such as the triangles of the mesh. The surface consists of the points at which f takes a
+given value, the level, and of the parts of facets where the level lies between the values of f on
+the two sides. Points on facets are found by a list of facets in the order of their distance, other
+points by rays.
 
 A *jump surface* consists of facets across which f jumps, such as the triangles of a mesh. A point
 of it belongs to the surface if a level lies between the values of f on both sides of it. A short
@@ -65,13 +67,13 @@ class JumpSurfaceSearch:
     max_facets: int
 
     def closest(self, x: Vec3, limit: Real) -> tuple[Vec3, Vec3]:
-        """Search for the point closest to x of the part of the surface that lies on facets.
+        """Search for the point closest to x on that part of the surface that lies on facets.
 
         limit: only facets nearer to x than this are examined.
 
-        Returns a point of the surface on a facet, NaN if none is found; and the vector from x to
-        the nearest facet, whether that is part of the surface or not, infinite if it is farther
-        than `limit`.
+        Returns two results: a point of the surface on a facet, NaN if none is found; and the vector
+        from x to the nearest facet, infinite if that is farther than `limit`. The nearest facet
+        need not be part of the surface.
 
         Facets are examined in the order of their distance, each at its point y nearest to x. If the
         facet is part of the surface at y, a short ray through y along the facet's normal hits the
@@ -98,7 +100,7 @@ class JumpSurfaceSearch:
 
         def body(*state: Any) -> tuple[Any, ...]:
             """Trace one probe, a short ray through the nearest point of a facet, and choose the
-            next probe or facet.
+            next probe or facet. Returns the new state.
 
             state: the attributes of the facet; the index of the probe (0 for the ray along the
                 normal, 1 to 6 for the edges of the tetrahedron); the surface point found; the
@@ -140,6 +142,7 @@ class JumpSurfaceSearch:
     ) -> tuple[Mask, Any, Vec3]:
         """Trace the segment from y + scale * start to y + scale * end.
 
+        scale: a length; `start` and `end` are vectors without a unit.
         active: mask of lanes that are traced.
 
         Returns the mask of lanes on which the segment hits the surface, the index of the facet that
@@ -161,8 +164,9 @@ class JumpSurfaceSearch:
         order of their distance from x. If the field cannot list its facets, the function finds only
         the nearest one.
 
-        The function takes the sort key and the index of the facet before, the largest distance, and
-        the active lanes; it returns the next facet.
+        The function takes three arguments: the sort key (a number that grows with the distance from
+        x) and the index of the facet before, as a pair; the largest distance from x; and the active
+        lanes. It returns the next facet (`NearestFacet`), whose index is NO_FACET if there is none.
         """
         field, backend = self.surface.field, self.surface.backend
         real, index = backend.Float, backend.UInt32
@@ -174,8 +178,9 @@ class JumpSurfaceSearch:
             facet = _nearest_jump_by_differences(backend, field, x)
 
             def single_facet(after: tuple[Real, Any], limit: Real, active: Mask) -> NearestFacet:
-                """Return the nearest facet if it is nearer than `limit` and `after` stands for the
-                start of the list (a sort key below 0); otherwise no facet."""
+                """Return the nearest facet if it is nearer to x than `limit` and the first number
+                of `after`, the sort key of the facet before, is below 0, that is, if there was none
+                before. Otherwise return the placeholder for no facet. `active` is not used."""
                 del active
                 is_first = (after[0] < 0) & (facet.sort_key < limit)
                 sort_key = dr.select(is_first, facet.sort_key, dr.inf)
@@ -185,8 +190,10 @@ class JumpSurfaceSearch:
             return single_facet
 
         def listed_facet(after: tuple[Real, Any], limit: Real, active: Mask) -> NearestFacet:
-            """Return the facet that follows the facet `after` (its sort key and index) in the
-            field's list, if it is not farther than `limit`, on the active lanes."""
+            """Return the next facet in the order of the distance from x: the one after the facet
+            `after`, which is given by its sort key (a number that grows with the distance) and its
+            index. The result is the placeholder for no facet if the next one is farther from x than
+            `limit`, and on lanes that are not active."""
             nearest = field.nearest_facet(x, after, limit, active)
             if nearest is None:
                 raise RuntimeError("nearest_sheet tells sheets at some times and not at others")
@@ -201,10 +208,10 @@ def straddles_level(surface: SurfaceTracer, y: Vec3, radius: Real, active: Mask)
 
     active: mask of lanes that are tested.
 
-    f is evaluated at the corners of a tetrahedron around y and, along its edges, just before each
-    jump surface. Two values on different sides of the level prove that the surface crosses the path
-    between them: f passes the level there, continuously or by a jump. No gradient is used, because
-    it is unbounded near the edge of a jump surface.
+    f is evaluated at the corners of a tetrahedron around y and, on each of its edges, just before
+    the first facet at which f jumps. Two values on different sides of the level prove that the
+    surface crosses the path between them: f passes the level there, continuously or by a jump. No
+    gradient is used, because it is unbounded near the edge of a jump surface.
     """
     backend, field = surface.backend, surface.field.exact(surface.backend)
     real, index, vector = backend.Float, backend.UInt32, backend.Array3f
@@ -265,10 +272,11 @@ def _nearest_jump_by_differences(backend: Backend, field: Field, x: Vec3) -> Nea
     """Return the facet nearest to x, for a field that knows only the distance d(x) from its nearest
     facet. The facet lies at the distance d in the direction in which d falls fastest.
 
-    That direction is computed by central differences over h = r d. Their truncation error is about
-    r^2. Rounding moves d by epsilon s, where s is the size of the coordinates, which adds epsilon
-    s/(r d). With r = (epsilon s/d)^(1/3) both errors are small down to distances of a few rounding
-    errors. At smaller distances any direction serves, as x itself is on the facet to rounding.
+    That direction is computed by central differences of d over the length h = r d, with a ratio r.
+    Their relative truncation error is about r^2. Rounding moves d by epsilon s, where s is the size
+    of the coordinates, which adds epsilon s/(r d). With r = (epsilon s/d)^(1/3) both errors are
+    small down to distances of a few rounding errors. At smaller distances any direction serves, as
+    x itself is on the facet to rounding.
     """
     real, vector = backend.Float, backend.Array3f
     d = real(field.distance_to_jumps(x))
@@ -311,7 +319,7 @@ _HIT_TEST_RADIUS = 1024.0
 @dataclass(frozen=True)
 class _HitPlane:
     """The plane tangent to the surface at the hit of a ray from the query x. It consists of the
-    points x + r with r . normal = offset, where |normal| = 1. normal = 0 stands for no plane."""
+    points x + r with r . normal = offset, where |normal| = 1. A normal of 0 stands for no plane."""
 
     normal: Vec3
     offset: Real
@@ -331,10 +339,8 @@ class _HitPlane:
 
     def nearest_on_line(self, other: _HitPlane) -> Vec3:
         """Return the shortest vector from x to the line in which this plane and the other one
-        intersect; not finite if they are parallel.
-
-        It is a combination of the two normals whose inner products with them are the two offsets.
-        """
+        intersect; not finite if they are parallel. It is the combination of the two normals whose
+        inner products with the normals are the two offsets."""
         vector = cast("Any", type(self.normal))
         cosine = dr.dot(self.normal, other.normal)
         along_normal = vector(self.offset - cosine * other.offset) * self.normal
@@ -343,8 +349,9 @@ class _HitPlane:
         )
 
     def intersection_point(self, second: _HitPlane, third: _HitPlane) -> Vec3:
-        """Return the vector from x to the point in which three planes intersect; not finite if the
-        three normals are linearly dependent (Cramer's rule)."""
+        """Return the vector from x to the point in which this plane and the planes `second` and
+        `third` intersect, by Cramer's rule; not finite if the three normals are linearly
+        dependent."""
         vector = cast("Any", type(self.normal))
         a, b, c = self.normal, second.normal, third.normal
         normals = (dr.cross(b, c), dr.cross(c, a), dr.cross(a, b))
@@ -384,13 +391,13 @@ class _HitPlanes:
         """Return the planes after another hit.
 
         plane: the hit's tangent plane.
-        is_hit: the lanes that have this plane.
+        is_hit: the lanes on which there was a hit; the others keep their planes.
         is_best: the lanes in which it belongs to the new best point and becomes the first plane.
 
-        If it becomes the first plane, the old first one moves to the second place, unless the two
-        are nearly parallel. Otherwise it becomes the second plane, unless it is nearly parallel to
-        the first. The third place gets the old second plane, unless that is nearly parallel to the
-        new plane.
+        If the new plane becomes the first one, the old first plane moves to the second place,
+        unless the two are nearly parallel. Otherwise the new plane becomes the second one, unless
+        it is nearly parallel to the first. The third place gets the old second plane, unless that
+        is nearly parallel to the new plane.
         """
         first, second, third = self.first, self.second, self.third
         select = _HitPlane.where
@@ -456,13 +463,14 @@ def compass_search(surface: SurfaceTracer, x: Vec3, foot: Vec3) -> Vec3:
         d: Vec3, t: Real, foot: Vec3, step: Real, angle: Real, failed: Any, ray: Any, active: Mask,
         *values: Any,
     ) -> tuple[Any, ...]:  # fmt: skip
-        """Trace one ray, and choose the next direction.
+        """Trace one ray, and choose the next direction. Returns the new state: values in the order
+        of the parameters.
 
         d, t, foot: direction, distance and position of the best point.
         step: tangent of the angle by which rays are tilted against d.
-        angle: the angle about d that gives the direction of the tilt.
+        angle: the angle about d, in radians, that gives the direction of the tilt.
         failed: the number of rays of this round so far; none of them found a nearer point.
-        ray: the number of the ray.
+        ray: the number of rays traced so far.
         active: whether the search goes on.
         values: the planes of hits, `_HitPlanes.parts`.
         """

@@ -45,10 +45,10 @@ class LevelTriangles:
     """The triangles of a mesh on which a level set of its winding number f lies (f jumps there from
     one side of the level to the other), in scaled coordinates.
 
-    corners: (k, 3, 3) in coordinates of at most about 1; the unscaled corners are center + size
-        times these.
-    center, size: (3,) and a power of two, the center and about half the longest side of the mesh's
-        box.
+    corners: (k, 3, 3) the corners, in coordinates of at most about 1; the unscaled corners are
+        center + size * corners.
+    center: (3,) the center of the mesh's bounding box.
+    size: about half the longest side of that box, a power of two.
     is_complete: whether the surface consists of these triangles only.
     """
 
@@ -95,8 +95,8 @@ class LevelTriangles:
         return cls(pieces[on_level], center, size, is_integer_off_faces)
 
     def upload(self, backend: Backend) -> Callable[[Vec3], Vec3]:
-        """Upload the triangles. Returns a function of points that gives the vector from each to the
-        nearest triangle point; NaN if there are no triangles."""
+        """Upload the triangles to the backend. Returns a function: for points it gives the vector
+        from each to the nearest point of a triangle; NaN if there are no triangles."""
         vector, real = backend.Array3f, backend.Float
         if not len(self.corners):
             return lambda p: vector(dr.nan) + 0 * p
@@ -133,6 +133,7 @@ def _proved_on_level(surface: TracedSurface, corners: FloatArray, size: float) -
     """Return the mask (k,) of triangles that are proved to belong to a level set as a whole.
 
     corners: (k, 3, 3) the corners of triangles through which no other triangle passes.
+    surface: the surface, whose levels are the values of f in question.
     size: the size of the mesh, a length.
 
     Proof. f is the winding number, which jumps by whole numbers. f modulo 1 is smooth around the
@@ -147,7 +148,8 @@ def _proved_on_level(surface: TracedSurface, corners: FloatArray, size: float) -
     levels = Levels(tuple(dr.opaque(backend.Float, level) for level in surface.level_values), 1.0)
 
     def clearance(p: Vec3) -> tuple[Any]:
-        """Return the proved radius about p."""
+        """Return the radius, as a tuple of one, of the ball about p in which f modulo 1 is proved
+        not to take the level."""
         return (level_distance_lower_bound(backend, smooth_field, levels, p, prepared.evaluate(p)),)
 
     center = corners.mean(axis=1)

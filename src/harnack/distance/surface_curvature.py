@@ -115,8 +115,8 @@ def curvature(
             """Return the curvatures at p, from the gradient and Hessian that the field computes
             inside of a kernel (`_Derivatives.curvatures`).
 
-            acceptance: the acceptance factor of a treecode; the larger it is, the smaller the
-                error.
+            acceptance: the acceptance factor of a treecode, a number; the larger it is, the smaller
+                the error.
             """
             refined = (
                 prepared.at_accuracy(acceptance) if prepared.has_variable_accuracy else prepared
@@ -154,8 +154,9 @@ def _refine_accuracy(
     can_refine: bool,
 ) -> CurvatureSamples:
     """Return the curvatures at points (n, 3). Where their error is too large, they are evaluated
-    again with a more accurate treecode: with larger acceptance factors (`_ACCEPTANCE_FACTORS`), by
-    which clusters of terms are expanded as a whole only from farther away.
+    again with a more accurate treecode. Its accuracy depends on an acceptance factor
+    (`_ACCEPTANCE_FACTORS`): the larger it is, the farther away a cluster of terms has to be to be
+    expanded as a whole.
 
     evaluate: a function of points and an acceptance factor that returns the values of
         `_Derivatives.curvatures`.
@@ -333,9 +334,9 @@ def curvature_lines(
     options: TraceOptions | None = None,
     **keywords: Unpack[TraceKeywords],
 ) -> list[FloatArray]:
-    """Trace the lines of curvature of a level set through seeds (n, 3): n polylines (k, 3), k >= 1.
-
-    They are curves on the level set along which it bends most, or least.
+    """Trace the lines of curvature of a level set through seeds (n, 3). Returns n polylines (k, 3),
+    each with a number k of its own. Lines of curvature are curves on the level set along which it
+    bends most, or least.
 
     A line that comes back to its seed ends there, and its first point is its last.
 
@@ -417,9 +418,9 @@ class _LineState:
 
 @dataclass(frozen=True)
 class _CurvatureLineTracer:
-    """Follows lines of curvature on the level set of f = `field`: curves along which the surface
-    bends most, or least. Their tangents are the principal directions, the directions of the larger
-    or of the smaller principal curvature.
+    """Follows lines of curvature on a level set of the field's function f: curves along which the
+    surface bends most, or least. Their tangents are the principal directions, the directions of the
+    larger or of the smaller principal curvature.
 
     level: the value of f on the surface.
     step: the arc length of a step.
@@ -459,7 +460,7 @@ class _CurvatureLineTracer:
         max_steps = dr.opaque(integer, count)
 
         def body(state: _LineState) -> _LineState:
-            """Advance all lines by a step, and store their points."""
+            """Advance all lines by a step, store their points, and return the new state."""
             x, direction, is_valid = self._advance(state)
             step_count = state.step_count + 1
             dr.scatter(points, x, step_count * (2 * n) + lane, state.active & is_valid)
@@ -498,7 +499,8 @@ class _CurvatureLineTracer:
         continued there: the direction is well defined, and the step is short enough for the
         curvature.
 
-        previous: the direction before, with which the sign of the result agrees; None for any sign.
+        previous: the line's direction before. Of the two opposite directions the result is the one
+            that makes an angle of at most 90 degrees with it. None: either of the two.
         """
         plane = TangentPlane.of(self.field.evaluate(x).gradient)
         eigen = SymmetricEigen2.of(*plane.restrict_hessian(self.field.hessian(x)))
@@ -559,9 +561,9 @@ def _join_halves(
     step: the arc length of a step.
     clip: the volume at whose boundary the halves are cut; None for no cut.
 
-    If `ahead` returns to the seed, the line is closed. Then the result is `ahead` up to there, and
-    it ends with the seed again. It returns where a step passes the seed at a distance below a
-    quarter of `step`, in about the direction of the first step.
+    If `ahead` returns to the seed, the line is closed. Then the result is `ahead` up to the seed,
+    which is also its last point. The line returns where a step passes the seed at a distance below
+    a quarter of `step`, in about the direction of the first step.
     """
     if clip is not None:
         ahead, behind = (_until_exit(half, clip) for half in (ahead, behind))

@@ -100,7 +100,7 @@ class SymmetricEigen2:
 
 
 def has_hessian(backend: Backend, field: Field) -> bool:
-    """Return whether a prepared field knows its second derivatives."""
+    """Return whether a field, prepared for the backend, can compute its second derivatives."""
     try:
         field.hessian(backend.Array3f(0))
     except NotImplementedError:
@@ -109,7 +109,7 @@ def has_hessian(backend: Backend, field: Field) -> bool:
 
 
 def matvec(rows: tuple[Vec3, Vec3, Vec3], vector: Vec3) -> Vec3:
-    """Return the product of the matrix with these rows and a vector."""
+    """Return the product of a 3x3 matrix, given by its three rows, and a vector."""
     return type(vector)(*(dr.dot(row, vector) for row in rows))
 
 
@@ -123,8 +123,8 @@ def first_order_distance(above: Real, gradient: Vec3) -> Real:
     along this line, from x back to y, and |grad f(x)| = |grad f(y)| + O(d) give
     above = d N.grad f(x) + O(d^2) = d |grad f(x)| + O(d^2).
 
-    If the gradient is zero, the estimate is infinite with the sign of above; on the level itself it
-    is zero.
+    If the gradient is zero, the estimate is infinite, with the sign of `above`; on the level itself
+    it is zero.
     """
     return dr.select(above == 0, 0, above / safe_norm(gradient))
 
@@ -134,7 +134,9 @@ def second_order_distance(above: Real, gradient: Vec3, rows: tuple[Vec3, Vec3, V
     d1/(1 - k d1/2) with above = f - level, d1 = above/|grad f| and k = n.An/|grad f|. Its error is
     O(d^3).
 
+    above: f - level at x.
     gradient, rows: g = grad f at x, and the three rows of the Hessian A there; n = g/|g|.
+
     k tells how fast the slope changes along n; it is not a curvature of the surface.
 
     Proof. With x = y + d N as in `first_order_distance`, Taylor along that line is

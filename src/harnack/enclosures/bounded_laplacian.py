@@ -49,7 +49,8 @@ class BoundedLaplacianEnclosure(Enclosure):
     radius: R.
     max_fall, max_rise: f(p) - c and C - f(p).
     laplacian_mean, laplacian_spread: m R^2 and l R^2, with m = (a+b)/2 and l = (b-a)/2.
-    slopes: the range of the derivative of f along the path at p.
+    slopes: the range of the derivative of f along the path at p; f_v in the proof stands for a
+        derivative in this range.
 
     Proof for R = 1, at the point x = p + q v for a unit direction v. Let G be the Green function of
     the ball. Then f = h - integral of G Lap f, where h is harmonic with the boundary values of f,
@@ -76,8 +77,9 @@ class BoundedLaplacianEnclosure(Enclosure):
     q^2/6, is convex in q, since A'' >= |B''| and kappa'' >= 0.1907 B'' (checked in the same place),
     and it is 0 at q = 0.
 
-    Both ends increase with the slope, or stay: the slope enters the upper end as f_v B/3 with B >=
-    0, and the lower end, which is the upper end of -f negated, in the same way.
+    Both ends of the interval that contains f(x) - f(p) increase with the slope, or stay. The slope
+    enters the upper end as f_v B/3 with B >= 0. The lower end is minus the upper end for -f, so the
+    slope enters it in the same way.
     """
 
     radius: Real
@@ -119,8 +121,8 @@ class BoundedLaplacianEnclosure(Enclosure):
         """Return the enclosure from bounds of a function on a ball.
 
         radius: the radius of the ball.
-        ranges: two differences in value: how far the function may fall from its value at the
-            center, and how far it may rise.
+        ranges: two differences in value, both >= 0: how far the function may fall on the ball below
+            its value at the center, and how far it may rise above it.
         laplacian: a lower and an upper bound of its Laplacian on the ball.
         slopes: the range of its derivative along the path at the center.
 
@@ -148,7 +150,8 @@ class BoundedLaplacianEnclosure(Enclosure):
 
     def is_free(self, gaps: LevelGaps, length: Real) -> Mask:
         """Return the mask of lanes on which f is proved to reach neither the level above nor the
-        level below on the length. gaps: the differences between f(p) and these levels."""
+        level below on the length `length` of the path. gaps: the differences between f(p) and these
+        levels."""
         above, below = self._conditions(gaps)
         q = length / self.radius
         is_inside = (q <= 1) & self._is_known(gaps)
@@ -186,7 +189,7 @@ class BoundedLaplacianEnclosure(Enclosure):
         u: f(p) - c, how far f may fall on the ball.
         rise: how far f may rise on the ball.
         mean: m R^2, the mean of the two bounds of the Laplacian times R^2.
-        slope: the largest derivative along the path.
+        slope: the largest derivative f_v along the path at p.
         """
         w = fmax(dr.fma(mean, 1 / 6, u), 0)
         scale = w + self.laplacian_spread
@@ -209,17 +212,18 @@ class BoundedLaplacianEnclosure(Enclosure):
 @dataclass(frozen=True)
 class _GreenCondition:
     """The condition for f not to reach a level at the gap d, on a fraction q of the radius: w (A-1)
-    + s B + l kappa + m q^2/6 <= d. The symbols are those of `BoundedLaplacianEnclosure`, with R =
-    1.
+    + s B + l kappa + m q^2/6 <= d. A, B, kappa, w, s = f_v/3, l and m are those of
+    `BoundedLaplacianEnclosure`, with R = 1. All numbers are divided by a difference of values, so
+    that they have no unit.
 
     Let S = (1-q)^2 (1 + left side), which has no pole, and g = sqrt(1 + d) - 1. The condition is
     sqrt(S) <= (1 + g) (1-q), that is, q k(q) <= g with k = g + 1 + (sqrt(S) - 1)/q.
 
     gap: g.
     weight: w.
-    slope: s = R f_v/3.
-    spread: l R^2.
-    mean: m R^2 where it is positive, else 0.
+    slope: s.
+    spread: l.
+    mean: m where it is positive, else 0.
     """
 
     gap: Real

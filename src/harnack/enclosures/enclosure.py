@@ -56,7 +56,7 @@ class PathRestriction(Protocol):
 
     def derivative_ranges(self, knots: Sequence[Real]) -> tuple[PathPiece, ...]:
         """Return ranges of the derivatives of F(s) = f(path(t+s)) on the pieces of the path between
-        each knot and the next.
+        each knot and the next, where t is the start of the path.
 
         knots: increasing lengths s, the first of them 0.
         """
@@ -89,7 +89,7 @@ class LevelGaps:
     level above. A level is a value of f that rays look for.
 
     below, above: the two differences; infinite if there is no level on that side.
-    is_one_sided: whether at most one of the two is finite on every lane, as with a single level.
+    is_one_sided: whether on every lane at most one of the two is finite, as with a single level.
         This is known while a kernel is being recorded, and saves the proof for the other side.
     """
 
@@ -108,7 +108,7 @@ class LevelGaps:
         return LevelGaps(below, above, self.is_one_sided)
 
     def swapped(self) -> LevelGaps:
-        """Return the gaps of -f: below and above exchanged."""
+        """Return the gaps of -f to the negated levels: `below` and `above` are exchanged."""
         return LevelGaps(self.above, self.below, self.is_one_sided)
 
 
@@ -124,7 +124,7 @@ class SlopeRange:
 
     @classmethod
     def around(cls, slope: Real, error: Real) -> SlopeRange:
-        """Return the interval of slopes within `error` of `slope`.
+        """Return the interval from slope - error to slope + error.
 
         An error that is the Python float 0.0 adds no operation to the kernel.
         """
@@ -133,8 +133,8 @@ class SlopeRange:
         return cls(slope - error, slope + error)
 
     def negated(self) -> SlopeRange:
-        """Return the range of the derivative along the opposite direction: the negated ends,
-        exchanged."""
+        """Return the range of the derivative along the opposite direction, from -upper to
+        -lower."""
         return SlopeRange(-self.upper, -self.lower)
 
 
@@ -151,14 +151,14 @@ class Enclosure(abc.ABC):
     tracer uses it for the way back from a sample.
 
     Each end of the interval must be an increasing function of the slope at the sample, or constant,
-    and every proof says why it is. Then the upper end of a `SlopeRange` gives a bound of F from
-    above, and its lower end a bound from below, for every slope in between. In particular slopes in
-    [-|grad f|, |grad f|] bound F in every direction.
+    and every proof says why it is. Then the upper end of a `SlopeRange` gives an upper bound of F
+    that holds for every slope in the range, and its lower end gives such a lower bound. In
+    particular slopes in [-|grad f|, |grad f|] bound F in every direction.
     """
 
     @property
     def reach_growth(self) -> float:
-        """The length on which the next sample should be enclosed, as a multiple of the length that
+        """How far the enclosures at the next sample should reach, as a multiple of the length that
         was proved free at this sample. The best values were found by experiment."""
         return 2.0
 
@@ -207,7 +207,8 @@ class Enclosure(abc.ABC):
 
     def arrives(self, gaps: LevelGaps, length: Real) -> Mask:
         """Return the mask of lanes on which f is proved to take a level for some 0 <= s <= length.
-        Here it is False: only enclosures that prove a change of at least some size override it.
+        Here the mask is False everywhere: only enclosures that prove a change of at least some size
+        override this method.
 
         gaps: the differences between f at the sample and the next levels.
         """

@@ -1,7 +1,7 @@
-"""Enclosures of functions that are made of several functions, or of one function by a map. An
-enclosure bounds how far a function can change along a path (a ray) from its value at a sample; so
-it proves a length on which the function takes no level, a value that rays look for. The gaps are
-the differences between the value and the next levels below and above.
+"""Enclosures of functions that are made of several functions, or of one function by a map such as
+negation or scaling. An enclosure bounds how far a function can change along a path (a ray) from its
+value at a sample; so it proves a length on which the function takes no level, a value that rays
+look for. The gaps are the differences between the value and the next levels below and above.
 
 - `MaximumEnclosure`, with `NegatedEnclosure` and `ScaledEnclosure`: unions, intersections and
   differences of solids, and solids that were moved and scaled.
@@ -41,7 +41,8 @@ class MaximumOperand:
 
 @dataclass(frozen=True)
 class MaximumEnclosure(Enclosure):
-    """An enclosure of max f_i along a path, from enclosures of all f_i (the operands).
+    """An enclosure of max f_i along a path, from enclosures of all f_i (the operands). The gaps are
+    the differences between the maximum at the start of the path and the next levels.
 
     Proof. Let the deficit of f_i be the difference between the maximum and f_i at the start. The
     maximum rises by a gap g only where some f_i rises by g plus its deficit. As long as no f_i
@@ -92,7 +93,7 @@ class MaximumEnclosure(Enclosure):
         """Return the length, from the start of the path, on which the enclosures of all operands
         are valid: the smallest of the lengths that they prove if there is no level.
 
-        infinity: infinity, as a number of the backend.
+        infinity: the number infinity, of the backend's type.
         """
         length = infinity
         for operand in self.operands:
@@ -119,8 +120,8 @@ class MaximumEnclosure(Enclosure):
 
 @dataclass(frozen=True)
 class NegatedEnclosure(Enclosure):
-    """The enclosure of -f. It uses an enclosure of f, for which the levels above and below are
-    exchanged.
+    """The enclosure of -f along a path, from an enclosure of f. -f rises to a level where f falls
+    to minus this level, so the gaps above and below are exchanged.
 
     inner: the enclosure of f.
     """
@@ -128,7 +129,8 @@ class NegatedEnclosure(Enclosure):
     inner: Enclosure
 
     def free_length(self, gaps: LevelGaps) -> Real:
-        """Return the length on which f is proved to take no level of -f, negated."""
+        """Return a length on which -f is proved to take no level. gaps: the differences between -f
+        at the start and the next levels below and above."""
         return self.inner.free_length(gaps.swapped())
 
     def is_free(self, gaps: LevelGaps, length: Real) -> Mask:
@@ -138,7 +140,7 @@ class NegatedEnclosure(Enclosure):
 @dataclass(frozen=True)
 class ScaledEnclosure(Enclosure):
     """An enclosure of h = value_factor * f(map(.)) along a path, from an enclosure of f along the
-    mapped path. The map multiplies all lengths on the path by `speed`.
+    mapped path. The map of space multiplies all lengths on the path by `speed`.
 
     inner: the enclosure of f along the mapped path.
     speed, value_factor: two factors > 0.
@@ -161,8 +163,8 @@ class ScaledEnclosure(Enclosure):
         return self.inner.is_free(self._gaps(gaps), length * self.speed / STEP_SAFETY)
 
     def _gaps(self, gaps: LevelGaps) -> LevelGaps:
-        """Return the gaps of f (the differences between its value and the next levels) for the
-        gaps of value_factor * f."""
+        """Return the gaps of f: those of value_factor * f, `gaps`, divided by value_factor. Gaps
+        are the differences between a value and the next levels."""
         factor = STEP_SAFETY / self.value_factor
         below, above = _scaled(gaps.below, factor), _scaled(gaps.above, factor)
         return LevelGaps(below, above, gaps.is_one_sided)
@@ -181,7 +183,8 @@ class BranchSample:
     the branch is a smooth function.
 
     slopes: the range of the derivative of |phi_j| along the path at the sample.
-    excess: |phi_j| minus the smallest |phi_i| at the sample, minus a bound of its rounding error.
+    excess: |phi_j| minus the smallest |phi_i| of all branches at the sample, minus a bound of the
+        rounding error of this difference.
     """
 
     slopes: SlopeRange
@@ -209,10 +212,10 @@ class NearestBranchEnclosure(Enclosure):
     along the parabola given by its slope and the bound of its second derivative.
 
     First for a level towards zero. Let f > 0 at the start, and take a level f - d below it (for f <
-    0 the proof is that of -f). As long as no g_j has fallen by |phi_j| - f + d, that is, to the
-    value f - d, f stays above the level. For if all g_j are positive, no sign has changed and f is
-    the smallest g_j. Otherwise the level is below 0. If f is negative then, an odd number of the
-    g_j is negative, so at least one is, and f is at least -|g_j| and thus above the level.
+    0 the proof is that of -f). As long as no g_j has fallen to the value f - d, that is, by |phi_j|
+    - f + d, f stays above the level. For if all g_j are positive, no sign has changed and f is the
+    smallest g_j. Otherwise the level is below 0. If f is negative then, an odd number of the g_j is
+    negative, so at least one is, and f is at least -|g_j| and thus above the level.
 
     Then for a level away from zero. f stays below a level f + a as long as |g_i| does, where phi_i
     is the nearest branch at the start. This holds as long as g_i has neither risen by a nor fallen
@@ -231,7 +234,7 @@ class NearestBranchEnclosure(Enclosure):
         """Return the shortest of the lengths that the two parts of the class's proof give, over all
         branches.
 
-        gaps: the differences between f and the next level below and above.
+        gaps: the differences between f at the start and the next levels below and above.
         """
         gap_towards_zero = dr.select(self.is_positive, gaps.below, gaps.above)
         gap_away = dr.select(self.is_positive, gaps.above, gaps.below)
@@ -269,22 +272,23 @@ class BranchPointEnclosure(Enclosure):
     u_j of a multivalued function of the plane are close to one value c. h is the height of a point
     of space, and s the sign of the product of all h - u_j. So f is 0 on the surfaces h = u_j.
 
-    The branches pass into each other around the line z = a. Let r be the distance from this line.
-    Within a radius R of it, |u_j - c| <= C r^alpha with alpha > 0, for all branches (up to a
-    period). A parabola proves only short lengths there: second derivatives grow without bound,
-    though the branches hardly move.
+    A point of space is (z, h), with z in the plane. The branches pass into each other around the
+    line z = a. Let r be the distance from this line. Within a radius R of it, |u_j - c| <= C
+    r^alpha with alpha > 0, for all branches (up to a period). A parabola proves only short lengths
+    there: second derivatives grow without bound, though the branches hardly move.
 
     Proof. Let y = |h - c| at the start, and v the largest rate at which it decreases along the
     path. On a disk of radius r <= R about the line, and for a length L of the path, all |h - u_j|
     are at least y - v L - C r^alpha. Let w = y - (|f| - gap). For any 0 < q < 1, the choice r = (q
-    w/C)^(1/alpha) and L = (1 - q) w/v makes this |f| - gap. The sign of f changes only where one of
-    the h - u_j is 0. So |f| does not fall by the gap on the length L, as long as the path does not
-    leave the disk.
+    w/C)^(1/alpha) and L = (1 - q) w/v makes this bound |f| - gap. The sign of f changes only where
+    one of the h - u_j is 0. So |f| does not fall by the gap on the length L, as long as the path
+    does not leave the disk.
 
     distance_to_limit: y.
     max_fall_rate: v.
-    closest_parameter, closest_distance: the length, in the plane, to the point of the path that is
-        closest to the branch line, and the distance from the line there.
+    closest_parameter, closest_distance: for the point of the path that is closest to the line z =
+        a, the length of the path up to it, measured in its projection to the plane, and its
+        distance from the line.
     speed: the length of the path's projection to the plane per length of the path.
     exponent, constant: alpha and C.
     max_radius: the largest r that may be used, R minus rounding.

@@ -6,10 +6,11 @@ A proof on the ball shows that all lengths up to q R are free if
 
     q k(q) <= gap,
 
-where k has no poles on [0, 1], and the gap is the difference between f(p) and a level, divided by a
-difference of values so that it has no unit. `largest_free_fraction` finds the largest such q from
-below. Large numbers are never subtracted, so the error of q is small relative to q. Near a surface
-the gap is tiny; if only the absolute error of q were small, rays would stall there.
+where k is a function without poles on [0, 1], and the gap is the difference between f(p) and a
+level, divided by a difference of values so that it has no unit. `largest_free_fraction` finds the
+largest such q from below. Large numbers are never subtracted, so the error of q is small relative
+to q. Near a surface the gap is tiny; if only the absolute error of q were small, rays would stall
+there.
 """
 
 from __future__ import annotations
@@ -68,19 +69,19 @@ def condition_rounding(real: Any) -> float:
 
 
 def is_free_fraction(condition: FreeRadiusCondition, q: Real) -> Mask:
-    """Return the mask of lanes on which a condition proves that f takes no level on all of [0, q],
-    for fractions q of the ball's radius, 0 <= q <= 1."""
+    """Return the mask of lanes on which a condition proves that f takes no level from the start of
+    the ray up to the fraction q of the ball's radius, 0 <= q <= 1."""
     rounding = condition_rounding(type(q))
     return q * (condition(q) + rounding) <= condition.gap * CONDITION_SAFETY
 
 
 def largest_free_fraction(condition: FreeRadiusCondition, rounds: int) -> Real:
-    """Return the largest fraction q in [0, 1) of the ball's radius on which a condition proves that
-    f takes no level, found from below.
+    """Return about the largest fraction q in [0, 1) of the ball's radius up to which a condition
+    proves that f takes no level, never a larger one.
 
     rounds: the number of iterations. Four come within 1e-5 of the largest q for four balls in five,
-        and within a few percent unless the extremal measure is concentrated in 1e-3 of the sphere;
-        twelve come within 1e-5.
+        and within a few percent for nearly all others (unless the boundary values for which the
+        bound is attained are concentrated in 1e-3 of the sphere); twelve come within 1e-5.
 
     The result is safe, because only a q at which q k(q) <= gap was *evaluated* is returned. By the
     single crossing, all smaller q are then free too. The choice of candidates affects the length
@@ -191,8 +192,11 @@ class HarmonicBallEnclosure(Enclosure):
 
     @classmethod
     def applies_to(cls, dimension: int, is_bounded_below: bool, is_bounded_above: bool) -> bool:
-        """Return whether this class has a proof for balls of this dimension, if f is bounded on
-        these sides. One bounded side is enough here."""
+        """Return whether this class has a proof for balls of this dimension.
+
+        is_bounded_below, is_bounded_above: whether f has a lower bound, and an upper bound, on the
+            ball. One of the two is enough here.
+        """
         del dimension
         return is_bounded_below or is_bounded_above
 
@@ -200,8 +204,8 @@ class HarmonicBallEnclosure(Enclosure):
 def allowed_movement(
     promise: HarmonicBall | BoundedLaplacian, value: Real, error: Real
 ) -> tuple[Real, Real | None, Real | None]:
-    """Return the radius of the ball on which a promise bounds f, how far f may fall on the ball
-    below its value at the center, and how far it may rise above it.
+    """Return three numbers: the radius of the ball on which a promise bounds f; how far f may fall
+    on the ball below its value at the center; and how far it may rise above that value.
 
     value: f at the center.
     error: a bound of the error of this value.
@@ -217,7 +221,7 @@ def allowed_movement(
 
     def movement(end: Real, sign: float) -> Real | None:
         """Return how far f may move to one end of the promised range; None if that end is infinite.
-        Where the distance is NaN, the mask `is_valid` is cleared.
+        Where the result is NaN, the mask `is_valid` is cleared.
 
         end: the upper end, with sign 1, or the lower end, with sign -1.
         """

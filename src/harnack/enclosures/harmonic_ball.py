@@ -42,9 +42,9 @@ class HarnackEnclosure(HarmonicBallEnclosure):
 
         u(p) (1-q)/(1+q)^(n-1) <= u(y) <= u(p) (1+q)/(1-q)^(n-1).
 
-    The step is the q at which one of the two first reaches a level. With u = f - lower and v =
-    level - lower the root is, in forms that do not cancel near v = u (the printed Eq. 7 does: 20 %
-    too long in float32 at |a-1| = 1e-6),
+    The free length is q R for the q at which one of the two bounds first reaches a level. With u =
+    f - lower and v = level - lower the root is, in forms that do not cancel near v = u (the printed
+    Eq. 7 cancels: in float32 its step is 20 % too long at |v/u - 1| = 1e-6),
 
         n = 2:  |v-u| / (u+v)         n = 3:  2 |v-u| / (u + 2v + sqrt(u (u + 8v)))
 
@@ -61,8 +61,8 @@ class HarnackEnclosure(HarmonicBallEnclosure):
         return dr.select(self.is_valid(gaps), self.radius * self._fraction(gaps), 0)
 
     def _fraction(self, gaps: LevelGaps) -> Real:
-        """Return the free length divided by the radius. If f is bounded on both sides, it is the
-        larger of the two fractions that the bounds prove. gaps: the differences between f(p) and
+        """Return the free length divided by the radius. If f is bounded on both sides, each bound
+        proves a fraction, and the larger one is returned. gaps: the differences between f(p) and
         the next levels."""
         lower = upper = None
         # For u = f - lower, "away from 0" is above.
@@ -187,13 +187,14 @@ class HarnackSlopeEnclosure(HarmonicBallEnclosure):
     (Jensen's inequality; the chord). Both bounds are attained, by a ring of mass at one latitude
     and by two point masses at the poles. The upper bound is convex in q. The lower bound rises,
     then falls: its derivative has the sign of m q^2 - 2q + m (n = 2), q^3 + m q^2 - 5q + 3m (n = 3)
-    or q^3 - 3q + 2m (n = 4), each of which decreases on [0, 1]. So each bound crosses a level at
-    most once in its direction, and if q is free of levels, all smaller q are. For upper - f > 0 the
-    same holds with the negated slope. On each side the better of the two bounds is used.
+    or q^3 - 3q + 2m (n = 4), and each of these decreases on [0, 1]. So the upper bound crosses a
+    level at most once upwards, and the lower bound at most once downwards; if q is free of levels,
+    all smaller q are. If f is bounded above, the same holds for u = upper - f > 0 with the negated
+    slope. On each side the better of the two bounds is used.
 
-    Both ends increase with the slope, or stay: the upper one because it grows with m, as P(q, 1) >=
-    P(q, -1); the lower one because P(q, .) increases. For upper - f, whose slope is negated, the
-    ends change places and signs.
+    Both bounds increase with the slope, or stay: the upper one because it grows with m, as P(q, 1)
+    >= P(q, -1); the lower one because P(q, .) increases. For u = upper - f the slope is negated,
+    and so are the bounds, which change places.
     """
 
     solver_iterations: ClassVar[int] = 4
@@ -213,8 +214,8 @@ class HarnackSlopeEnclosure(HarmonicBallEnclosure):
 
     def is_free(self, gaps: LevelGaps, length: Real) -> Mask:
         """Return the mask of lanes on which, for each of the levels above and below, at least one
-        condition proves that f does not reach it on the length. gaps: the differences between f(p)
-        and these levels."""
+        condition proves that f does not reach it on the length `length`. gaps: the differences
+        between f(p) and these levels."""
         q = length / self.radius
         is_covered = q <= 1
         q = clamp(q, 0, 1)
@@ -271,14 +272,15 @@ class _ChordCondition:
     """The condition that a positive harmonic u, bounded by the chord of Poisson's kernel, does not
     reach the level above on a fraction q of the radius.
 
-    With the symbols of `HarnackSlopeEnclosure` it is (1+m)/2 P(q,1) + (1-m)/2 P(q,-1) <= w with w =
-    1 + (gap of u)/u. The left side times (1-q)^K, K = n-1, is B = (1-q)^K + q A/(1+q)^K with a
-    polynomial A. So the condition is B^(1/K) <= w^(1/K) (1-q), which has no pole. This is q k(q) <=
-    g with g = w^(1/K) - 1 and k = g + 1 + (B^(1/K) - 1)/q.
+    With Poisson's kernel P and the other symbols of `HarnackSlopeEnclosure` it is (1+m)/2 P(q,1) +
+    (1-m)/2 P(q,-1) <= w with w = 1 + (gap of u)/u, where the gap is the difference between the
+    level and u at the center. The left side times (1-q)^K, K = n-1, is B = (1-q)^K + q A/(1+q)^K
+    with a polynomial A. So the condition is B^(1/K) <= w^(1/K) (1-q), which has no pole. This is q
+    k(q) <= g with g = w^(1/K) - 1 and k = g + 1 + (B^(1/K) - 1)/q.
 
     gap: g.
-    mean: m, the mean of s.
-    dimension: n.
+    mean: m, the mean of the cosine s.
+    dimension: n, that of the ball.
     """
 
     gap: Real
@@ -287,8 +289,11 @@ class _ChordCondition:
 
     @classmethod
     def of(cls, gap: Real, mean: Real, dimension: int) -> _ChordCondition:
-        """Make the condition for a gap that is given in units of u, that is, w - 1. mean,
-        dimension: m and n."""
+        """Make the condition.
+
+        gap: the gap divided by u at the center, which is w - 1.
+        mean, dimension: m and n.
+        """
         # g = w^(1/K) - 1, in forms that do not cancel for small gaps.
         if dimension == 3:
             gap = gap / (dr.sqrt(1 + gap) + 1)
@@ -327,13 +332,14 @@ class _JensenCondition:
     """The condition that a positive harmonic u, bounded by Jensen's inequality, does not reach the
     level below on a fraction q of the radius.
 
-    With the symbols of `HarnackSlopeEnclosure` it is P(q, m) >= 1 - g with g = (gap of u)/u. With D
-    = 1+q^2-2qm this is (1-g) D^(n/2) <= 1-q^2, that is, q k(q) <= g with k = (1-g) (D^(n/2) - 1 +
-    q^2)/q + g q. The product q k(q) is convex.
+    With Poisson's kernel P and the other symbols of `HarnackSlopeEnclosure` it is P(q, m) >= 1 - g
+    with g = (gap of u)/u, where the gap is the difference between u at the center and the level.
+    With D = 1+q^2-2qm this is (1-g) D^(n/2) <= 1-q^2, that is, q k(q) <= g with k = (1-g) (D^(n/2)
+    - 1 + q^2)/q + g q. The product q k(q) is convex.
 
     gap: g.
-    mean: m, the mean of s.
-    dimension: n.
+    mean: m, the mean of the cosine s.
+    dimension: n, that of the ball.
     """
 
     gap: Real
@@ -367,12 +373,15 @@ class SphericalCapEnclosure(HarmonicBallEnclosure):
     has values between c and C. It bounds f along a ray from p, at the fraction q of the radius.
 
     Proof. f = c + (C-c) g, where g is the Poisson integral of boundary values in [0, 1]. Their mean
-    is p = (f-c)/(C-c), and their first moment along a unit direction v is mu = R f_v/(3 (C-c)). For
-    fixed q the kernel P(q, s) is convex in s. So among densities in [0, 1] with this mass and first
-    moment, the integral of P times the density is largest for the indicator of {s <= s1} and {s >=
-    s2}, because P minus its chord through s1 and s2 is positive exactly there (bathtub principle).
-    These are two spherical caps about v and -v of heights b = p + mu/(1-p) and a = p - mu/(1-p),
-    which depend on p and mu alone. The integral over the caps is elementary. So f is at most
+    is p = (f-c)/(C-c) with f at the center, and their first moment along the direction v of the ray
+    is mu = R f_v/(3 (C-c)), where f_v is the derivative of f along v. Let s be the cosine of the
+    angle between v and a boundary point. For fixed q the kernel P(q, s) is convex in s. So among
+    densities in [0, 1] with this mass and first moment, the integral of P times the density is
+    largest for the indicator of the two ends {s <= a-1} and {s >= 1-b}, because P minus its chord
+    through a-1 and 1-b is positive exactly there (bathtub principle). These are two spherical caps
+    about v and -v of heights b = p + mu/(1-p) and a = p - mu/(1-p), which depend on p and mu alone.
+    The integral over the caps is elementary. Let s1 and s2 be the distances, divided by R, from the
+    point at the fraction q to the edges of the caps about v and about -v. So f is at most
 
         U = c + (C-c) [1 - (1-q^2)/(2q) (1/s1 - 1/s2)],
         s1^2 = (1-q)^2 + 2qb,   s2^2 = (1+q)^2 - 2qa,
@@ -381,12 +390,12 @@ class SphericalCapEnclosure(HarmonicBallEnclosure):
 
         (1 - gap/(C-f)) s1 s2 (s1+s2)/2 <= 1-q^2.
 
-    The lower bound is that of C - f, negated: p becomes 1-p and mu becomes -mu. |mu| <= p (1-p)
-    holds in exact arithmetic and is enforced.
+    A lower bound follows from the upper bound for C + c - f: p becomes 1-p and mu becomes -mu. |mu|
+    <= p (1-p) holds in exact arithmetic and is enforced.
 
-    Both ends increase with the slope, or stay. As the slope grows, weight moves from s = a-1 to s =
-    1-b, which is no smaller since a + b = 2p <= 2, and P(q, .) increases. For the lower bound the
-    same holds of C - f.
+    Both bounds increase with the slope, or stay. As the slope grows, weight moves from s = a-1 to s
+    = 1-b, which is no smaller since a + b = 2p <= 2, and P(q, .) increases. For the lower bound the
+    same argument holds for C + c - f.
 
     The first crossing of a level is unique. With X = (1+q^2)/(2q), (X-s)^(-3/2) is a Laplace
     transform of exp(-tX) exp(ts), hence totally positive in (q, s) on (0, 1) x (-1, 1) (Karlin
@@ -399,8 +408,12 @@ class SphericalCapEnclosure(HarmonicBallEnclosure):
 
     @classmethod
     def applies_to(cls, dimension: int, is_bounded_below: bool, is_bounded_above: bool) -> bool:
-        """Return whether this class has a proof: the ball has dimension 3, and f is bounded on both
-        sides."""
+        """Return whether this class has a proof for balls of this dimension: it has one for
+        dimension 3, if f is bounded on both sides.
+
+        is_bounded_below, is_bounded_above: whether f has a lower bound, and an upper bound, on the
+            ball.
+        """
         return dimension == 3 and is_bounded_below and is_bounded_above
 
     def free_length(self, gaps: LevelGaps) -> Real:
@@ -453,10 +466,9 @@ def _two_caps(gap: Real, max_rise: Real, p: Real, rest: Real, mu: Real) -> _CapC
     gap: the difference between f and that level.
     max_rise: C - f at the center.
     p, rest: p and 1 - p.
-    mu: the largest first moment.
+    mu: the largest first moment that the range of slopes allows.
 
-    If the range of f is a point, f is constant and no level is ever reached. A level beyond C is
-    not reached, either.
+    If c = C, f is constant and no level is ever reached. A level beyond C is not reached, either.
     """
     slack = condition_rounding(type(gap)) * p
     cap_shift = dr.select(rest > 0, mu / rest, 0) + slack
@@ -472,7 +484,8 @@ class _CapCondition:
 
     That is q k(q) <= g with k = (1-g) (S - 1 + q^2)/q + g q.
 
-    gap: g = (gap of f)/(C-f), where C is the upper bound of f on the ball.
+    gap: g = gap/(C-f), where the gap is the difference between the level and f at the center, and C
+        the upper bound of f on the ball.
     p: the mean of the boundary values, which are scaled to [0, 1].
     rest: 1 - p, accurate where it is small.
     shift: mu/(1-p), where mu is the first moment of the boundary values along the ray.
@@ -491,7 +504,8 @@ class _CapCondition:
 
     def __call__(self, q: Real) -> Real:
         """Return k(q), in a form that does not cancel near q = 0. For each of s1 and s2, s^2 = 1 +
-        q e, so s = 1 + q x with x = e/(s+1). `total` is x1 + x2, and `rise` is (S - 1 + q^2)/q."""
+        q e with a number e, so s = 1 + q x with x = e/(s+1). In the code `total` is the sum of the
+        two numbers x, and `rise` is (S - 1 + q^2)/q."""
         e1, e2 = q - 2 * (self.rest - self.shift), q + 2 * (self.rest + self.shift)
         one_minus_q, one_plus_q = 1 - q, 1 + q
         s1 = dr.sqrt(dr.fma(one_minus_q, one_minus_q, 2 * q * (self.p + self.shift)))

@@ -53,8 +53,9 @@ class ParabolaEnclosure(Enclosure):
     reach: Real
 
     def free_length(self, gaps: LevelGaps) -> Real:
-        """Return the length up to which the upper parabola stays below the level above, and the
-        lower one above the level below; at most `reach`, and 0 if a number is NaN.
+        """Return the length up to which the upper parabola stays below the next level above, and
+        the lower parabola above the next level below. It is at most `reach`, and 0 if a number is
+        NaN.
 
         gaps: the differences between f at the sample and these two levels.
         """
@@ -65,7 +66,7 @@ class ParabolaEnclosure(Enclosure):
 
     def is_free(self, gaps: LevelGaps, length: Real) -> Mask:
         """Return the mask of lanes on which both parabolas stay between the next levels below and
-        above on the given length, and this is at most `reach`.
+        above on the length `length`, and this length is at most `reach`.
 
         gaps: the differences between f at the sample and these two levels.
         """
@@ -97,15 +98,15 @@ class LipschitzEnclosure(ParabolaEnclosure):
     # Both sides in one formula, for speed: a ray along an edge uses a dozen cones at each point.
 
     def free_length(self, gaps: LevelGaps) -> Real:
-        """Return the smaller gap divided by the Lipschitz constant, at most `reach`; 0 if a gap is
-        0 or a number is NaN."""
+        """Return the smaller of the two gaps divided by the Lipschitz constant, at most `reach`; 0
+        if a gap is 0 or a number is NaN."""
         length = gaps.nearest / self.slopes.upper
         is_valid = (gaps.below > 0) & (gaps.above > 0) & (self.slopes.upper >= 0) & (self.reach > 0)
         return dr.select(is_valid, fmin(length, self.reach), 0) * STEP_SAFETY
 
     def is_free(self, gaps: LevelGaps, length: Real) -> Mask:
-        """Return the mask of lanes on which f changes on the given length by no more than the
-        smaller gap, and the length is at most `reach`."""
+        """Return the mask of lanes on which f is proved to change on the length `length` by no more
+        than the smaller of the two gaps, and this length is at most `reach`."""
         movement = self.slopes.upper * length
         free = (length <= self.reach) & (movement <= gaps.below) & (movement <= gaps.above)
         return (length <= 0) | free
@@ -145,7 +146,7 @@ def first_reach(gap: Real, slope: Real, curvature: Real) -> Real:
     is none.
 
     gap: the difference in value to a level, >= 0; infinite if there is no level on this side.
-    curvature: the second derivative of the parabola.
+    slope, curvature: the slope of the parabola at s = 0, and its second derivative.
 
     With r = sqrt(slope^2 + 2 curvature gap), s is gap/(slope/2 + r/2) for slope > 0, and (r -
     slope)/curvature for slope <= 0 < curvature. r is computed from the larger and the smaller of
@@ -171,8 +172,10 @@ def first_reach(gap: Real, slope: Real, curvature: Real) -> Real:
 def _stays_below(gap: Real, slope: Real, curvature: Real, length: Real) -> Mask:
     """Return the mask of lanes on which slope s + curvature s^2/2 <= gap for 0 <= s <= length.
 
-    The largest value is at an end of the length or, if the parabola rises and then falls on it, at
-    its vertex.
+    gap: the difference in value to a level.
+
+    The largest value of the parabola is at s = 0, at s = length, or at its vertex if it rises and
+    then falls in between.
     """
     half_change = 0.5 * curvature * length
     # The slope at the end is slope + curvature length.
@@ -193,9 +196,9 @@ def _rounded_down_where(turns: Mask, gap: Real) -> Real:
     all others.
 
     turns: the lanes on which the parabola slope s + curvature s^2/2 bends away from the level, so
-        that it may turn back before it. If its vertex is close to the level, rounding would decide
-        whether the discriminant slope^2 + 2 curvature gap is negative, that is, whether the
-        parabola reaches the level.
+        that it may turn back before it reaches the level. If its vertex is close to the level,
+        rounding would decide whether the discriminant slope^2 + 2 curvature gap is negative, that
+        is, whether the parabola reaches the level.
     """
     return dr.select(turns, gap * (1 - 8 * float(dr.epsilon(type(gap)))), gap)
 
@@ -230,9 +233,9 @@ _PI_BELOW = 3.14159
 
 @dataclass(frozen=True)
 class SphereArcEnclosure(Enclosure):
-    """The bound |F - slope psi| <= curvature psi^2/2, where psi is the angle traveled along the
-    path's image, a circle, and F is the change of f. It is for functions of points on the sphere
-    S^3.
+    """The bound |F - m psi| <= curvature psi^2/2 for functions f of points on the sphere S^3. F is
+    the change of f along a line, psi the angle traveled along the line's image on the sphere, a
+    circle, and m the derivative of f by psi at the start.
 
     By stereographic projection a line of space becomes a circle on S^3. A function that is a
     trigonometric polynomial on the circle has a bounded second derivative by its angle, from one
@@ -240,17 +243,17 @@ class SphereArcEnclosure(Enclosure):
 
     slopes: the range of the derivative of f along the path, by length, where it starts.
     curvature: a bound of the second derivative of f by the angle, on the whole circle.
-    offset: the parameter t of the start, measured from the point q of the line closest to the
-        origin.
+    offset: the length t along the line from q to the start of the path, where q is the point of the
+        line closest to the origin.
     squared_radius: c^2 = 1 + |q|^2.
 
     Proof. The line x = q + t v with q . v = 0 becomes the circle of the points
 
         y = 2x/(1 + |x|^2) = (q (1 + cos a) + c v sin a)/c^2,   w = 1 - (1 + cos a)/c^2,
 
-    with t = c tan(a/2), at speed da/dt = 2c/S, where S = c^2 + t^2. So the slope by the angle is
-    S/(2c) times the slope, and f stays within the parabola of `curvature`. `first_reach` gives the
-    first psi at which that parabola meets a gap. From t the angle psi leads to t + s with
+    with t = c tan(a/2), at speed da/dt = 2c/S, where S = c^2 + t^2. So m is S/(2c) times the slope
+    by length, and f stays within the parabola of `curvature`. `first_reach` gives the first psi at
+    which that parabola meets a gap. From t the angle psi leads to t + s with
 
         s = S sin(psi/2)/(c cos(psi/2) - t sin(psi/2)),
 

@@ -31,16 +31,16 @@ class PiecewiseTaylorEnclosure(Enclosure):
     slopes: the range of F' at s = 0.
     pieces: the pieces, in their order along the path.
 
-    Proof of the step. At the start of a piece let F <= A and F' <= D, and on the piece let F' <= k
-    and F'' <= c. Then F <= A + min(k s, D s + c s^2/2) on the piece, s measured from its start. The
-    next piece starts with the value of this bound at the end of the piece, and with a slope of at
-    most min(D + c w, k), where w is the length of the piece. The first s at which the bound reaches
-    the gap is the root of a line or of a parabola. For the level below the same holds of -F. With
-    exact ranges the bound converges to F with the third power of the length of the pieces, so that
-    one sample may prove much of a ray.
+    Proof of the step. Take a level above. At the start of a piece let F <= A and F' <= D, and on
+    the piece let F' <= k and F'' <= c. Then F <= A + min(k s, D s + c s^2/2) on the piece, s
+    measured from its start. The next piece starts with the value of this bound at the end of the
+    piece, and with a slope of at most min(D + c w, k), where w is the length of the piece. The
+    first s at which the bound reaches the gap is the root of a line or of a parabola. For the level
+    below the same holds of -F. With exact ranges the bound converges to F with the third power of
+    the length of the pieces, so that one sample may prove much of a ray.
 
-    Source: new in harnack. One piece is the linear and the quadratic Taylor form together
-        (Aydinlilar and Zanni 2023, section 6.1).
+    Source: new in harnack. With one piece it is the tighter of the linear and the quadratic Taylor
+        form (Aydinlilar and Zanni 2023, section 6.1).
     """
 
     slopes: SlopeRange
@@ -55,6 +55,7 @@ class PiecewiseTaylorEnclosure(Enclosure):
 
         function: f along the path.
         slopes: the range of its derivative at the start.
+        length: the length of the path on which the enclosure is wanted.
 
         The first two pieces are equally long; each of the others is twice as long as the one before
         it.
@@ -113,8 +114,9 @@ class PiecewiseTaylorEnclosure(Enclosure):
         """
 
         def one_sided(upper: Real, lower: Real) -> Real:
-            """Return the largest value for F (`upper`) or, if the level is below, the largest value
-            for -F (-`lower`)."""
+            """Return the upper bound of a quantity of F (a slope or a second derivative) that lies
+            between `lower` and `upper`; if the level is below, the upper bound -lower of the same
+            quantity of -F."""
             return dr.select(rises, upper, -lower)
 
         slope = one_sided(self.slopes.upper, self.slopes.lower)

@@ -76,7 +76,7 @@ class Promise(abc.ABC):
         slopes: the range of the derivative of f along the direction at p.
         length: |y - p|, less than the radius.
 
-        All are NumPy or Dr.Jit arrays.
+        All arguments are NumPy or Dr.Jit arrays.
         """
 
     def taylor_remainder_bound(self, value: Real, length: Real, degree: int = 1) -> Real:
@@ -137,7 +137,7 @@ class Promise(abc.ABC):
         return dataclasses.replace(self, **numbers)
 
     def negated(self) -> Self:
-        """Return the promise of -f: the ends of each range are negated and exchanged."""
+        """Return the promise of -f: a range from a to b becomes the range from -b to -a."""
         numbers = {
             name: -getattr(self, opposite)
             for lower, upper in self.interval_pairs
@@ -160,7 +160,7 @@ class Promise(abc.ABC):
     def linearly_mapped(self, stretch: Real) -> Self:
         """Return the promise of x -> f(A x) for a linear map A, at the point that A maps to p.
 
-        stretch: A stretches no length by more than this factor.
+        stretch: an upper bound of the factor by which A stretches lengths.
 
         A number with the unit (length)^j is divided by stretch^j: lengths shrink, and slopes grow.
         """
@@ -178,8 +178,8 @@ class Promise(abc.ABC):
     def map_numbers(self, change: Callable[[Any, int, int], Any]) -> Self:
         """Return a promise of the same kind with other numbers.
 
-        change: a function (number, i, j) -> new number, where the number's unit is (unit of f)^i
-            (length)^j.
+        change: a function of (number, i, j) that returns the new number; i and j are the exponents
+            of the number's unit, (unit of f)^i (length)^j.
         """
         numbers = {name: change(getattr(self, name), *powers) for name, *powers in self.units}
         return dataclasses.replace(self, **numbers)
@@ -211,8 +211,8 @@ class HarmonicBall(Promise):
     and f elsewhere up to multiples of the period.
 
     lower, upper: bounds of the harmonic function on the open ball. One of them may be infinite.
-    dimension: 2 for a function of the plane, extended constantly along z; 3 for a function of
-        space; 4 if f is a slice of a function of R^4.
+    dimension: 2 for a function of x and y that does not depend on z; 3 for a function of space; 4
+        if f is the restriction of a function of R^4 to a space in it.
     """
 
     radius: Real
@@ -237,9 +237,10 @@ class HarmonicBall(Promise):
         degree: the degree of T, 1 or 2.
 
         Proof for a harmonic f >= c on a ball of radius R in n dimensions. f - c is the integral of
-        Poisson's kernel P(q, s), q = length/R, with a measure of mass f(p) - c. P is the sum over l
-        of the zonal harmonics of degree l, which are all largest at s = 1. Those of degree 0 and 1
-        give the value and the gradient. The sum of all others is at most P - 1 - n q at s = 1, in
+        Poisson's kernel P(q, s) with a measure of mass f(p) - c. Here q = length/R, and s is the
+        cosine of the angle between y - p and a point of the sphere. P is the sum over l of the
+        zonal harmonics of degree l, which are all largest at s = 1. Those of degree 0 and 1 give
+        the value and the gradient. The sum of all others is at most P - 1 - n q at s = 1, in
         absolute value, where P = (1 + q)/(1 - q)^(n - 1). So the error is at most this number times
         f(p) - c. The same holds for C - f with f <= C, and the smaller of the two bounds is
         returned. For degree 2, the harmonic of degree 2 is left out, too: at s = 1 it is 2, 5 and 9
@@ -450,6 +451,6 @@ class TaylorRemainder(Promise):
 
 
 def _is_infinite(end: Any) -> bool:
-    """Return whether `end` is an infinite Python float, which is known while a kernel is being
-    recorded."""
+    """Return whether the end `end` of a range is an infinite Python float, which is known while a
+    kernel is being recorded. For a Dr.Jit number the result is False."""
     return isinstance(end, float) and math.isinf(end)

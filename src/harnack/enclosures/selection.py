@@ -79,8 +79,8 @@ class EnclosureKinds:
 
     kinds: the classes, the sharpest first. A later class would only prove less from the same
         promise.
-    uses_alternative_promises: whether to use also the promises that the field declares weaker than
-        its other promises (`Sample.alternative_promises`).
+    uses_alternative_promises: whether enclosures are made also from those promises that the field
+        declares weaker than its others (`Sample.alternative_promises`).
     """
 
     kinds: tuple[type[Enclosure], ...]
@@ -137,7 +137,8 @@ class EnclosureKinds:
     def _enclosure(
         self, promise: Promise, value: Real, error: Real, slopes: SlopeRange
     ) -> Enclosure | None:
-        """Return the enclosure of the first class that can use the promise; None if none can.
+        """Return the enclosure that the first class that can use the promise makes of it; None if
+        no class can.
 
         value, error: f at the point, and a bound of its error.
         slopes: the range of the derivative of f along the direction.
@@ -151,8 +152,8 @@ class EnclosureKinds:
     def _nothing_applies_message(
         self, promises: tuple[Promise, ...], value: Real, error: Real, slopes: SlopeRange
     ) -> str:
-        """Return the text of the error that none of these classes of enclosures can use the field's
-        promises. It names the choices of the option `enclosures` that can use them.
+        """Return the text of an error: none of these classes of enclosures can use the field's
+        promises. The text names the choices of the option `enclosures` that can use them.
 
         promises: all promises of the field at a point.
         value, error: f at the point, and a bound of its error.
@@ -209,16 +210,17 @@ def choose_enclosures(enclosures: EnclosureChoice = None) -> EnclosureKinds:
 
     Names for all fields:
 
-    - "classic": the published rule.
+    - "classic": Harnack's inequality without the slope, the published rule.
     - "slope": Harnack's inequality with the slope.
     - "caps": spherical caps if a function is bounded on both sides, else as "slope".
     - "laplacian": the bound for functions with a bounded Laplacian.
     - "lipschitz": the Lipschitz cone.
     - "curvature": Taylor's formula if second derivatives are bounded, else as "caps".
 
-    Names for fields with a formula: "pieces", and for comparison "quadratic-taylor",
-    "linear-taylor" and "segment", and by the formula's own arithmetic "bottom-up-linear",
-    "bottom-up-quadratic", "mixed", "affine" and "interval".
+    Names for fields with a formula: "pieces", from ranges of derivatives on pieces of the ray. For
+    comparison there are "quadratic-taylor", "linear-taylor" and "segment", from ranges of
+    derivatives on the whole length; and "bottom-up-linear", "bottom-up-quadratic", "mixed",
+    "affine" and "interval", for which the formula is evaluated in another arithmetic.
 
     None means "pieces", but without the promises that a field declares weaker than its others. For
     fields without a formula "pieces" means "curvature".
@@ -271,7 +273,7 @@ def longest_free_length(enclosures: tuple[Enclosure, ...], gaps: LevelGaps) -> R
 
 def any_is_free(enclosures: tuple[Enclosure, ...], gaps: LevelGaps, length: Real) -> Mask:
     """Return the mask of lanes on which at least one of the enclosures proves that f takes no level
-    on the length. gaps: the differences between f and the next levels."""
+    on the length `length`. gaps: the differences between f and the next levels."""
     is_free = length <= 0
     for enclosure in enclosures:
         is_free |= enclosure.is_free(gaps, length)

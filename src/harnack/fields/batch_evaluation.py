@@ -46,7 +46,7 @@ def evaluate_points(
 
     kernel: a function that takes a backend and a Dr.Jit 3-vector of points, and returns a tuple of
         Dr.Jit arrays.
-    precision: "single" or "double"; None for double if the points are an array of float64, else
+    precision: "single" or "double"; None means double if the points are an array of float64, else
         single.
 
     The points are visited cell by cell along a Morton curve. Neighboring lanes then visit the same
@@ -58,8 +58,8 @@ def evaluate_points(
     backend = choose_backend(precision or precision_of_input(points))
 
     def visit(x: Vec3) -> tuple[Any, ...]:
-        """The results of `kernel` at the Dr.Jit points x, in the order of x. The kernel itself is
-        given the points in the order of a Morton curve."""
+        """The results of `kernel` at the Dr.Jit points x, as a tuple of arrays in the order of x.
+        The kernel itself is given the points in the order of a Morton curve."""
         order = morton_order(backend, x)
         results = kernel(backend, dr.gather(backend.Array3f, x, order))
         return tuple(_restore_order(array, order, dr.width(x)) for array in results)
@@ -80,13 +80,16 @@ def accepts_numpy_points(hessian: Callable[[Any, Vec3], Any]) -> Callable[..., A
     @functools.wraps(hessian)
     def general(self: Any, p: Any, *, precision: Precision | None = None) -> Any:
         """The second derivatives at p (`Field.hessian`): for a Dr.Jit 3-vector p, the three rows of
-        the matrix; for NumPy points, NumPy matrices."""
+        the matrix; for NumPy points, NumPy matrices.
+
+        precision: for NumPy points, "single" or "double"; None for that of the points.
+        """
         if dr.is_array_v(type(p)):
             check_no_derivatives(f"the Hessian of {type(self).__name__}", p, self.parameters())
             return hessian(self, p)
 
         def kernel(backend: Backend, x: Vec3) -> tuple[Vec3, Vec3, Vec3]:
-            """The rows of the Hessian at the Dr.Jit points x."""
+            """The three rows of the Hessian at the Dr.Jit points x."""
             return self.prepare(backend).hessian(x)
 
         # Three arrays of rows (n, 3) become matrices (n, 3, 3).

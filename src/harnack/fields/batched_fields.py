@@ -203,8 +203,11 @@ class BatchedField(Field):
     def value_and_gradient(
         self, points: Any, *, precision: Precision | None = None
     ) -> tuple[FloatArray, FloatArray]:
-        """Values (n,) and gradients (n, 3) of f at points (n, 3), as NumPy arrays. Together they
-        take hardly more time than gradients alone."""
+        """Return the values (n,) and the gradients (n, 3) of f at points (n, 3), as NumPy arrays.
+        Together they take hardly more time than gradients alone.
+
+        precision: "single" or "double"; None for that of the points.
+        """
         value, gradient = self._choose_at_points(
             points, precision, 1, lambda at: (at.value, at.gradient)
         )
@@ -213,12 +216,15 @@ class BatchedField(Field):
     def rough_value_and_gradient(
         self, points: Any, *, precision: Precision | None = None
     ) -> tuple[FloatArray, FloatArray]:
-        """Values (n,) and gradients (n, 3) at points (n, 3), by a single pass over the tree of
-        sources. The gradients may have large errors, so they are for estimates only, or for points
-        where f is so steep that the errors do not matter."""
+        """Return the values (n,) and the gradients (n, 3) at points (n, 3), by a single pass over
+        the tree of sources. The gradients may have large errors, so they are for estimates only, or
+        for points where f is so steep that the errors do not matter.
+
+        precision: "single" or "double"; None for that of the points.
+        """
 
         def kernel(backend: Backend, x: Vec3) -> tuple[Any, ...]:
-            """The values and gradients at the Dr.Jit points x."""
+            """The values, then the gradients, at the Dr.Jit points x."""
             del backend
             at = self.values_at(x, 1)
             return at.value, at.gradient
@@ -236,7 +242,10 @@ class BatchedField(Field):
     def error_bound(self, points: Any, *, precision: Precision | None = None) -> FloatArray:
         """Bounds (n,) of the error of `value` at points (n, 3). They include the proved truncation
         error and the rounding error of f. They do not include the change of f by rounding the
-        points to single precision."""
+        points to single precision.
+
+        precision: "single" or "double"; None for that of the points.
+        """
         return self._choose_at_points(points, precision, 0, lambda at: (at.error,))[0]
 
     @accepts_dask_arrays("points")
@@ -250,6 +259,8 @@ class BatchedField(Field):
         For a sum over a tree the bound is about a hundred times the error itself: the sum is made
         only as accurate as an estimate of the error demands (`sharpened`), and the proved bound is
         far larger than the estimate.
+
+        precision: "single" or "double"; None for that of the points.
         """
         return self._choose_at_points(points, precision, 1, lambda at: (at.gradient_error,))[0]
 
@@ -257,7 +268,10 @@ class BatchedField(Field):
     def hessian_error_bound(self, points: Any, *, precision: Precision | None = None) -> FloatArray:
         """Bounds (n,) of the error of `hessian`, in the spectral norm, at points (n, 3). They
         include the proved truncation error and the rounding error. They do not include the change
-        of the Hessian by rounding the points."""
+        of the Hessian by rounding the points.
+
+        precision: "single" or "double"; None for that of the points.
+        """
         return self._choose_at_points(points, precision, 2, lambda at: (at.hessian_error,))[0]
 
     def _choose_at_points(
@@ -277,8 +291,9 @@ class BatchedField(Field):
         """
 
         def kernel(backend: Backend, x: Vec3) -> tuple[Any, ...]:
-            """The results that `choose` selects, at the Dr.Jit points x. If gradients but no
-            Hessians are asked for, they are computed more accurately, by `sharp_values_at`."""
+            """The tuple that `choose` selects from the values at the Dr.Jit points x. If gradients
+            but no Hessians are asked for, the gradients are computed more accurately, by
+            `sharp_values_at`."""
             del backend
             sharp = derivatives == 1
             return choose(self.sharp_values_at(x) if sharp else self.values_at(x, derivatives))
@@ -364,7 +379,7 @@ def sharpened(at: Callable[[Vec3, Real], PointValues], x: Vec3) -> PointValues:
 
 
 def _required_hessian(values: PointValues) -> SymmetricMatrix:
-    """The Hessian of `PointValues`, which must have been computed with second derivatives.
+    """The Hessian in `values`, which must have been computed with second derivatives.
 
     Raises:
         RuntimeError: they were computed without second derivatives.
@@ -392,10 +407,10 @@ class FieldCache(Generic[Value]):
         self._kept: dict[int, tuple[Any, dict[str, Any], Value]] = {}
 
     def get(self, field: Field, key: Any, make: Callable[[], Value]) -> Value:
-        """The value of a field for this key: the cached one if it was made for the same key and no
-        attribute of the field was set since then; otherwise the result of make(), which is then
-        cached. (A value that is the field itself is not cached, as it would keep the field
-        alive.)"""
+        """The value of a field for this key. It is the cached value if that was made for the same
+        key, and no attribute of the field was set since then. Otherwise it is the result of make(),
+        which is then cached. (A value that is the field itself is not cached, as it would keep the
+        field alive.)"""
         if id(field) in self._kept:
             kept_key, attributes, value = self._kept[id(field)]
             now = vars(field)

@@ -125,9 +125,9 @@ class JumpSurface:
         `coarsest_accuracy`.
 
         If so, those samples set `Sample.branch_unknown`, and all jumps of f are integers. Besides,
-        `extent` has to keep a condition. Consider a set of levels that contains, for each of its
-        levels L, also the number nearest to 0 among L plus all integers. At points outside of the
-        extent of such a set, none of the numbers L plus an integer lies between 0 and f.
+        `extent` has to fulfill a condition. Take a set of levels that contains, with each level L,
+        also that one of the numbers L + k, k an integer, which is nearest to 0. Then at points
+        outside of the extent of this set no number L + k lies between 0 and f.
         """
         return False
 
@@ -155,9 +155,9 @@ class JumpSurface:
         return cast("Field", self).evaluate(p)
 
     def value_if_cheap(self, p: Vec3, rounding: Real, active: Mask) -> Real:
-        """f at p, on active lanes on which it takes less time than `evaluate`. The result is NaN on
-        all other lanes, and where p may lie on a facet. It is used only for fields with
-        `has_unknown_branch`. The default is NaN everywhere.
+        """f at p, if there is a way to compute it that takes less time than `evaluate`. The result
+        is NaN on lanes where there is none, on lanes that are not active, and where p may lie on a
+        facet. It is used only for fields with `has_unknown_branch`. The default is NaN everywhere.
 
         rounding: a bound of the rounding errors of the coordinates of p, and of the ray on which p
             lies.
@@ -169,21 +169,26 @@ class JumpSurface:
         self, o: Vec3, d: Vec3, after: JumpCrossing, t_max: Real, active: Mask
     ) -> JumpCrossing:
         """The first crossing of the ray o + t d with a facet strictly after the crossing `after`,
-        with t <= t_max.
+        with t <= t_max, on active lanes.
 
         Crossings are ordered by (t, facet): facets that are crossed at the same t follow each other
         by index. NO_FACET is the largest index, so nothing follows it at the same t. Repeated calls
         must give every crossing of the ray in this order. The t and the jump of a crossing must not
         depend on the crossing at which the calls began. If there is no further crossing, t = inf,
         facet = NO_FACET and jump = 0.
+
+        o, d: origin and direction of each ray.
+        after: the crossing after which the search begins.
+        t_max: the largest t.
         """
         del o, d, after, t_max, active
         return JumpCrossing(float("inf"), NO_FACET, 0.0, (0.0, 0.0, 0.0))
 
     def initial_offset(self, o: Vec3, d: Vec3, t_min: Real, active: Mask) -> Real:
-        """A number that describes f at the start of a ray o + t d, of a kind that the field
-        chooses; for example the sum of the signs of the ray's crossings beyond the start. The
-        tracer adds the jump at each crossing to it, and passes the sum to `continuation`.
+        """A number that describes f at the start of a ray o + t d, on active lanes. The field
+        chooses what kind of number it is, for example the sum of the signs of the ray's crossings
+        beyond the start. The tracer adds the jump at each crossing to it, and passes the sum to
+        `continuation`.
 
         t_min: the parameter of the start. Crossings with t <= t_min lie behind the start
             (`next_jump` after (t_min, NO_FACET)); all others lie in front of it.
@@ -219,14 +224,17 @@ class JumpSurface:
     def nearest_facet(
         self, p: Vec3, after: tuple[Real, Any], limit: Real, active: Mask
     ) -> NearestFacet | None:
-        """The facet that follows the facet `after` in the order of distance from p, if it is nearer
-        than `limit`.
+        """The facet that follows the facet `after` in the order of distance from p. On lanes where
+        it would be farther than `limit` from p, and on lanes that are not active, no facet is found
+        (NO_FACET).
 
         after: (sort_key, index) of a facet; (-1, NO_FACET) to begin with the nearest.
+        limit: a length.
 
         Facets are ordered by `NearestFacet.sort_key`, then by index. Repeated calls must give each
-        facet once. The default is None: computations of distances then search for the nearest facet
-        only, by descent of `distance_to_jumps`.
+        facet once. A field that cannot list its facets returns None, as the default does:
+        computations of distances then search for the nearest facet only, by descent of
+        `distance_to_jumps`.
         """
         del p, after, limit, active
         return None
@@ -271,8 +279,8 @@ class PatchUnion:
     def next_patch(
         self, o: Vec3, d: Vec3, after: PatchEntry, start: Real, end: Real, active: Mask
     ) -> PatchEntry:
-        """The first box that a ray enters after the entry `after`, with start <= t <= end. Each box
-        is proved to contain one patch.
+        """The first box that a ray o + t d enters after the entry `after`, with start <= t <= end,
+        on active lanes. Each box is proved to contain one patch.
 
         A ray that begins in a box enters it at `start`. Entries are ordered by (enter, patch).
         Repeated calls, the first of them with an entry before `start`, must give every box that the
@@ -322,9 +330,9 @@ class CommonBoundary:
         return np.zeros((0, 3))
 
     def continuous_change(self, p: FloatArray, q: FloatArray) -> FloatArray | None:
-        """The change (n,) of an angle-valued f along the straight segments from p to q, if f is
-        followed continuously, so without jumps by its period. None, the default, if only values
-        modulo the period are known. Meshing uses it on long edges.
+        """The change (n,) of an angle-valued f along the straight segments from p to q, where f is
+        followed continuously, without jumps by its period. None, the default, if only values modulo
+        the period are known. Meshing uses it on long edges.
 
         p, q: (n, 3).
         """

@@ -52,8 +52,9 @@ def clearance_function(
     bounds of the distance to the nearest of the level sets f = level
     (`level_distance_lower_bound`).
 
-    levels: the levels.
-    precision: of the computation.
+    field: the field f.
+    levels: the levels of f.
+    precision: "single" or "double", in which f is evaluated.
     """
     backend = choose_backend(precision)
     prepared = field.prepare(backend)
@@ -80,7 +81,8 @@ def tight_extent(
     finest: int = 5,
     points: FloatArray | None = None,
 ) -> ConvexHull:
-    """A convex polytope of few planes that contains every point of the level sets inside a box.
+    """A convex polytope of few planes that contains every point of the field's level sets, for the
+    given levels, inside a box.
 
     The box is cut into cells, in several rounds. A cell is left out if its clearance (the proved
     lower bound of the distance from its center to the level sets) is larger than the radius of the
@@ -91,7 +93,7 @@ def tight_extent(
     max_cells: the largest number of cells tested in a round.
     finest: the largest number of rounds.
     points: (n, 3) points that the polytope must contain in any case. A first polytope is put around
-        them. Cells inside of it need no test, so they are not tested.
+        them. Cells inside of it need no test, so they are not tested. None for no such points.
     """
     clearance = clearance_function(field, levels)
     margin = 1e-4 * float(np.linalg.norm(upper - lower))
@@ -137,7 +139,8 @@ def occupied_cells(
     """A grid of cells over the box of an extent, which contains the level sets. Cells that may
     contain a point of a level set are marked as occupied; all others are proved to contain none.
 
-    cells_across: the approximate number of cells along the longest side.
+    extent: a volume that contains the level sets.
+    cells_across: the approximate number of cells along the longest side of its box.
     """
     return OccupancyGrid.from_clearance(
         *extent.bounds(), clearance_function(field, levels, "single"), cells_across
@@ -223,7 +226,7 @@ class DeviceField(Field, Generic[Uploaded]):
 
     @abc.abstractmethod
     def _upload(self, backend: Backend, *, traced: bool) -> Uploaded:
-        """The field's data, uploaded to a backend.
+        """Upload the field's data to a backend, and return them.
 
         traced: True for the data for tracing rays; False for the data for values at points.
         """

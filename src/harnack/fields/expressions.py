@@ -74,7 +74,7 @@ class TextFormula:
     def parse(cls, text: str, parameters: Mapping[str, float] | None = None) -> TextFormula:
         """Parse a text to a formula.
 
-        parameters: numbers by their names in the text.
+        parameters: numbers by their names in the text; None for no parameters.
 
         Raises:
             ValueError: the text is not a formula (the message states the position and the mistake);
@@ -210,7 +210,7 @@ def _check_tree(text: str, node: ast.expr, parameters: Iterable[str], depth: int
 
 
 def _as_float(text: str, value: float) -> float:
-    """A number in a formula as a float.
+    """The number `value`, which stands in a formula, as a float.
 
     text: the formula, for the message.
 
@@ -257,6 +257,7 @@ def _check_call(text: str, node: ast.Call, parameters: Iterable[str], depth: int
 def _value(node: ast.expr, names: Mapping[str, Any]) -> Any:
     """The value of a syntax tree that `_check_tree` accepted.
 
+    node: the root of the tree.
     names: the values of coordinates, constants and parameters, by their names.
 
     Raises:
@@ -353,7 +354,8 @@ def expression(
         `atan2`, `asin`, `acos`, `sinh`, `cosh`, `maximum`, `minimum`, `norm`. NumPy's functions of
         the same names work too. Or a text, such as "x^2 + y^2 = 1 + sin(2*z)", in which maximum and
         minimum are `max` and `min`; an equation means left - right.
-    parameters: for a text, numbers by their names, such as {"a": 2.0} for "x^2 + y^2 = a".
+    parameters: for a text, numbers by their names, such as {"a": 2.0} for "x^2 + y^2 = a"; None for
+        no parameters.
     domain: the volume in which the surface is drawn, such as `harnack.Ball()`; None for all of
         space.
     level: the level that is drawn by default.

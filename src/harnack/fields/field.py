@@ -157,9 +157,9 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
         return other
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Restore a pickled field or a deep copy, and make its arrays read-only again, because
-        NumPy does not pickle this. (They are read-only because results were computed from them
-        already: writing to an array would not update these.)"""
+        """Restore a pickled field or a deep copy from its attributes `state`, and make its arrays
+        read-only again, because NumPy does not pickle this. (They are read-only because results
+        were computed from them already: writing to an array would not update these.)"""
         vars(self).update(state)
         make_read_only(state)
 
@@ -176,8 +176,8 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
         return f"{type(self).__name__}({', '.join(arguments)})"
 
     def __getattr__(self, name: str) -> Any:
-        """Raise AttributeError, as Python calls this only for an attribute that does not exist. For
-        the name of a method that only solids have, the message says how to make a solid of the
+        """Raise AttributeError: Python calls this method only for an attribute that does not exist.
+        For the name of a method that only solids have, the message says how to make a solid of the
         field."""
         message = f"{type(self).__name__!r} object has no attribute {name!r}"
         if name in _SOLID_METHODS:
@@ -263,8 +263,8 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
     @property
     def is_steep(self) -> bool:
         """Whether f may change by any amount within the tolerance of a hit. This is so if |grad f|
-        may be unbounded in a bounded box, or has no bound that limits the change of f within the
-        rounding of coordinates. The tracer then also samples f behind the hit."""
+        may be unbounded in a bounded box, or if its bound is so large that f may change by any
+        amount within the rounding of coordinates. The tracer then also samples f behind the hit."""
         return False
 
     def gradient_change_bound(self, p: Vec3, radius: Real) -> Real:
@@ -357,6 +357,8 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
         have derivatives with respect to the points if these have derivatives enabled and the field
         defines `hessian`. Raises the errors of `value`, and NotImplementedError if parameters of
         the field have derivatives enabled.
+
+        precision: as for `value`.
         """
         if not dr.is_array_v(type(points)):
             return self._evaluate_points(points, precision, lambda sample: sample.gradient)
@@ -384,7 +386,8 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
         """
 
         def kernel(backend: Backend, x: Vec3) -> tuple[Any, ...]:
-            """What `choose` takes from the samples at the Dr.Jit points x."""
+            """The number or vector that `choose` takes from the samples at the Dr.Jit points x, in
+            a tuple of one entry."""
             return (choose(self.prepare(backend).evaluate(x)),)
 
         return evaluate_points(points, kernel, precision)[0]
@@ -406,8 +409,8 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
 
     def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
         """Two error bounds at the point p of a sample: of the gradient, as a length, and of
-        `hessian`, in the spectral norm. The default is the sample's `gradient_error`, and infinity
-        for the Hessian, because its error is not known."""
+        `hessian`, in the spectral norm. The default for the gradient is the sample's
+        `gradient_error`. For the Hessian it is infinity, because its error is not known."""
         del p
         return sample.gradient_error, math.inf
 
@@ -475,7 +478,7 @@ def _prepared(value: Any, backend: Backend) -> Any:
 
 
 def check_is_field(value: Any) -> None:
-    """Raise TypeError unless the argument is a field whose domain is a volume or None."""
+    """Raise TypeError unless `value` is a field whose domain is a volume or None."""
     if not isinstance(value, Field):
         raise TypeError(
             f"a harnack field is needed, such as harnack.Gyroid(1.0), not {suggest_field(value)}"
@@ -484,8 +487,8 @@ def check_is_field(value: Any) -> None:
 
 
 def suggest_field(value: Any) -> str:
-    """The end of an error message about an object that is given in place of a field: what kind of
-    object it is, and how to make a field of it."""
+    """The end of an error message about an object, `value`, that is given in place of a field: what
+    kind of object it is, and how to make a field of it."""
     kind, name = type(value).__name__, getattr(value, "__name__", "")
     # An object that holds a field, a list of fields, a class, a mesh, a text, points, or a
     # function.

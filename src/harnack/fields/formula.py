@@ -124,10 +124,11 @@ class Formula(Field):
         """Whether f may change within the rounding of coordinates by far more than its slopes
         allow, as a steep step between two flat parts does.
 
-        `Tally.turns_within` decides it from the smallest number in the formula, within which f may
-        turn. If a Lipschitz constant is stated, values are about distances, as for the library's
-        shapes. Then small numbers in the formula are mere lengths, and 1 is taken in place of the
-        smallest number, so that only large numbers make f abrupt.
+        `Tally.turns_within` estimates this from the numbers in the formula: how steep f may be, and
+        how small the smallest number is. f may bend sharply where it changes by no more than the
+        smallest number. If a Lipschitz constant is stated, values of f are about as large as
+        distances, as for the library's shapes. Then small numbers in the formula are mere lengths,
+        and 1 is taken in place of the smallest number, so that only large numbers make f abrupt.
         """
         return self.tally.turns_within(1.0 if self.lipschitz is not None else self.tally.finest)
 
@@ -145,8 +146,9 @@ class Formula(Field):
         There the jet gives a range of gradients. The range contains all gradients nearby, and
         further ones if terms of several ties are added, as on the faces of
         `orthogonal_intersection`. The middle of the range is the gradient at no point, but its
-        direction mostly leads across the tie. So f is evaluated once more (by `Dual`) at a point a
-        few roundings away, in about this direction, and the gradient there is used.
+        direction mostly leads across the tie. So f is evaluated once more, with dual numbers
+        (`Dual`), at a point a few roundings away, in about this direction, and the gradient there
+        is used.
 
         Proof of the error. The gradient at p lies within `gradient_error` of the middle. If the
         second gradient is farther from the middle than twice that error, it does not come from a
@@ -189,8 +191,8 @@ class Formula(Field):
         return self._sample_of(self._jet(Jet.at_point(p), p.x), p)
 
     def _sample_of(self, jet: Jet, p: Vec3) -> Sample:
-        """The sample at p: value, gradient and their errors are the midpoints and half widths of
-        the ranges in `jet`, the jet of f at p."""
+        """The sample at p, made from `jet`, the jet of f at p. Value and gradient are the midpoints
+        of the ranges in it; their errors are half the widths of the ranges."""
         # Adding it turns a Python number into a Dr.Jit array.
         zero = 0 * p.x
         gradient = type(p)(*(zero + derivative.midpoint for derivative in jet.first_derivatives))
@@ -226,8 +228,8 @@ class Formula(Field):
         return tuple(promises)
 
     def promises(self, p: Vec3) -> tuple[Promise, ...]:
-        """Proved bounds of f that hold in every direction from p: the Lipschitz constant, if it is
-        known."""
+        """Proved bounds of f that hold in every direction from p, as a tuple of promises. It holds
+        the Lipschitz constant, and is empty if this is not known."""
         return () if self.lipschitz is None else (Lipschitz(0 * p.x + self.lipschitz),)
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
@@ -318,11 +320,15 @@ class Formula(Field):
 
         The jet computed here also occurs at the start of the first piece of the ray
         (`FormulaOnRay`). Dr.Jit finds equal operations, so that the kernel does them once.
+
+        p: the point.
+        direction: the vector along which the derivative is taken.
         """
         zero = 0 * p.x
 
         def coordinate(k: int) -> Jet:
-            """The jet of coordinate number k along the direction, at p."""
+            """The jet of a coordinate along the direction, at p: the ranges of its value and of its
+            derivative. k: 0, 1 or 2 for x, y or z."""
             at = Interval.point(p[k])
             # The interval of all coordinates that round to p[k].
             at = at.widened(machine_epsilon(p[k])) if is_rounded else at
@@ -355,6 +361,7 @@ class Formula(Field):
         """The jet of f (ranges of its value and derivatives) from the jets of the three
         coordinates.
 
+        coordinates: the jets of x, y and z.
         like: not used.
         """
         return as_jet(self.formula(*coordinates), coordinates[0], type(self).__name__)
@@ -416,8 +423,8 @@ def is_jet(x: Any, name: str) -> bool:
 
 
 def as_jet(value: Any, like: Jet, name: str) -> Jet:
-    """The result of a formula as a jet (ranges of a number and its derivatives). A constant becomes
-    a constant jet.
+    """The result `value` of a formula as a jet (ranges of a number and its derivatives). A constant
+    becomes a constant jet.
 
     like: any jet of the same variables on the same piece.
     name: the name of the field, for the message.
@@ -458,9 +465,9 @@ class FormulaOnRay:
     piece_count: int = 1
 
     def rounded(self, t: Real) -> FormulaOnRay:
-        """The formula along all lines that lead through p up to its rounding, where p is the point
-        of a ray at the parameter t. The first piece begins before p, by more than the rounding of
-        t."""
+        """The formula along all lines that lead through p up to the rounding of p, where p is the
+        point of a ray at the parameter t. The first piece begins before p, by more than the
+        rounding of t."""
         before = _ROUNDINGS_BEFORE * float(dr.epsilon(type(t))) * dr.abs(t)
         return dataclasses.replace(self, before=before)
 
@@ -489,7 +496,7 @@ class FormulaOnRay:
         return x.constant(float(value)) if isinstance(value, int | float) else value
 
     def _piece(self, start: Real, end: Real) -> PathPiece:
-        """The proved ranges of F' and F'' for start <= s <= end."""
+        """The proved ranges of F' and F'' on the piece start <= s <= end of the line."""
         jet = self._jet(start, end)
         (slopes,), (curvatures,) = jet.first_derivatives, jet.second_derivatives
         zero = 0 * self.p.x

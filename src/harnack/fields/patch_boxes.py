@@ -42,8 +42,9 @@ class PatchBoxes(UnitFrame):
 
     @classmethod
     def upload(cls, backend: Backend, lower: FloatArray, upper: FloatArray) -> PatchBoxes:
-        """Make the tree of the boxes with these lowest and highest corners, each (n, 3), on a
-        backend.
+        """Make the tree of n boxes on a backend.
+
+        lower, upper: (n, 3) the lowest and the highest corners of the boxes.
 
         The size of the unit coordinates is a power of two. So ray parameters are scaled without
         rounding, and keep their order.
@@ -60,9 +61,9 @@ class PatchBoxes(UnitFrame):
         self, o: Vec3, d: Vec3, after: PatchEntry, start: Real, end: Real, active: Mask
     ) -> PatchEntry:
         """The first box that a ray o + t d enters after the entry `after`, with start <= t <= end,
-        as a `PatchEntry`: the ray parameters at which the ray enters and leaves the box, and the
-        index of the patch in it (NO_PATCH if there is no further box). Entries are ordered by the
-        parameter of entering, then by the index of the patch."""
+        on active lanes. Returns the ray parameters at which the ray enters and leaves the box, and
+        the index of the patch in it (NO_PATCH if there is no further box). Entries are ordered by
+        the parameter of entering, then by the index of the patch."""
         behind = after.enter / self.size, after.patch
         enter, leave, box = self.tree.next_box(
             self.to_unit(o), d, behind, start / self.size, end / self.size, active
@@ -106,7 +107,7 @@ class PatchField(Field, Generic[_Buffers]):
 
     @abc.abstractmethod
     def _upload(self, backend: Backend) -> _Buffers:
-        """Upload the boxes and the data of the patches to a backend."""
+        """Upload the boxes and the data of the patches to a backend, and return them."""
 
     def with_levels(self, levels: tuple[float, ...]) -> Self:
         """This field with boxes that contain the patches of these levels, not yet prepared for a
@@ -143,7 +144,7 @@ class PatchField(Field, Generic[_Buffers]):
         return self._require_data().boxes.next(o, d, after, start, end, active)
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
-        """A box that contains the patches of these levels: the box around the boxes of all
-        patches."""
+        """A box that contains the patches of these levels: the box around the boxes of all patches.
+        It is never None."""
         lower, upper = self.boxes(levels)
         return Box(lower.min(axis=0), upper.max(axis=0))

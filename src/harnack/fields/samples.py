@@ -96,9 +96,9 @@ class Sample:
         return self.map_promises(lambda promise: promise.shifted(offset), value=self.value + offset)
 
     def select(self, mask: Mask, other: Sample) -> Sample:
-        """The sample `other` on the lanes of the mask, and this sample on all other lanes. Both
-        samples must have promises of the same kinds in the same order. The result has no shading
-        normal."""
+        """The sample `other` on the lanes on which the mask is true, and this sample on all other
+        lanes. Both samples must have promises of the same kinds in the same order. The result has
+        no shading normal."""
         names = "value", "gradient", "value_error", "gradient_error", "truncation_error"
         numbers = {k: dr.select(mask, getattr(other, k), getattr(self, k)) for k in names}
         groups: dict[str, Any] = {}
@@ -162,7 +162,7 @@ def validate_samples(
 
 
 def _unbox_numpy(record: _R) -> _R:
-    """The same sample or promise, with attributes that are NumPy scalars turned into Python
+    """The sample or promise `record`, with attributes that are NumPy scalars turned into Python
     numbers, because Dr.Jit takes no NumPy scalars."""
     scalars: dict[str, Any] = {
         key: value.item() for key, value in vars(record).items() if isinstance(value, np.generic)
@@ -265,9 +265,9 @@ class Ray:
         return dr.fma(type(self.origin)(t), self.direction, self.origin)
 
     def enclose(self, sample: Sample) -> RaySample:
-        """The ray sample that follows from a sample at a point of the ray: its enclosures, in front
-        of the point and behind it, are proved by the sample's promises (proved bounds of f near the
-        point) and by the slope of f along the ray.
+        """The ray sample that follows from a sample at a point of the ray. Its enclosures, in front
+        of the point and behind it, are of the kinds in `proofs`. They follow from the sample's
+        promises (proved bounds of f near the point) and from the slope of f along the ray.
 
         The gradient has an error. So the slope enters the proofs as an interval.
         """

@@ -40,8 +40,8 @@ SLOPE_ROUNDINGS, SECOND_ROUNDINGS = 16.0, 320.0
 
 
 def max_step_fraction(coarse_ratio: float) -> float:
-    """The longest step from x for which the bounds of f hold that `SourceSums.sample` proves, as a
-    fraction of the distance from x to the center of the nearest far node.
+    """The longest step from x for which the bounds of `SourceSums.sample` are proved. The result is
+    a fraction of the distance from x to the center of the nearest far node.
 
     coarse_ratio: a node is far if its center is farther from x than this many times its radius.
     """
@@ -59,9 +59,9 @@ def free_radius_fraction(coarse_ratio: float) -> float:
 
 def remainder_factor(q: float) -> float:
     """The function phi(q) = (3 - 2 q)/(1 - q)^2 for 0 <= q < 1. It is convex, and phi(0) = 3. It
-    bounds the change of a dipole's value beyond its linear part: at the distance t from x, Taylor's
-    remainder is at most a t^2 rho^-4 phi(t/rho), where a is the area of the dipole and rho its
-    distance from x."""
+    bounds the change of a dipole's value beyond its linear part. Let a be the area of the dipole
+    and rho its distance from x. At the distance t < rho from x, Taylor's remainder is at most a t^2
+    rho^-4 phi(t/rho)."""
     return (3 - 2 * q) / (1 - q) ** 2
 
 
@@ -184,8 +184,8 @@ class SourceSums:
         return self.total, self.gradient, hessian, *bounds, *ends
 
     def select(self, mask: Mask, other: SourceSums) -> SourceSums:
-        """The sums `other` on the lanes where the mask holds, and these sums on all other lanes.
-        Neither may have a Hessian."""
+        """The sums `other` on the lanes on which the mask is true, and these sums on all other
+        lanes. Neither of the two may have a Hessian."""
         pairs = zip(other.to_state(), self.to_state(), strict=True)
         # None stands for a sum that was not requested, in both.
         return SourceSums(*(None if b is None else dr.select(mask, a, b) for a, b in pairs))
@@ -197,7 +197,7 @@ class SourceSums:
 
     def add_term(self, terms: SourceTerm, active: Mask) -> SourceSums:
         """These sums plus the contribution of one more source, on the active lanes. A derivative
-        that is None in `terms` counts as 0.
+        that is None in `terms` counts as 0. terms: what the source adds.
 
         Proof of the rounding error of the value. If the errors of n additions all have the same
         sign, they add up to n times one error; this happens where small terms are lost in a large
@@ -382,11 +382,11 @@ class SourceSums:
     def add_line_rates(
         self, v: Vec3, unit: Real, lengths: tuple[Real, ...], rates: tuple[Real, ...], active: Mask
     ) -> tuple[Real, ...]:
-        """For each of several lengths, a rate K with |f(x + s v) - f(x)| <= K |s| for |s| up to
-        that length. f is the sum over the sources of these sums and over some further edges. K is
-        the sum of two rates: one that is computed here from these sums, and the given rate of those
-        edges. K is infinite on lanes that are not active, and for lengths above the radius R of the
-        proof.
+        """Return, for each of several lengths, a rate K with |f(x + s v) - f(x)| <= K |s| for |s|
+        up to that length. f is the sum over the sources of these sums and over some further edges.
+        K is the sum of two rates: one that is computed here from these sums, and the given rate of
+        those edges. K is infinite on lanes that are not active, and for lengths above the radius R
+        of the proof.
 
         v: (3,) unit directions of the lines through x.
         unit: a bound of the rounding error of a coordinate of x.
@@ -415,7 +415,7 @@ class SourceSums:
         """The number K such that f differs from its linear part by at most K t^2 at any distance t
         <= r from x: K = 3 s4 + rise r s5, with the symbols of `sample`.
 
-        b: the largest ratio of t to the distance rho of a source.
+        b: the largest ratio of t to the distance of a source from x.
         r: b times the distance to the nearest singular point, or less.
         """
         return dr.fma(_chord_slope(b) * r, self.s5, 3 * self.s4)

@@ -225,7 +225,8 @@ class LoadedMesh:
     summary: the contents of the file, and why they are read as a mesh.
     zero_area_faces: (k, 3) the faces of zero area, which are not among `faces`. They may close gaps
         that have no width.
-    rounded: the number of corners that were joined with others from which rounding separated them.
+    rounded: the number of corners that differed from others only by rounding, and were joined with
+        them.
     """
 
     vertices: FloatArray

@@ -1,7 +1,7 @@
 """Reading .glb and .gltf scenes through trimesh, after their headers were checked. A "scene" is a
 tree of nodes; each has a transform, and may draw a mesh. A "buffer" is a block of bytes, an
 "accessor" describes an array in it (type and length), and a "primitive" is a part of a mesh that
-draws triangles, points or lines.
+draws triangles, points or lines. `place` is the file, for error messages.
 
 A glTF file is a JSON header and buffers of bytes. The header says which bytes to read, and a
 hostile header can ask for more memory than there is; so it is compared with the sizes of the
@@ -73,7 +73,7 @@ def read_gltf(path: Path, data: bytes) -> FileGeometry:
 
 
 def _header(place: FileLocation, data: bytes) -> dict[str, Any]:
-    """Parse the JSON header of a .gltf file, or of a .glb file.
+    """Return the JSON header of a .gltf file, or of a .glb file, from the bytes `data` of the file.
 
     Raises:
         FileFormatError: another format or version, a truncated file, or no JSON object.

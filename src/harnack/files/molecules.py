@@ -126,10 +126,11 @@ def _drop_alternate_locations(model: Any) -> list[Any]:
     """Return the atoms of a model of a molecule, without alternatives. Only atoms that the file
     marks by a letter can be alternatives.
 
-    Of marked atoms with the same name in a residue, only those with the letter that comes first are
-    kept. If residues with different names are at the same position, marked atoms of the later ones
-    are dropped unless their letter is that of the first. A line TER in the file ends a chain; the
-    same residue number after it stands for another position.
+    Of marked atoms with the same name in a residue, only those are kept that have the letter of the
+    first one in the file. Residues with different names may be at the same position in a chain.
+    Then marked atoms of the later residues are dropped, unless they have the letter of the first
+    marked atom at this position. A line TER in the file ends a chain; the same residue number after
+    it stands for another position.
     """
     # The first marked residue at each position (its name and its letter); and the first letter of
     # each marked atom.

@@ -251,9 +251,9 @@ def _parse_svg(data: bytes) -> Element:
     count = depth = 0
 
     def start_element(name: str, attributes: dict[str, str]) -> None:
-        """Add an element of the XML file to the tree, with its name without the prefix of the
-        namespace. Raises a ValueError if there are too many elements, or if they are nested too
-        deeply."""
+        """Add an element of the XML file to the tree, with its attributes, and with its name
+        without the prefix of the namespace. Raises a ValueError if there are too many elements, or
+        if they are nested too deeply."""
         nonlocal count, depth
         count, depth = count + 1, depth + 1
         if count > _MAX_SVG_ELEMENTS or depth > _MAX_SVG_DEPTH:

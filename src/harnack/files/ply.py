@@ -1,6 +1,7 @@
 """Reading Stanford .ply files, text and binary: vertices, faces and edges. Other elements are
 ignored. A .ply file is a header and rows. An "element" is a kind of row, such as "vertex", with the
-number of its rows; its "properties" are the numbers, or lists of numbers, in each row.
+number of its rows; its "properties" are the numbers, or lists of numbers, in each row. `data` are
+the bytes of a file, and a `place` is a location in it, for error messages.
 
 Each property is read in all rows of an element at once. A "position" says where a number is in the
 file: in bytes for a binary file, in words (entries between blanks) for a text file. The position of
@@ -163,8 +164,8 @@ Values: TypeAlias = BinaryValues | TextValues
 
 
 def _any_number(word: bytes, place: FileLocation) -> float:
-    """Return the number that a word stands for, also NaN or infinite. Raises a FileFormatError that
-    names its `place` if it stands for none."""
+    """Return the number that a word (an entry between blanks) stands for, also NaN or infinite.
+    Raises a FileFormatError that names its `place` if it stands for none."""
     try:
         return float(word)
     except ValueError as error:
@@ -323,7 +324,8 @@ def _columns(
     begins: (n,) the position at which each row begins.
     places: the locations of the rows, for errors.
 
-    A row whose list has an invalid length ends after the end of the file; callers test for that.
+    If the length of a list is invalid, the returned end of its row lies after the end of the file;
+    callers test for that.
     """
     columns: dict[str, PropertyColumn] = {}
     positions, offset = begins, 0
@@ -502,8 +504,8 @@ def _header(path: Path, data: bytes) -> PlyHeader:
 
 
 def _parse_count(word: bytes, place: FileLocation) -> int:
-    """Return the number of rows of an element, from its digits in the header. Raises a
-    FileFormatError if it has more than 18."""
+    """Return the number of rows of an element. word: its digits in the header. Raises a
+    FileFormatError for more than 18 digits."""
     if len(word) > 18:
         raise place.error(f"{excerpt(word)} is too large a count")
     return int(word)

@@ -1,8 +1,7 @@
 """Reading geometry files in text formats: .xyz, .loops, .blobs, .obj, .off and .stl (.stl may also
-be binary). Each reader takes the path of a file, for messages, and its bytes `data`. A "statement"
-is a line of an .obj file, whose first word says what it defines. Errors are FileFormatErrors that
-name the line.
-"""
+be binary). Each reader takes the path of a file, for messages, and `data`, the bytes of the file. A
+"statement" is a line of an .obj file, whose first word says what it defines. Errors are
+FileFormatErrors that name the line."""
 
 from __future__ import annotations
 

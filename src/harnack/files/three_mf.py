@@ -67,7 +67,7 @@ def read_3mf(path: Path, data: bytes) -> FileGeometry:
 
 def _contents(place: FileLocation, scene: Any) -> FileGeometry:
     """Return the triangles of all nodes of a trimesh scene, in one coordinate system and in
-    millimeters.
+    millimeters. place: the file, for error messages.
 
     Raises:
         FileFormatError: an unknown unit, an index out of range, numbers that are not finite, or no

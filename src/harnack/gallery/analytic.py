@@ -122,8 +122,9 @@ def _fitted_knot() -> list[Surface]:
     width = 0.15 * float(np.ptp(curve, axis=0).max()) / 2
 
     def density(x: FloatArray) -> FloatArray:
-        """Return the sum of Gaussians (n,) at points x (n, 3): the integral along the curve,
-        divided by its value for a straight line."""
+        """Return the sum of Gaussians (n,) at points x (n, 3): the integral over the curve of a
+        Gaussian of the distance to x. It is divided by the integral for a straight line through x,
+        so that it is about 1 on the curve."""
         # In batches, as the array of all distances would take much memory.
         sums = [
             np.exp(-((batch[:, None] - curve) ** 2).sum(axis=2) / width**2) @ step

@@ -91,9 +91,9 @@ def boundary_edges(faces: Iterable[Sequence[int]]) -> list[Edge]:
 def join_edges(edges: Sequence[Edge]) -> list[list[int]]:
     """Join all edges (start, end) to closed loops, each a list of vertex indices.
 
-    If at every vertex as many edges begin as end, their directions are kept, and a loop ends where
-    it first returns to one of its own vertices. Otherwise exactly two edges must meet at every
-    vertex, and each loop runs in the direction of its first edge.
+    If at every vertex as many edges begin as end, the edges keep their directions, and a loop ends
+    where it first returns to one of its own vertices. Otherwise exactly two edges must meet at
+    every vertex, and each loop runs in the direction of its first edge.
 
     Raises:
         OpenChainError: neither is the case.
@@ -117,7 +117,7 @@ def join_edges(edges: Sequence[Edge]) -> list[list[int]]:
 
 def _loops_through(start: int, leaving: dict[int, list[int]]) -> list[list[int]]:
     """Follow edges from the vertex `start` until they return to it. Returns the loops that this
-    path forms, each a list of vertices; their edges are removed from `leaving`.
+    path forms, each a list of vertices. The edges of these loops are removed from `leaving`.
 
     leaving: for each vertex the ends of the edges that begin there.
     """
@@ -179,8 +179,8 @@ class NetFaces(NamedTuple):
 
     faces: (k, 3), no two faces with the same three vertices.
     multiplicity: (k,) how often each face counts, positive.
-    source: (k,) ascending: the index of the first original face that has the vertices and the
-        orientation of `faces[i]`.
+    source: (k,) ascending: entry i is the index of the first original face that has the vertices
+        and the orientation of `faces[i]`.
     """
 
     faces: IntArray
@@ -232,8 +232,8 @@ def net_faces(faces: IntArray) -> NetFaces:
 def singular_edges(faces: IntArray, multiplicity: npt.ArrayLike = 1) -> tuple[IntArray, IntArray]:
     """The edges at which a mesh's winding number is singular: directed edges (k, 2) that do not
     cancel between the faces, and their weights (k,) > 0. Each edge has the direction that remains
-    after cancellation. The edges are sorted by their lower, then by their higher index. The
-    docstring of this module proves that there are no other singular edges.
+    after cancellation. The edges are sorted by the lower, then by the higher one of their two
+    vertex indices. The docstring of this module proves that there are no other singular edges.
 
     faces: (m, 3) of a welded mesh (equal positions have equal indices).
     multiplicity: (m,) how often each face counts, integers of any sign; or one integer for all.
@@ -248,8 +248,8 @@ def net_edges(
     begin: IntArray, end: IntArray, weight: npt.ArrayLike = 1
 ) -> tuple[IntArray, IntArray]:
     """Cancel opposite edges. Returns the directed edges (k, 2) that remain, and their weights (k,)
-    > 0, which say how often each remains. The edges are sorted by their lower, then by their higher
-    index.
+    > 0, which say how often each remains. The edges are sorted by the lower, then by the higher one
+    of their two vertex indices.
 
     begin, end: (m,) the first and the last vertex of each edge.
     weight: how often each edge counts, (m,) or one number for all, integers of any sign. The
@@ -292,9 +292,8 @@ def _group_equal_rows(rows: npt.NDArray[np.uint64]) -> tuple[IntArray, IntArray]
     """Group the rows of an array (n, k) by equality. Returns an order (n,) of the rows that puts
     equal rows next to each other, and the positions in it at which the groups start.
 
-    Rows are ordered by a 64-bit hash, and neighbors are then compared in full. Should different
-    rows ever have the same hash, the rows are sorted by their columns instead, which is three times
-    slower.
+    Rows are ordered by a 64-bit hash, and neighbors are then compared in full. If different rows
+    have the same hash, the rows are sorted by their columns instead, which is three times slower.
     """
     hashes = np.zeros(len(rows), dtype=np.uint64)
     for column in rows.T:

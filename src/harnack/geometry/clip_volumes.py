@@ -60,7 +60,8 @@ class PlaneTable:
     backend: the backend on which the kernel runs.
     rows: (m, 4) on the host.
     buffer: the rows on the backend; None if they are literals.
-    plane_count: the number of rows in the buffer as a kernel parameter.
+    plane_count: the number of rows in the buffer, as a kernel parameter (a number that may change
+        without compiling again).
     max_offset: the largest |h|; a kernel parameter if there is a buffer.
 
     Time per plane and ray: 0.4 ns if the loop over planes is unrolled, where reading a number from
@@ -113,7 +114,8 @@ class PlaneTable:
             return state
 
         def body(k: Any, *values: Any) -> tuple[Any, ...]:
-            """Apply four planes, from row k on. Returns the next row, and the state."""
+            """Apply the step to the planes of the four rows from row k on. Returns the index of the
+            next row, and the new state. values: the state."""
             folded: Any = values
             for i in range(_PLANES_PER_ITERATION):
                 row: Any = dr.gather(self.backend.Array4f, self.buffer, k + i)
@@ -121,7 +123,7 @@ class PlaneTable:
             return (k + _PLANES_PER_ITERATION, *folded)
 
         def may_continue(*values: Any) -> Mask:
-            """The lanes in which further planes may change the state."""
+            """The mask of lanes in which further planes may change the state. values: the state."""
             return self.backend.Bool(True) if may_change is None else may_change(*values)
 
         while_loop: Any = dr.while_loop  # its overloads do not know run-time array types
@@ -134,7 +136,8 @@ class PlaneTable:
         return result[1:]
 
     def _entry(self, k: int, i: int) -> Real:
-        """Entry i of row k: a literal, or read from the buffer."""
+        """Entry i (0 to 2 for the normal, 3 for the offset) of row k: a literal, or read from the
+        buffer."""
         if self.buffer is None:
             return self.backend.Float(float(self.rows[k, i]))
         return dr.gather(self.backend.Float, self.buffer, self.backend.UInt32(4 * k + i))
@@ -144,7 +147,7 @@ RoundingSlacks: TypeAlias = tuple[Real, Real]
 
 
 def _max_offset(rows: FloatArray) -> float:
-    """The largest |h| of the rows (n, h), (m, 4)."""
+    """The largest |h| of the planes (n, h), given by rows (m, 4)."""
     return float(np.abs(rows[:, 3]).max(initial=0.0))
 
 
@@ -187,30 +190,34 @@ class Polytope(Volume):
     def _slacks(
         self, table: PlaneTable, o: Vec3, d: Vec3
     ) -> Callable[[Vec3, Real], RoundingSlacks]:
-        """Returns a function of the normal n and the offset h of a plane. It returns bounds of the
-        rounding errors of h - n.o and of n.d, for rays o + t d."""
+        """Return a function of the normal n and the offset h of a plane. The function returns
+        bounds of the rounding errors of h - n.o and of n.d, for rays o + t d. table: the planes of
+        the polytope."""
         del table
         eps = clip_rounding(backend_of(o))
         abs_o, abs_d = dr.abs(o), dr.abs(d)
 
         def slacks(n: Vec3, h: Real) -> RoundingSlacks:
-            """Bounds of the rounding errors of h - n.o and of n.d."""
+            """Bounds of the rounding errors of h - n.o and of n.d, as a pair, for the plane n.x <=
+            h."""
             abs_n = dr.abs(n)
             return eps * (dr.dot(abs_n, abs_o) + dr.abs(h)), eps * dr.dot(abs_n, abs_d)
 
         return slacks
 
     def clip(self, o: Vec3, d: Vec3, t_min: Real, t_max: Real) -> tuple[Real, Real]:
-        """The interval [t0, t1] of each ray o + t d within the polytope (see `Volume.clip`). It is
-        cut by one plane after the other."""
+        """The interval [t0, t1] of each ray o + t d within the polytope (see `Volume.clip`).
+        Returns t0 and t1; t0 = inf and t1 = -inf if the ray misses the polytope. The interval
+        [t_min, t_max] is cut by one plane after the other."""
         backend = backend_of(o)
         table = self._plane_table(backend)
         slacks = self._slacks(table, o, d)
 
         def step(state: tuple[Real, Real], n: Vec3, h: Real) -> tuple[Real, Real]:
-            """Cut the interval [t0, t1] to the half-space n.x <= h, which is the condition room - t
-            speed >= 0 with room = h - n.o and speed = n.d. Bounds of their rounding errors are
-            added to room and subtracted from speed, so that no point is lost."""
+            """Cut the interval `state`, (t0, t1), to the half-space n.x <= h, and return the new
+            interval. The condition is room - t speed >= 0 with room = h - n.o and speed = n.d.
+            Bounds of their rounding errors are added to room and subtracted from speed, so that no
+            point is lost."""
             t0, t1 = state
             room_slack, speed_slack = slacks(n, h)
             room = h - dr.dot(n, o) + room_slack
@@ -226,7 +233,8 @@ class Polytope(Volume):
         lanes = dr.zeros(backend.Float, dr.width(o, d, t_min, t_max))
 
         def is_nonempty(t0: Real, t1: Real) -> Mask:
-            """Whether further planes can change the interval: an empty one stays empty."""
+            """Whether further planes can change the interval [t0, t1]: only if it is not empty, as
+            an empty one stays empty."""
             return t0 < t1
 
         return normalize_empty_interval(
@@ -240,7 +248,8 @@ class Polytope(Volume):
         abs_p = dr.abs(p)
 
         def step(state: tuple[Mask], n: Vec3, h: Real) -> tuple[Mask]:
-            """Whether the points also lie in the half-space n.x <= h, up to rounding."""
+            """Whether the points lie in the half-space n.x <= h, too, up to rounding. state:
+            whether they lie in all half-spaces before; a tuple of one, as is the result."""
             slack = eps * (dr.dot(dr.abs(n), abs_p) + dr.abs(h))
             return (state[0] & (dr.dot(n, p) - h <= slack),)
 
@@ -261,8 +270,9 @@ class Polytope(Volume):
         backend = backend_of(p)
 
         def step(state: tuple[Real, Vec3], n: Vec3, h: Real) -> tuple[Real, Vec3]:
-            """Keep the larger one of the signed distance so far and the signed distance from the
-            plane n.x = h, with the normal of its plane."""
+            """The larger of two signed distances, and the normal of the plane to which it belongs.
+            One distance is that of `state`, the largest so far; the other is that from the plane
+            n.x = h."""
             distance = dr.dot(n, p) - h
             is_larger = distance > state[0]
             return dr.select(is_larger, distance, state[0]), dr.select(is_larger, n, state[1])
@@ -313,8 +323,8 @@ class Ball(Volume):
         object.__setattr__(self, "radius", radius)
 
     def _center_and_radius(self, backend: Backend) -> tuple[Vec3, Real]:
-        """Center and radius on the backend: kernel parameters if the ball was prepared, otherwise
-        literals."""
+        """The center (3,) and the radius on the backend: kernel parameters if the ball was
+        prepared, otherwise literals."""
         if self._device_numbers is not None and backend_of(self._device_numbers[0]) == backend:
             return self._device_numbers
         return backend.Array3f(*self.center), backend.Float(self.radius)
@@ -325,7 +335,8 @@ class Ball(Volume):
         return replace(self, _device_numbers=(center, dr.opaque(backend.Float, self.radius)))
 
     def clip(self, o: Vec3, d: Vec3, t_min: Real, t_max: Real) -> tuple[Real, Real]:
-        """The interval [t0, t1] of each ray o + t d within the ball (see `Volume.clip`).
+        """The interval [t0, t1] of each ray o + t d within the ball, for t_min <= t <= t_max.
+        Returns t0 and t1; t0 = inf and t1 = -inf if the ray misses the ball.
 
         The line's half-length in the ball follows from r^2 - |perp|^2, where r is the radius, c the
         center, and perp the vector from c to the nearest point of the line. The usual formula
@@ -427,8 +438,8 @@ class HalfSpace(Polytope):
     n points out of the half-space.
 
     normal: (3,), not zero; it is scaled to length one.
-    offset: the distance of the plane from the origin, negative if the origin is outside of the
-        half-space.
+    offset: the distance of the boundary plane from the origin, negative if the origin is outside of
+        the half-space.
     """
 
     normal: Point
@@ -453,8 +464,9 @@ class HalfSpace(Polytope):
         return np.array([[*self.normal, self.offset]])
 
     def bounds(self) -> tuple[FloatArray, FloatArray]:
-        """Lower and upper corner (3,) of a box around the half-space: infinite, but for a plane at
-        right angles to an axis."""
+        """The lower and the upper corner, (3,) each, of a box around the half-space. All
+        coordinates are infinite, except that one is finite if the plane is at right angles to an
+        axis."""
         lower, upper = np.full(3, -np.inf), np.full(3, np.inf)
         for k, n in enumerate(self.normal):
             if n and not any(
@@ -477,8 +489,8 @@ class VolumeIntersection(Volume):
     volumes: tuple[Volume, ...]
 
     def __init__(self, volumes: Iterable[Volume]) -> None:
-        """Validate and store the volumes. Raises TypeError for anything else, and ValueError if
-        there is none."""
+        """Validate and store the volumes. Raises TypeError if one of them is no volume, and
+        ValueError if there is none."""
         if not isinstance(cast("Any", volumes), Iterable):
             raise TypeError(f"an intersection is of several volumes, not of {volumes!r:.60}")
         members = tuple(volumes)
@@ -492,7 +504,8 @@ class VolumeIntersection(Volume):
         return VolumeIntersection(v.prepare(backend) for v in self.volumes)
 
     def clip(self, o: Vec3, d: Vec3, t_min: Real, t_max: Real) -> tuple[Real, Real]:
-        """The interval [t0, t1] of each ray o + t d within all volumes (see `Volume.clip`)."""
+        """The interval [t0, t1] of each ray o + t d within all volumes, for t_min <= t <= t_max.
+        Returns t0 and t1; t0 = inf and t1 = -inf if the ray misses the intersection."""
         t0, t1 = t_min, t_max
         for volume in self.volumes:
             t0, t1 = volume.clip(o, d, t0, t1)

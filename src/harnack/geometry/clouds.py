@@ -140,16 +140,17 @@ def estimate_areas(
     point on the other side of a thin wall does not shrink the cell, since its bisecting plane is
     parallel to the tangent plane. Points at the same position share a cell.
 
-    Let R be the distance of the farthest neighbor that is used. All other points can cut the cell
-    only at distances above R/2. So within the disc of radius R/2 the cell is exact, and it is cut
-    off at this radius. At the boundary of an open surface a cell may be unbounded: if all neighbors
-    lie on one side of a line through the point, their mirror images bound the cell too, so that it
-    extends as far outwards as inwards. The radius is also limited to three times the median of its
-    neighbors' radii, so that an isolated point gets no more area than its neighbors.
+    Let R be the distance of the farthest neighbor that is used. Points that are no neighbors are
+    farther away, and can cut the cell only at distances above R/2. So within the disc of radius R/2
+    the cell is exact, and it is cut off at this radius. At the boundary of an open surface a cell
+    may be unbounded: if all neighbors lie on one side of a line through the point, their mirror
+    images bound the cell too, so that it extends as far outwards as inwards. The radius is also
+    limited to three times the median of its neighbors' radii, so that an isolated point gets no
+    more area than its neighbors.
 
     points, normals: (n, 3) each.
-    neighbors: the number of neighbors that are used; more take more time, fewer cut off large cells
-        of uneven samples.
+    neighbors: the number of neighbors that are used. More neighbors take more time; with fewer,
+        large cells of uneven samples are cut off.
 
     Raises:
         CloudError: points or normals are not valid (see `validate_cloud`); all points are at one
@@ -172,8 +173,8 @@ def estimate_areas(
     radii = np.empty(len(positions))
 
     def find_neighbors(rows: slice) -> None:
-        """Find the neighbors of a slice of the points (`nearest`), and half the distance of the
-        farthest neighbor (`radii`)."""
+        """Find the neighbors of the points `rows` (stored in `nearest`), and half the distance of
+        each point from its farthest neighbor (stored in `radii`)."""
         batch = order[rows]
         nearest[batch], distance = nearest_neighbors(tree, x[batch], neighbors)
         radii[position_of[batch]] = 0.5 * distance[:, -1]
@@ -196,7 +197,7 @@ def _as_numbers(values: Any, name: str) -> FloatArray:
     name: what they are, for messages.
 
     Raises:
-        CloudError: they are not real numbers, or too many.
+        CloudError: they are not real numbers, or there are too many.
     """
     ragged = "are ragged: every row needs as many numbers"
     array = as_real_array(values, name, CloudError, ragged=ragged, other="must be real numbers")
@@ -284,14 +285,15 @@ def estimate_normals(points: npt.ArrayLike, neighbors: int | None = None) -> Flo
     the spanning tree of the graph of neighbors in which normals agree best. Normals are compared
     after mirroring, as Xie et al. 2003 propose; this propagates the sign correctly around edges and
     thin walls. Points are first moved onto the planes of their neighbors, as noise would disturb
-    the mirroring. A single sign then remains for each connected component of the graph. It is
-    chosen such that the component's extreme points in 26 directions face outward, summed over the
-    directions; for a closed surface this is right, however unevenly it is sampled.
+    the mirroring. A single sign then remains to be chosen for each connected component of the
+    graph. In 26 directions the component's extreme point is found; the sign is chosen such that the
+    normals of these points face outward, summed over the directions; for a closed surface this is
+    right, however unevenly it is sampled.
 
     neighbors: the number of neighbors to which planes are fitted. None chooses 16; for noisy points
-        up to 64, so that the planes are known to a few degrees; and if that is not enough, 64
-        neighbors among a random subset of the points (with a fixed seed), as sparse as the noise
-        requires.
+        up to 64, so that the directions of the planes are known to a few degrees. If 64 are not
+        enough, neighbors are searched only among a random subset of the points (with a fixed seed),
+        as sparse as the noise requires.
 
     As each component faces outward by itself, the inner wall of a hollow body does not face its
     cavity. The side that an open surface faces is a convention; for a flat surface it is the
@@ -328,9 +330,9 @@ def estimate_normals(points: npt.ArrayLike, neighbors: int | None = None) -> Flo
 
 
 def _choose_neighborhood(x: FloatArray) -> tuple[int, IntArray]:
-    """Choose how planes are fitted to the points x (n, 3), by their noise. Returns the number of
-    neighbors, and the indices (k,) of the points among which neighbors are searched: all points, or
-    a random subset if the noise is large."""
+    """Choose the neighbors to which planes are fitted at the points x (n, 3), by the noise of the
+    points. Returns the number of neighbors, and the indices (k,) of the points among which
+    neighbors are searched: all points, or a random subset if the noise is large."""
     rng = np.random.default_rng(0)
     probes = x[rng.choice(len(x), min(len(x), _PROBES), replace=False)]
     subset = np.arange(len(x))
@@ -376,7 +378,7 @@ def _transfer_normals(
     normals = np.empty_like(x)
 
     def fit_slice(rows: slice) -> None:
-        """Compute the normals of a slice of the points."""
+        """Compute the normals of the points `rows`."""
         _, index = tree.query(x[rows], k=min(neighbors, tree.n))
         offsets = tree.data[index] - tree.data[index].mean(axis=1, keepdims=True)
         _, eigenvectors = np.linalg.eigh(np.einsum("mki,mkj->mij", offsets, offsets))
@@ -420,8 +422,8 @@ def _fit_tangent_planes(x: FloatArray, tree: Any, neighbors: int) -> _TangentPla
     on_line = np.zeros(len(x), dtype=bool)
 
     def fit_slice(rows: slice) -> None:
-        """Fit the planes of a slice of the points. Offsets are relative to the point, in units of
-        the distance of the farthest neighbor."""
+        """Fit the planes of the points `rows`. Offsets of neighbors are relative to the point, in
+        units of the distance of the farthest neighbor."""
         # The farthest neighbor is at a distance above 0, as all points of the tree are different.
         index, distance = nearest_neighbors(tree, x[rows], neighbors)
         nearest[rows] = index
@@ -483,8 +485,8 @@ def _spanning_forest(planes: _TangentPlanes) -> tuple[IntArray, IntArray]:
     weight = np.empty((n, k))
 
     def weigh_edges(rows: slice) -> None:
-        """Compute the weights of the edges from a slice of the points: small where normals
-        agree."""
+        """Compute the weights of the edges that begin at the points `rows`; they are small where
+        normals agree."""
         start = np.repeat(np.arange(rows.start, rows.stop, dtype=np.int64), k)
         agreement = np.abs(_agreement(planes, start, nearest[rows].ravel()))
         # SciPy takes a weight of 0 for a missing edge.
@@ -508,8 +510,9 @@ def _spanning_forest(planes: _TangentPlanes) -> tuple[IntArray, IntArray]:
 
 
 def _propagate_signs(planes: _TangentPlanes, parent: IntArray) -> FloatArray:
-    """Find the sign (n,) for each normal such that neighbors in the forest agree. It is the product
-    of the signs on the path from the point to the root of its tree.
+    """Find the sign (n,) for each normal such that neighbors in the forest agree. Each edge of the
+    forest has the sign of the agreement of its two normals (`_agreement`); the sign of a point is
+    the product of the signs of the edges from the point to the root of its tree.
 
     planes: the planes with their normals.
     parent: (n,) the parent of each point in the forest; a root is its own parent.
@@ -529,9 +532,9 @@ def _propagate_signs(planes: _TangentPlanes, parent: IntArray) -> FloatArray:
 
 def _outward_signs(x: FloatArray, normals: FloatArray, component: IntArray) -> FloatArray:
     """Find the sign (p,) for each connected component of a cloud such that the normals of its
-    extreme points in 26 directions, on the whole, face outward. For a flat component, whose extreme
-    points do not decide, it is the sign for which the normals point to the positive side of the
-    axis nearest to them.
+    extreme points in 26 directions, on the whole, face outward. The extreme points of a flat
+    component do not decide; its sign is that for which the normals point to the positive side of
+    the coordinate axis nearest to them.
 
     x, normals: (n, 3) points, and normals that agree within each component.
     component: (n,) the component of each point.

@@ -55,15 +55,15 @@ def is_convex_position(loops: tuple[FloatArray, ...]) -> bool:
 
     Stability. P is the curve, H its hull. If no vertex exceeds the plane of an edge, that edge lies
     on the boundary of H, and nothing remains to be proved. Otherwise move each point of P along the
-    normal of its edge until it is on the boundary of H: by at most delta = 1e-12. A vertex has two
-    edges, with the normals n and n', and may move to two positions. Both lie in the wedge { x = a n
-    + b n', a, b >= 0 } at the vertex, in which n.x <= delta and n'.x <= delta imply |x| <= 2 delta
-    / (1 + n.n'). As n.n' >= -0.9 is required, a path of that size on the boundary joins the two
-    positions. The path cannot meet other edges, which are 1e-9 away; where it crosses an edge at
-    the same vertex, loops of area below 1e-15 are cut off. So the theorems hold for a curve within
-    w = 2e-11 of P. The solid angles of the two curves differ by at most 2 w / r for each edge at
-    distance r: at r = 1e-4 that is less than the rounding error of the solid angle itself in single
-    precision.
+    normal of its edge's plane until it is on the boundary of H: by at most delta = 1e-12. A vertex
+    has two edges, with the normals n and n', and may move to two positions. Both lie in the wedge {
+    x = a n + b n', a, b >= 0 } at the vertex, in which n.x <= delta and n'.x <= delta imply |x| <=
+    2 delta / (1 + n.n'). As n.n' >= -0.9 is required (and tested), a path of this length on the
+    boundary joins the two positions. The path cannot meet other edges, which are 1e-9 away; where
+    it crosses an edge at the same vertex, loops of area below 1e-15 are cut off. So the theorems
+    hold for a curve within w = 2e-11 of P. The solid angles of the two curves differ by at most 2 w
+    / r for each edge at distance r: at r = 1e-4 that is less than the rounding error of the solid
+    angle itself in single precision.
     """
     if len(loops) != 1 or not 3 <= len(loops[0]) <= MAX_EXAMINED_VERTICES:
         return False
@@ -114,12 +114,13 @@ def _supporting_planes(
     x: FloatArray, indices: np.ndarray[tuple[int], np.dtype[np.intp]]
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
     """For each edge of the polygon x (n, 3) that begins at a vertex of `indices` (k,), find a plane
-    that contains the edge and, if possible, has all vertices on one side. Seen along the edge, the
-    vertices must leave an angle of at least pi free for that; the plane's normal points to the
-    middle of the largest free angle.
+    that contains the edge and, if possible, has all vertices on one side. All vertices are on one
+    side if, seen along the edge, they leave an angle of at least pi free. The plane's normal points
+    to the middle of the largest free angle.
 
-    Returns the unit normals (k, 3); the largest height (k,) of a vertex above the plane; and
-    whether (k,) all vertices but the edge's ends are below the plane by more than rounding.
+    Returns three arrays: the unit normals (k, 3) of the planes; the largest height (k,) of a vertex
+    above the plane; and a mask (k,), True if all vertices except the edge's ends are below the
+    plane by more than rounding.
     """
     count = len(x)
     start = x[indices]
@@ -143,8 +144,8 @@ def _supporting_planes(
 
 
 def _widest_gap_direction(a: FloatArray, b: FloatArray) -> FloatArray:
-    """The directions of n points in the plane, seen from the origin, leave gaps between them. For
-    each of k such sets of points, find the middle of the largest gap, an angle (k,) in radians.
+    """For each of k sets of n points in the plane, find the largest angle at the origin that is
+    free of points. Returns the direction of its middle, an angle (k,) in radians.
 
     a, b: (k, n) the coordinates of the points.
 
@@ -264,8 +265,9 @@ class ConvexHull(Polytope):
         """The convex hull of points (n, 3), enlarged by about 1e-12 of their size.
 
         Each plane is pushed out to the farthest point in its direction, so all points lie inside
-        however the facets' normals were rounded or merged. Points in a plane or on a line give a
-        slab or a rod that is thicker than the points by 1e-6 of their size on every side.
+        however the facets' normals were rounded or merged. For points in a plane the result is a
+        slab, and for points on a line a rod, which extends beyond the points by 1e-6 of their size
+        on every side.
 
         Raises:
             ValueError: no points, NaN or infinite values, or all points the same.
@@ -293,9 +295,9 @@ class ConvexHull(Polytope):
     def _slacks(
         self, table: PlaneTable, o: Vec3, d: Vec3
     ) -> Callable[[Vec3, Real], RoundingSlacks]:
-        """Returns a function of the normal n and the offset h of a plane. It returns bounds of the
-        rounding errors of h - n.o and of n.d, for rays o + t d. The bounds are the same for all
-        planes, as |n| = 1 implies |n|.|o| <= |o|."""
+        """Return a function of the normal n and the offset h of a plane. The function returns
+        bounds of the rounding errors of h - n.o and of n.d, for rays o + t d. table: the planes of
+        the polytope. The bounds are the same for all planes, as |n| = 1 implies |n|.|o| <= |o|."""
         rounding = clip_rounding(backend_of(o))
         offset_slack, slope_slack = (
             rounding * (dr.norm(o) + table.max_offset),
@@ -327,8 +329,9 @@ def _support(x: FloatArray, normals: FloatArray) -> FloatArray:
 def _hull_normals(x: FloatArray) -> tuple[FloatArray, bool]:
     """Find the planes of the hull of points x (n, 3), centered and of size 1. Returns the unit
     outward normals (m, 3) of half-spaces whose intersection, with suitable offsets, is the hull;
-    and whether the points are flat or on a line. For flat points the normals are those of the sides
-    of the slab, and of the edges of the outline; for points on a line, those of a rod (a box)."""
+    and whether the points are flat or on a line. For flat points the normals are those of the two
+    sides of a slab, and of the edges of the points' outline in their plane; for points on a line,
+    those of a rod (a box)."""
     # The axes along which the points vary most, less and least. For fewer than three points the
     # missing axes are added (`full_matrices`).
     axes: FloatArray = np.linalg.svd(x - x.mean(axis=0), full_matrices=len(x) < 3)[2]
@@ -349,8 +352,9 @@ def _hull_normals(x: FloatArray) -> tuple[FloatArray, bool]:
 
 
 def _facet_normals(x: FloatArray) -> FloatArray | None:
-    """Compute the unit normals (m, d) of the facets of the convex hull of points x (n, d), by
-    Qhull, which merges coplanar facets. None if Qhull finds that the points have no volume."""
+    """Compute the unit normals (m, d) of the facets of the convex hull of points x (n, d), by the
+    library Qhull, which merges coplanar facets. None if Qhull finds that the points have no
+    volume."""
     import scipy.spatial  # imported here: it takes half a second, and few programs need it
 
     qhull: Any = scipy.spatial

@@ -106,7 +106,7 @@ class Circle:
         return Circle(self.radius, self.center, (-x, -y, -z))
 
     def bounds(self) -> tuple[FloatArray, FloatArray]:
-        """Lower and upper corner (3,) of the box around the circle."""
+        """The lower and the upper corner, (3,) each, of the box around the circle."""
         # The circle's extent along an axis is r times the sine of the angle between axis and
         # normal.
         half_size = self.radius * np.sqrt(np.maximum(1 - np.square(self.normal), 0))
@@ -205,7 +205,7 @@ def validate_loops(loops: LoopsLike, *, closed: bool = True) -> Loops:
     is an error. Edges that fold back on themselves are allowed.
 
     loops: an array (n, 3) of vertices, or a list of such arrays.
-    closed: False for curves that end at their first and last vertex, which then may be equal.
+    closed: False for open curves, which end at their first and last vertex; these two may be equal.
 
     Raises:
         CurveError: the subclass above that names the fault.
@@ -257,8 +257,8 @@ def _as_parts(curves: Any) -> list[Any]:
 
 def _as_list(loops: Any) -> list[tuple[int, Any]]:
     """The loops in the argument of `validate_loops`, as pairs of a number, counted from 0, and a
-    loop. The argument is several loops if its entries are lists of points; otherwise it is a single
-    loop. Numbers and shapes of the loops are not checked here.
+    loop. The argument stands for several loops if its entries are lists of points, otherwise for a
+    single loop. Numbers and shapes of the loops are not checked here.
 
     Raises:
         CurveShapeError: the points of a single loop have different numbers of coordinates.
@@ -336,7 +336,7 @@ def _as_vertices(loop: Any, name: str) -> FloatArray:
 
 
 def _count_distinct(vertices: FloatArray) -> int:
-    """Count the different vertices among vertices (n, 3), up to 3."""
+    """Count the different vertices among vertices (n, 3). Counting stops at 3."""
     remaining = vertices
     for count in range(3):
         if len(remaining) == 0:
@@ -380,8 +380,8 @@ def _too_many(name: str, count: int) -> str:
 
 
 def edge_endpoints(loops: Loops) -> tuple[FloatArray, FloatArray]:
-    """The start points and the end points of all edges of closed loops, (m, 3) each, loop after
-    loop."""
+    """Two arrays (m, 3): the start points and the end points of all edges of closed loops, loop
+    after loop."""
     return np.concatenate(loops), np.concatenate([np.roll(v, -1, axis=0) for v in loops])
 
 
@@ -392,6 +392,6 @@ def total_length(loops: Loops) -> float:
 
 
 def bounding_box(loops: Loops) -> tuple[FloatArray, FloatArray]:
-    """Lower and upper corner (3,) of the box around the vertices of loops."""
+    """The lower and the upper corner, (3,) each, of the box around the vertices of loops."""
     vertices = np.concatenate(loops)
     return vertices.min(axis=0), vertices.max(axis=0)

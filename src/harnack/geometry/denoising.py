@@ -5,7 +5,8 @@ points. The neighbors of a point are the points nearest to it. `CloudDenoiser` m
 their normals to the height of the surface that their neighbors predict, so that sums over them need
 less smoothing, and edges stay sharper.
 
-A neighbor j, at p_j with the normal n_j, predicts that the surface near x is at the height
+Let x be a point with the normal n. A neighbor j of it, at p_j with the normal n_j, predicts that
+the surface near x is at the height
 
     t_j = (n + n_j)/2 . (p_j - x)
 
@@ -76,7 +77,7 @@ class NoiseEstimate:
     the points.
 
     deviation: the standard deviation of the points from the surface, along its normal.
-    spacing: the square root of the area that a point stands for (median).
+    spacing: the square root of the median area that a point stands for.
     """
 
     deviation: float
@@ -90,8 +91,9 @@ class NoiseEstimate:
         return min(max(count, _MIN_NEIGHBORS), _MAX_NEIGHBORS)
 
     def kept_fraction(self) -> float:
-        """The fraction of the points to be selected and moved, at most 1: with large noise, fewer
-        points show the surface just as well."""
+        """The fraction, at most 1, of the points that `CloudDenoiser` selects and moves. If the
+        noise is large relative to the spacing, it is less than 1: fewer points show the surface
+        just as well."""
         fraction = _MAX_NOISE_PER_SPACING * self.spacing / max(self.deviation, 1e-300)
         return min(max(fraction, _MIN_KEPT_FRACTION), 1.0)
 
@@ -109,7 +111,8 @@ def outlier_indices(points: FloatArray, tree: Any) -> IntArray:
     distances = np.empty(len(points))
 
     def find_neighbors(rows: slice) -> None:
-        """Find the neighbors of a slice of the points, and the distance of the fourth one."""
+        """Find the neighbors of the points `rows`, and the distance of each point from its fourth
+        neighbor."""
         distance, index = tree.query(points[rows], k=count + 1)
         nearest[rows], distances[rows] = index[:, 1:], distance[:, -1]
 
@@ -122,14 +125,15 @@ def outlier_indices(points: FloatArray, tree: Any) -> IntArray:
 def estimate_noise(points: FloatArray, normals: FloatArray | None, tree: Any) -> NoiseEstimate:
     """Estimate the noise and the spacing of a cloud.
 
-    Each of up to 1000 probe points has neighbors. A neighbor j at p_j with the normal n_j predicts
-    that the surface is at the height t_j = (n + n_j)/2 . (p_j - x) above a probe x with the normal
-    n. The noise is the median, over the probes, of the standard deviation of t_j. If `normals` is
-    None, distances from the plane that best fits the neighbors are used instead, so that curvature
-    counts as noise.
+    Up to 1000 points of the cloud are probes. A neighbor j of a probe, at p_j with the normal n_j,
+    predicts that the surface is at the height t_j = (n + n_j)/2 . (p_j - x) above a probe x with
+    the normal n. The noise is the median, over the probes, of the standard deviation of t_j. If
+    `normals` is None, distances from the plane that best fits the neighbors are used instead, so
+    that curvature counts as noise.
 
-    The number of neighbors grows from 16 to 1024, until the farthest is (in the median) 4.5
-    standard deviations away: fewer neighbors reach no farther than the noise, and show no surface.
+    The number of neighbors grows from 16 to at most 1024, until the farthest neighbor of a probe is
+    (in the median over the probes) 4.5 standard deviations away: fewer neighbors reach no farther
+    than the noise, and show no surface.
 
     points: (n, 3).
     normals: (n, 3) unit normals, or None.
@@ -183,9 +187,10 @@ def _min_variance_axes(offsets: FloatArray, weights: FloatArray | None) -> Float
 def _deviations_by_normals(
     offsets: FloatArray, normals: FloatArray, neighbor_normals: FloatArray
 ) -> FloatArray:
-    """For each of m points, the standard deviation (m,) of the heights t_j that its neighbors with
-    a similar normal predict. A neighbor j with the offset d_j and the normal n_j predicts the
-    surface at the height t_j = (n + n_j)/2 . d_j above a point with the normal n.
+    """For each of m points, the standard deviation (m,) of the heights t_j of the surface that are
+    predicted by those of its neighbors that have a similar normal. A neighbor j with the offset d_j
+    and the normal n_j predicts the surface at the height t_j = (n + n_j)/2 . d_j above a point with
+    the normal n.
 
     offsets: (m, k, 3) from each point to its neighbors.
     normals: (m, 3) the unit normals of the points.
@@ -200,8 +205,8 @@ def _deviations_by_normals(
 
 class CloudDenoiser:
     """Moves points of a noisy cloud along their normals onto the surface that the cloud samples.
-    The selected points are moved: all points, unless the noise is so large that a random part of
-    them shows the surface just as well. All points count as neighbors.
+    The selected points are moved. These are all points, or a random part of them if the noise is so
+    large that fewer points show the surface just as well. All points count as neighbors.
 
     points: (n, 3).
     noise: the noise of the cloud.
@@ -210,7 +215,8 @@ class CloudDenoiser:
     """
 
     def __init__(self, points: FloatArray, noise: NoiseEstimate, tree: Any | None = None) -> None:
-        """Select the points to be moved. The search tree is built if it is not given."""
+        """Select the points to be moved. points, noise: the cloud, and its noise. tree: the search
+        tree of the points; it is built if it is None."""
         self.points, self.noise = points, noise
         self.tree = build_point_tree(points) if tree is None else tree
         self.selected = np.arange(len(points))
@@ -230,8 +236,9 @@ class CloudDenoiser:
 
     def denoise_points(self, normals: FloatArray) -> FloatArray:
         """Move the selected points along their known normals onto the surface; returns the points
-        (m, 3). If only a part of the points is selected, they are first moved by their nearest
-        neighbors among themselves, so that the search for neighbors starts near the surface.
+        (m, 3). If only a part of the points is selected, the selected points are first moved to the
+        heights that the nearest selected points predict, so that the search for neighbors starts
+        near the surface.
 
         normals: (n, 3) the unit normals of all points.
         """
@@ -295,7 +302,7 @@ def _neighbors(tree: Any, points: FloatArray, count: int) -> Indices:
     index = np.empty((len(points), count), np.int32)
 
     def find_slice(rows: slice) -> None:
-        """Find the neighbors of a slice of the points."""
+        """Find the neighbors of the points `rows`."""
         index[rows] = tree.query(points[rows], k=count)[1].reshape(-1, count)
 
     parallel_over_slices(find_slice, len(points))
@@ -313,7 +320,8 @@ def _move_along_normals(
     """Move points along their normals onto the surface that their neighbors predict; returns the
     moved points (m, 3). A neighbor j at p_j with the normal n_j predicts that the surface is at the
     height t_j = (n + n_j)/2 . (p_j - x) above a point x with the normal n. Each point moves along n
-    to where the weighted mean of t_j is 0. A point whose normal no neighbor supports stays.
+    to where the weighted mean of t_j is 0. A point stays in its place if the weighted mean of t_j
+    hardly changes with the movement, as where the normals of the neighbors point the other way.
 
     start: (m, 3) the points.
     own_normals: (m, 3) their unit normals.
@@ -327,7 +335,7 @@ def _move_along_normals(
     moved = np.empty_like(start)
 
     def move_slice(rows: slice) -> None:
-        """Move the points of a slice."""
+        """Move the points `rows`."""
         n, index = own_normals[rows], neighbors[rows]
         neighbor_normals, offsets = normals[index], points[index] - start[rows, None]
         # n . (p_j - x), the height of each neighbor above the point.
@@ -356,19 +364,20 @@ def _agreeing_weight(
     normal_scale: float,
 ) -> FloatArray:
     """For each of m points, the fraction (m,) of its neighbors, by weight, that have a normal
-    similar to its own. Neighbors have weights that fall with the distance; a normal counts as
-    similar by a number that falls from 1 with the angle.
+    similar to its own. Neighbors have weights that fall with the distance. A normal counts as
+    similar by a number that is 1 for equal normals and falls with the angle between them.
 
     start, own_normals: (m, 3) the points and their unit normals.
     neighbors: (m, k) indices of their neighbors among `points`.
     is_own: (m, k) whether a neighbor is the point itself, which does not count.
     points, normals: (n, 3) each, the points of the cloud and their unit normals.
-    normal_scale: the difference of two normals at which they count as similar by 1/e only.
+    normal_scale: the length |n - n'| of the difference of two unit normals at which this number is
+        1/e.
     """
     fraction = np.empty(len(start))
 
     def compute_slice(rows: slice) -> None:
-        """Compute the fractions for a slice of the points."""
+        """Compute the fractions for the points `rows`."""
         n, index = own_normals[rows], neighbors[rows]
         offsets = points[index] - start[rows, None]
         height = np.einsum("mi,mki->mk", n, offsets)
@@ -401,7 +410,7 @@ def _refit_normals(
     refitted = np.empty_like(normals)
 
     def refit_slice(rows: slice) -> None:
-        """Fit the normals of a slice of the points."""
+        """Fit the normals of the points `rows`."""
         index = neighbors[rows]
         offsets = points[index] - points[rows, None]
         cosine = np.einsum("mi,mki->mk", normals[rows], normals[index])
@@ -451,7 +460,8 @@ def _weights(square: FloatArray, cosine: FloatArray, normal_scale: float) -> Flo
 
     square: (m, k) the squared distances.
     cosine: (m, k) the cosines of the angles between the normals.
-    normal_scale: the difference of two unit normals at which the weight falls to 1/e.
+    normal_scale: the length |n - n'| of the difference of two unit normals at which the weight
+        falls to 1/e.
     """
     weight = np.exp(-_DISTANCE_DECAY * _relative_to_largest(square)) * _normal_weight(
         cosine, normal_scale

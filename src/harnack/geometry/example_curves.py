@@ -1,6 +1,6 @@
 """Closed curves for pictures, tests and examples. A curve is an array (n, 3) of vertices, float64,
 whose last vertex is joined to the first (which is not repeated); a list of such arrays is a curve
-of several loops. All are counter-clockwise seen from +z where that has a meaning."""
+of several loops. All curves for which that has a meaning run counter-clockwise as seen from +z."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ ReturnPath = Literal["outside", "axis"]
 
 
 def _check_whole(name: str, number: Any) -> None:
-    """Raise TypeError for an argument that is not an integer."""
+    """Raise TypeError if the value `number` of the argument `name` is not an integer."""
     if not isinstance(number, int | np.integer):
         raise TypeError(f"{name} must be a whole number, not {number!r}")
 
@@ -58,7 +58,7 @@ def torus_knot(
     major_radius, minor_radius: of the torus on which it lies.
 
     Raises:
-        ValueError: p and q have a common divisor, which would be a link.
+        ValueError: p and q have a common divisor; the curve would be a link of several loops.
         TypeError: p or q is not an integer.
     """
     _check_whole("p of a torus knot", p)
@@ -90,8 +90,8 @@ def coil(
     return_path: ReturnPath = "outside",
 ) -> FloatArray:
     """A closed coil with n vertices, (n, 3): a helix about the z axis and a way back to its start.
-    The solid angle of such a curve spans `turns` times 4 pi, which breaks bounds that hold for
-    curves on convex bodies.
+    The solid angle of such a curve takes values in a range of the length 4 pi `turns`; bounds that
+    hold for curves on convex bodies do not hold for it.
 
     turns: the number of full turns of the helix.
     radius: of the helix.
@@ -179,8 +179,9 @@ def random_closed_curve(
 def spiky_polygon(
     rng: np.random.Generator, n: int, *, inner: float = 0.2, height: float = 0.5
 ) -> FloatArray:
-    """A star with n vertices, (n, 3), with random radii in [inner, 1] and heights in [-height,
-    height]. Even vertices are spikes, odd ones lie near the inner radius.
+    """A star with n vertices, (n, 3), with random distances from the z axis in [inner, 1] and
+    random heights z in [-height, height]. Even vertices are spikes, odd ones lie near the distance
+    `inner`.
 
     rng: the source of random numbers.
     """

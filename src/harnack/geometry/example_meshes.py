@@ -73,13 +73,14 @@ def torus_mesh(major_radius: float, minor_radius: float, n: int, m: int) -> Mesh
 
 
 def remove_faces(faces: IntArray, fraction: float, seed: int) -> IntArray:
-    """The faces (m, 3) without a random fraction of them, in the same order."""
+    """The faces (m, 3) without a random fraction of them, in the same order. seed: a seed of the
+    random choice."""
     return np.delete(faces, _random_faces(faces, fraction, seed), axis=0)
 
 
 def flip_faces(faces: IntArray, fraction: float, seed: int) -> IntArray:
     """The faces (m, 3) with a random fraction of them reversed; the winding number jumps the
-    opposite way across a reversed face."""
+    opposite way across a reversed face. seed: a seed of the random choice."""
     flipped = faces.copy()
     chosen = _random_faces(faces, fraction, seed)
     flipped[chosen] = faces[chosen][:, [0, 2, 1]]
@@ -89,8 +90,8 @@ def flip_faces(faces: IntArray, fraction: float, seed: int) -> IntArray:
 def duplicate_faces(
     faces: IntArray, fraction: float, seed: int, *, flipped: bool = False
 ) -> IntArray:
-    """The faces (m, 3), followed by a second copy of a random fraction of them; by reversed copies
-    if `flipped`.
+    """The faces (m, 3), followed by copies of a random fraction of them. The copies are reversed if
+    `flipped`. seed: a seed of the random choice.
 
     The winding number jumps by 2 across a duplicated face. Across a face with a reversed duplicate
     it does not jump, as if there were a hole.
@@ -100,8 +101,8 @@ def duplicate_faces(
 
 
 def _random_faces(faces: IntArray, fraction: float, seed: int) -> IntArray:
-    """Choose a random fraction (rounded to a whole number) of the faces; returns their indices, all
-    different.
+    """Choose a random fraction of the faces; returns their indices, all different. Their number is
+    rounded to a whole one. seed: a seed of the random choice.
 
     Raises:
         ValueError: fraction outside [0, 1].

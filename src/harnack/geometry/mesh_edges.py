@@ -94,8 +94,8 @@ def longest_edges(corners: FloatArray) -> FloatArray:
 
 
 def distance_from_triangles(point: FloatArray, corner: FloatArray) -> float:
-    """The distance of a point (3,) from the nearest of triangles (k, 3, 3). It is infinite if there
-    are no triangles."""
+    """The distance of a point (3,) from the nearest of k triangles, whose corners are `corner` (k,
+    3, 3). It is infinite if there are no triangles."""
     return float(distances_from_triangles(point, corner).min(initial=np.inf))
 
 
@@ -176,8 +176,8 @@ def edge_keys(pairs: IntArray, count: int) -> IntArray:
 
 def half_edges(faces: IntArray) -> IntArray:
     """The edges of faces (m, 3) in the directions in which the faces run them, as pairs (3m, 2) of
-    indices of points: first the edges of all faces from corner 0 to corner 1, then all from 1 to 2,
-    then all from 2 to 0. So row k m + i is edge k of face i."""
+    indices of points. First come the edges of all faces from corner 0 to corner 1, then those from
+    1 to 2, then those from 2 to 0. So row k m + i is edge k of face i."""
     return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
 
 
@@ -197,9 +197,10 @@ def sorted_unique(keys: IntArray) -> IntArray:
 
 
 def unique_with_inverse(keys: IntArray) -> tuple[IntArray, IntArray, IntArray, IntArray]:
-    """What `np.unique` computes for nonnegative integers (n,), in a third of the time: the distinct
-    values (k,) in increasing order; for each integer the index (n,) of its value; the number (k,)
-    of integers with each value; and the permutation (n,) that sorts the integers."""
+    """What `np.unique` computes for nonnegative integers (n,), in a third of the time. Returns four
+    arrays: the distinct values (k,) in increasing order; for each integer the index (n,) of its
+    value; the number (k,) of integers with each value; and the permutation (n,) that sorts the
+    integers."""
     bits = len(keys).bit_length()
     # Keys too large to stand in one word with an index.
     if int(keys.max(initial=0)) >> (62 - bits):

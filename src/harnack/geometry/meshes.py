@@ -48,8 +48,8 @@ def validate_mesh(
     """Validate a mesh. Returns vertices (n, 3) float64 and faces (m, 3) int64: copies that cannot
     be written to. Vertices that no face uses are kept, and checked like all others.
 
-    allow_zero_area: whether faces may have zero area, as faces of closed meshes that only join
-        others.
+    allow_zero_area: whether faces may have zero area, as those faces of closed meshes that only
+        join other faces.
 
     Raises:
         MeshError: not numbers of these shapes, faces that are not triangles of integers, an empty
@@ -68,9 +68,9 @@ def validate_mesh(
 
 def zero_area_faces(vertices: npt.ArrayLike, faces: npt.ArrayLike) -> IntArray:
     """Find the faces that count as faces of zero area; returns their indices (k,). Twice the area
-    of such a face is at most 8 units in the last place (2^-49) of the square of its longest edge:
-    up to the rounding of a cross product, its vertices lie on a line or two of them are equal. This
-    depends neither on the scale nor on the position of the mesh. Such a face has no reliable
+    of such a face is at most 2^-49 (8 units in the last place) of the square of its longest edge.
+    So up to the rounding of a cross product, its vertices lie on a line, or two of them are equal.
+    This depends neither on the scale nor on the position of the mesh. Such a face has no reliable
     normal.
 
     Raises:
@@ -86,10 +86,10 @@ def without_zero_area_faces(
     faces (k, 3) int64, copies that cannot be written to. All vertices stay, so indices keep their
     meaning.
 
-    A face of zero area adds nothing to a winding number. If it filled a gap of zero width (a vertex
-    in the middle of its neighbor's edge), the edges at that gap become boundary edges on top of
-    each other: they still cancel in every sum, and only make distances to boundary edges smaller
-    than need be.
+    A face of zero area adds nothing to a winding number. If it filled a gap of zero width (where a
+    vertex lies in the middle of a neighboring face's edge), the edges on the two sides of that gap
+    become boundary edges at the same place. They still cancel in every sum. But they count as
+    boundary edges, so that distances to boundary edges become smaller than necessary.
 
     Raises:
         MeshError: the mesh is not valid, apart from faces of zero area (see `validate_mesh`); or no
@@ -208,9 +208,9 @@ def _as_array(values: Any, name: str, ragged: str) -> npt.NDArray[Any]:
 
 
 def _measure_faces(x: FloatArray, faces: IntArray) -> tuple[BoolArray, FloatArray]:
-    """For each face: whether it counts as a face of zero area, (m,); and the largest difference of
-    two of its vertices in any coordinate, (m,). Edges are scaled before they are multiplied, so
-    that nothing overflows or underflows.
+    """Two results for each face: whether it counts as a face of zero area, (m,); and the largest
+    difference of two of its vertices in any coordinate, (m,). Edges are scaled before they are
+    multiplied, so that nothing overflows or underflows.
 
     x: (n, 3) the vertices.
     faces: (m, 3).
@@ -244,7 +244,7 @@ def _zero_area_message(x: FloatArray, faces: IntArray, flat: IntArray) -> str:
     """The text of an error message about faces of zero area.
 
     x, faces: (n, 3), (m, 3) the mesh.
-    flat: the indices of these faces.
+    flat: the indices of the faces of zero area.
     """
     a, b, c = (x[k] for k in faces[flat[0]])
     corners = ", ".join(format_vector(corner) for corner in (a, b, c))

@@ -122,8 +122,9 @@ def _edges_and_successors(loops: list[FloatArray]) -> tuple[FloatArray, FloatArr
 
 
 def _self_intersects(loops: list[FloatArray], tolerance: float) -> bool:
-    """Whether two edges that are not neighbors come within `tolerance` (a length) of each other, or
-    an edge folds back on its neighbor. True also if there are too many pairs to compare."""
+    """Whether loops (n, 2) cross or touch themselves or each other: two edges that are not
+    neighbors come within `tolerance` (a length) of each other, or an edge folds back on its
+    neighbor. Also True if there are too many pairs of edges to compare."""
     start, end, successor = _edges_and_successors(loops)
     next_edge = end[successor] - start[successor]
     edge = end - start
@@ -164,7 +165,8 @@ def _segments_touch(
     length) of each other: (k,) for k pairs. a, b, c and d are (k, 2)."""
 
     def orientation(p: FloatArray, q: FloatArray, r: FloatArray) -> FloatArray:
-        """Twice the signed area of the triangles p q r: positive if r is to the left of p -> q."""
+        """Twice the signed area (k,) of the triangles with the corners p, q and r: positive if r is
+        to the left of the line from p to q."""
         return (q[:, 0] - p[:, 0]) * (r[:, 1] - p[:, 1]) - (q[:, 1] - p[:, 1]) * (r[:, 0] - p[:, 0])
 
     # The ends of each segment are on different sides of the other one's line.
@@ -178,7 +180,8 @@ def _segments_touch(
 
 
 def _distances(p: FloatArray, a: FloatArray, b: FloatArray) -> FloatArray:
-    """The distances (k,) of points p from the segments from a to b; all are (k, 2)."""
+    """The distances (k,) of points p from the segments from a to b, for k triples (p, a, b) of
+    points; each array is (k, 2)."""
     edge = b - a
     t = ((p - a) * edge).sum(axis=1) / (edge * edge).sum(axis=1)
     return np.linalg.norm(p - a - np.clip(t, 0, 1)[:, None] * edge, axis=1)

@@ -80,7 +80,7 @@ class PolygonFaces:
 
     @property
     def edges(self) -> IntArray:
-        """(e, 2) the pairs of vertices that an edge of a face joins, each pair once."""
+        """(e, 2) the pairs of vertices that are joined by an edge of a face, each pair once."""
         ends = np.column_stack([self.corners, self.corners[self.next_corner]])
         return np.unique(np.sort(ends, axis=1), axis=0)
 
@@ -93,7 +93,8 @@ class PolygonFaces:
         return [self.vertices[self.corners[corners]] for corners in slices]
 
     def face_boxes(self) -> tuple[FloatArray, FloatArray]:
-        """Lower and upper corners (m, 3) of the bounding boxes of the faces' vertices."""
+        """The lower and the upper corners, (m, 3) each, of the bounding boxes of the faces'
+        vertices."""
         x, first = self.vertices[self.corners], self.first_corners
         return np.minimum.reduceat(x, first), np.maximum.reduceat(x, first)
 
@@ -106,8 +107,9 @@ class PolygonFaces:
     @functools.cached_property
     def in_convex_position(self) -> BoolArray:
         """(m,) whether each face is a single loop without self-intersections that is proved to lie
-        on the boundary of a convex set; False where there is no proof. Faces whose projection is
-        not convex are examined by `is_convex_position`, but no more than 20,000 of them."""
+        on the boundary of a convex set; False where there is no proof. A convex projection proves
+        it for most faces (`_projects_to_convex_polygon`). Other faces of a single loop are examined
+        by `is_convex_position`, but no more than 20,000 of them."""
         is_convex = self._projects_to_convex_polygon()
         is_single = np.bincount(self.face_of_loop, minlength=self.face_count) == 1
         unproved = np.flatnonzero(is_single & ~is_convex)[:_MAX_EXAMINED_FACES]
@@ -120,8 +122,9 @@ class PolygonFaces:
         a convex polygon that is run around once.
 
         Such a loop has no self-intersection, for its projection has none. It lies on the boundary
-        of a convex set, the cylinder over the projection. A turn counts only if its sine is more
-        than a millionth, far above rounding, so that True is always right.
+        of a convex set, the cylinder over the projection. A turn at a corner counts only if the
+        sine of its angle is more than a millionth, far above rounding, so that True is always
+        right.
         """
         x = self.vertices[self.corners]
         face, first = self.face_of_corner, self.first_corners
@@ -280,8 +283,8 @@ def _check_edges(mesh: PolygonFaces) -> None:
 
 
 def _first_repeated_key(keys: IntArray) -> int | None:
-    """The smallest index of a key that also occurs earlier in the array; None if all keys
-    differ."""
+    """The index of the first entry of `keys` whose value occurs earlier in the array; None if all
+    entries differ."""
     _, first = np.unique(keys, return_index=True)
     if len(first) == len(keys):
         return None
@@ -344,6 +347,7 @@ def cluster_into_polygons(
     are left out.
 
     vertices, faces: (n, 3) and (m, 3), the triangle mesh.
+    count: the number of clusters wanted.
     iterations: the number of steps of Lloyd's algorithm.
     smoothing: how often each corner with exactly two edges is moved to the middle between its
         position and the mean of its two neighbors, since boundaries along triangles are zigzags.

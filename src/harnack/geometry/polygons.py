@@ -34,15 +34,15 @@ def cancel_opposite_edges(loops: Loops) -> Loops:
     distances and in tests of convexity as a curve that is not there.
 
     Vertices at exactly the same position are the same. If edges run both ways between two vertices,
-    the surplus of a direction is left, with its multiplicity. If no edges cancel, the loops are
-    returned as they are; if all cancel, no loop is returned. Only entire edges are compared: of two
-    edges that overlap in part and run opposite ways, both stay.
+    the surplus is left: as many edges as one direction has more than the other. If no edges cancel,
+    the loops are returned as they are; if all cancel, no loop is returned. Only entire edges are
+    compared: of two edges that overlap in part and run opposite ways, both stay.
 
     Proof that the remaining loops are closed: in loops the same number of edges begins and ends at
     a vertex, and this stays true when an edge and its reverse are removed. Proof that the solid
-    angle stays the same: its gradient is the sum of the edges' fields, which cancel (Biot and
-    Savart), and the integral along closed paths is still a multiple of 4 pi, so that values change
-    by a constant at most; far away both vanish, modulo 4 pi.
+    angle stays the same modulo 4 pi: its gradient is the sum of the fields of the edges (Biot and
+    Savart), and those of opposite edges cancel. So the solid angle changes by a constant at most,
+    modulo 4 pi. This constant is 0, since both solid angles vanish far away.
     """
     points = np.concatenate(loops)
     begin, end = _welded_edges(loops, points)
@@ -54,12 +54,12 @@ def cancel_opposite_edges(loops: Loops) -> Loops:
 
 
 def remaining_edges(loops: Loops) -> tuple[FloatArray, FloatArray]:
-    """The starts and ends (k, 3) of the edges of closed loops that remain after opposite edges were
-    cancelled, each edge once.
+    """Two arrays (k, 3): the starts and the ends of the edges of closed loops that remain after
+    opposite edges were cancelled, each edge once.
 
-    Around an edge that is run n times net (once in each direction counts 0), the solid angle
-    changes by 4 pi n. Unless n = 0 it takes every value modulo 4 pi next to each point of the edge,
-    so that every level set ends there.
+    Let n be how often an edge is run in one direction, less how often it is run in the other.
+    Around this edge the solid angle changes by 4 pi n. Unless n = 0 it takes every value modulo 4
+    pi next to each point of the edge, so that every level set ends there.
     """
     if not loops:
         return np.zeros((0, 3)), np.zeros((0, 3))
@@ -69,8 +69,8 @@ def remaining_edges(loops: Loops) -> tuple[FloatArray, FloatArray]:
 
 
 def _welded_edges(loops: Loops, points: FloatArray) -> tuple[IntArray, IntArray]:
-    """The edges of loops, by the indices of their first and last points, (m,) each. Points at the
-    same position have the same index.
+    """The edges of loops: the indices (m,) of their first points, and the indices (m,) of their
+    last points. Points at the same position have the same index.
 
     points: (m, 3) the points of all loops, to which the indices refer.
     """
@@ -99,9 +99,9 @@ def triangulate(vertices: FloatArray, corners: IntArray, sizes: IntArray) -> Int
     A polygon need not be exactly planar: it is judged by its projection along its mean normal.
     First the fan around its first corner is tried (all diagonals from that corner), then the fan
     around its second corner. If neither is a valid triangulation, because the polygon is not
-    convex, ears are cut off it (Meisters 1975). The edges of the triangles always cancel to those
-    of the polygon: polygons that cross themselves get triangles that overlap, and in a winding
-    number these still add up to the polygon.
+    convex, ears are cut off it (Meisters 1975). If opposite edges of the triangles are cancelled,
+    those of the polygon always remain. So a polygon that crosses itself gets triangles that
+    overlap, but in a winding number they still add up to the polygon.
 
     vertices: (n, 3).
     corners: the vertex indices of all polygons, one polygon after the other.

@@ -48,7 +48,8 @@ class Volume(abc.ABC):
         return super().__new__(cls)
 
     def __and__(self, other: object) -> Volume:
-        """The intersection of two volumes. Intersections among them are flattened."""
+        """The intersection of two volumes. If one of them is an intersection itself, its volumes
+        become members of the new intersection."""
         from harnack.geometry.clip_volumes import VolumeIntersection
 
         if not isinstance(other, Volume):
@@ -57,9 +58,9 @@ class Volume(abc.ABC):
 
     @abc.abstractmethod
     def clip(self, o: Vec3, d: Vec3, t_min: Real, t_max: Real) -> tuple[Real, Real]:
-        """The interval [t0, t1] of the ray parameters t for which the point o + t d of each ray
-        lies inside the volume, within 0 <= t_min <= t <= t_max. If a ray misses the volume, t0 =
-        inf and t1 = -inf; otherwise t0 < t1.
+        """The interval [t0, t1] of the ray parameters t, 0 <= t_min <= t <= t_max, for which the
+        point o + t d of each ray lies inside the volume. Returns t0 and t1. If a ray misses the
+        volume, t0 = inf and t1 = -inf; otherwise t0 < t1.
 
         o, d: origins and directions; d need not have unit length, but must not be zero.
         """
@@ -91,8 +92,8 @@ class Volume(abc.ABC):
         """A volume that contains every point within `distance` (>= 0, finite) of this volume."""
 
     def prepare(self, backend: Backend) -> Volume:
-        """An equal volume whose numbers are kernel parameters on the backend. So another volume of
-        the same kind does not compile another kernel."""
+        """An equal volume whose numbers are kernel parameters on the backend. So no other kernel
+        has to be compiled for another volume of the same kind."""
         del backend
         return self
 

@@ -52,7 +52,8 @@ class _BisectorLine:
 @dataclass(frozen=True)
 class TangentVoronoi:
     """Computes the areas of Voronoi cells of points in their tangent planes, on a device. Each cell
-    is bounded by the bisector lines of the point's neighbors, and cut off at a radius R.
+    is bounded by the bisector lines of the point's neighbors (on which a point of the plane is as
+    far from the cell's point as from the neighbor), and cut off at a radius R.
 
     positions: the three coordinates of all n possible neighbors, each an array (n,) on the device.
     """
@@ -72,8 +73,8 @@ class TangentVoronoi:
     ) -> FloatArray:
         """Compute the areas (m,) of the cells of points. The cell of a point x is the set of the
         points y of its tangent plane with |y - x| <= R that are nearer to x than to each of its
-        neighbors. If all neighbors lie on one side of a line through the point, their mirror images
-        at the point count as neighbors, too.
+        neighbors. If all neighbors lie on one side of a line through x, the images of the neighbors
+        under reflection in x count as neighbors, too.
 
         points: (m, 3).
         normals: (m, 3) unit normals of the tangent planes.
@@ -101,13 +102,14 @@ class TangentVoronoi:
         points, normals: (m, 3) the points, and the unit normals of their tangent planes.
         nearest: (m, k) indices of the neighbors among `positions`.
         radii: (m,) the radius at which each cell is cut off.
-        mirrored: whether the mirror images of the neighbors at the point count as neighbors too.
+        mirrored: whether the images of the neighbors under reflection in the point count as
+            neighbors, too.
 
-        Each neighbor j has a bisector line in the tangent plane, at the distance h_j from the
-        center of the cell. The other lines and the circle leave an interval of line j: an edge of
-        the cell. The cell is star shaped, so its area is the sum of the triangles between these
-        edges and the center, and of circular sectors in the remaining directions. All neighbors lie
-        on one side if one of them has no other neighbor to its left.
+        Each neighbor j has a bisector line in the tangent plane. The part of this line that lies
+        within the circle of the radius and not beyond another line is an edge of the cell. The cell
+        is star shaped, so its area is the sum of the triangles between these edges and the center,
+        and of circular sectors in the remaining directions. All neighbors lie on one side if there
+        is one to whose left, as seen from the point, no other neighbor lies.
         """
         backend, index = self.backend, self.backend.UInt32
         u, v = (upload_vectors(backend, axis) for axis in orthonormal_basis_rows(normals))
@@ -120,8 +122,9 @@ class TangentVoronoi:
         neighbor_count = dr.opaque(index, count)
 
         def bisector(i: Any, active: Mask) -> _BisectorLine:
-            """The bisector line of neighbor i; beyond `neighbor_count`, of the mirror image of a
-            neighbor. `active` masks the lanes in which it is needed."""
+            """The bisector line of neighbor i; for i from `neighbor_count` on, that of the image of
+            neighbor i - neighbor_count under reflection in the point. active: mask of lanes in
+            which it is needed."""
             row = dr.select(i < neighbor_count, i, i - neighbor_count)
             neighbor_id = dr.gather(index, table, row * width + lane, active)
             position = [
@@ -137,7 +140,8 @@ class TangentVoronoi:
         def add_lines(j: Any, *state: Any) -> tuple[Any, ...]:
             """Add the triangles at the lines j, j + 1, ... to the area, and the angles of these
             triangles to the sum of angles. Note whether there is a line whose neighbor has no other
-            neighbor to the left. The state is (area, angle, is_one_sided)."""
+            neighbor to its left. Returns the next line's number and the new state; the state is
+            (area, angle, is_one_sided)."""
             numbers = [j + t for t in range(_LINES_PER_ITERATION)]
             own_lines = [bisector(number, number < line_count) for number in numbers]
             area, angle, is_one_sided = state
@@ -185,7 +189,8 @@ def _below(count: Any) -> Callable[..., Mask]:
 
 def _line_in_disc(backend: Backend, q: tuple[Real, Real], b: Real) -> _BisectorLine:
     """The line q . y = b in the plane, with its normal scaled to unit length. If it misses the unit
-    disc, its normal becomes 0. q is also kept as the neighbor's projection."""
+    disc, its normal becomes 0. q is the projection of the neighbor to the plane, and is kept with
+    the line."""
     length = dr.sqrt(dr.square(q[0]) + dr.square(q[1]))
     crosses = length > b
     inverse = dr.select(crosses, dr.rcp(length), 0)
@@ -199,12 +204,15 @@ def _clip_bisectors(
     bisector: Any,
     line_count: Any,
 ) -> list[tuple[Real, Real, Mask]]:
-    """Find the edges of a cell on the lines `own_lines`. Returns for each of them: the interval
-    (lower, upper) of positions along it that lie in the cell, that is in the unit disc and not
-    beyond another line (empty if lower >= upper); and whether some neighbor lies to the left of the
-    line's own neighbor: the direction to it, projected to the tangent plane, is less than 180
-    degrees counter-clockwise of the direction to the line's own neighbor. If no neighbor does, all
-    lie on one side.
+    """Find the edges of a cell on the lines `own_lines`. Each line belongs to a neighbor, its own
+    neighbor.
+
+    Returns three results for each of these lines. The first two, lower and upper, are the ends of
+    the interval of positions along the line that lie in the cell, that is, in the unit disc and not
+    beyond another line; it is empty if lower >= upper. The third tells whether some neighbor lies
+    to the left of the line's own neighbor: its direction from the point, projected to the tangent
+    plane, is less than 180 degrees counter-clockwise of the direction to the own neighbor. If no
+    neighbor does, all neighbors lie on one side of a line through the point.
 
     indices: the index of each of `own_lines` among all lines.
     bisector: bisector(i, mask) returns line i, in lanes of the mask.
@@ -219,7 +227,7 @@ def _clip_bisectors(
     def clip_by_line(i: Any, *state: Any) -> tuple[Any, ...]:
         """Clip the intervals of all own lines by line i. Note for each own line whether the
         neighbor of line i is to the left of the own line's neighbor. The state has three entries
-        for each own line: lower, upper, has_left."""
+        for each own line: lower, upper, has_left. Returns the next i, and the new state."""
         other, clipped = bisector(i, i < line_count), list[Any]()
         for t, (index, own_line) in enumerate(zip(indices, own_lines, strict=True)):
             lower, upper, has_left = state[3 * t : 3 * t + 3]

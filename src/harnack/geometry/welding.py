@@ -40,13 +40,13 @@ class Welded:
     cancels against the same edge run the other way; the edges that are left over are boundary
     edges.
 
-    index: (n,) the vertex that each vertex was joined to: the first at exactly its position, or the
-        first of the positions that rounding separates.
+    index: (n,) for each vertex the index of the vertex to which it was joined: the first one at
+        exactly its position or, if positions were joined that differ by rounding, the first one at
+        any of these.
     net: the faces between these vertices, duplicates added up (`net_faces`).
     edges, weights: the directed edges (k, 2) at which these faces do not cancel, and how often each
         remains (`singular_edges`).
-    rounded: the number of positions that were joined with others from which rounding separates
-        them.
+    rounded: the number of positions that were joined with others although they differ by rounding.
     """
 
     index: IntArray
@@ -60,11 +60,12 @@ class Welded:
         """Weld the vertices (n, 3) of faces (m, 3).
 
         Two vertices are joined if both are on edges that do not cancel, and if their distance is at
-        most `rounding_of` and at most a thousandth of the shortest edge there. The result is used
-        only if it has fewer edges that do not cancel. If a face would lose its area, or two of its
-        corners would become one, the corners of that face are not joined. So the number of faces is
-        the same as before, except for faces that cancel. Wider gaps stay, as two vertices are
-        joined only if they are as near as two results of the same computation.
+        most `rounding_of` and at most a thousandth of the shortest edge there. If this does not
+        leave fewer edges that do not cancel, only vertices at exactly the same position are joined.
+        If a face would lose its area, or two of its corners would become one, the corners of that
+        face are not joined. So the number of faces is the same as before, except for faces that
+        cancel. Wider gaps stay, as two vertices are joined only if they are as near as two results
+        of the same computation.
         """
         welded = cls._from_index(weld_vertices(vertices), vertices, faces, 0)
         # The mesh is closed.
@@ -81,18 +82,18 @@ class Welded:
     def _from_index(
         cls, index: IntArray, vertices: FloatArray, faces: IntArray, rounded: int
     ) -> Welded:
-        """The mesh in which vertex k is replaced by vertex index[k].
+        """The welded mesh in which vertex k is replaced by vertex index[k].
 
-        rounded: the number of positions that were joined although rounding separates them.
+        rounded: the number of positions that were joined although they differ by rounding.
         """
         net = net_faces(index[faces])
         return cls(index, net, *singular_edges(net.faces, net.multiplicity), rounded)
 
 
 def _joined_by_rounding(positions: FloatArray, faces: IntArray, candidates: IntArray) -> IntArray:
-    """For each vertex the vertex (n,) to which it is joined, or itself. Pairs of candidates are
-    joined if rounding explains their distance. If a face would then lose its area or a corner, the
-    vertices of that face are not joined after all, and the rest is tried again.
+    """For each vertex the index (n,) of the vertex to which it is joined, or its own index. Pairs
+    of candidates are joined if rounding explains their distance. If a face would then lose its area
+    or a corner, the vertices of that face are not joined after all, and the rest is tried again.
 
     positions: (n, 3) of the vertices.
     faces: (m, 3).

@@ -65,15 +65,15 @@ class Framing:
         return cls(placement, _orbit(camera, placement, points), box)
 
     def with_box(self, camera: Camera) -> Camera:
-        """Return the camera, with this framing's box if it has no box of its own. `render` with
-        this camera places the surfaces on the stage exactly as this framing does."""
+        """Return the given camera; if it has no box of its own, with the box of this framing.
+        `render` with this camera places the surfaces on the stage exactly as this framing does."""
         return camera if camera.box is not None else replace(camera, box=self.box)
 
 
 def extreme_points(points: FloatArray) -> FloatArray:
-    """Return those of the points (n, 3) that are farthest in at least one of 200 fixed random
-    directions; all points if there are at most 200. A camera that frames them frames nearly all n
-    points."""
+    """Return those of the points (n, 3) that are the farthest point in at least one of 200 fixed
+    random directions; all points if there are at most 200. A camera that frames them frames nearly
+    all n points."""
     if len(points) <= _DIRECTIONS:
         return points
     directions = np.random.default_rng(0).normal(size=(3, _DIRECTIONS))

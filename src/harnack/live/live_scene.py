@@ -204,18 +204,20 @@ class LiveScene:
 
         places: the slider values, each a mapping from slider names to values.
 
-        Slider values for which nothing can be drawn are left out here: drawing them reports the
-        error.
+        Slider values for which nothing can be drawn are left out here. The error is reported when
+        the surfaces are drawn at these values.
         """
         if not self.content.sliders or self.camera.box is not None:
             return self
         backend = choose_backend("single")
         points = [*self.points]
         for values in places:
+            # Errors at these values become SliderValueErrors, which are ignored here.
             with suppress(SliderValueError), slider_values_in_errors(values):
                 for body in _objects_at(self.content, values):
                     with suppress(NothingVisibleError):
                         points.append(extreme_points(visible_points(body.surface, backend)))
+        # The points are not those of the surfaces at the start alone, so `is_whole` is False.
         framing = Framing.of(self.camera, self.up, np.concatenate(points), is_whole=False)
         return replace(self, framing=framing)
 
@@ -226,7 +228,7 @@ class LiveScene:
 
     @cached_property
     def rays(self) -> tuple[tuple[FloatArray, FloatArray], ...]:
-        """Test rays for each surface: origins and unit directions, both (2048, 3), in stage
+        """Test rays, a pair for each surface: origins and unit directions, both (2048, 3), in stage
         coordinates. A browser traces them and compares its results with Dr.Jit's."""
         return tuple(_rays(self.placement.apply(points)) for points in self.points)
 
@@ -427,16 +429,16 @@ class LiveScene:
         return to_scene_text(surfaces, {**settings, **options}, self.sources), lost_sliders
 
     def _fitted(self, body: StudioObject) -> StudioObject:
-        """Return the object with its own hit tolerance or, if it has none, with a tolerance of 1e-4
-        in units of the stage."""
+        """Return the object `body` with a hit tolerance for its surface: its own or, if it has
+        none, 1e-4 in units of the stage."""
         if body.surface.tolerance is not None:
             return body
         tolerance = HitTolerance(_TOLERANCE / self.placement.scale)
         return replace(body, surface=replace(body.surface, tolerance=tolerance))
 
     def place(self, body: StudioObject) -> PlacedSurface:
-        """Return the object's surface, moved to the stage and prepared for tracing in single
-        precision."""
+        """Return the surface of the object `body`, moved to the stage and prepared for tracing in
+        single precision."""
         size = float(np.linalg.norm(np.diff(bounding_box(body.surface), axis=0)))
         backend = choose_backend("single")
         return PlacedSurface.of(body.surface, self.placement, backend, body.isolines, size)
@@ -463,9 +465,13 @@ def with_cut(surface: TracedSurface, volume: Volume) -> TracedSurface:
 def _with_cut_options(
     surfaces: list[Any], settings: dict[str, Any], volume: Volume
 ) -> tuple[list[Any], dict[str, Any]]:
-    """Return the surfaces and the options, cut by one more volume. The volume becomes an option if
-    the options have keywords of `Surface`, such as a level (whose values may be sliders); otherwise
-    it becomes part of each surface."""
+    """Cut surfaces by one more volume. Returns the surfaces and the options of the scene.
+
+    settings: the options by name; values may be sliders.
+
+    If keywords of `Surface`, such as a level, are among the options, the volume becomes part of the
+    option `section` or `clip`; otherwise it becomes part of each surface.
+    """
     name = _cut_option(volume)
     if any(option in SURFACE_OPTIONS for option in settings):
         return surfaces, {**settings, name: _overlap(settings.get(name), volume)}
@@ -568,8 +574,8 @@ def _kernel_data(
     placed: the surface on the stage.
     origins, directions: (n, 3) of the test rays, in stage coordinates.
 
-    "lanes" and "results" say in which order the shader reads the entries of a ray (`_LANES`) and
-    writes its results (`_RESULTS`). "key" is a hash of the shader.
+    The entries "lanes" and "results" say in which order the shader reads the entries of a ray
+    (`_LANES`) and writes its results (`_RESULTS`). "key" is a hash of the shader.
     """
     backend = choose_backend("single")
     lanes = {
@@ -623,9 +629,9 @@ def status_of(met: SurfaceHit) -> Any:
 
 
 def color_index(met: SurfaceHit) -> Any:
-    """Return for each ray the index in `surface_colors` of the color of its hit: 0 for the surface
-    itself, 1 for a filling of a hole, 2 for a cut face on a section, 2 + k for isoline k = 1, 2,
-    ... . met: the hits of the rays."""
+    """Return for each ray the index in `surface_colors` of the color of its hit. It is 0 for the
+    surface itself, 1 for a filling of a hole, 2 for a cut face on a section, and 2 + k for isoline
+    k = 1, 2, and so on. met: the hits of the rays."""
     index = cast("Any", type(met.evaluations))
     plain = dr.select(
         met.is_on_section, index(_CUT), dr.select(met.is_hole_filling, index(_MENDED), index(0))
@@ -634,13 +640,20 @@ def color_index(met: SurfaceHit) -> Any:
 
 
 def placed_tolerance(body: StudioObject, placed: PlacedSurface) -> float:
-    """Return the hit tolerance of the object's surface as a length in units of the stage."""
+    """Return the hit tolerance of a surface as a length in units of the stage.
+
+    body: the surface, with the tolerance in its own coordinates.
+    placed: the same surface on the stage, whose scale converts the length.
+    """
     return body.surface.hit_tolerance.distance * float(placed.scale[0])
 
 
 def _place(kernel: RecordedKernel, label: str) -> int:
-    """Return the index of a result, such as "result t", in the shader's output; `_NO_OUTPUT` if it
-    is 0 for all rays, so that the shader does not write it."""
+    """Return the index of a result in the output of a kernel's shader; `_NO_OUTPUT` if the shader
+    does not write the result, as it is the constant 0 for all rays.
+
+    label: the name of the result, such as "result t".
+    """
     if label in kernel.constants:
         return _NO_OUTPUT
     return kernel.shader.results.index(label)
@@ -684,7 +697,7 @@ def surface_colors(body: StudioObject) -> list[JsonDict]:
 
 def _paint(front: Any, back: Any, glossy: bool) -> JsonDict:
     """Return one entry of `surface_colors`. front, back: the colors of the two sides, Dr.Jit colors
-    of one lane."""
+    of one lane. glossy: whether the material is glossy."""
     sides = {"front": front, "back": back}
     return {
         "glossy": glossy,

@@ -189,7 +189,8 @@ def _framing_values(places: Mapping[str, list[float]]) -> Mapping[str, list[floa
     """Return the slider values by which the picture is framed.
 
     places: the values of each slider in the page. They are returned unchanged if they have at most
-        `_FRAMED` combinations; otherwise every other value and the last one of each slider.
+        `_FRAMED` combinations; otherwise every other value of each slider, and its last one, are
+        returned.
     """
     if math.prod(map(len, places.values())) <= _FRAMED:
         return places
@@ -206,8 +207,8 @@ def _slider_combinations(places: Mapping[str, list[float]]) -> list[dict[str, fl
 
 
 def _slider_state(live: LiveScene, values: Mapping[str, float]) -> JsonDict:
-    """Return the state at the given slider values, as its difference from the initial state, in
-    JSON data."""
+    """Return the state of the scene `live` at the given slider values, as JSON data that hold its
+    difference from the initial state."""
     with slider_values_in_errors(values):
         state = live.state(ControlState(values))
     return encode_arrays(state_delta(live.initial_state, state, checks=False))
@@ -274,6 +275,7 @@ def _slider_states(job: PageJob, workers: Executor, advance: Any) -> JsonDict:
     difference from the initial state for each combination of them, in the order of
     `_slider_combinations`}.
 
+    job: the arguments of the page.
     workers: run the parts of the work, in this process or on a cluster.
     advance: called with the finished fraction of the work after each part.
     """

@@ -168,8 +168,8 @@ class PreviewRenderer:
         self, mi: Any, painted: Sequence[PreviewSurface], eye: CameraAxes, size: tuple[int, int], *,
         has_floor: bool,
     ) -> dict[str, Any]:  # fmt: skip
-        """Trace the rays through the middles of the pixels, row by row. Returns Dr.Jit arrays by
-        name, with a lane for each pixel.
+        """Trace the rays of the camera `eye` through the middles of the pixels, row by row, to the
+        surfaces `painted` and the floor. Returns Dr.Jit arrays by name, with a lane for each pixel.
 
         has_floor: whether the floor is drawn.
 

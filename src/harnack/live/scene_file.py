@@ -778,8 +778,8 @@ def _construct(kind: type, value: Any, where: str) -> Any:
 
 
 def _settings_of(data: Plain, known: Sequence[str]) -> Plain:
-    """Return the options that a JSON object describes, by name. known: the names of the options
-    that are allowed."""
+    """Return the options, by name, that the JSON object `data` describes. known: the names of the
+    options that are allowed."""
     settings: Plain = {}
     for name, value in data.items():
         _check_name(name, known, "setting")

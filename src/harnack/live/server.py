@@ -201,6 +201,8 @@ class _PageServer:
     def start(self, host: str, port: int) -> LiveView:
         """Serve the page in a new thread, and return the view.
 
+        host, port: the address to serve at; port 0 for a free port.
+
         Raises:
             OSError: the address cannot be served at.
             ModuleNotFoundError: the package aiohttp is not installed.

@@ -215,11 +215,11 @@ class Session:
         return ControlState(values, loops, cut, _settings(question.get("settings", {})))
 
     def _values(self, numbers: Any) -> dict[str, float]:
-        """Return the values of all sliders by name: the values in `numbers`, moved to steps, and
-        start values for the others.
+        """Return the values of all sliders by name: the values in `numbers` (a dictionary by slider
+        name), moved to values that the sliders can have, and the start values of all other sliders.
 
         Raises:
-            RequestError: an unknown slider, or a value beyond its ends.
+            RequestError: an unknown slider, or a value that is not between the ends of its slider.
         """
         sliders = self.live.content.sliders
         if not isinstance(numbers, dict):
@@ -237,7 +237,8 @@ class Session:
         return values
 
     def _loops(self, curves: Any) -> list[FloatArray] | None:
-        """Return the vertices (n, 3) of each edited loop; None if `curves` is None, for no edits.
+        """Return the vertices (n, 3) of each edited loop; None if there are no edits. curves: a
+        list of points for each loop, or None.
 
         Raises:
             RequestError: malformed or too many points.
@@ -356,9 +357,10 @@ class Session:
 
         rays: the number of rays of the next picture.
 
-        They are prepared again if the controls changed. They are also prepared again once so many
-        rays were traced that building cells takes less time than it saves. Cells hold local
-        expansions of the field, which make each ray faster.
+        The surfaces of the last call are returned again if the controls are the same. But once so
+        many rays were traced that building cells takes less time than it saves, the surfaces are
+        prepared again, with cells. These hold local expansions of the field, which make each ray
+        faster.
         """
         # Arrays are compared by their bytes.
         loops = None if controls.curves is None else [loop.tobytes() for loop in controls.curves]
@@ -394,8 +396,8 @@ class Session:
         return {"png": base64.b64encode(picture._repr_png_()).decode()}
 
     def _camera(self, question: Mapping[str, Any]) -> Camera:
-        """Return the camera of a question. The question gives it in stage coordinates; the result
-        has the surfaces' coordinates."""
+        """Return the camera of a question. In the question, position and target are in stage
+        coordinates; in the result they are in the surfaces' coordinates."""
         placement = self.live.placement
         eye, target, fov = parse_camera(question.get("camera"))
         eye, target = (placement.apply_inverse(point[None])[0] for point in (eye, target))

@@ -38,7 +38,8 @@ class Slider:
     """A number between two ends that a person moves while looking at a page or a view.
 
     low, high: its ends.
-    start: its value at first; by default the middle, or the largest step below the middle.
+    start: its value at first; by default the middle or, for a slider with a step, the largest of
+        its values that is at most the middle.
     step: the distance of neighboring values, which are counted from `low`; None for a slider that
         takes all values.
 
@@ -80,8 +81,8 @@ class Slider:
         return number if abs(number - step_value) <= 1e-9 * self.step else step_value
 
     def values(self, count: int) -> list[float]:
-        """Return all values of the slider in ascending order; for a slider without a step `count`
-        evenly spaced values, both ends included."""
+        """Return values of the slider in ascending order: all of them if the slider has a step;
+        otherwise `count` evenly spaced values, both ends included."""
         if self.step is None:
             return [self.low + (self.high - self.low) * k / (count - 1) for k in range(count)]
         step_count = math.floor((self.high - self.low) / self.step + 1e-9)
@@ -183,8 +184,8 @@ class SliderValueError(ValueError):
 
 @contextmanager
 def slider_values_in_errors(values: Mapping[str, float]) -> Generator[None]:
-    """Context manager: errors raised in it become errors that name the slider values. If `values`
-    is empty, the errors stay as they are.
+    """Context manager: errors that are raised in its block become errors that name the slider
+    values. values: of the sliders, by name. If `values` is empty, the errors stay as they are.
 
     Raises:
         SliderValueError: in place of the error.

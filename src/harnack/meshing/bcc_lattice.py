@@ -99,8 +99,8 @@ class BccLattice:
 
     def nonempty_cells(self, clearance: Clearance, most_faces: int) -> IntArray:
         """Find the cells that are not proved to be free of the level set; returns their indices (n,
-        3). The search begins with blocks of 2^k cells along each axis. It drops blocks that are
-        proved empty and halves the others k times (octrees).
+        3). The search begins with blocks of 2^k cells along each axis. Blocks that are proved empty
+        are dropped; the others are halved, k times (octrees).
 
         clearance: returns for points (k, 3) proved lower bounds (k,) of their distances from the
             level set.
@@ -143,9 +143,9 @@ class BccLattice:
     def relevant_cells(
         self, clearance: Clearance, matter: IntArray, values: Clearance, most_faces: int
     ) -> tuple[IntArray, BoolArray]:
-        """Choose the cells in which the surface is meshed, if it is needed only in some cells, the
-        relevant ones. The function f counts as positive in irrelevant cells, also at the points
-        that these share with relevant cells.
+        """Choose the cells in which the surface is meshed. It is needed only in some cells of the
+        lattice, the relevant ones. The function f counts as positive in irrelevant cells, also at
+        the points that these share with relevant cells.
 
         Two kinds of relevant cells are chosen: cells that may hold the level set; and cells that
         have an irrelevant neighbor and a center at which f <= 0. Then every tetrahedron with
@@ -156,7 +156,7 @@ class BccLattice:
 
         clearance: returns for points (n, 3) proved lower bounds (n,) of their distances from the
             level set.
-        matter: (k, 3) indices of the relevant cells.
+        matter: (k, 3) the indices of the relevant cells.
         values: returns the values (n,) of f at points (n, 3).
         most_faces: the largest number of triangles of the mesh; it also limits the number of cells.
 
@@ -180,9 +180,9 @@ class BccLattice:
         return matter[chosen], is_relevant
 
     def interior_cells(self, cells: BoolArray) -> BoolArray:
-        """The cells of a mask whose neighbors in the lattice all belong to the mask as well;
-        returns a mask. Cells that share a corner are neighbors, and neighbors outside of the box
-        count as in the mask. Both masks have the shape `counts`."""
+        """Return the mask of those cells in the mask `cells` whose neighbors in the lattice all
+        belong to that mask as well. Cells that share a corner are neighbors, and neighbors outside
+        of the box count as in the mask. Both masks have the shape `counts`."""
         padded = np.pad(cells, 1, constant_values=True)
         inner = cells.copy()
         for shift in itertools.product((0, 1, 2), repeat=3):
@@ -196,7 +196,7 @@ class BccLattice:
         return np.clip(index, 0, self.counts - 1)
 
     def touches_cells(self, coordinates: IntArray, cells: BoolArray) -> BoolArray:
-        """Whether points are corners or centers of cells in a mask, (n,).
+        """(n,) whether each point is a corner or the center of a cell in a mask.
 
         coordinates: (n, 3) the lattice coordinates of the points.
         cells: the mask, of the shape `counts`.
@@ -223,9 +223,9 @@ class BccLattice:
         return distinct_rows(np.concatenate(layers))
 
     def tetrahedra(self, cells: IntArray) -> tuple[IntArray, IntArray]:
-        """The tetrahedra at all faces of chosen cells. Each belongs to an edge of a face: its
-        corners are the ends of the edge, and the points on both sides of the face (centers of cells
-        or, on the boundary of the box, the center of the face).
+        """The tetrahedra at all faces of chosen cells. Each belongs to an edge of a face. Its
+        corners are the ends of the edge, and one point on each side of the face: the center of the
+        cell there or, outside of the box, the center of the face instead.
 
         cells: (k, 3) the indices of the chosen cells.
 

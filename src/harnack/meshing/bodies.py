@@ -58,7 +58,7 @@ def closed_parts(x: FloatArray, raw: IntArray, joined: IntArray) -> list[IntArra
     faces. The list is empty if there are more than 200 components.
 
     Two faces are connected at a common edge. If the edge has two faces, they are connected; if it
-    has more, two faces are connected if they have material of the solid between them.
+    has more faces, two of them are connected if they have material of the solid between them.
 
     x: (n, 3) the vertices.
     raw: (m, 3) the faces as in the input. They are searched first: here components that touch are
@@ -81,9 +81,8 @@ def closed_parts(x: FloatArray, raw: IntArray, joined: IntArray) -> list[IntArra
 
 def _connected_groups(x: FloatArray, faces: IntArray) -> list[IntArray]:
     """Divide faces (m, 3) into their connected groups; each is an array (k,) of indices of faces.
-    Two faces are connected at a common edge (`neighbors`): if the edge has two faces, they are
-    connected; if it has more, two faces are connected if they have material of the solid between
-    them.
+    Faces are connected at common edges (`neighbors`). If an edge has two faces, they are connected;
+    if it has more, two of them are connected if they have material of the solid between them.
 
     x: (n, 3) the vertices.
     """
@@ -109,9 +108,9 @@ def volume_of(x: FloatArray, faces: IntArray) -> float:
 
 
 def nested(x: FloatArray, parts: list[IntArray]) -> list[list[int]]:
-    """Find for each closed component the components that contain all of it. Returns for each a list
-    of the indices of these, in order of increasing volume. Components may touch, since each is
-    tested at points a little inside of it.
+    """Find for each closed component the components that contain all of it. Returns for each
+    component the list of the indices of those that contain it, in order of increasing volume.
+    Components may touch, since each is tested at points a little inside of it.
 
     x: (n, 3) the vertices.
     parts: the faces (k, 3) of each component.
@@ -197,8 +196,9 @@ def united_parts(
 
 
 def _make_overlap(parts: list[TriangleMesh]) -> list[TriangleMesh]:
-    """Move vertices of components that are in contact only up to rounding, so that these overlap
-    there; returns all components. Otherwise their union would have gaps as thin as rounding errors.
+    """Move vertices of components that touch each other only up to rounding, so that these
+    components overlap there. Returns all components. Without that, their union would have gaps as
+    thin as rounding errors.
 
     A face counts as in contact with an earlier component if that component has a parallel face that
     looks the opposite way, and the distance from the plane of that face is not 0 but at most
@@ -267,8 +267,8 @@ def _union_of_components(components: list[TriangleMesh], within: float) -> Trian
 
 
 def _manifold_of_component(component: TriangleMesh) -> tuple[Manifold, bool]:
-    """The manifold3d solid inside of a closed component; and whether the component's faces look
-    outwards, so that it winds counter-clockwise.
+    """Returns two results: the manifold3d solid inside of a closed component; and whether the
+    component's faces look outwards, so that it winds counter-clockwise.
 
     Raises:
         MeshError: the component intersects itself.

@@ -143,15 +143,15 @@ class _FaceBoxTree:
             return dr.all((vector(*row[:3]) <= high) & (vector(*row[3:6]) >= low))
 
         def visit(node: VisitedNode, state: LoopValues) -> tuple[Mask, LoopValues]:
-            """Visit a node: returns whether to descend, which is where its box overlaps the box of
-            the lane's own face. In a leaf, the pairs with its faces are listed."""
+            """Visit a node of the tree. In a leaf, the pairs of the lane's own face and the leaf's
+            faces are listed. Returns the mask of lanes that descend, those where the node's box
+            overlaps the box of the own face; and `state`, unchanged."""
             is_near = overlap(node.head)
             return is_near, for_each_primitive(node, is_near & node.is_leaf, add_pair, state)
 
         def add_pair(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
             """List the pair of the lane's own face and the face of the record `row`, if their boxes
-            overlap. `active` masks the lanes that do so; the state, which is unused, is
-            returned."""
+            overlap. active: mask of the lanes that do so. state: not used; it is returned."""
             index = row[_FACE_INDEX]
             # Two chosen faces are listed once, by the face of smaller index. Empty slots (index -1)
             # are never listed.
@@ -252,8 +252,8 @@ def _are_apart(a: Corners, b: Corners, shared: list[list[Mask]]) -> Mask:
 
     def by_edges_or_line(*arguments: Any) -> Mask:
         """Whether the two triangles are apart by the condition on edges or by the condition on a
-        line (`_are_apart`). arguments: the three corners of `a` and of `b`; for each corner of `a`
-        and of `b` whether it is shared; and the number of shared corners."""
+        line (`_are_apart`). arguments: the three corners of `a`; those of `b`; for each corner of
+        `a` whether it is shared; the same for `b`; and the number of shared corners."""
         first, second = cast("tuple[Corners, Corners]", (arguments[:3], arguments[3:6]))
         in_first, in_second, count = (list(arguments[6:9]), list(arguments[9:12]), arguments[12])
         may_pierce = _edge_may_pierce(first, second, _sides(first, second), in_second)
@@ -265,8 +265,8 @@ def _are_apart(a: Corners, b: Corners, shared: list[list[Mask]]) -> Mask:
         return ((count < 1.5) & ~may_pierce) | _are_beside_edge(*reordered, count)
 
     def never(*arguments: Any) -> Mask:
-        """False in all lanes. It stands for the other conditions where the first one holds
-        already."""
+        """False in all lanes. It takes the place of the conditions on edges and on a line
+        (`_are_apart`) where the condition on a plane holds already."""
         return arguments[12] < 0
 
     arguments = (*a, *b, *is_shared_a, *is_shared_b, shared_count)
@@ -389,7 +389,8 @@ def _are_beside_edge(a: Corners, b: Corners, shared_count: Real) -> Mask:
             rounding = ROUNDING * m_length + dot_error
 
             def sides_of(offset: Vec3, m: Vec3 = m, rounding: Real = rounding) -> tuple[Mask, Mask]:
-                """Whether m'.offset is proved positive, and whether it is proved negative."""
+                """Whether m'.offset is proved positive, and whether it is proved negative.
+                rounding: a bound of |m'.x - computed m.x|/|x| for every vector x."""
                 value, error = dr.dot(m, offset), rounding * dr.norm(offset) + _UNDERFLOW
                 return value > error, value < -error
 

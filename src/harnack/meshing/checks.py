@@ -84,9 +84,9 @@ def euler_characteristic(faces: IntArray, edges: Edges | None = None) -> int:
 
 
 def check_manifold(faces: IntArray, vertices: FloatArray | None = None) -> None:
-    """Raise an error unless faces (m, 3) form a manifold: every edge has one or two faces, two
-    faces run their common edge in opposite directions, and the faces around every vertex are joined
-    to each other by edges.
+    """Raise an error unless faces (m, 3) form a manifold. Three conditions must hold: every edge
+    has one or two faces; two faces run their common edge in opposite directions; and the faces
+    around every vertex are joined to each other by edges.
 
     vertices: (n, 3), for the locations of failures; may be None.
 

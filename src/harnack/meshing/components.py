@@ -109,9 +109,9 @@ def drop_degenerate_components(surface: TriangleMesh) -> TriangleMesh:
 
 
 def component_facts(surface: TriangleMesh) -> list[dict[str, Any]]:
-    """Facts about each connected component of a closed surface, the largest first: a dictionary
-    with the entries `faces`, the number of faces; `volume`, which is negative for a cavity; and
-    `center`, the center of the bounding box as a list of three numbers."""
+    """Facts about the connected components of a closed surface: a dictionary for each component,
+    the largest first. It has the entries `faces`, the number of faces; `volume`, which is negative
+    for a cavity; and `center`, the center of the bounding box as a list of three numbers."""
     shells, facts = Shells.of(surface), list[dict[str, Any]]()
     counts = np.bincount(shells.component_of_face)
     for k in np.argsort(-np.abs(shells.volumes), kind="stable"):
@@ -164,8 +164,8 @@ class Shells:
         return cls(number, volumes, lower, upper, corners)
 
     def winding_number(self, component: Any, part: Any) -> float:
-        """How often the component with index `component` winds around a point of the component with
-        index `part`: the center of a face."""
+        """The winding number of the component with index `component` around a point of the
+        component with index `part`. The point is the center of one of its faces."""
         point = self.corners[np.argmax(self.component_of_face == part)].mean(axis=0)
         return winding_around(self.corners[self.component_of_face == component], point)
 

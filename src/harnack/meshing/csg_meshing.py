@@ -155,8 +155,8 @@ class CsgMesher:
     levels: the number of level sets.
     smallest_cell: the smallest size of cells used for them.
     uploads: the fields' data on the device, kept for further level sets of the same fields.
-    intersected_with: solids, with levels, with which everything that is meshed next will be
-        intersected. Where one of them has no points, nothing need be meshed
+    intersected_with: solids, each with a level, with which everything that is meshed next will be
+        intersected. Where one of the sets {solid <= level} has no points, nothing need be meshed
         (`IntersectedOperands`).
     irrelevant_region_cache: the value of `intersected_with` for which a region was computed last;
         and this region, in which one of these solids has no points.
@@ -214,9 +214,9 @@ class CsgMesher:
 
     def _combine_operands(self, solid: BooleanSolid, level: float) -> Manifold:
         """Mesh the set {solid <= level} for a union or an intersection: its operands are meshed and
-        combined by manifold3d. An operand of an intersection that is a complement is not meshed:
-        the solid that it is the complement of is meshed and cut away. If all operands are
-        complements, they are cut from the whole box."""
+        combined by manifold3d. If an operand of an intersection is a complement ~Q, it is not
+        meshed; Q is meshed and cut away. If all operands are complements, the solids Q are cut from
+        the whole box."""
         from manifold3d import Manifold, OpType
 
         indices = range(len(solid.parts))
@@ -231,10 +231,10 @@ class CsgMesher:
         return Manifold.batch_boolean([common, *cut_away], OpType.Subtract)
 
     def _mesh_operand(self, solid: BooleanSolid, number: int, level: float) -> Manifold:
-        """Mesh the set {operand <= level} for one operand of a union or an intersection. If it is a
-        complement in an intersection, mesh the solid that it is the complement of. While an operand
-        of an intersection is meshed, `intersected_with` holds the other operands, so that it is
-        meshed only where these leave something (`IntersectedOperands`).
+        """Mesh the set {operand <= level} for one operand of a union or an intersection. If the
+        operand of an intersection is a complement ~Q, mesh Q instead. While an operand of an
+        intersection is meshed, `intersected_with` holds the other operands. So the operand is
+        meshed only where these leave something of it (`IntersectedOperands`).
 
         solid: the union or intersection.
         number: the index of the operand.
@@ -260,8 +260,8 @@ class CsgMesher:
 
         If there are many cells, cells in which the solids `intersected_with` are proved to leave
         nothing are left out. If there are few cells, all are meshed, so that copies of a surface
-        are the same bit by bit. If that fails, cells are left out as well: in these cells a
-        function may jump, as the angle about an axis does, or have no finite value.
+        are the same bit by bit. If meshing all cells fails, cells are left out as well: in these
+        cells a function may jump, as the angle about an axis does, or have no finite value.
 
         Raises:
             MeshingError: the level set cannot be meshed.
@@ -551,7 +551,8 @@ def is_single_level_set(solid: Solid) -> bool:
 
 
 def _sublevel_bounds(solid: MeshSolid, level: float) -> tuple[FloatArray, FloatArray]:
-    """The lower and upper corners (3,) of a box that contains {solid <= level}."""
+    """The lower and the upper corner, (3,) each, of a box that contains the set {solid <=
+    level}."""
     low, high = cast("Volume", solid.sublevel_extent(level)).bounds()
     return np.array(low), np.array(high)
 
@@ -789,6 +790,7 @@ def _check_and_mend(
     triangles are too far from the level set, return the surface with these points moved nearer to
     it.
 
+    mesher: meshed the surface; it makes the function of the level set.
     size: the longest edge of the box around the solid, which `check` needs.
     check: called with the surface and the size; raises an error if the surface fails a check.
 
@@ -813,6 +815,7 @@ def apart_of(whole: Manifold, tolerance: float) -> TriangleMesh:
     """The surface of a manifold3d solid made by Boolean operations. Thin triangles are removed, and
     vertices are moved where triangles would pass through each other.
 
+    whole: the solid.
     tolerance: a length; vertices are moved by at most half of it.
 
     Raises:
@@ -831,7 +834,8 @@ def _without_crossings(parts: TriangleMesh | _Assembly, tolerance: float) -> Tri
 
     Raises:
         MeshingError: the surface is empty. It is a SelfIntersectionError if moving vertices does
-            not help, or if hardly any fewer triangles cross when fewer slivers are removed.
+            not help, or if the number of crossing triangles hardly falls when fewer slivers are
+            removed.
     """
     raised: SelfIntersectionError | None = None
     for factor in _SLIVERS_WITHIN if isinstance(parts, _Assembly) else (0.0,):
@@ -875,7 +879,7 @@ def _mesh_in_volume(
 ) -> TriangleMesh | _Assembly:
     """Mesh the boundary of the part of {solid <= level} in the volume; None stands for all of
     space. Returns a mesh if the boundary is one whole level set, else an assembly of the meshes of
-    operands."""
+    operands. mesher: meshes level sets and combines them."""
     if volume is None and is_single_level_set(solid):
         return mesher.mesh_smooth_level(solid, level)[0]
     lower, upper = mesher.lower, mesher.upper

@@ -86,8 +86,8 @@ def drop_cancelled_operands(solid: BooleanSolid, level: float) -> BooleanSolid |
 
 def _factors(solid: Solid, level: float) -> list[SolidAtLevel]:
     """The factors of the set {solid <= level}: pairs of a solid and its own level, whose sets have
-    {solid <= level} as their intersection. A solid that is no intersection is its own single
-    factor."""
+    {solid <= level} as their intersection. If the solid is no intersection, the list has one
+    factor, the solid itself."""
     if isinstance(solid, BooleanSolid) and not solid.is_union:
         return [factor for part in solid.parts for factor in _factors(part, level)]
     if isinstance(solid, OffsetSolid):
@@ -141,7 +141,7 @@ def _with_level_zero(solid: Solid, level: float) -> Solid:
 
 def _intersection(factors: Iterable[SolidAtLevel]) -> Solid:
     """A solid for the intersection of the sets of all factors (pairs of a solid and its level); its
-    level is 0. A single factor is not wrapped."""
+    level is 0. If there is a single factor, its solid is not put into an intersection."""
     parts = tuple(_with_level_zero(*factor) for factor in factors)
     return parts[0] if len(parts) == 1 else BooleanSolid(parts, is_union=False)
 

@@ -217,7 +217,7 @@ class SpanningMesh:
 @dataclass(frozen=True)
 class _SpanningInput:
     """What all attempts to mesh a level set have in common: the function f, and the box in which
-    its level set is meshed.
+    its level set {f = 0} is meshed.
 
     lower, upper: (3,) the corners of the box.
     walls: the same corners, if the surface may end at the faces of the box; else None.
@@ -298,8 +298,9 @@ def mesh_spanning_curve(
 
 
 def _curve_loops(function: LevelFunction) -> tuple[FloatArray, ...]:
-    """The closed loops of the boundary curve of the function's solid angle, each an array (k, 3) of
-    vertices. Edges that are run in both directions are left out."""
+    """Returns the closed loops of the boundary curve of a solid angle, each an array (k, 3) of
+    vertices. function: the solid angle minus its level. Edges that are run in both directions are
+    left out."""
     assert isinstance(function.field, SolidAngle)
     return cancel_opposite_edges(function.field.loops)
 
@@ -311,6 +312,7 @@ def _mesh_with_retries(
     check fails. If that does not help, or the places are not known, mesh it in smaller cells
     everywhere. The mesh is not refined yet.
 
+    task: the function, and the box in which it is meshed.
     attempts: how many sizes of cells may be tried.
     finer: sets of balls; a cell is halved once for each set with a ball that meets it.
 
@@ -340,6 +342,7 @@ def _mesh_in_cells(
     """Mesh the level set in cells of the size `spacing`, without refinement; and find out on how
     many tetrahedra the topology is proved.
 
+    task: the function, and the box in which it is meshed.
     finer: sets of balls; a cell is halved once for each set with a ball that meets it.
 
     Raises:
@@ -376,6 +379,8 @@ def _tetrahedralize(
     of the curve that are missing in it, because other points are too near to them, are halved, and
     it is computed again.
 
+    task: the function, and the box that tetrahedra fill.
+    curve: the boundary curve.
     root: cells that fill the box, and how many times they are to be halved.
     finer: sets of balls; a cell is halved once more for each set with a ball that meets it.
 

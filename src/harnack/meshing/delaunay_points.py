@@ -233,7 +233,10 @@ def _subdivided_cells(
     """The cells into which leaves of the octree are split, grouped by size, smallest first. A leaf
     is split into octants if it meets a ball of the first entry of `finer`; all cells so far are
     split again if they meet a ball of the second entry; and so on. Cells that are proved to be free
-    of the level set are left out, and so are leaves that are not split."""
+    of the level set are left out, and so are leaves that are not split.
+
+    function: f - level for a field f; it is 0 on the level set.
+    """
     pool = [leaves]
     for balls in finer:
         octants: list[BoxCells] = []
@@ -388,6 +391,7 @@ def newton_to_level(
     """Move points towards the level set {f = 0} by steps of Newton's method along the gradient:
     each step is -f grad f / |grad f|^2. Returns the moved points (n, 3).
 
+    function: f - level for a field f; it is 0 on the level set.
     points: (n, 3).
     samples: of f at the points.
     max_step: (n,) the largest length of each step.

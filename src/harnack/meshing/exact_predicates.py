@@ -69,8 +69,8 @@ def orient2d(a: FloatArray, b: FloatArray, c: FloatArray) -> SignArray:
 
 def _scaled(points: FloatArray) -> FloatArray:
     """The points, times a power of two that makes the largest absolute value of a coordinate at
-    least 1/2 and less than 1. The signs of determinants stay the same. Short of underflow no
-    coordinate is rounded."""
+    least 1/2 and less than 1. The signs of determinants stay the same. No coordinate is rounded,
+    unless it underflows."""
     largest = float(np.abs(points).max(initial=0.0))
     return points if largest == 0 else np.ldexp(points, -int(np.frexp(largest)[1]))
 

@@ -40,9 +40,9 @@ _SIMPLIFIED_WITHIN, _MENDED_WITHIN = (0.4, 0.2, 0.1), 0.05
 
 
 def check_options(spacing: Any, thickness: Any, seed: Any, max_triangles: Any) -> None:
-    """Raise ValueError or TypeError unless options of `mesh` are in their ranges: `cell_size` and
-    `thickness` positive or None, `seed` a nonnegative integer, `max_triangles` a positive
-    integer."""
+    """Raise ValueError or TypeError unless options of `mesh` are in their ranges: `cell_size` (the
+    parameter `spacing`) and `thickness` positive or None, `seed` a nonnegative integer,
+    `max_triangles` a positive integer."""
     for name, value in (("cell_size", spacing), ("thickness", thickness)):
         if value is not None and not 0 < as_real(value, name) < math.inf:
             raise ValueError(f"{name} must be a positive length, not {value!r}")
@@ -52,9 +52,9 @@ def check_options(spacing: Any, thickness: Any, seed: Any, max_triangles: Any) -
 
 def vertex_normals(function: LevelFunction, surface: TriangleMesh) -> FloatArray:
     """Unit normals (n, 3) at the vertices of a surface, in the direction of the gradient of the
-    field. At a vertex where the field has no gradient, as at a curve at which the surface ends, or
-    where the gradient is far from the direction of the faces, the normal is the mean of the normals
-    of the faces there, weighted by area.
+    field. At some vertices the field has no gradient, as at a curve at which the surface ends, or
+    the gradient is far from the direction of the faces. There the normal is the mean of the faces'
+    normals, weighted by area.
 
     function: the field minus its level.
     """

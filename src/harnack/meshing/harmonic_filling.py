@@ -304,6 +304,7 @@ def _mesh_patches(
     seed: the seed of the random moves of points.
     is_last: whether this is the last attempt; then a filling that cannot be refined to the
         tolerance is accepted.
+    report: called with messages about the progress.
 
     Raises:
         MeshingError: no filling ends at the edges, or a check of the mesh fails. It is a
@@ -375,13 +376,14 @@ def _refine_patches(
     tolerance: float,
     report: Callable[[str], None],
 ) -> tuple[FloatArray, IntArray]:
-    """Refine a filling to the tolerance; returns its vertices and faces. Three ways are tried, and
-    the first result that does not pass through itself is taken: smoothing, refining and improving;
-    smoothing before and after refining; refining alone.
+    """Refine a filling until it is within the tolerance of the level set; returns its vertices and
+    faces. Three ways are tried, and the first result that does not pass through itself is taken:
+    smoothing, refining and improving; smoothing before and after refining; refining alone.
 
     function: f, whose level set {f = 0} is meshed.
     x, faces: (n, 3), (m, 3) the filling before refinement.
     tolerance: a length.
+    report: called with messages about the progress.
 
     Raises:
         LocalizedMeshingError: all results pass through themselves, as small triangles do that turn
@@ -495,9 +497,9 @@ def _check_filled_mesh(
     patches: HarmonicFilling,
     report: Callable[[str], None],
 ) -> None:
-    """Raise an error unless a mesh together with its filling passes all checks: it is a manifold;
-    at the filling's vertices the winding number of the mesh is 1/2 modulo 1; and the filling
-    intersects neither the mesh nor itself.
+    """Raise an error unless a mesh together with its filling passes three checks. They form a
+    manifold. At the filling's vertices the winding number of the mesh is 1/2 modulo 1. And the
+    filling intersects neither the mesh nor itself.
 
     vertices, faces: (n, 3), (m, 3) the mesh.
     patches: the filling.

@@ -349,8 +349,8 @@ def _turned(faces: IntArray, is_turned: BoolArray) -> IntArray:
 def _on_faces(
     triangles: FloatArray, count: int, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
-    """Random points (count, 3) on triangles (m, 3, 3), uniform by area; and for each point the unit
-    normal of its triangle, (count, 3)."""
+    """Returns random points (count, 3) on triangles (m, 3, 3), uniform by area; and for each point
+    the unit normal of its triangle, (count, 3). rng: the source of random numbers."""
     normal = area_normals(triangles)
     area = row_norms(normal)
     chosen = rng.choice(len(triangles), count, p=area / area.sum())
@@ -361,8 +361,9 @@ def _on_faces(
 
 
 def _near(triangles: FloatArray, size: float, rng: np.random.Generator) -> FloatArray:
-    """Random points (k, 3) on both sides of triangles (m, 3, 3), uniform by area. The logarithm of
-    their distance from the triangle is uniform between `_NEAREST` and `_FARTHEST` times `size`."""
+    """Random points (k, 3) on both sides of triangles (m, 3, 3), uniform by area. Their distances
+    from the triangles are between `_NEAREST` and `_FARTHEST` times `size`, and the logarithms of
+    these distances are uniform. rng: the source of random numbers."""
     points, normals = _on_faces(triangles, _NEAR, rng)
     offsets = size * np.exp(rng.uniform(math.log(_NEAREST), math.log(_FARTHEST), len(points)))
     offsets *= rng.choice((-1.0, 1.0), len(points))

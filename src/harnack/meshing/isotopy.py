@@ -165,8 +165,11 @@ def isotopy_of(
 
 def _has_bounds(function: LevelFunction, corners: FloatArray) -> bool:
     """Whether the field gives a finite bound of the change of its gradient, so that something can
-    be proved: tried on about a hundred of the tetrahedra with corners (n, 4, 3), of which one must
-    have a bound."""
+    be proved. About a hundred of the tetrahedra with corners (n, 4, 3) are tried; it is enough that
+    one has a bound.
+
+    function: f - level for a field f; it is 0 on the level set.
+    """
     tried = corners[:: max(1, len(corners) // _MAX_TRIED)]
     center, radius = _balls(tried)
     return not len(tried) or bool((function.gradient_bounds(center, radius)[1] < _NO_BOUND).any())
@@ -466,8 +469,8 @@ def _regular_on_walls(
 
 
 def _distances(points: FloatArray, boundary: BoundaryCurve) -> FloatArray:
-    """Distances (n,) of points (n, 3) from the curve, measured to nine points of each of its edges.
-    They are too large by at most a sixteenth of the longest edge."""
+    """Distances (n,) of points (n, 3) from the curve `boundary`, measured to nine points of each of
+    its edges. They are too large by at most a sixteenth of the longest edge."""
     a, b = (boundary.points[boundary.edges[:, k]] for k in (0, 1))
     fraction = np.linspace(0, 1, 9)[:, None, None]
     curve_points: FloatArray = (a + fraction * (b - a)).reshape(-1, 3)

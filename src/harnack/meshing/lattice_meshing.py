@@ -578,8 +578,11 @@ def split_faces_off_level(
     """Cut into three each face whose center is farther than `farthest` (a length) from the level
     set, as happens where the face cuts across a crease. Returns the new mesh.
 
+    function: f - level for a field f; it is 0 on the level set.
+
     The new vertex is the face's center, moved onto the level set. The new faces are examined in the
-    same way, in `times` rounds at most. All edges stay."""
+    same way, in `times` rounds at most. All edges stay.
+    """
     vertices, faces = surface.vertices, surface.faces
     pending = np.arange(len(faces))
     for _ in range(times):
@@ -605,11 +608,12 @@ def split_faces_off_level(
 
 
 def _are_negative(function: LevelFunction, lattice: BccLattice, cells: IntArray) -> BoolArray:
-    """(k,) whether the function is at most 0 at the centers of the cells with indices `cells` (k,
-    3).
+    """(k,) whether the function is at most 0 at the centers of those cells of the lattice that have
+    the indices `cells` (k, 3).
 
     Cells are grouped in blocks of 8^3. If the level set is proved not to enter a block, the sign at
-    the block's center holds for all of its cells."""
+    the block's center holds for all of its cells.
+    """
     # Number the blocks, and keep those that contain a cell.
     shape = lattice.counts // _BLOCK + 1
     x, y, z = (cells // _BLOCK).T
@@ -746,8 +750,8 @@ def _check_is_continuous(
     function: LevelFunction, vertices: FloatArray, faces: IntArray, lattice: BccLattice
 ) -> None:
     """Raise UnrefinableError if more than 4 in 100 vertices of the mesh are farther than a tenth of
-    a cell from the level set. The function changes its sign at every vertex, so it jumps at these,
-    and refinement would never end."""
+    a cell from the level set. The function changes its sign at every vertex; so it jumps at these
+    vertices, and refinement would never end. lattice: tells the size of cells."""
     x = vertices[np.unique(faces)]
     is_far = function.sample(x).distance > _JUMP_DISTANCE * float(lattice.size.max())
     if is_far.sum() > _MAX_JUMP_SHARE * len(x):

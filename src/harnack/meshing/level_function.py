@@ -139,7 +139,7 @@ class LevelFunction:
         """(n,) f - level at points (n, 3), without gradients."""
 
         def value(p: Vec3) -> tuple[Real]:
-            """The value of f at the points p."""
+            """The value of f at the points p, as a tuple of one."""
             with share_samples(), without_alternatives():
                 return (self._prepared.evaluate(p).value,)
 
@@ -150,7 +150,7 @@ class LevelFunction:
         computed value (rounding, and for a truncated sum its truncation)."""
 
         def value_and_error(p: Vec3) -> tuple[Real, Real]:
-            """The value of f at the points p, and the bound of its error."""
+            """Two results for the points p: the value of f, and a bound of its error."""
             with without_alternatives():
                 sample = self._prepared.evaluate(p)
             return sample.value, self._backend.Float(sample.value_error)
@@ -189,7 +189,8 @@ class LevelFunction:
         (`level_distance_lower_bound`)."""
 
         def bound(p: Vec3) -> tuple[Real]:
-            """The lower bound of the distance from the points p to the level set."""
+            """The lower bound of the distance from the points p to the level set, as a tuple of
+            one."""
             sample = self._prepared.evaluate(p)
             return (
                 level_distance_lower_bound(self._backend, self._prepared, self._levels, p, sample),

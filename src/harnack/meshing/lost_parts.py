@@ -193,10 +193,12 @@ class LostParts:
     ) -> LostParts:
         """Find the parts of a level set that a mesh has lost.
 
+        function: side * (f - level) for a field f; its sign changes at the level set.
         known: points on the level set, near which the mesh should be.
         surface: the mesh.
         tolerance: a length. A point within this distance of the mesh is no sign of a lost part.
-        spacing: the size of the mesh's cells, a length."""
+        spacing: the size of the mesh's cells, a length.
+        """
         corner = surface.vertices[surface.faces]
         distant = known.select(_are_farther(known.points, corner, tolerance))
         beyond = _are_farther(distant.points, corner, max(tolerance, _ALLOWED_CELLS * spacing))

@@ -74,10 +74,10 @@ def mesh_manifold(solid: MeshSolid) -> Manifold | None:
     union of the solids of the mesh's components, or None if a component intersects itself or is a
     cavity.
 
-    Components that are in contact only up to rounding would leave gaps as thin as rounding, whose
-    walls add to the area, or would pass through each other. So if the area of the union differs
-    from the area of the solid's boundary, or if triangles of the union cross, the faces of all
-    components are first moved outwards by a tiny length. If triangles cross then too, the first
+    Where components touch each other only up to rounding, their union may have gaps as thin as
+    rounding, whose walls add to the area, or triangles that cross. So if the area of the union
+    differs from the area of the solid's boundary, or if triangles of the union cross, the faces of
+    all components are first moved outwards by a tiny length. If triangles cross then too, the first
     union of the right area is returned, or None if there is none.
 
     Raises:
@@ -150,7 +150,7 @@ def from_manifold(manifold: Manifold) -> TriangleMesh:
 
 
 def box_manifold(lower: FloatArray, upper: FloatArray) -> Manifold:
-    """The box between two corners (3,) as a manifold3d solid."""
+    """The box between the corners `lower` and `upper`, (3,) each, as a manifold3d solid."""
     from manifold3d import Manifold
 
     x, y, z = (float(v) for v in upper - lower)
@@ -208,9 +208,9 @@ def extruded_manifold(
 
 def revolved_manifold(outline: Outline, tolerance: float) -> Manifold:
     """An outline in the (r, z) plane, revolved about the z axis, as a manifold3d solid. Vertices
-    lie on the exact surface, and faces are within `tolerance` (a length) of it: if a circle of
-    radius r is divided into n segments, a chord is at most r (1 - cos(pi/n)) <= r (pi/n)^2/2 from
-    its arc.
+    lie on the exact surface, and faces are within `tolerance` (a length) of it. Proof. If a circle
+    of radius r is divided into n segments, a chord is at most r (1 - cos(pi/n)) <= r (pi/n)^2/2
+    from its arc.
 
     Raises:
         MeshingError: the tolerance is so small that there are too many segments.
@@ -228,8 +228,8 @@ def revolved_manifold(outline: Outline, tolerance: float) -> Manifold:
 
 
 def _cross_section(outline: Outline) -> tuple[CrossSection, float]:
-    """The manifold3d cross-section of an outline, scaled so that manifold3d does not round its
-    coordinates (`scale_for_clipper`); and the factor by which it was scaled."""
+    """Returns two results: the manifold3d cross-section of an outline, scaled so that manifold3d
+    does not round its coordinates (`scale_for_clipper`); and the factor by which it was scaled."""
     from manifold3d import CrossSection
 
     loops, scale = scale_for_clipper(outline)

@@ -346,10 +346,10 @@ def _halves(vertices: FloatArray, ring: list[IntArray]) -> tuple[IntArray, IntAr
 
 
 def _sides(points: TetrahedronPoints, tets: Tetrahedra, crossings: EdgeCrossings) -> IntArray:
-    """(m, 4) for each corner of each of m tetrahedra, on which side of the level it lies: the
-    number of level crossings (upward minus downward) on the edge to this corner from the first
-    corner of the tetrahedron that is not on the level. It is 0 for that corner and for corners on
-    the level.
+    """(m, 4) for each corner of each of m tetrahedra, an integer that tells on which side of the
+    level it lies. It is counted from the first corner of the tetrahedron that is not on the level:
+    the number of level crossings (upward minus downward) on the edge from there to this corner. It
+    is 0 for that first corner and for corners on the level.
 
     Raises:
         LocalizedMeshingError: the crossings of three edges of a face do not add up.
@@ -440,11 +440,13 @@ def _illinois(
 ) -> FloatArray:
     """(r,) the fractions of edges at which they meet the level set, by a few secant steps.
 
+    function: f - level for a field f; it is 0 on the level set.
     p, edge: (r, 3) one end of each edge, and the vector to the other end.
     low, high: (r,) the values of f - level at these two ends, of different signs.
 
     Each step replaces one end of the search interval. If it is the same end twice or more in a row,
-    the value at the other end is halved for the next secant (the Illinois method)."""
+    the value at the other end is halved for the next secant (the Illinois method).
+    """
     left, right = np.zeros(len(p)), np.ones(len(p))
     is_rising = high > low
     # Falling edges are negated, so that values are negative at the left ends.
@@ -563,8 +565,10 @@ def _side_sample(
     given face, and the value (n,) of f - level there. It is the corner opposite to the face or, if
     that is on the level, the center of the tetrahedron.
 
+    function: f - level for a field f; it is 0 on the level set.
     table: (n, 5) one row for each tetrahedron and face: the three corners of the face, the index of
-        the tetrahedron, and which of its corners (0 to 3) is opposite to the face."""
+        the tetrahedron, and which of its corners (0 to 3) is opposite to the face.
+    """
     corners = tets.corners[table[:, 3]]
     apex = corners[np.arange(len(table)), table[:, 4]]
     side_points, value = points.points[apex], points.samples.value[apex]

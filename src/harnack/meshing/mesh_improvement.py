@@ -62,8 +62,10 @@ def flip_edges(
     and if the new edge does not exist already. Of several possible flips of a triangle, only the
     best is made in a round.
 
+    function: f - level for a field f; it is 0 on the level set.
     tolerance: a length, the largest distance of the midpoints of new edges and of the centers of
-        new triangles from the level set, estimated by the gradient there."""
+        new triangles from the level set, estimated by the gradient there.
+    """
     refused_keys = np.zeros(0, np.int64)
     boundary_keys = edge_keys(boundary_edges(faces), len(vertices))
     for _ in range(_MOST_ROUNDS_OF_FLIPS):
@@ -124,7 +126,9 @@ def _independent_flips(
     gain: (n,) how much the smallest angle grows by the flip of each pair (as a difference of
         cosines).
     pairs: (n, 2) the two faces of each pair.
-    key: (n,) a number that identifies the new edge of each pair."""
+    key: (n,) a number that identifies the new edge of each pair.
+    face_count: the number of faces of the mesh.
+    """
     rows = rows[np.argsort(-gain[rows], kind="stable")]
     rank = np.arange(len(rows))
     # For each face the rank of the best candidate that changes it; rank 0 gains most.
@@ -140,12 +144,14 @@ def _independent_flips(
 def _flips_stay_near(
     function: LevelFunction, vertices: FloatArray, new: IntArray, tolerance: float
 ) -> BoolArray:
-    """(k,) for each of k flips, whether the mesh stays near the level set. That is so if the middle
-    of the new edge and the centers of both new triangles are within `tolerance` (a length) of the
-    level set, estimated by the gradient there, and if the normals of both triangles are within 60
-    degrees of the gradient.
+    """(k,) for each of k flips, whether the mesh stays near the level set. Two conditions must
+    hold. The middle of the new edge and the centers of both new triangles are within `tolerance` (a
+    length) of the level set, estimated by the gradient there. And the normals of both triangles are
+    within 60 degrees of the gradient.
 
-    new: (k, 2, 3) the corners of the two new triangles of each flip."""
+    function: f - level for a field f; it is 0 on the level set.
+    new: (k, 2, 3) the corners of the two new triangles of each flip.
+    """
     corner = vertices[new]  # (k, 2, 3, 3)
     normal = np.cross(corner[:, :, 1] - corner[:, :, 0], corner[:, :, 2] - corner[:, :, 0])
     middle = corner[:, 0, :2].mean(axis=1)
@@ -188,13 +194,15 @@ def collapse_slivers(
     """Remove slivers (triangles with an angle below 4 degrees) by contracting their shortest edge
     to one of its ends, if possible. Returns the faces that are left, with their new corners.
 
+    function: f - level for a field f; it is 0 on the level set.
     fixed: (n,) the mask of the vertices that may not be removed, such as those of the boundary.
     tolerance: a length, the largest distance of the centers of new triangles from the level set.
 
     An edge (u, v) can be contracted to u without a change of topology if v is not fixed and if u
     and v have only two neighbors in common, the third corners of the edge's two faces (the link
     condition). It is contracted if no new triangle is a sliver, and if the normals of all new
-    triangles are along the gradient, and their centers near the level set."""
+    triangles are along the gradient, and their centers near the level set.
+    """
     slivers = np.flatnonzero(least_angles(vertices, faces) < _SLIVER)
     is_removed = np.zeros(len(faces), np.bool_)
     faces = faces.copy()
@@ -240,6 +248,8 @@ def _is_good(
 ) -> bool:
     """Whether all `new` triangles (k, 3) are good: the normal of each is within about 70 degrees of
     the gradient, its center is within `tolerance` (a length) of the level set, and it is no sliver.
+
+    function: f - level for a field f; it is 0 on the level set.
     """
     corner = vertices[new]
     normal = area_normals(corner)
@@ -268,9 +278,11 @@ def relax_vertices(
     """Move vertices of thin triangles along the level set, if that makes the smallest angle of the
     triangles around them larger. Returns the vertices (n, 3). Boundary vertices stay.
 
+    function: f - level for a field f; it is 0 on the level set.
     tolerance: a length, the largest distance of the centers of triangles around moved vertices from
         the level set.
-    walls: None, or the lower and the upper corner (3,) of a box to which vertices are confined."""
+    walls: None, or the lower and the upper corner (3,) of a box to which vertices are confined.
+    """
     is_fixed = np.zeros(len(vertices), np.bool_)
     is_fixed[boundary_edges(faces)] = True
     vertices = vertices.copy()
@@ -347,6 +359,7 @@ def _best_places(
     """For each of k vertices, find a position at which the smallest angle of the triangles around
     it is large.
 
+    function: f - level for a field f; it is 0 on the level set.
     stars: the faces around the k vertices.
     walls: None, or the lower and the upper corner (3,) of a box to which positions are confined.
 
@@ -387,13 +400,14 @@ def _best_places(
 def _least_at(
     positions: FloatArray, stars: _VertexStars, a: FloatArray, b: FloatArray, normal: FloatArray
 ) -> FloatArray:
-    """(k,) for each of k vertices, the smallest angle (in radians) of the triangles around it if it
-    is moved to its position in `positions` (k, 3); -1 if that turns one of these triangles by more
-    than 60 degrees.
+    """(k,) for each of k vertices that is moved to its position in `positions` (k, 3), the smallest
+    angle (in radians) of the triangles around it after the move; -1 if the move turns one of these
+    triangles by more than 60 degrees.
 
     stars: the faces around the vertices, as p pairs of a vertex and a face.
     a, b: (p, 3) the other two corners of the face of each pair.
-    normal: (p, 3) the unit normal of the face of each pair, before the move."""
+    normal: (p, 3) the unit normal of the face of each pair, before the move.
+    """
     center = positions[stars.owner]
     cross = np.cross(a - center, b - center)
     size = row_norms(cross)
@@ -411,7 +425,10 @@ def _independent_moves(
     Returns the chosen ones of `rows`.
 
     rows: (j,) the candidates, as positions in `stars.centers`.
-    gain: (k,) for all k stars, how much the smallest angle grows by the move, in radians."""
+    gain: (k,) for all k stars, how much the smallest angle grows by the move, in radians.
+    stars, faces: the faces around the k vertices, and all faces (m, 3) of the mesh.
+    vertex_count: the number of vertices of the mesh.
+    """
     rank = np.full(vertex_count, len(rows))
     ordered = rows[np.argsort(-gain[rows], kind="stable")]
     rank[stars.centers[ordered]] = np.arange(len(rows))
@@ -429,13 +446,15 @@ def _moves_stay_near(
     rows: IntArray,
     tolerance: float,
 ) -> BoolArray:
-    """(j,) for each of j vertices, whether it may move to its target without the mesh leaving the
-    level set. Three conditions must hold: the target is on the level set; the centers of the
+    """(j,) for each of j vertices, whether the mesh stays near the level set if the vertex moves to
+    its target. Three conditions must hold: the target is on the level set; the centers of the
     triangles around it are within `tolerance` (a length) of the level set; and the normals of these
     triangles are within 60 degrees of the gradient.
 
+    function: f - level for a field f; it is 0 on the level set.
     stars: the faces around k vertices. rows: (j,) the vertices, as positions in `stars.centers`.
-    targets: (k, 3) the targets of all k vertices."""
+    targets: (k, 3) the targets of all k vertices.
+    """
     is_candidate = np.zeros(len(stars.centers), np.bool_)
     is_candidate[rows] = True
     pairs = np.flatnonzero(is_candidate[stars.owner])

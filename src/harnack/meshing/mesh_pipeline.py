@@ -772,6 +772,7 @@ def _mesh_in_lattice(
     spacing: the size of the lattice cells that are tried first, a length.
     attempts: the largest number of attempts. If one fails in a way that smaller cells may mend, the
         next one has cells 0.6 times as large.
+    report: called with messages about the progress.
 
     Raises:
         MeshingError: the last attempt failed, or one that smaller cells do not mend.
@@ -817,10 +818,13 @@ def _mesh_spanning_curve(
     """Mesh the level set of a `SolidAngle`, a surface that ends at the curve of this angle. Returns
     the mesh, and its entries in `metadata["harnack"]`.
 
+    function: f - level for a field f; it is 0 on the level set.
     tolerance: the largest distance of triangles from the level set, a length.
     spacing: the size of the cells that are tried first, a length.
     attempts: the largest number of attempts, each with smaller cells.
-    seed: of the small random moves that keep points in general position."""
+    seed: of the small random moves that keep points in general position.
+    report: called with messages about the progress.
+    """
     ends = box.lower, box.upper
     made = mesh_spanning_curve(
         function, spacing, attempts, ends, box.has_walls, seed, tolerance, report

@@ -87,9 +87,9 @@ def is_retry_promising(
     now: MeshingError, before: MeshingError | None, smallest: float = 1.0
 ) -> bool:
     """Whether to try again with smaller cells after an attempt at meshing failed. It is not
-    worthwhile if smaller cells cannot help. Nor is it if a check failed at more than 20 places, and
-    at more than half as many as in the attempt before: along a pole of the function, or where
-    surfaces on which it jumps cross, cells of every size fail.
+    worthwhile if smaller cells cannot help. Nor is it worthwhile if a check failed at more than 20
+    places, and at more than half as many as in the attempt before. That happens along a pole of the
+    function, or where surfaces on which it jumps cross: there cells of every size fail.
 
     now: the error of the last attempt.
     before: the error of the attempt before it, or None.

@@ -99,6 +99,7 @@ def _project_and_split(
     half of `tolerance` (a length), or at its center if there are none. The new vertices are moved
     onto the level set.
 
+    function: f - level for a field f; it is 0 on the level set.
     is_new: (m,) the mask of the faces that earlier calls made.
 
     Returns:
@@ -207,7 +208,8 @@ def _in_boxes_of(triangles: FloatArray, rows: IntArray) -> IntArray:
 
 
 def _rows_at(targets: FloatArray, points: FloatArray) -> IntArray:
-    """The indices of the points (n, 3) that are equal to one of the targets (k, 3), bit by bit."""
+    """The indices of those of the points (n, 3) that are equal to one of the targets (k, 3), bit by
+    bit."""
     rows = np.flatnonzero(np.isin(points[:, 0], targets[:, 0]))
     is_equal = (points[rows, None] == targets).all(axis=2).any(axis=1)
     return rows[is_equal]

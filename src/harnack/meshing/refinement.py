@@ -148,6 +148,7 @@ def _converge_vertices(
     within a step. A vertex is moved only if that brings it closer to the level set, and by less
     than `tolerance` (a length). Boundary vertices stay if `walls` is None.
 
+    function: f - level for a field f; it is 0 on the level set.
     walls: None, or the lower and the upper corner (3,) of a box on whose faces the boundary lies.
     """
     samples = function.sample(vertices)
@@ -175,6 +176,7 @@ def _project_to_creases(
     """The new vertices (k, 3) of k edges that are split. If an edge cuts off a sharp crease of the
     level set, its new vertex is put onto the crease; otherwise it is the given one.
 
+    function: f - level for a field f; it is 0 on the level set.
     ends: (k, 2) the indices of the vertices at the ends of each edge.
     moved: (k, 3) the given new vertices: the midpoints of the edges, moved onto the level set by
         Newton's method.
@@ -189,7 +191,8 @@ def _project_to_creases(
     An edge cuts off a crease if the normals at its ends differ by 20 degrees or more, and the
     normals at the moved midpoint and at one of the ends differ by nearly that angle. On a smooth
     surface the latter two differ by about half of it. The given vertex is also kept if the segment
-    does not pass the level, or passes it too near to an end of the edge."""
+    does not pass the level, or passes it too near to an end of the edge.
+    """
     used, vertex_rows = np.unique(ends, return_inverse=True)
     gradient = function.sample(vertices[used]).gradient
     end_normals = unit_rows(gradient)[vertex_rows.reshape(-1, 2)]
@@ -232,7 +235,9 @@ def _crease_corners(
     this point passes the level. If it does not pass the level, or if the normals are dependent, the
     new vertex is the center of the face, moved onto the level set by Newton's method.
 
-    walls: None, or the lower and the upper corner (3,) of a box to which points are confined."""
+    function: f - level for a field f; it is 0 on the level set.
+    walls: None, or the lower and the upper corner (3,) of a box to which points are confined.
+    """
     corner = vertices[faces]
     center = corner.mean(axis=1)
     longest_edge = longest_edges(corner)
@@ -255,6 +260,7 @@ def _level_along(
 ) -> tuple[FloatArray, BoolArray]:
     """Search for the level set along segments.
 
+    function: f - level for a field f; it is 0 on the level set.
     start, along: (k, 3) the start of each segment, and the vector to its end. A vector longer than
         `limit` (k,) is shortened to that length. The search goes a quarter of the length beyond the
         end.
@@ -288,7 +294,10 @@ def unrefined_midpoints(
     function: LevelFunction, vertices: FloatArray, faces: IntArray, tolerance: float
 ) -> FloatArray:
     """(k, 3) the midpoints of the edges of a mesh that `refine` would still split, because the mesh
-    is farther than `tolerance` (a length) from the level set there."""
+    is farther than `tolerance` (a length) from the level set there.
+
+    function: f - level for a field f; it is 0 on the level set.
+    """
     marks = _RefinementMarks.of(function, vertices, faces, tolerance, None, None)
     return marks.middle[marks.marked]
 
@@ -376,6 +385,7 @@ def _normals_turn(function: LevelFunction, corner: FloatArray) -> BoolArray:
     """(k,) for each of k faces, whether the level set between its corners has a crease: the normals
     at two corners differ by more than 20 degrees.
 
+    function: f - level for a field f; it is 0 on the level set.
     corner: (k, 3, 3) the corners of the faces."""
     normal = unit_rows(function.sample(corner.reshape(-1, 3)).gradient).reshape(-1, 3, 3)
     cosines = [row_dots(normal[:, k], normal[:, k - 1]) for k in range(3)]
@@ -448,8 +458,10 @@ def improve(
     are split where triangles are no longer within `tolerance` (a length) of the level set. Finally
     edges are flipped and vertices moved for larger angles.
 
+    function: f - level for a field f; it is 0 on the level set.
     walls: None, or the lower and the upper corner (3,) of a box on whose faces the boundary lies.
-    report: called with messages about progress."""
+    report: called with messages about progress.
+    """
     for _ in range(2):
         faces = flip_edges(function, vertices, faces, tolerance)
         vertices = smooth(function, vertices, faces, walls, rounds=2)
@@ -476,7 +488,9 @@ def smooth(
     Boundary vertices stay. A vertex that does not come back to the level set stays too, and moves
     that turn a face by more than about 70 degrees are undone.
 
-    walls: None, or the lower and the upper corner (3,) of a box to which vertices are confined."""
+    function: f - level for a field f; it is 0 on the level set.
+    walls: None, or the lower and the upper corner (3,) of a box to which vertices are confined.
+    """
     ends, _, _ = _edges(faces)
     boundary = np.unique(boundary_edges(faces))
     is_free = np.zeros(len(vertices), np.bool_)

@@ -262,7 +262,8 @@ def _checked_settings(
     report: Callable[[str], None],
 ) -> _RepairOptions:
     """Check the arguments of `repair`, and collect them in one object. patches: the argument
-    `filling`. spacing: the argument `cell_size`. The others have the same names.
+    `filling`. spacing: the argument `cell_size`. report: the argument `progress`. The others (keep,
+    tolerance, seed) have the same names.
 
     Raises:
         ValueError: one of them is not among the allowed values.
@@ -439,8 +440,13 @@ def _remesh(
     is 1/2. It is closed whatever the mesh is. Returns this mesh, and its entries in
     `metadata["harnack"]`.
 
+    settings: the options of the repair.
+
     If cells of a 48th of the mesh's size (and larger ones) fail, cells 0.6 times as large are
-    tried."""
+    tried.
+
+    intended: the damaged mesh, whose winding number it is.
+    """
     intended.check_encloses()
     mesh_arrays = without_zero_area_faces(intended.vertices, intended.oriented)
     field = WindingNumber(*mesh_arrays)
@@ -465,7 +471,9 @@ def _remesh_of_bounded_size(
     because the time of the checks grows with the number of triangles. After three attempts the
     surface is extracted from still larger cells without this limit.
 
-    spacing: the size of cells that is tried first, a length."""
+    spacing: the size of cells that is tried first, a length.
+    settings: the options of the repair.
+    """
     for k in range(_MAX_GROWTHS):
         try:
             return _mesh_half_level(field, spacing * _GROWTH**k, settings, _MAX_TRIANGLES)
@@ -481,8 +489,10 @@ def _mesh_half_level(
     cells.
 
     spacing: the size of cells, a length.
+    settings: the options of the repair.
     most: the largest number of triangles. If the surface takes more, a TriangleLimitError is
-        raised."""
+        raised.
+    """
     return mesh_of(
         field, level=0.5, side="above", tolerance=settings.tolerance.length, cell_size=spacing,
         max_triangles=most, progress=settings.report,
@@ -495,8 +505,10 @@ def _mesh_half_level(
 def _keep_valid(
     intended: IntendedSolid, settings: _RepairOptions
 ) -> tuple[TriangleMesh, dict[str, Any]]:
-    """Stage "cleaned" of the repair: keep the valid triangles, remove the others, and fill all
-    holes.
+    """Stage "cleaned" of the repair: keep the valid triangles of the damaged mesh `intended`,
+    remove the others, and fill all holes.
+
+    settings: the options of the repair.
 
     Returns:
         The closed mesh; and its entries in `metadata["harnack"]`: how many triangles were kept,
@@ -542,9 +554,11 @@ def _count_turned(intended: IntendedSolid, cleaned: CleanedMesh) -> int:
 def _weld_loose(
     intended: IntendedSolid, settings: _RepairOptions
 ) -> tuple[TriangleMesh, dict[str, Any]]:
-    """Stage "welded" of the repair, for loose triangles, which share no vertices: merge corners
-    that are near to each other, clean the mesh and fill its holes. Vertices move, so no triangle
-    counts as kept.
+    """Stage "welded" of the repair, for loose triangles, which share no vertices: merge corners of
+    the damaged mesh `intended` that are near to each other, clean the mesh and fill its holes.
+    Vertices move, so no triangle counts as kept.
+
+    settings: the options of the repair.
 
     Returns:
         The closed mesh; and its entries in `metadata["harnack"]`.
@@ -575,7 +589,10 @@ def _weld_loose(
 def _fill_only(
     intended: IntendedSolid, settings: _RepairOptions
 ) -> tuple[TriangleMesh, dict[str, Any]]:
-    """Stage "filled" of the repair: keep all triangles of the mesh, and fill its holes.
+    """Stage "filled" of the repair: keep all triangles of the damaged mesh `intended`, and fill its
+    holes.
+
+    settings: the options of the repair.
 
     If smooth fillings were asked for and cannot be made, all holes get harmonic fillings instead,
     provided that `keep` is "all"; otherwise the error is raised, and `repair` tries its next stage.
@@ -636,6 +653,7 @@ def _with_filled_holes(
     vertices, faces: (n, 3), (m, 3) the mesh.
     loops: for each hole, the indices (k,) of the vertices around it. A hole gets a smooth filling
         if the options ask for these; a harmonic filling if they do not, or if the smooth one fails.
+    settings: the options of the repair.
 
     Returns:
         The closed mesh; and its entries in `metadata["harnack"]`.

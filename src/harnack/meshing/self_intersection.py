@@ -124,10 +124,11 @@ def touching_pairs(vertices: FloatArray, faces: IntArray) -> tuple[IntArray, Flo
 def _pairs_in_doubt(
     vertices: FloatArray, faces: IntArray, among: BoolArray | None
 ) -> Generator[tuple[IntArray, tuple[SignArray, SignArray]]]:
-    """Generate the pairs of faces that floating point does not prove to have only vertices in
-    common, in batches. Each batch consists of the indices (k, 2) of the faces, and two arrays (k,
-    3) of signs: for each corner of the second face, the side of the first face's plane on which it
-    lies; and the reverse (`_side_signs`).
+    """Generate, in batches, the pairs of faces for which floating point leaves it open whether they
+    have only vertices in common. Each batch consists of the indices (k, 2) of the faces, and two
+    arrays (k, 3) of signs (`_side_signs`). The first array holds for each corner of the second face
+    the side of the first face's plane on which it lies. The second array holds the same with the
+    faces exchanged.
 
     vertices, faces: (n, 3), (m, 3) the mesh.
     among: (m,) mask of chosen faces; pairs without a chosen face are left out. None if all are
@@ -233,10 +234,10 @@ def _are_separated(vertices: FloatArray, faces: IntArray, pairs: IntArray) -> Bo
 
 
 def _side_signs(vertices: FloatArray, base: IntArray, other: IntArray) -> SignArray:
-    """For each corner of the faces `other`, the side of the plane of the face in the same row of
-    `base` on which it lies; (k, 3) signs, decided exactly. The sign is 1 below the plane, from
-    where the corners of `base` run clockwise; -1 above the plane; and 0 on it. Corners that both
-    faces have get 0.
+    """(k, 3) signs, decided exactly: for each corner of the faces `other`, on which side of a plane
+    it lies, that of the face in the same row of `base`. The sign is 1 below the plane, from where
+    the corners of `base` run clockwise; -1 above the plane; and 0 on it. Corners that both faces
+    have get 0.
 
     vertices: (n, 3).
     base, other: (k, 3) indices of the corners of faces.

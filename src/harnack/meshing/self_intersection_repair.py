@@ -228,8 +228,8 @@ class _Neighborhood:
 
 
 def _reduce_crossings(patch: _Neighborhood, length: float) -> tuple[IntArray, int]:
-    """Contract and flip edges of a neighborhood, one after the other, as long as each change
-    reduces the number of crossing faces.
+    """Contract and flip edges of the neighborhood `patch`, one after the other, as long as each
+    change reduces the number of crossing faces.
 
     length: the largest distance by which one change may move the surface.
 
@@ -248,8 +248,9 @@ def _reduce_crossings(patch: _Neighborhood, length: float) -> tuple[IntArray, in
 def _best_change(
     patch: _Neighborhood, crossing: IntArray, length: float
 ) -> tuple[_Neighborhood, IntArray] | None:
-    """Find one change of an edge that reduces the number of crossing faces. Returns the
-    neighborhood after it, and the indices of the faces that still cross; None if no change does so.
+    """Find one change of an edge in the neighborhood `patch` that reduces the number of crossing
+    faces. Returns the neighborhood after it, and the indices of the faces that still cross; None if
+    no change does so.
 
     crossing: the indices of the faces that cross now.
     length: the largest distance by which the change may move the surface.
@@ -271,11 +272,12 @@ def _best_change(
 def _changes(
     patch: _Neighborhood, rows: IntArray, length: float
 ) -> Iterator[tuple[float, IntArray, IntArray]]:
-    """All contractions and flips of the edges of the faces with the indices `rows` that move the
-    surface by at most `length`.
+    """All contractions and flips that move the surface by at most `length`, of the edges of those
+    faces of the neighborhood `patch` that have the indices `rows`.
 
     Yields: For each change, how far it moves the surface, a length; the indices of the faces that
-    it removes; and the faces (k, 3) that replace them."""
+    it removes; and the faces (k, 3) that replace them.
+    """
     count = len(patch.vertices)
     # A key is the number a * count + b for the edge between the vertices a < b.
     keys = sorted_unique(edge_keys(half_edges(patch.faces[rows]), count))
@@ -299,8 +301,8 @@ def _changes(
 def _is_small_change(
     patch: _Neighborhood, old_rows: IntArray, new_faces: IntArray, max_shift: float
 ) -> bool:
-    """Whether new faces may replace some faces of a neighborhood, without a fold and without a
-    large change of the surface.
+    """Whether new faces may replace some faces of the neighborhood `patch`, without a fold and
+    without a large change of the surface.
 
     old_rows: the indices of the faces that are replaced.
     new_faces: (k, 3) the faces that replace them, with vertices of the neighborhood.
@@ -309,7 +311,9 @@ def _is_small_change(
     Two conditions must hold. The normal of each new face, slivers excepted, is less than 90 degrees
     from the mean normal of the old faces. And the volume between old and new faces is at most
     `max_shift` times the area of the old faces. (The distance of a removed vertex from the new
-    faces would not do instead: it misses old faces that are folded, as at a thin spike.)"""
+    faces is not used instead, as it says nothing about old faces that are folded, as at a thin
+    spike.)
+    """
     old_corners, new_corners = patch.vertices[patch.faces[old_rows]], patch.vertices[new_faces]
     old_normals, new_normals = area_normals(old_corners), area_normals(new_corners)
     normal_sum = old_normals.sum(axis=0)

@@ -174,7 +174,7 @@ class SignFunction(LevelFunction):
             prepared = self.field.prepare(backend)
 
             def value_and_gradient(p: Vec3) -> tuple[Real, Vec3]:
-                """The value and the gradient of the field at the points p."""
+                """Two results for the points p: the value and the gradient of the field."""
                 sample = prepared.evaluate(p)
                 return sample.value, sample.gradient
 
@@ -267,8 +267,9 @@ class SignFunction(LevelFunction):
         start, direction: (n, 3) one end of each segment, and the vector to the other. The function
             is not positive at the first end and positive at the other.
 
-        Returns the fractions (n,) and (n,) of the segments at which what is left of them begins and
-        ends."""
+        Returns two arrays (n,): the fractions of the original segments at which the shortened ones
+        begin and end.
+        """
         first, last = np.zeros(len(start)), np.ones(len(start))
         for _ in range(_HALVINGS):
             t = 0.5 * (first + last)
@@ -408,7 +409,7 @@ def _clearances(
         levels = Levels((dr.opaque(backend.Float, level),), smooth.period)
 
         def kernel(p: Vec3) -> tuple[Real]:
-            """The lower bound of the distance from p to the level set."""
+            """The lower bound of the distance from p to the level set, as a tuple of one."""
             return (level_distance_lower_bound(backend, prepared, levels, p, prepared.evaluate(p)),)
 
         return lambda points: _evaluate_in_batches(backend, kernel, points)
@@ -418,7 +419,7 @@ def _clearances(
     sheets = field.prepare(backend)
 
     def distance(p: Vec3) -> tuple[Real]:
-        """The distance of the points p from the triangles of the mesh."""
+        """The distance of the points p from the triangles of the mesh, as a tuple of one."""
         return (sheets.distance_to_jumps(p),)
 
     return [

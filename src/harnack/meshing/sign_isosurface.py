@@ -222,6 +222,7 @@ def _distances(
 ) -> tuple[int, int, float]:
     """Measure how far the vertices and the centers of faces of a mesh are from the level set.
 
+    function: side * (f - level) for a field f; its sign changes at the level set.
     tolerance: a length.
     lattice, closed: the lattice of the mesh, and whether parts of the box's faces close the mesh.
         If they do, faces in the two outermost layers of cells are not measured, because they will
@@ -344,6 +345,7 @@ def _march(
     signs (marching tetrahedra).
 
     closed: whether the function counts as positive on the box's faces, so that the mesh is closed.
+    report: called with messages about the progress.
 
     Cells that are proved to contain no level are left out. Values and proofs are subject to
     rounding, so signs may nevertheless differ at the corners of such a cell. Then the surface has
@@ -413,8 +415,8 @@ def _march(
 def _collapse_slivers(
     raw: _RawIsosurface, tolerance: float
 ) -> tuple[FloatArray, IntArray, FloatArray, bool]:
-    """Simplify a mesh: contract short edges, and remove vertices whose faces lie in a plane. The
-    surface moves by at most `tolerance` (a length).
+    """Simplify the mesh `raw`: contract short edges, and remove vertices whose faces lie in a
+    plane. The surface moves by at most `tolerance` (a length).
 
     The mesh stays unchanged if it is open, or if triangles of the simplified mesh would intersect.
 
@@ -536,6 +538,7 @@ class _CreaseRefinement:
     ) -> _CreaseRefinement:
         """Choose the edges and faces of a mesh that are to be split, and find their new vertices.
 
+        function: side * (f - level) for a field f; its sign changes at the level set.
         x, normals: (n, 3) the vertices, and the unit normals of the level set there.
         bent: (n,) the mask of the vertices that lie on a crease. Since the surface has two tangent
             planes there, edges at these vertices are not split.
@@ -545,7 +548,8 @@ class _CreaseRefinement:
         at both ends meet, and if the level set is found between the edge and that line. The new
         vertex lies on a crease if the normal there differs from the normal at one end of the edge
         by nearly the angle between both ends; on a smooth surface it differs by about half of that.
-        A face gets a vertex in its interior if all of its edges are split at a crease."""
+        A face gets a vertex in its interior if all of its edges are split at a crease.
+        """
         all_edges = Edges.of(half_edges(faces))
         edges = all_edges.edge_of_pair.reshape(3, -1).T
         # Candidates: interior edges without an end on a crease.
@@ -691,6 +695,7 @@ def _crease_corners(
     """New vertices in the interior of faces that cut off a corner of the level set, where creases
     meet.
 
+    function: side * (f - level) for a field f; its sign changes at the level set.
     x, normals: (n, 3) the vertices of the mesh, and the unit normals there. faces: (m, 3).
     rows: (k,) the indices of the faces that may get a new vertex.
 

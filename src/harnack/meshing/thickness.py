@@ -93,9 +93,9 @@ def wall_thickness(part: Any, **options: Any) -> WallThickness:
     surface that is nearest to the ball's center is computed. If it lies inside of the ball and on
     an opposite wall, the ball is replaced by the smaller ball that touches the face and that point.
     A wall is opposite if its normal differs from that of the face by more than 120 degrees. This is
-    repeated until it does not hold (Ma, Bae and Choi 2012, 3D medial axis point approximation using
-    nearest neighbors and the normal field). The thickness is the diameter of the last ball. Where
-    walls are parallel it is their distance, and it is never more than t.
+    repeated as long as there is such a point (Ma, Bae and Choi 2012, 3D medial axis point
+    approximation using nearest neighbors and the normal field). The thickness is the diameter of
+    the last ball. Where walls are parallel it is their distance, and it is never more than t.
 
     Near an edge of the part the adjacent wall is near, but not opposite. It does not count, so
     edges are not reported as thin: the ball stops shrinking there, and the value is an upper bound
@@ -136,7 +136,8 @@ def _medial_diameters(solid: MeshSolid, start: FloatArray, normal: FloatArray) -
     surface. Then the point of the surface nearest to the ball's center is computed. If it is inside
     of the ball and its normal differs from the start's by more than 120 degrees, the ball is
     replaced by the smaller one that touches both. This is repeated for each ball until its nearest
-    point is no longer like that, and at most 30 times."""
+    point does not meet both conditions, and at most 30 times.
+    """
     size = solid.surface.size
     start_depth = _START_DEPTH * size
     # The tolerance is relative to the mesh: with a fixed one, rays into a small mesh would end

@@ -110,12 +110,13 @@ def _index(line: IntArray, step: IntArray, lines: int, segments: int, shift: int
 
 
 def _faces(lines: int, segments: int, shift: int) -> IntArray:
-    """The faces (m, 3) of the closed mesh of a screw thread: two triangles for each quadrilateral
-    between neighboring vertices of neighboring helical lines; and at both ends of the thread a fan
-    of triangles around a point of the axis (`_middles`).
+    """The faces (m, 3) of the closed mesh of a screw thread. There are two triangles for each
+    quadrilateral between neighboring vertices of neighboring helical lines, and at both ends of the
+    thread a fan of triangles around a point of the axis (`_middles`).
 
     lines, segments: the number of helical lines, and of the vertices of a line in one turn.
-    shift: after a full turn, line i is where line i + shift began (at angle 0)."""
+    shift: after a full turn, line i is where line i + shift began (at angle 0).
+    """
     line, step = (grid.ravel() for grid in np.mgrid[: lines - 1, :segments])
 
     def at(i: IntArray, j: IntArray) -> IntArray:
@@ -139,8 +140,12 @@ def _faces(lines: int, segments: int, shift: int) -> IntArray:
 
 
 def _middles(vertices: FloatArray, lines: int, segments: int) -> FloatArray:
-    """(2, 3) two points of the axis that close the ends of a thread's mesh: at the mean height of
-    the first helical line, and at the mean height of the last."""
+    """(2, 3) two points of the axis that close the ends of a thread's mesh. One is at the mean
+    height of the first helical line, the other at the mean height of the last.
+
+    vertices: those of the lines (`_vertices`).
+    lines, segments: the number of lines, and of the vertices of a line in one turn.
+    """
     low = vertices[:segments, 2].mean()
     high = vertices[(lines - 1) * segments : lines * segments, 2].mean()
     return np.array([[0.0, 0.0, low], [0.0, 0.0, high]])

@@ -134,8 +134,8 @@ class _Sweep:
 
     def surface(self) -> TriangleMesh | None:
         """The triangles between the rings of points along the polyline. None if an edge leads back
-        along the edge before it, or is too short for its corners: then a line along the tube
-        between corresponding points of two rings would run backwards."""
+        along the edge before it, or is too short for its corners: then a line along the tube would
+        run backwards."""
         points, edge_vectors = self.points, np.diff(self.points, axis=0)
         # Scaled before they are normalized, since squares of small numbers underflow.
         directions = edge_vectors / np.abs(edge_vectors).max(axis=1)[:, None]

@@ -178,7 +178,8 @@ def _job(
     frames: list[dict[str, Any]], shared: dict[str, Any]
 ) -> tuple[_FilmJob, list[tuple[dict[str, Any]]]]:
     """Separate the arguments that all pictures of a film share from those that change. Returns the
-    job with the shared ones, and for each picture a tuple that holds its other arguments.
+    job with the shared ones, and for each picture a tuple (changes,) for a call of
+    `_FilmJob.frame`.
 
     frames: for each picture, the arguments of `render` by name.
     shared: further shared arguments.
@@ -230,11 +231,11 @@ def _is_function_of_s(value: Any) -> bool:
 def _cameras(
     moments: list[dict[str, Any]], steps: FloatArray, orbit: float, size: tuple[int, int]
 ) -> list[Camera]:
-    """Choose the camera of each picture of a film such that the surfaces of all pictures are always
-    in view. All cameras have the same box, target, distance and angle of view, unless an option
-    sets them.
+    """Choose the cameras of a film, one for each picture, such that the surfaces of all pictures
+    are always in view. All cameras have the same box, target, distance and angle of view, unless an
+    option sets them.
 
-    moments: the arguments of each picture.
+    moments: for each picture, the arguments of `render` by name.
     steps: (n,) the time s of each picture.
     orbit: degrees that the camera goes around its target from s = 0 to s = 1.
     size: (width, height) in pixels.
@@ -292,9 +293,9 @@ def _cameras(
 
 
 def _orbited(camera: Camera, orbit: float, upright: FloatArray) -> Camera:
-    """Return the camera after it has gone around its target by `orbit` degrees.
+    """Return a camera that has gone around the target of the given camera by `orbit` degrees.
 
-    upright: (3, 3) the rotation that turns the direction up to z.
+    upright: (3, 3) the rotation that turns the direction that is up in the film to z.
 
     A camera that stands at a position is rotated about the vertical through its target; for other
     cameras the azimuth changes.
@@ -311,7 +312,7 @@ def _orbited(camera: Camera, orbit: float, upright: FloatArray) -> Camera:
 def _points(moments: list[dict[str, Any]], steps: FloatArray) -> FloatArray:
     """Find points (n, 3) of the visible parts of all surfaces in a film.
 
-    moments: the arguments of each picture.
+    moments: for each picture, the arguments of `render` by name.
     steps: (n,) the time s of each picture, for messages.
 
     Raises:
@@ -359,8 +360,9 @@ def _encoder(path: Path, size: tuple[int, int], fps: float) -> Generator[Callabl
 
 @contextmanager
 def _gif(path: Path, fps: float) -> Generator[Callable[[Pixels], None]]:
-    """Open a GIF file for writing. The context's value is a function that adds a picture (h, w, 3
-    or 4). The file is written when the block ends."""
+    """Open the GIF file `path` for writing, to be shown with `fps` pictures a second. The context's
+    value is a function that adds a picture (h, w, 3 or 4). The file is written when the block
+    ends."""
     try:
         from PIL import Image
     except ModuleNotFoundError:
@@ -392,8 +394,9 @@ def _gif(path: Path, fps: float) -> Generator[Callable[[Pixels], None]]:
 
 @contextmanager
 def _mp4(path: Path, size: tuple[int, int], fps: float) -> Generator[Callable[[Pixels], None]]:
-    """Open an MP4 file for writing. The context's value is a function that adds a picture (h, w,
-    3). An odd row or column at the end is left out, as H.264 stores colors for pairs of pixels."""
+    """Open the MP4 file `path` for writing, for pictures of `size` (width, height) pixels, `fps` a
+    second. The context's value is a function that adds a picture (h, w, 3). An odd row or column at
+    the end is left out, as H.264 stores colors for pairs of pixels."""
     try:
         import av
     except ModuleNotFoundError:

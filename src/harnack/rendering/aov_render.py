@@ -1,7 +1,8 @@
 """Renders pictures of numbers, which renderers call arbitrary output variables (AOVs): normals,
 numbers of evaluations, status of rays, depth, and values of another function on the surface. `mi`
-is the Mitsuba module, and a ray that is neither proved free nor led to a hit is called lost. A
-color scale says which color each number has.
+is the Mitsuba module, and a ray that ran out of steps, neither proved free nor led to a hit, is
+called lost. `view` is an `AovBuffers`: what the rays of a picture found. A color scale says which
+color each number has.
 
 The numbers of a pixel are those of the single ray through its middle; nothing is averaged. The
 pixels of pictures show these numbers, too, except for pictures of values: at edges, the colors of
@@ -90,6 +91,7 @@ class AovTask:
     results are `AovBuffers`.
 
     world: the Mitsuba scene with the level sets in it.
+    sensor: Mitsuba's camera, with the film that has the size of the picture.
     placement: the map from the coordinates of the surfaces to the world. Depths are in the
         coordinates of the surfaces.
     function: the function that is evaluated at hits, in the coordinates of the surfaces; None for
@@ -257,8 +259,8 @@ class AovTask:
 
 def _map_arrays(change: Callable[..., Any], *views: AovBuffers) -> AovBuffers:
     """Combine the arrays of several `AovBuffers`. Returns `AovBuffers` in which each array is
-    `change(...)` of the arrays of the same name in all `views`. Entries that are no arrays are
-    those of the first view."""
+    `change(...)` of the arrays of this name in all `views`. Entries that are no arrays are those of
+    the first view."""
     arrays = {
         name: change(*(getattr(view, name) for view in views))
         for name, value in vars(views[0]).items()
@@ -344,7 +346,8 @@ def value_of(view: AovBuffers) -> FloatArray:
 
 
 def _range(view: AovBuffers, numbers: FloatArray) -> tuple[float, float]:
-    """Return the smallest and the largest finite number at hits; (0, 1) if there is no such number.
+    """Return the smallest and the largest finite one of `numbers` at hits; (0, 1) if there is no
+    such number.
 
     numbers: an array with an entry for each pixel of `view`.
     """
@@ -353,14 +356,15 @@ def _range(view: AovBuffers, numbers: FloatArray) -> tuple[float, float]:
 
 
 def _of_surfaces(view: AovBuffers, picture: FloatArray) -> npt.NDArray[np.uint8]:
-    """Return a picture (h, w, 3) with the colors of `picture` at hits, magenta for rays out of
-    steps, and the background elsewhere."""
+    """Return the 8-bit pixels (h, w, 3) that have the colors of `picture` (h, w, 3; sRGB in [0, 1])
+    at hits, magenta for rays out of steps, and the background elsewhere."""
     is_hit = (view.status == int(RayStatus.HIT))[..., None]
     return _with_lost(view, np.where(is_hit, picture, view.background))
 
 
 def _with_lost(view: AovBuffers, picture: FloatArray) -> npt.NDArray[np.uint8]:
-    """Return the picture (h, w, 3) with magenta for rays out of steps."""
+    """Return `picture` (h, w, 3; sRGB in [0, 1]) as 8-bit pixels, with magenta for rays out of
+    steps."""
     is_lost = (view.status == int(RayStatus.OUT_OF_STEPS))[..., None]
     return to_uint8(np.where(is_lost, OUT_OF_STEPS_COLOR, picture))
 
@@ -416,8 +420,9 @@ def aov_picture(
 
     show: the kind of picture, a key of `AOV_MODES`.
     viewer, view: the task, and its result for all pixels.
-    value_range: (low, high) of the color scale, in place of the range of the numbers that are seen.
-    bar: whether to put a color bar beside the picture, or the title of this bar.
+    value_range: (low, high), the numbers at the ends of the color scale; None for the least and the
+        greatest number that is seen.
+    bar: whether to put a color bar beside the picture; a text is the title of this bar.
     spp: the number of rays of a pixel at an edge, for pictures in which edges are averaged.
     executor: calls methods of `viewer`, for example on a cluster; None to call them in this
         process.

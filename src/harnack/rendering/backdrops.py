@@ -85,8 +85,8 @@ def lights(mi: Any, azimuth: float) -> dict[str, Any]:
 
     azimuth: of the camera, in degrees.
 
-    The environment is smooth: light paths that reach it by sampling BSDFs are less noisy than paths
-    that sample the environment. So it is not sampled as a light.
+    The environment is not sampled as a light: it is so smooth that light paths that reach it by
+    sampling BSDFs are less noisy than paths that sample it.
     """
     # 52 degrees to the left of the camera, and 55 degrees above the horizon.
     key_position = 4.9 * _direction(azimuth - 52, 55)

@@ -112,11 +112,12 @@ class Camera:
         height), as close as its angle of view allows. Returns its origin (3,) and a target (3,) in
         front of it.
 
-        Let x, y, z be the coordinates of a point to the right, up, and back to the camera. A point
-        is in the picture if |x - cx| <= slope (h - z), and likewise for y; (cx, cy, h) are the
-        coordinates of the camera. So the largest x + slope z and the smallest x - slope z over all
-        points give cx and the least h. The larger of the two h, of x and of y, is taken. zoom then
-        divides the distance from the middle of the points.
+        Let x, y, z be the coordinates of a point to the right, up, and back to the camera. Let (cx,
+        cy, h) be those of the camera, and slope the tangent of half its horizontal angle of view. A
+        point is in the picture if |x - cx| <= slope (h - z), and likewise for y with the vertical
+        angle. So the largest x + slope z and the smallest x - slope z over all points give cx and
+        the least h. The same for y gives cy and another least h; the larger h is taken. Then the
+        distance of the camera from the middle of the points is divided by `zoom`.
         """
         right, up, back = self.axes()
         x, y, z = points @ right, points @ up, points @ back
@@ -204,6 +205,7 @@ class Camera:
         across: (2, n) absolute horizontal and vertical distances of the points from the axis of the
             view.
         depth: (n,) their distances from the camera along this axis.
+        size: (width, height) of the picture in pixels.
         """
         if depth.min() <= 0:
             return _FOV_INSIDE
@@ -223,8 +225,9 @@ class Camera:
         return _DEFAULT_FOV if self.fov is None else self.fov
 
     def _slopes(self, size: tuple[int, int]) -> tuple[float, float]:
-        """Return the tangents of half the angle of view, to the right and upwards, of the part of
-        the picture that surfaces are to fill (86 percent)."""
+        """Return two numbers for a picture of `size` (width, height): the tangents of half the
+        angle of view, horizontally and vertically, of the part in the middle that surfaces are to
+        fill (86 percent of each side)."""
         slope = math.tan(math.radians(self.fov_or_default) / 2) * _FILL_FRACTION / max(size)
         return slope * size[0], slope * size[1]
 

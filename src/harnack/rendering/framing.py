@@ -39,8 +39,9 @@ UP_AXES: tuple[str, ...] = (*_UPRIGHT, *("-" + axis for axis in _UPRIGHT))
 
 
 def rotation_to_z_up(up: Any) -> FloatArray:
-    """Return the rotation matrix (3, 3) that turns an axis ("x", "-y", ...) or a vector to z. For y
-    it also turns z, the front of a glTF model, to -y, where the studio's camera stands.
+    """Return the rotation matrix (3, 3) that turns an axis ("x", "-y", ...) or a vector to z. With
+    the axis "y" it also turns z, to which the front of a glTF model looks, to -y, where the
+    studio's camera stands.
 
     Raises:
         TypeError, ValueError: `up` is neither an axis nor a vector that is not zero.
@@ -109,8 +110,9 @@ def bounding_box(surface: TracedSurface) -> FloatArray:
 
 
 def _unbounded(surface: TracedSurface) -> UnboundedSurfaceError:
-    """Return the error for a surface without a box. Its message explains the reason, if it is one
-    of two known ones, and suggests the field's default level if that one has a box."""
+    """Return the error for a surface without a box. Its message explains the reason if it is one of
+    the two that are known here, and suggests the default level of the field if the surface of that
+    level has a box."""
     field = surface.field
     levels = surface.level_values
     levels_text = ", ".join(f"{level:g}" for level in levels)
@@ -147,8 +149,10 @@ def visible_points(surface: TracedSurface, backend: Backend) -> FloatArray:
     """Find points (n, 3) of the surface that are seen from the six sides of the box in which it
     lies. Returns them in the surface's coordinates.
 
-    They are cached for a field that is prepared once for all calls, as long as the other settings
-    are the same. So if only the camera moves, no ray is traced for the framing.
+    If preparing the field for tracing makes a new object, the points are cached for this object and
+    for the options of the surface. So no ray is traced for the framing if only the camera has
+    moved. If the field is traced as it is, without preparation, it may have been changed in place
+    since the last call, so the points are found anew.
 
     Raises:
         UnboundedSurfaceError: no box around the surface is known.

@@ -126,7 +126,7 @@ class HybridScene:
         interaction of Mitsuba's and as a `SurfaceHit`. For a ray out of steps the interaction is
         not valid.
 
-        start: the interaction that rays leave; not valid for rays that come from a camera.
+        start: the interaction at which rays start; not valid for rays that come from a camera.
         active: mask of rays to trace.
         hidden: mask of rays that do not see shapes that emit light; None if there are no such rays.
 
@@ -169,7 +169,8 @@ class HybridScene:
         return si, dr.select(has_ended, hit, scene_hit)
 
     def _skip_emitters(self, ray: Any, first: Any, active: Mask) -> Any:
-        """Find the first hits of rays with those of Mitsuba's shapes that do not emit light.
+        """Find the first hits of rays with shapes of Mitsuba's that do not emit light. Returns the
+        interactions.
 
         first: the first hits with all of Mitsuba's shapes.
         active: mask of rays that pass through shapes that emit light; other rays keep their first
@@ -209,7 +210,10 @@ class HybridScene:
 
     def _of_scene(self, si: Any, active: Mask) -> SurfaceHit:
         """Return the `SurfaceHit` of surface interactions with Mitsuba's own shapes. Entries that
-        only level sets have are 0."""
+        only level sets have are 0.
+
+        active: mask of the interactions that count as hits if they are valid.
+        """
         mi, vector = self.mi, mitsuba_backend(self.mi).Array3f
         return SurfaceHit(
             t=si.t,

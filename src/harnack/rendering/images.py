@@ -63,7 +63,8 @@ def tone_map(image: FloatImage, behind: FloatImage | None = None) -> npt.NDArray
 
 
 def _tone_mapped(image: FloatArray, behind: FloatImage | None) -> npt.NDArray[np.uint8]:
-    """Apply `tone_map` to some rows of an image."""
+    """Apply `tone_map` to some rows of an image. behind: the same rows of what lies behind it, or
+    None."""
     if image.ndim < 3 or image.shape[-1] < 4:
         return to_uint8(linear_to_srgb(_apply_shoulder(image)))
     alpha = np.clip(image[..., 3:], 0.0, 1.0)
@@ -211,5 +212,6 @@ class Picture(np.ndarray[Any, np.dtype[Any]]):
 
 
 def _restored(numbers: npt.NDArray[Any], shown: npt.NDArray[np.uint8] | None) -> Picture:
-    """Return the picture that was pickled as its numbers and its pixels."""
+    """Return a picture from its numbers and from the pixels that are shown (None if it has none).
+    Pickle calls this to rebuild it."""
     return numbers.view(Picture) if shown is None else Picture.of(numbers, shown)

@@ -48,11 +48,11 @@ class SobolSampler:
     depends only on the path's pixel, the index of the path in this pixel, and the dimension, which
     counts how many numbers the path has used.
 
-    A sampler with a state would have to be carried along with each path. This one has none. So
-    paths can be moved to other lanes, and a path has the same numbers whatever else is drawn. Every
-    call uses the first two dimensions of Sobol's points, but in another order and scrambled in
-    another way (Burley 2020, Practical Hash-based Owen Scrambling). This stratifies the samples of
-    a pixel as well as multi-jittering does, for any number of samples.
+    A sampler with a state would have to be carried along with the path when it changes lanes. This
+    one has none. So paths can be moved to other lanes, and a path has the same numbers whatever
+    else is drawn. Every call uses the first two dimensions of Sobol's points, but in another order
+    and scrambled in another way (Burley 2020, Practical Hash-based Owen Scrambling). This
+    stratifies the samples of a pixel as well as multi-jittering does, for any number of samples.
 
     Methods are called as those of Mitsuba's samplers. Each call takes the next dimension.
 
@@ -181,7 +181,7 @@ class _PathState:
     eta: the product of the relative refractive indices so far. It keeps Russian roulette from
         ending paths in glass.
     previous: the last vertex.
-    pdf: the probability density with which the last vertex sampled the ray.
+    pdf: the probability density with which the last vertex sampled the direction of the ray.
     delta: whether the last vertex could sample no other direction, like a mirror. pdf and delta
         determine the weight of light that the ray hits.
     is_diffused: whether a rough surface has scattered the path at or before the last vertex.
@@ -471,8 +471,10 @@ class PathTracer:
         vertex scatters along its path, weighted against finding the emitter by the BSDF, and the
         ray to the point. The light counts only if this ray is free, which is not tested here.
 
+        world: the scene that is traced.
+        paths: the rays that led to the vertices.
         si: the interaction at the vertex.
-        clearance: the distance from the surface at which a ray has to start.
+        clearance: the least distance from the surface at which a ray may start.
         vertex_sampler: the random numbers of the paths at this vertex.
         active: mask of vertices to connect. Of these, only those with a BSDF that scatters into a
             range of directions are connected.

@@ -278,8 +278,9 @@ class PreparedIsolines:
         across, down: (3,) vectors from p to the points of the tangent plane in the middles of the
             neighboring pixels.
 
-        The edge is where |g - level| equals half_width |grad_T g|. To first order, g differs from
-        g(p) by at most `reach` in the whole pixel and at the middles of its eight neighbors.
+        The edge is where |g - level| equals half_width |grad_T g|. A pixel is in the mask if the
+        difference of the two at p is less than `reach`, which to first order bounds |g - g(p)| in
+        the whole pixel and at the middles of its eight neighbors.
         """
         distance_in_value, tangential_gradient = self._gap_and_gradient(p, normal)
         reach = dr.abs(dr.dot(tangential_gradient, across)) + dr.abs(
@@ -332,6 +333,7 @@ def isoline_index_at(
     """Return the number of the isoline on which each point lies, counted from 1; 0 if it lies on
     none, and the last one if several overlap.
 
+    lines: the isolines, in the order of their numbers.
     p, normal: (3,) points of the surface and unit normals.
     index: the array type of the result.
     """

@@ -152,6 +152,8 @@ def trace_samples(
     """Trace one light path through a random point of each given pixel. Returns the `PathResults` of
     the paths, with light weighted by the sensor, and the wavelengths that they carry.
 
+    scene, sensor: Mitsuba's scene and camera.
+    tracer: follows the paths.
     pixel, sample: (n,) for each path, the index of its pixel, counted by rows, and the index of the
         path among those of its pixel.
     seed: another seed gives other random numbers.
@@ -194,6 +196,7 @@ def _camera_ray(mi: Any, sensor: Any, sampler: Any, position: Any) -> tuple[Any,
     light. Time, wavelength and the point on the lens are sampled if the sensor has them.
 
     position: (2,) the point, in [0, 1]^2 across the whole film.
+    sampler: gives the random numbers.
     """
     time = sensor.shutter_open()
     if sensor.shutter_open_time() > 0:
@@ -269,6 +272,8 @@ def estimate_time(
     """Estimate how long a picture takes, by timing a few paths all over it. Returns a
     `TimeEstimate`.
 
+    scene, sensor: Mitsuba's scene and camera.
+    tracer: follows the paths.
     spp: the number of paths of a pixel.
     features: whether albedo and normal are stored, too.
 
@@ -331,9 +336,9 @@ def denoise_image(render: PathRender) -> npt.NDArray[np.float32]:
     """Remove the noise of a rendered picture. Returns the image (h, w, 4).
 
     Open Image Denoise, a neural network that runs on CPUs, removes the noise. It guesses: the
-    result looks clean and is close to a picture with more samples, but its numbers are no means of
-    samples. It needs the features of the render (albedo and normal). The covered fraction of each
-    pixel is not changed.
+    result looks clean and is close to a picture with more samples, but its numbers are not averages
+    of samples, and may be biased. It needs the features of the render (albedo and normal). The
+    covered fraction of each pixel is not changed.
 
     Raises:
         ValueError: the render has no features.
@@ -357,8 +362,8 @@ _DEFAULT_REFLECTANCE = 0.04
 
 @dataclass
 class RefractedHits:
-    """Rays on their way through transparent solids, with one entry for each ray. When all have
-    ended, it holds their first opaque hits.
+    """Rays on their way through transparent solids, with one entry for each ray. When all rays have
+    ended, the object holds their first opaque hits.
 
     A ray is bent at each boundary of a transparent solid, so its path consists of several segments.
     A segment is traced by `intersect`, which returns an interaction of Mitsuba's and a
@@ -486,7 +491,7 @@ class RefractionTracer:
         si, d: the interaction at the boundary, and the unit direction of the ray that arrives
             there.
         index: the refractive index of the inside relative to the outside.
-        fraction: the reflected fraction of the sky's light.
+        fraction: the fraction of the sky's light that the boundary reflects.
         """
         mi = self.world.mi
         normal = mi.Vector3f(si.n)

@@ -34,7 +34,7 @@ def load_mitsuba() -> Any:
     when it is first needed.
 
     A variant that was set before stays. If none was set, it becomes cuda_ad_rgb, metal_ad_rgb or
-    llvm_ad_rgb, after the device that `harnack.backend.choose_backend` finds.
+    llvm_ad_rgb, according to the device that `harnack.backend.choose_backend` finds.
 
     Raises:
         RuntimeError: Mitsuba lacks the variant of the device, or the variant that is set has no
@@ -252,7 +252,7 @@ def refractive_index(mi: Any, carrier: Any) -> Any:
     """Return the index of refraction of a transparent solid, relative to its surroundings, as a
     kernel parameter. None for opaque shapes and for surfaces that bound no solid.
 
-    carrier: the proxy, the mesh that stands for the solid in Mitsuba.
+    carrier: the proxy, the Mitsuba mesh that stands for the solid.
     """
     bsdf = carrier.bsdf()
     transmissions = (mi.BSDFFlags.DeltaTransmission, mi.BSDFFlags.GlossyTransmission)
@@ -279,16 +279,17 @@ def is_inside(mi: Any, carrier: Any, start: Any, d: Any) -> Any:
 
 
 def transmittance(mi: Any, carriers: Any, start: Any, si: Any, d: Any) -> Any:
-    """Return the fraction of light that transparent solids let through along rays.
+    """Return the fraction of light, as a spectrum, that transparent solids let through along rays
+    up to their next hits.
 
     carriers: the proxies, meshes that stand for surfaces of harnack in Mitsuba.
     start, d: the surface interactions at which rays start, and their directions (3,).
     si: the next hits of the rays.
 
     If one unit of length in a solid leaves the fraction a of the light, a length t leaves the
-    fraction a^t (Beer and Lambert). Going in and out of a solid alternate
-    (`CappedSolid.intersect`). So a ray that leaves a point of a solid's boundary against the
-    outward normal is inside up to the next hit.
+    fraction a^t (Beer and Lambert). A ray crosses the boundary of a solid alternately inward and
+    outward (`CappedSolid.intersect`). So a ray that leaves a point of a solid's boundary against
+    the outward normal is inside up to the next hit.
     """
     remaining = mi.Spectrum(1)
     for carrier in carriers:

@@ -108,9 +108,9 @@ def warn_unsupported_integrator(scene: Any, integrator: Any) -> None:
 
 
 def equivalent_path_tracer(mi: Any, scene: Any) -> PathTracer | None:
-    """Return a path tracer of harnack that computes the same light as the scene's integrator. None
-    if Mitsuba has to draw the scene. That is so if its integrator follows no paths, and either the
-    scene has no level sets of harnack or the integrator can see them.
+    """Return a path tracer of harnack that computes the same light as the scene's integrator.
+    Returns None if Mitsuba itself can draw the scene: its integrator is none of Mitsuba's path
+    tracers, and either the scene has no level sets of harnack or the integrator can see them.
 
     Raises:
         ValueError: the scene has level sets of harnack, and its integrator asks for something that

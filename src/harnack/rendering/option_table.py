@@ -326,7 +326,7 @@ def complete_options(verb: str, keywords: Mapping[str, Any]) -> dict[str, Any]:
     because those classes have the defaults.
 
     verb: the name of the function, such as "render".
-    keywords: the options that the caller set.
+    keywords: the options that the caller set, by name.
 
     Raises:
         TypeError: there is no such option, or it is an option of other functions only.

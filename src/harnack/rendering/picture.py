@@ -251,7 +251,10 @@ def _with_time_estimate(
     at a time chosen such that a progress bar moves every few seconds. If the picture will take
     long, a line with the estimated time is printed to stderr.
 
-    progress: True to print the line; a function that receives the progress prints nothing.
+    job: the scene and the options of the picture.
+    task: follows the light paths of the picture.
+    progress: whether the line may be printed; with a function, which receives the progress, it is
+        not.
     """
     estimate = estimate_time(
         job.mi, job.scene, task.sensor, task.tracer, spp=task.spp,
@@ -336,6 +339,7 @@ def _composite_over_backdrop(
     """Put the backdrop behind the surfaces of a rendered picture. Returns the picture as linear
     light (floating-point numbers) and as 8-bit sRGB pixels.
 
+    sensor: Mitsuba's camera, with the film.
     image: (h, w, 4) linear sRGB light and the covered fraction of each pixel.
     stage: the studio; None for a Mitsuba scene, which has no backdrop.
     show: the kind of picture, "path" for path tracing or "shaded"; the ground backdrop needs it.

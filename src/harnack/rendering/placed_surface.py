@@ -139,6 +139,7 @@ class PlacedSurface:
     ) -> PlacedSurface:  # fmt: skip
         """Prepare a surface on a backend, the device that traces rays, and place it in the world.
 
+        placement: the map from the coordinates of the surface to the world.
         isolines: lines to draw on it.
         size: the diagonal of the surface's box, which determines the lines' default width.
         """
@@ -197,7 +198,7 @@ class PlacedSurface:
         index = self.prepared.backend.UInt32
 
         def find_index(point: _HitPoint) -> _IsolineIndex:
-            """The number of the isoline at points, as a record."""
+            """Return the numbers of the isolines at points, as an `_IsolineIndex`."""
             return _IsolineIndex(
                 isoline_index_at(self.isolines, point.position, point.normal, index)
             )
@@ -240,13 +241,14 @@ class PlacedSurface:
         t_max: Real,
         bounding_balls: tuple[Vec3, Real, Real] | None,
     ) -> Mask:
-        """Return the mask of cones that this surface covers in part, before t_max. The axes of the
-        cones are rays o + t d of the world.
+        """Return the mask of cones that this surface covers only in part, at some t before t_max.
+        The axes of the cones are rays o + t d of the world.
 
-        radius: of each cone, per unit of t.
-        bounding_balls: (center, inner_radius, outer_radius) in the surface's coordinates. The ball
-            with the inner radius lies inside the extent of the surface, and the ball with the outer
-            radius contains it. None for an unbounded extent.
+        radius: of each cone at t = 1; at t it is t times as large.
+        bounding_balls: (center, inner_radius, outer_radius) in the surface's coordinates. The
+            extent of a surface is a volume that is proved to contain it. The ball with the inner
+            radius lies inside the extent, and the extent lies inside the ball with the outer
+            radius. None for an unbounded extent.
 
         The surface must be prepared for crossings (`TracedSurface.prepare`).
         """
@@ -259,9 +261,9 @@ class PlacedSurface:
         return cones.partially_covered(t_max, True)[0]
 
     def _local_ray(self, o: Vec3, d: Vec3, t_max: Real) -> tuple[Vec3, Vec3, Real]:
-        """Map rays from the world to the coordinates of the surface. Returns their origins,
-        directions and largest parameters. Directions keep the length 1, so parameters are divided
-        by the scale."""
+        """Map rays o + t d, t <= t_max, from the world to the coordinates of the surface. Returns
+        their origins, directions and largest parameters there. Directions keep the length 1, so
+        parameters are divided by the scale."""
         backend = self.prepared.backend
         local_origin = self._to_local(backend.Array3f(o) - self.translation) / self.scale
         return local_origin, self._to_local(backend.Array3f(d)), backend.Float(t_max) / self.scale

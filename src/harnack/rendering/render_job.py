@@ -152,8 +152,8 @@ class RenderJob:
         return _arrays_of(cast("AovTask", self._task_in_variant()).render_samples(*part))
 
     def render_gbuffer(self, start: int, stop: int) -> TaskResult:
-        """Call `ShadedTask.render_gbuffer`, which finds the first hits of a range of pixels.
-        Returns its result as arrays by name."""
+        """Call `ShadedTask.render_gbuffer`, which finds the first hits in the pixels from `start`
+        to `stop`. Returns its result as arrays by name."""
         return cast("ShadedTask", self._task_in_variant()).render_gbuffer(start, stop).to_numpy()
 
     def refine_pixels(self, *part: Any) -> TaskResult:
@@ -191,7 +191,8 @@ class ClusterRenderExecutor:
 
 
 def _with_lost(result: tuple[Any, int]) -> TaskResult:
-    """Return means of colors and the number of rays that ran out of steps, as arrays by name."""
+    """Return a result of `render_range` or `refine_pixels`, means of colors and the number of rays
+    that ran out of steps, as arrays by name."""
     return {"means": result[0], "lost": np.array(result[1])}
 
 

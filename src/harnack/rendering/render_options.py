@@ -1,6 +1,7 @@
 """Checks of the options of pictures, made before anything is drawn. Each check returns the value in
-its final form, or raises an error that names the option. `show` is the kind of the picture, such as
-"path" for path tracing or "depth"."""
+its final form, or raises an error that names the option. The first parameter is the value that the
+caller gave to the option of the same name, or the option's default. `show` is the kind of the
+picture, such as "path" for path tracing or "depth"."""
 
 from __future__ import annotations
 
@@ -36,10 +37,12 @@ _AOV_BYTES = 130
 
 
 def check_max_depth(max_depth: Any, show: str) -> int | None:
-    """Return the length of the longest light path in edges, or None.
+    """Return max_depth, the largest number of edges of a light path (-1 for no limit), as an int.
+    Returns None if the option is not set (None); then the scene or a default decides.
 
     Raises:
-        ValueError: the picture has no light paths.
+        ValueError: it is set, and a picture of this kind has no light paths; or it is too
+            large.
         TypeError: not an integer.
     """
     if max_depth is None:
@@ -63,8 +66,8 @@ def check_denoise(denoise: Any, show: str) -> bool:
 
 
 def _check_has_paths(setting: str, show: str) -> None:
-    """Raise ValueError for pictures without light paths. setting: the name of the option that needs
-    them."""
+    """Raise ValueError if a picture of the kind `show` has no light paths. setting: the name of the
+    option that needs them."""
     if show != "path":
         raise ValueError(f'{setting} needs a picture with show="path", not show="{show}"')
 
@@ -104,10 +107,12 @@ def check_color_by(color_by: Any, show: str) -> Field | None:
 
 
 def check_color_range(color_range: Any, show: str) -> tuple[float, float] | None:
-    """Return the ends (low, high) of the color scale, or None.
+    """Return the numbers (low, high) at the ends of the color scale; None if the option is not set,
+    so that the ends are the least and the greatest number that is seen.
 
     Raises:
-        ValueError: the picture has no color scale, or the ends are not in order.
+        ValueError: it is set, and a picture of this kind has no color scale; or the ends are not in
+            order.
         TypeError: not two numbers.
     """
     if color_range is None:
@@ -124,7 +129,7 @@ def check_color_range(color_range: Any, show: str) -> tuple[float, float] | None
 
 
 def check_color_bar(color_bar: Any, show: str) -> bool | str:
-    """Return whether to draw a color bar, or the title of the bar.
+    """Return whether to draw a color bar; a text is the title of the bar.
 
     Raises:
         ValueError: the picture has no color scale, or the title cannot be written.
@@ -166,8 +171,8 @@ def check_backdrop(backdrop: Any, show: str) -> Backdrop:
 
 
 def _check_scaled(setting: str, show: str) -> None:
-    """Raise ValueError for pictures without a color scale. setting: the name of the option that
-    needs one."""
+    """Raise ValueError if a picture of the kind `show` has no color scale. setting: the name of the
+    option that needs one."""
     if show not in MODES_WITH_SCALE:
         raise ValueError(
             f'{setting} needs a picture with show={_join_or(MODES_WITH_SCALE)}, not "{show}"'
@@ -195,10 +200,10 @@ def check_show(show: Any) -> str:
 
 def check_antialias(antialias: Any, show: str) -> str | None:
     """Return how pixels of a shaded picture are chosen that get more samples: "edges", "cones", or
-    None for the default.
+    None if the option is not set, which means "edges".
 
     Raises:
-        ValueError: another value, or another kind of picture.
+        ValueError: another value, or it is set for another kind of picture.
     """
     if antialias is None:
         return None
@@ -261,7 +266,8 @@ def check_integer(name: str, number: Any) -> int:
 
 
 def check_chunks(chunks: Any, *, is_divided: bool) -> int | None:
-    """Return the number of parts into which a picture is divided, or None.
+    """Return the number of parts into which a picture is divided; None if the option is not set;
+    then the number is chosen to suit the workers.
 
     is_divided: whether it is divided at all, as it is with a client or a checkpoint.
 
@@ -341,8 +347,8 @@ def refuse_studio_options(options: Mapping[str, Any]) -> None:
 
 
 def check_memory(show: str, width: int, height: int) -> None:
-    """Raise ValueError for a picture that does not fit into this machine's memory. width, height:
-    in pixels."""
+    """Raise ValueError for a picture that does not fit into this machine's memory. show: the kind
+    of picture, on which the bytes of a pixel depend. width, height: in pixels."""
     needed = width * height * _BYTES.get(show, _AOV_BYTES)
     if width * height > 2**30 or needed > _memory():
         raise ValueError(

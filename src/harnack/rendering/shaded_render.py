@@ -56,9 +56,9 @@ class ConeCoverage:
     the neighbors. The cone contains the whole pixel, so it does not miss them.
 
     Raises:
-        ValueError: the field of a surface jumps, such as the winding number of a mesh. It is nearly
-            constant on both sides of the surface, so its values tell no distance. Or the surface
-            consists of level sets of several functions.
+        ValueError: the field of a surface jumps, such as the winding number of a mesh. Such a field
+            is nearly constant on each side of the surface, so its values tell no distance. Or a
+            surface consists of level sets of several functions.
     """
 
     def __init__(self, mi: Any, world: HybridScene) -> None:
@@ -260,7 +260,8 @@ class GBuffer:
 
     @classmethod
     def from_numbers(cls, mi: Any, numbers: Mapping[str, npt.NDArray[Any]]) -> GBuffer:
-        """Return the buffer whose NumPy arrays `to_numpy` returned, in this process or another."""
+        """Return the buffer with these arrays, which `to_numpy` returned in this process or in
+        another one."""
         empty = vars(cls.nothing(mi, 0))
         return cls(
             **{name: _of_numbers(mi, type(kind), numbers[name]) for name, kind in empty.items()}

@@ -442,8 +442,10 @@ def studio_wall(
     """Compute the radiance (h, w, 3) of the studio's ground and of the wall behind it, at the
     middle of each pixel.
 
+    sensor: Mitsuba's camera, with the film.
+    ground: the backdrop.
     azimuth: of the camera, in degrees.
-    show: the kind of picture, "path" or "shaded", whose ground looks differently bright.
+    show: the kind of picture, "path" or "shaded", on which the brightness of the ground depends.
 
     The camera does not see the environment that lights the stage. It sees the ground as far as the
     horizon, and above it a wall of the same color that is darker higher up. So the horizon is no

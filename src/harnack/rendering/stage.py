@@ -45,8 +45,11 @@ def _rgb(color: Color) -> Dictionary:
 
 
 def _coated(color: Color, roughness: float) -> Dictionary:
-    """Return the BSDF dictionary of a colored base under a clear coat. color: linear sRGB
-    reflectance."""
+    """Return the BSDF dictionary of a colored base under a rough clear coat.
+
+    color: the linear sRGB reflectance of the base.
+    roughness: of the coat, Mitsuba's `alpha`: 0 is smooth, and 0.5 is very rough.
+    """
     return {
         "type": "roughplastic",
         "diffuse_reflectance": _rgb(color),
@@ -56,7 +59,11 @@ def _coated(color: Color, roughness: float) -> Dictionary:
 
 
 def _metal(name: str, roughness: float) -> Dictionary:
-    """Return the BSDF dictionary of a rough metal. name: its symbol in Mitsuba, such as "Au"."""
+    """Return the BSDF dictionary of a rough metal.
+
+    name: its symbol in Mitsuba, such as "Au".
+    roughness: Mitsuba's `alpha`: 0 is smooth, and 0.5 is very rough.
+    """
     return {"type": "roughconductor", "material": name, "alpha": roughness, "distribution": "ggx"}
 
 
@@ -91,8 +98,8 @@ class Material:
 
         solid: whether the surface is the boundary of a solid; otherwise it is open.
         traced_light: whether light paths are to be traced at it. Otherwise only its diffuse
-            reflectance and its kind are needed, and the dictionary may describe a similar BSDF that
-            is made faster.
+            reflectance and whether it is glossy or transparent are needed, and the dictionary may
+            describe a similar BSDF that Mitsuba loads faster.
 
         Raises:
             ValueError: the material is transparent, and the surface is open.
@@ -327,10 +334,10 @@ def corners_of(ends: FloatArray) -> FloatArray:
 
 
 def stage_placement(points: FloatArray, turned: FloatArray | None = None) -> Placement:
-    """Return the placement of surfaces in the studio: they are rotated, scaled until half the
-    diagonal of their box is 1, and put on the ground.
+    """Return the placement of surfaces in the studio: the map that rotates them, scales them such
+    that half the diagonal of their box is 1, and puts them on the ground.
 
-    points: (n, 3) points of the surfaces, whose box counts.
+    points: (n, 3) points of the surfaces; the box is that of these points, after the rotation.
     turned: the rotation (3, 3); None for no rotation.
 
     Raises:
@@ -347,7 +354,8 @@ def stage_placement(points: FloatArray, turned: FloatArray | None = None) -> Pla
 
 
 def _sensor(mi: Any, pose: CameraPose, size: tuple[int, int]) -> dict[str, Any]:
-    """Return the dictionary of the camera for Mitsuba. size: (width, height) in pixels.
+    """Return the dictionary of the camera for Mitsuba, at the position and with the orientation of
+    `pose`. size: (width, height) of the picture in pixels.
 
     Raises:
         ValueError: the camera is too far away for single precision.

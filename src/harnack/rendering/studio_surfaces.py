@@ -42,8 +42,13 @@ def drawn_surfaces(
     thickness: float | None = None,
     **shorthand: Any,
 ) -> list[TracedSurface]:
-    """Return the surfaces that `render` draws for its first argument. The other parameters are the
-    options of `render` that change the surfaces."""
+    """Return the surfaces that `render` draws for its first argument, `surfaces`.
+
+    options: the `TraceOptions` of all surfaces.
+    boundary_radius: the radius of tubes around the curves at which surfaces end; None for no tubes.
+    thickness: if not None, closed walls of this thickness are drawn in place of the surfaces.
+    shorthand: options of `Surface` and `TraceOptions` as keywords.
+    """
     drawn = studio_objects(
         surfaces, None, options, shorthand, boundary_radius=boundary_radius, thickness=thickness
     )
@@ -231,8 +236,9 @@ def _is_cut_alike(first: TracedSurface, second: TracedSurface) -> bool:
 def _boundary_tubes(
     objects: list[StudioObject], radius: Any, material: Material
 ) -> list[StudioObject]:
-    """Return objects that are tubes of a radius around the curves at which the given surfaces end.
-    Levels of the same field with the same clip end at the same curves, which get one tube.
+    """Return objects of the studio: tubes with this radius and material around the curves at which
+    the surfaces of the given objects end. Levels of the same field with the same clip end at the
+    same curves, which get one tube.
 
     Raises:
         ValueError: the radius is no positive number, or no surface ends at a curve.
@@ -265,6 +271,7 @@ def _surface(
     call. A `Solid` (a field that is negative inside of a closed body) is drawn as a solid if its
     inside can be seen: if a section opens it, or its material is transparent.
 
+    element: the entry.
     options, shorthand: the `TraceOptions` of the call, and options given as keywords, by name.
     is_clear: whether the material is transparent.
     """

@@ -138,8 +138,8 @@ def _refine_hits(prepared: SurfaceTracer, rays: _MarchedRays) -> SurfaceHit:
 
     rays: the rays and the `MarchResult` of each.
 
-    Every movement is limited to `reach`, twice the distance from the level at which the march may
-    stop.
+    The march may stop within some distance of the level set (`_uncertainty`). Every movement is
+    limited to `reach`, twice this distance.
     """
     vector, o, d, trace = prepared.backend.Array3f, rays.o, rays.d, rays.trace
     # Of a union of patches (level sets of several functions), the patch that each ray hit.
@@ -230,12 +230,13 @@ def _hit_on_facet(
     jumps). The intersection with the facet's plane is exact up to rounding, so neither t nor the
     normal is refined.
 
-    hit: the same rays' `SurfaceHit` as for smooth hits. Its entries that do not depend on the facet
-        are kept.
+    o, d, trace: origins and directions (3,) of the rays, and how their march ended.
+    hit: the same rays' `SurfaceHit` as for hits where f is smooth. Its entries that do not depend
+        on the facet are kept.
 
     f is larger on the side to which the normal points. So a ray that runs along the normal comes
-    from the side of smaller values. The next ray starts as far off as from a level set, and at
-    least several roundings of the position.
+    from the side of smaller values. A ray that leaves the facet starts as far off it as off a level
+    set, and at least several roundings of the position.
     """
     t = dr.select(trace.at_jump, trace.t, 0)
     position = dr.fma(prepared.backend.Array3f(t), d, o)
@@ -258,8 +259,8 @@ def _hit_on_facet(
 def _uncertainty(
     prepared: SurfaceTracer, gradient: Vec3, t: Real, f: Real, error: Real = 0.0
 ) -> Real:
-    """Bound, to first order, how far from the level a point may be that the march accepts as a hit.
-    Returns this distance.
+    """Return a distance: to first order, a point that the march accepts as a hit lies within this
+    distance of the level set.
 
     gradient, t, f, error: at the point, the gradient (3,) of f, the ray parameter, the value of f,
         and the bound of the rounding error of the value.
@@ -440,9 +441,9 @@ class CappedSolid:
         return hits_cap | self.prepared.occluded(o, d, 0, t_max, active & ~hits_cap)
 
     def _meet_levels(self, o: Vec3, d: Vec3, t_max: Real, active: Mask) -> SurfaceHit:
-        """Find the first hits of rays with the level sets inside the volume. Returns a `SurfaceHit`
-        whose normals point out of the solid: toward smaller f at the lower bound, and toward larger
-        f at the upper one."""
+        """Find the first hits of rays o + t d, 0 <= t <= t_max, with the level sets inside the
+        volume. Returns a `SurfaceHit` whose normals point out of the solid: toward smaller f at the
+        lower bound, and toward larger f at the upper one."""
         hit = intersect_surface(self.prepared, o, d, t_max, active)
         is_at_low = dr.abs(hit.value - self.low) < dr.abs(hit.value - self.high)
         normal = dr.select(is_at_low, -hit.normal, hit.normal)

@@ -52,9 +52,14 @@ def check_branch_points(field: RiemannSurface, size: float, rng: np.random.Gener
 def _check_branch_point(
     field: RiemannSurface, point: BranchPoint, radius: float, rng: np.random.Generator
 ) -> None:
-    """Check the bound that a Riemann surface states for one branch point (`check_branch_points`),
-    at random complex points within `radius` of it. Raises a BrokenPromiseError if it does not
-    hold."""
+    """Check the bound that a Riemann surface states for one branch point, at random complex points
+    within `radius` of it. `check_branch_points` has the formula of the bound.
+
+    rng: a generator of random numbers.
+
+    Raises:
+        BrokenPromiseError: the bound does not hold.
+    """
     backend = choose_backend("double")
     assert point.power is not None
     # Half of the points are near the branch point, half are spread evenly over the disc.

@@ -175,7 +175,11 @@ def _without_truncation(
 ) -> list[_StencilSample]:
     """The stencil (samples at the nodes) with the gradients of the exact field, without the
     truncation error of a treecode (`Field.exact`). It is needed because the Hessian that a treecode
-    computes may be the derivative of its own gradient or of the exact one."""
+    computes may be the derivative of its own gradient or of the exact one.
+
+    points: (n, 3) the points of the differences.
+    stencil: the samples at all nodes.
+    """
     error = sample_field(field, points, closely=True).gradient_error
     exact: list[_StencilSample] = []
     for node_sample in stencil:
@@ -218,15 +222,20 @@ def _pick_spacing(
 
 
 def _first_spacing(points: FloatArray, samples: FieldSamples) -> FloatArray:
-    """The spacings (n,) of central differences at points (n, 3) that are tried first, as
-    lengths."""
+    """The spacings (n,) of central differences at points (n, 3) that are tried first, as lengths.
+
+    samples: the samples of the field at the points.
+    """
     return 2e-3 * _scale(points, samples)
 
 
 def _scale(points: FloatArray, samples: FieldSamples) -> FloatArray:
-    """For each of the points, a length (n,) over which f is smooth: the smallest radius of the
-    balls on which f is promised to be harmonic, at most the extent of the points. Without such
-    balls it is the extent, which proves nothing."""
+    """For each of the points (n, 3), a length (n,) over which f is smooth: the smallest radius of
+    the balls on which f is promised to be harmonic, at most the extent of the points. Without such
+    balls it is the extent, which proves nothing.
+
+    samples: the samples of the field at the points.
+    """
     size = float(np.ptp(points, axis=0).max()) or 1.0
     radii = [promise.radius for promise in samples.promises if isinstance(promise, HarmonicBall)]
     smooth_length = np.min([np.full(len(points), size), *radii], axis=0)
@@ -254,8 +263,8 @@ def _check_gradient(
 
 
 def _difference(stencil: list[_StencilSample]) -> tuple[FloatArray, FloatArray]:
-    """Gradients (n, 3) from central differences of the value: a first array with the spacing h, and
-    a second with the spacing 2h.
+    """Two arrays of gradients (n, 3) from central differences of the value: the first with the
+    spacing h, the second with the spacing 2h.
 
     stencil: the samples at the nodes.
     """
@@ -270,9 +279,9 @@ def _limits(
     field: Field, points: FloatArray, samples: FieldSamples, nodes: list[_StencilSample]
 ) -> tuple[FloatArray, FloatArray]:
     """The allowed difference between the gradient and central differences of the value, in two
-    parts (n,) and (n,): a bound of the truncation and rounding error of the differences
-    (tolerance); and the contribution of the errors that the field states for value and gradient
-    (allowance).
+    parts (n,) and (n,). The first, the tolerance, bounds the truncation and rounding error of the
+    differences. The second, the allowance, comes from the errors that the field states for value
+    and gradient.
 
     points: (n, 3).
     samples: the samples at the points.
@@ -301,9 +310,9 @@ def _limits(
 
 
 def _second_derivatives(stencil: list[_StencilSample]) -> FloatArray:
-    """(n,) for each point, the sum of the absolute values of all terms in the central differences
-    of the gradient that give the second derivatives along the three axes. It is at least the sum of
-    the absolute values of these derivatives.
+    """The sums (n,) for each point of the absolute values of all terms in the central differences
+    of the gradient that give the second derivatives along the three axes. Each is at least the sum
+    of the absolute values of these derivatives.
 
     stencil: the samples at the nodes.
     """
@@ -329,9 +338,9 @@ def _check_laplacian(
     length = np.linalg.norm(samples.gradient, axis=1)
 
     def compare(stencil: list[_StencilSample]) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """The Laplacian by central differences with one spacing, and the two parts of the allowed
-        difference: a bound of the error of the differences, and the contribution of the field's own
-        errors; (n,) each.
+        """Return three arrays (n,): the Laplacian by central differences with one spacing; a bound
+        of the error of the differences (tolerance); and the contribution of the field's own errors
+        (allowance).
 
         stencil: the samples at the nodes.
         """
@@ -468,9 +477,9 @@ def _check_hessian(
         hessian_error = field.hessian_error_bound(points, precision="double")
 
     def compare(stencil: list[_StencilSample]) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """The largest difference between an entry of the field's Hessian and central differences of
-        the gradient with one spacing; and the two parts of the allowed difference: a bound of the
-        error of the differences, and the contribution of the field's own errors; (n,) each.
+        """Return three arrays (n,): the largest difference between an entry of the field's Hessian
+        and central differences of the gradient with one spacing; a bound of the error of the
+        differences (tolerance); and the contribution of the field's own errors (allowance).
 
         stencil: the samples at the nodes.
         """

@@ -56,7 +56,8 @@ class PromiseCase:
     function per row.
 
     promise: the promise.
-    gap_below, gap_above: the differences of f(p) to the next level below and above, both positive.
+    gap_below, gap_above: the differences between f(p) and the next level below and above, both
+        positive; infinite if there is no such level.
     """
 
     promise: Promise
@@ -64,8 +65,8 @@ class PromiseCase:
     gap_above: Real
 
     def map_numbers(self, change: Callable[[Any], Any]) -> PromiseCase:
-        """A copy of the case in which each number x is replaced by change(x). The numbers may be
-        Python numbers, or arrays of NumPy or Dr.Jit."""
+        """A copy of the case in which each number x of the promise and each gap x is replaced by
+        change(x). The numbers may be Python numbers, or arrays of NumPy or Dr.Jit."""
         promise = self.promise.map_numbers(lambda number, _, __: change(number))
         return PromiseCase(promise, change(self.gap_below), change(self.gap_above))
 
@@ -194,7 +195,10 @@ def check_enclosure(
 def random_functions(rng: np.random.Generator, rows: int) -> Iterator[RandomFunctions]:
     """Yield sets of `rows` random functions of different kinds: functions that are harmonic in 2, 3
     or 4 dimensions, that have a bounded Laplacian, that are Lipschitz, or that have a bounded
-    second derivative. Each set satisfies a promise of that kind."""
+    second derivative. Each set satisfies a promise of that kind.
+
+    rng: a generator of random numbers.
+    """
     with np.errstate(all="ignore"):
         for dimension in (2, 3, 4):
             yield _positive_harmonic(rng, rows, dimension, mirrored=False)
@@ -214,7 +218,9 @@ def _positive_harmonic(
     or three rings of mass on the sphere. A ring is given by its latitude, the cosine of its angle
     to the ray.
 
+    rng: a generator of random numbers.
     rows: the number of functions.
+    n: the dimension.
     """
     radius, mass = _log_uniform(rng, rows, -3, 3), _log_uniform(rng, rows, -3, 3)
     latitudes = rng.uniform(-1, 1, (rows, 3))
@@ -247,6 +253,7 @@ def _bounded_harmonic(rng: np.random.Generator, rows: int, n: int) -> RandomFunc
     """Random harmonic functions on a ball in n dimensions, each with the promise of a range of its
     values on the ball.
 
+    rng: a generator of random numbers.
     rows: the number of functions.
     n: the dimension.
 
@@ -287,13 +294,14 @@ def _bounded_laplacian(rng: np.random.Generator, rows: int, *, mirrored: bool) -
     `mirrored`, above. Each is a Poisson integral of rings of mass on the sphere, minus the
     potential of sources in the ball.
 
+    rng: a generator of random numbers.
     rows: the number of functions.
 
     The sources are a constant density in the unit ball, two balls of constant density, and a
-    multiple of the Legendre polynomial P_2 of the latitude (the wave). The latter has the potential
-    q^2 ln(q) P_2/5 at the distance q from the center, and so the logarithm that occurs in the
-    bound. The bound is attained if there is only a constant density that is not negative, and mass
-    only at the poles.
+    multiple of the Legendre polynomial P_2 of the latitude (the wave). At the distance q from the
+    center, the potential of P_2 is q^2 ln(q) P_2/5 up to its sign; such a logarithm also occurs in
+    the bound of `BoundedLaplacian`. The bound is attained if there is only a constant density that
+    is not negative, and mass only at the poles.
     """
     radius, mass = _log_uniform(rng, rows, -3, 3), _log_uniform(rng, rows, -3, 3)
     latitudes, weights = rng.uniform(-1, 1, (rows, 3)), rng.dirichlet([0.7] * 3, rows)
@@ -357,6 +365,7 @@ def _zigzag_lines(rng: np.random.Generator, rows: int) -> RandomFunctions:
     """Random functions with a Lipschitz constant: straight lines, and zigzag lines with two kinks.
     The absolute values of their slopes are at most the constant.
 
+    rng: a generator of random numbers.
     rows: the number of functions.
     """
     radius, constant = _log_uniform(rng, rows, -3, 3), _log_uniform(rng, rows, -3, 3)
@@ -389,6 +398,7 @@ def _parabolas(rng: np.random.Generator, rows: int) -> RandomFunctions:
     slopes. The absolute value of the second derivative is at most the promised constant, and for
     half of the functions equal to it.
 
+    rng: a generator of random numbers.
     rows: the number of functions.
     """
     radius, constant = _log_uniform(rng, rows, -3, 3), _log_uniform(rng, rows, -3, 3)
@@ -438,6 +448,7 @@ def _with_random_levels(
     these functions it is the only level, since of two levels the other one is often met first. All
     other levels are at random differences from f(0).
 
+    rng: a generator of random numbers.
     name: the name of the kind of functions, for messages.
     scale: (rows,) a typical size of f - f(0).
     reach: (rows,) the radius of the ball about t = 0 on which the promise holds.
@@ -463,13 +474,14 @@ def _with_random_levels(
 
 
 def _log_uniform(rng: np.random.Generator, rows: int, lower: float, upper: float) -> FloatArray:
-    """(rows,) random numbers whose decimal logarithms are uniform between `lower` and `upper`."""
+    """An array (rows,) of random numbers whose decimal logarithms are uniform between `lower` and
+    `upper`. rng: a generator of random numbers."""
     return 10 ** rng.uniform(lower, upper, rows)
 
 
 def _upload(trial: RandomFunctions, precision: Precision) -> tuple[PromiseCase, Any]:
-    """The promise with its levels, and the slopes (rows,), of some random functions, as Dr.Jit
-    arrays of the given precision."""
+    """Convert numbers of a set of random functions, the trial, to Dr.Jit arrays of the given
+    precision. Returns its promise with the levels, and its slopes (rows,)."""
     real = choose_backend(precision).Float
     case = trial.case.map_numbers(lambda n: real(n) if isinstance(n, np.ndarray) else n)
     return case, real(trial.slope)
@@ -488,6 +500,8 @@ def _check_trial(
     trial: the random functions.
     case: the trial's promise with its levels, as Dr.Jit arrays.
     slope: the trial's slopes (rows,), as a Dr.Jit array.
+    rng: a generator of random numbers.
+    precision: of these arrays.
 
     Raises:
         BrokenPromiseError: a free length is wrong for one of the functions.
@@ -520,8 +534,9 @@ def _check_trial(
 
 
 def _meets_level(trial: RandomFunctions, length: FloatArray, precision: Precision) -> BoolArray:
-    """(rows,) for each function of the trial, whether it meets a level strictly within `length`
-    (rows,), as far as samples of the function show."""
+    """A mask (rows,): whether each function of the trial meets a level strictly within its entry of
+    `length` (rows,), as far as samples of the function show. In single precision the test allows
+    for more rounding."""
     tolerance = 1e-9 if precision == "double" else 1e-5
     # Half of the samples are evenly spaced, the others dense towards the end of the length.
     fractions = np.concatenate([np.linspace(0, 1, _SAMPLES // 2), 1 - np.geomspace(1e-7, 0.5, 24)])
@@ -541,8 +556,8 @@ def _meets_level(trial: RandomFunctions, length: FloatArray, precision: Precisio
 
 
 def _value_scale(trial: RandomFunctions) -> FloatArray:
-    """(rows,) for each function of the trial, the size of the numbers in its evaluation, to which
-    the rounding errors of its values are proportional."""
+    """For each function of the trial, the size (rows,) of the numbers in its evaluation. The
+    rounding errors of its values are proportional to it."""
     promise, size = trial.case.promise, np.abs(trial.slope) * trial.reach
     for low, high in promise.interval_pairs[
         :1

@@ -133,7 +133,7 @@ def proved_free_lengths(
 
     points, directions: (n, 3) the starts of the rays, and their unit directions.
     ahead: (n,) the length of the ray for which enclosures are requested.
-    gaps: (n, 2) the differences of f at the start to the next level below and above.
+    gaps: (n, 2) the differences between f at the start and the next level below and above.
     enclosures: the classes of enclosures that may be used; None for the default.
     precision: of the computation.
     forwards: True for the free length of the ray in front of its start. False for a ray that ends
@@ -373,6 +373,7 @@ def _check_promise(
 
     samples: the samples of the field at the points.
     promise: the promise, with one number for each point.
+    rng: a generator of random numbers.
     directions: the number of rays from each point.
 
     A promise that also holds outside of the field's domain, such as that of a harmonic ball, is
@@ -432,9 +433,9 @@ def _distance_to_exit(field: Field, points: FloatArray, d: FloatArray) -> FloatA
 def _harnack_excess(
     ball: HarmonicBall, value: FloatArray, movement: FloatArray, fraction: FloatArray
 ) -> FloatArray:
-    """(n, m) by how much the change of f along rays exceeds what is possible for a harmonic
-    function on a ball, by Harnack's inequality and by the range of its values there. If it is
-    positive, f is not harmonic on the ball or leaves the range.
+    """An array (n, m): by how much the change of f along rays exceeds what Harnack's inequality,
+    and the range of f, allow for a harmonic function on a ball. If it is positive, f is not
+    harmonic on the ball or leaves the range.
 
     ball: the promises: n balls on which f is harmonic, with the ranges of f.
     value: (n,) f at the centers of the balls.
@@ -458,7 +459,13 @@ def _harnack_excess(
 def _check_extent(field: Field, level: float, rng: np.random.Generator, count: int) -> None:
     """Check that the level set stays within its extent, the volume that is stated to contain it: f
     must not cross the level outside of the extent on `count` random segments (more for a field with
-    a domain). Raises a BrokenPromiseError if it does."""
+    a domain).
+
+    rng: a generator of random numbers.
+
+    Raises:
+        BrokenPromiseError: f crosses the level outside of the extent.
+    """
     volume = field.extent((level,))
     if volume is None:
         return
@@ -508,8 +515,9 @@ def _check_extent(field: Field, level: float, rng: np.random.Generator, count: i
 
 
 def _level_interval(field: Field, offset: FloatArray) -> FloatArray:
-    """The number of the interval between neighboring levels in which f lies. It is the same for two
-    values of f if no level separates them.
+    """A number for the interval between neighboring levels in which f lies. It is the same for two
+    values of f if no level separates them. If f has a period, all values that differ from a level
+    by whole periods are levels, too.
 
     offset: f - level for one of the levels.
     """
@@ -517,7 +525,8 @@ def _level_interval(field: Field, offset: FloatArray) -> FloatArray:
 
 
 def _distance_to_level(field: Field, offset: FloatArray) -> FloatArray:
-    """The difference |f - level| to the nearest level.
+    """The difference |f - level| from the nearest level. If f has a period, all values that differ
+    from a level by whole periods are levels, too.
 
     offset: f - level for one of the levels.
     """

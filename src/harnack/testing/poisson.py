@@ -26,9 +26,12 @@ _TERMS = 30
 
 
 def kernel_difference(q: npt.ArrayLike, s: npt.ArrayLike, dimension: int) -> FloatArray:
-    """P(q, s) - 1 for 0 <= q < 1 and -1 <= s <= 1, where P = (1-q^2)/(1+q^2-2qs)^(n/2) is the
-    Poisson kernel of the unit ball of dimension n, at the position q on the axis, for mass at the
-    latitude s."""
+    """P - 1 for 0 <= q < 1 and -1 <= s <= 1, where P = (1-q^2)/(1+q^2-2qs)^(n/2) is the Poisson
+    kernel of the unit ball of dimension n = `dimension`.
+
+    q: the position on the axis.
+    s: the latitude of the mass.
+    """
     q, s = np.asarray(q, np.float64), np.asarray(s, np.float64)
     squared_distance = (1 - q) ** 2 + 2 * q * (1 - s)  # accurate where q and s are near 1
     log = np.where(q < 0.5, np.log1p(np.maximum(q * (q - 2 * s), -0.99)), np.log(squared_distance))
@@ -49,7 +52,8 @@ def cap_mass(height: npt.ArrayLike, dimension: int) -> FloatArray:
 
 def cap_slope(height: npt.ArrayLike, dimension: int) -> FloatArray:
     """The derivative at q = 0, by the position q on the axis, of the Poisson integral of the
-    indicator of the cap s >= 1 - height of the unit sphere (`cap_movement`)."""
+    indicator of the cap s >= 1 - height of the unit sphere of R^n, n = `dimension`
+    (`cap_movement`)."""
     b = np.asarray(height, np.float64)
     if dimension == 3:
         return 0.75 * b * (2 - b)
@@ -58,8 +62,9 @@ def cap_slope(height: npt.ArrayLike, dimension: int) -> FloatArray:
 
 
 def cap_movement(q: npt.ArrayLike, height: npt.ArrayLike, dimension: int) -> FloatArray:
-    """The Poisson integral of the indicator of the cap s >= 1 - height of the unit sphere, at the
-    position q on the axis, -1 < q < 1, minus its value at the center (`cap_mass`).
+    """The Poisson integral of the indicator of the cap s >= 1 - height of the unit sphere of R^n, n
+    = `dimension`, at the position q on the axis, -1 < q < 1, minus its value at the center
+    (`cap_mass`).
 
     For the opposite cap, s <= -(1 - height), evaluate at -q.
     """
@@ -81,7 +86,8 @@ def _cap_angle(height: FloatArray) -> FloatArray:
 
 def _cap_series(q: FloatArray, b: FloatArray, dimension: int) -> FloatArray:
     """The Poisson integral of the indicator of the cap of height b, at the position q on the axis,
-    minus its value at q = 0. It is computed as the sum of c_l q^l over l >= 1, for small q.
+    minus its value at q = 0, in R^n with n = `dimension`. It is computed as the sum of c_l q^l over
+    l >= 1, for small q.
 
     The series is the expansion of the Poisson kernel in Gegenbauer polynomials, integrated over the
     cap, which reaches from the latitude s = 1 - b to 1. For n = 3 these are the Legendre
@@ -110,8 +116,9 @@ def _cap_series(q: FloatArray, b: FloatArray, dimension: int) -> FloatArray:
 
 
 def _cap_closed_form(q: FloatArray, b: FloatArray, dimension: int) -> FloatArray:
-    """The Poisson integral of the indicator of a cap of height b, at the position q on the axis, by
-    a formula in closed form. If its value at q = 0 is subtracted, digits are lost at small q."""
+    """The Poisson integral of the indicator of a cap of height b, at the position q on the axis, in
+    R^n with n = `dimension`, by a formula in closed form. If its value at q = 0 is subtracted from
+    the result, digits are lost at small q."""
     if dimension == 3:  # the integral of (1-q^2)/2 (1+q^2-2qs)^(-3/2) over [1-b, 1]
         s = np.sqrt((1 - q) ** 2 + 2 * q * b)
         return b * (1 + q) / (s * (s + 1 - q))
@@ -147,7 +154,7 @@ class AxialFunctions:
 
     @property
     def slope(self) -> FloatArray:
-        """(rows,) the derivatives of the functions along the axis, at the center."""
+        """The derivatives (rows,) of the functions along the axis, at the center."""
         if self.measure == "points":
             slopes = self.dimension * self.latitudes_or_heights
         else:
@@ -217,7 +224,7 @@ class GreenPotentials:
 
 def _newton(q: FloatArray, y: FloatArray, size: FloatArray) -> FloatArray:
     """Newton's potential of a ball of density 1, at the position q on the axis, minus its value at
-    0.
+    the position 0.
 
     y, size: the position of the ball's center on the axis, and its radius.
     """

@@ -101,7 +101,8 @@ def mutated_enclosure(kind: type[Enclosure], factor: float, *, covers: float | N
 
 
 def original_enclosure(kind: type[Enclosure]) -> type[Enclosure]:
-    """The class from which `mutated_enclosure` derived a class; any other class itself."""
+    """The class from which `mutated_enclosure` made the class `kind`. A class that it did not make
+    is returned as it is."""
     return getattr(kind, "original", kind)
 
 
@@ -211,9 +212,13 @@ def lift_along_rays(
 def accumulated_jumps(
     field: Field, start: FloatArray, direction: FloatArray, lengths: FloatArray
 ) -> FloatArray:
-    """(n, m) the sums of the jumps of f across facets between the first point and each other point
-    of a ray. The points are start + t direction for each t of `lengths` (n, m). The field's method
-    `next_jump` reports the jumps one after the other."""
+    """An array (n, m): for each of n rays, the sums of the jumps of f across facets between the
+    ray's first point and each of its m points. The field's method `next_jump` reports the jumps one
+    after the other.
+
+    start, direction: (n, 3) the starts of the rays, and unit vectors.
+    lengths: (n, m) the points of a ray are start + t direction for each t of its row.
+    """
     total = np.zeros_like(lengths)
     if not field.has_jumps:
         return total
@@ -235,9 +240,9 @@ def accumulated_jumps(
 
 
 def random_points(field: Field, rng: np.random.Generator, n: int) -> FloatArray:
-    """n random points (n, 3) of the field's domain. If it has none, points of the extent of its
-    default surface; if that is not known either, points around the origin. Where a box is
-    unbounded, it is cut at -3 and 3."""
+    """n random points (n, 3) of the field's domain. If the field has no domain, points in the box
+    of the extent of its default surface; if that is not known either, points around the origin.
+    Where a box is unbounded, it is cut at -3 and 3. rng: a generator of random numbers."""
     volume = field.domain if field.domain is not None else field.extent((field.default_level,))
     if volume is None:
         return 3 * random_directions(rng, n) * rng.random((n, 1))
@@ -254,7 +259,7 @@ def random_points(field: Field, rng: np.random.Generator, n: int) -> FloatArray:
 
 
 def random_directions(rng: np.random.Generator, n: int) -> FloatArray:
-    """n unit vectors (n, 3), uniform on the sphere."""
+    """n random unit vectors (n, 3), uniform on the sphere. rng: a generator of random numbers."""
     directions = rng.normal(size=(n, 3))
     return directions / np.linalg.norm(directions, axis=1, keepdims=True)
 
@@ -348,6 +353,7 @@ def search_violations(
 
     points: (n, 3) the points from which the search starts.
     look: the samples of the field at the points.
+    rng: a generator of random numbers.
 
     A promise that is wrong by a few percent is violated only at special points: beside a
     singularity that lies just inside of the ball, or in the one direction in which a range is
@@ -460,7 +466,7 @@ class _ViolationSearch:
         return _Candidates(p, w, radii, np.where(np.isnan(ratios), -np.inf, ratios))
 
     def _is_in_domain(self, p: FloatArray) -> BoolArray:
-        """(n,) whether points are finite and in the field's domain."""
+        """A mask (n,): whether the points p (n, 3) are finite and in the field's domain."""
         is_inside = np.asarray(np.isfinite(p).all(axis=1))
         if self.field.domain is not None:
             is_inside &= self.field.domain.contains_points(np.nan_to_num(p))
@@ -469,14 +475,14 @@ class _ViolationSearch:
     def _ratio(
         self, at_p: FieldSamples, p: FloatArray, w: FloatArray, reach: FloatArray, samples: int
     ) -> FloatArray:
-        """The violation ratios (n,) of pairs of points p (n, 3) and y = p + reach * w: the change
-        of f from p to y, minus the error of this change, relative to the bounds of the promise made
-        at p. Above 1 the promise is violated.
+        """The violation ratios (n,) of pairs of points p (n, 3) and y = p + reach * w. A ratio is
+        the change of f from p to y, minus the error of this change, divided by the bound that the
+        promise made at p gives for it. Above 1 the promise is violated.
 
         at_p: the samples at p.
         w: (n, 3), |w| < 1.
         reach: (n,) the radius of the promise.
-        samples: the number of samples on a path from p to y.
+        samples: the number of samples on a path from p to y, if f must be followed along it.
 
         For promises that are about harmonic functions or Laplacians, the ratio is also computed
         from the gradients near y, and the larger one is taken.
@@ -525,8 +531,9 @@ class _ViolationSearch:
     def _laplacian_ratio(
         self, bound: BoundedLaplacian, y: FloatArray, at_y: FieldSamples, h: FloatArray
     ) -> FloatArray:
-        """(n,) the violation ratios of a promised bound of the Laplacian, at points y (n, 3): 1
-        plus the amount by which the Laplacian is outside of its bounds, relative to their size.
+        """The violation ratios (n,) of a promised bound of the Laplacian, at points y (n, 3). A
+        ratio is 1 plus the amount by which the Laplacian is outside of its bounds, divided by the
+        size of the bounds.
 
         bound: the promise.
         at_y: the samples at y.
@@ -555,14 +562,14 @@ class _ViolationSearch:
 def _slope_ratio(
     promise: HarmonicBall, at_y: FieldSamples, margin: FloatArray, gap: FloatArray
 ) -> FloatArray:
-    """The violation ratio (k,) of a promise that f is harmonic on a ball, from its gradient: |grad
-    f(y)| relative to the largest value that it can have if f is harmonic on the ball and within its
-    range there.
+    """The violation ratios (k,) of the promise that f is harmonic on a ball and stays within a
+    range there, from gradients. A ratio is |grad f(y)| divided by the largest value that it can
+    have if the promise is right.
 
     promise: the promise, a ball with a range of f.
     at_y: the samples at points y of the balls.
     margin: (k,) the distances of the points y from the border of their ball.
-    gap: (k,) the differences between f(y) and the nearer end of its range.
+    gap: (k,) the differences between f(y) and the nearer end of the range.
 
     Proof. f - lower is positive and harmonic on the ball of radius `margin` about y. So by
     Harnack's inequality |grad f(y)| <= n (f(y) - lower)/margin; likewise for upper - f. If there is

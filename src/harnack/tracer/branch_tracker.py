@@ -38,10 +38,14 @@ _MAX_CHANGE, _MAX_ERROR = 0.25, 0.125
 
 @dataclass(frozen=True)
 class BranchReading(LevelReading):
-    """A `LevelReading` of samples that may have been given without their branch.
+    """A `LevelReading` of samples that may have been given without their branch, the integer that
+    has to be added to f. True levels are the values of f at which rays hit; periodic levels are all
+    numbers that differ from a true level by an integer. A ray passes a periodic level if its next
+    step may go beyond a periodic level that is no true level.
 
-    passes_branch_level: mask of rays at which `gaps` holds the differences to true levels. On other
-        rays it holds those to periodic levels.
+    passes_branch_level: mask of the rays that pass a periodic level. For these `gaps` holds the
+        differences between f and the next true levels, for other rays (but those of `needs_branch`)
+        those between f and the next periodic levels.
     needs_branch: mask of rays whose point has to be sampled again, with the branch.
     """
 
@@ -49,8 +53,9 @@ class BranchReading(LevelReading):
     needs_branch: Mask
 
     def gaps_after_jump(self, behind: LevelGaps) -> LevelGaps:
-        """The differences `gaps` for f behind a jump. The jump is an integer, so differences to
-        periodic levels stay as they are. Those to true levels are replaced by `behind`."""
+        """The attribute `gaps` for f behind a jump at the point. The jump is an integer, so
+        differences to periodic levels stay as they are. Differences to true levels are replaced by
+        `behind`, the differences between f behind the jump and the true levels."""
         down = dr.select(self.passes_branch_level, behind.below, self.gaps.below)
         return replace(
             self.gaps,
@@ -59,13 +64,19 @@ class BranchReading(LevelReading):
         )
 
     def must_repeat(self, too_coarse: Mask, accepted: Mask) -> Mask:
-        """Mask of the points that have to be sampled again: also those that need the branch. A
-        point that is not accepted is left anyway."""
+        """Mask of the points that have to be sampled again: those of `too_coarse`, whose sample is
+        not accurate enough, and the accepted points that need the branch. (`accepted` is the mask
+        of points before which no level lies on the ray; a ray leaves other points anyway.)"""
         return too_coarse | (self.needs_branch & accepted)
 
     def next_accuracy(self, accuracy: Real, coarser: Real) -> Real:
-        """The accuracy scale of the next sample. A ray that passes a periodic level needs the
-        branch, which samples of accuracy scale 1 and above have, at the next point, too."""
+        """The accuracy scale of the next sample; larger is more accurate. A ray that passes a
+        periodic level needs the branch at the next point, too, and samples of accuracy scale 1 and
+        above have it.
+
+        accuracy: the accuracy scale of this sample.
+        coarser: the accuracy scale that the truncation error asks for.
+        """
         return dr.select(self.passes_branch_level, fmax(accuracy, 1), coarser)
 
 
@@ -83,14 +94,14 @@ class BranchTracker:
     def begin(
         self, field: Field, known: Volume, path: Ray, ends: tuple[Real, Real], state: MarchState
     ) -> MarchState:
-        """The state of rays at their start, with f there and the accuracy scale of the first
-        sample.
+        """The state of rays at their start: `state` with f at the start and the accuracy scale of
+        the first sample.
 
         known: a volume outside of which the branch is that of f = 0.
         ends: t_min and t_max of the rays `path`. They are marched from `state.proved_to` on.
 
-        A ray that starts inside of `known` needs f at its start. If that is not cheap, its first
-        sample is made with the branch.
+        A ray that starts inside of `known` needs f at its start. If f there takes long to compute,
+        the first sample of the ray is made with the branch instead.
         """
         start, backend = state.proved_to, backend_of(state.proved_to)
         entry, _ = known.clip(path.origin, path.direction, *ends)
@@ -105,14 +116,19 @@ class BranchTracker:
         return replace(state, accuracy_scale=accuracy, value=backend.Float(value))
 
     def accuracy_of(self, field: Field, scale: Real) -> Real:
-        """The accuracy scale that the march asks for."""
+        """The accuracy scale with which `field` is sampled: `scale` itself, for which the march
+        asks."""
         del field
         return scale
 
     def read(self, ray_sample: RaySample, before: Real, step: Real, size: Real) -> LevelReading:
-        """Compare samples with the levels, after adding the branch to those that lack it. For the
-        parameters see `LevelRule.read`; before: also behind a facet, if the last accepted point
-        lies on one (`resolve`)."""
+        """Compare samples with the levels, after adding the branch to those that lack it.
+
+        ray_sample: the samples at the trial points.
+        before: f at the last accepted points, as `resolve` needs it.
+        step: the distance from the trial point back to the last accepted point.
+        size: a bound of the absolute values of coordinates on the ray up to the trial point.
+        """
         is_modulo = ray_sample.sample.branch_unknown
         if is_modulo is None:
             return read_plainly(self.levels, ray_sample, size)
@@ -140,9 +156,9 @@ class BranchTracker:
 
         ray_sample: the samples at the trial points, with enclosures (intervals that are proved to
             contain the change of f along the ray).
-        before: f at the last accepted point; behind the facet (a triangle at which f jumps) if the
-            point lies on one. On rays without an accepted point it is an approximate value, or 0,
-            and only tells between which periodic levels f lies.
+        before: f at the last accepted point. If this point lies on a facet (a triangle at which f
+            jumps), it is f behind the facet. On rays without an accepted point it is an approximate
+            value, or 0, and only tells between which periodic levels f lies.
         step: the distance from the trial point back to the last accepted point.
         total_error: a bound of the error of the sampled f.
 
@@ -151,9 +167,9 @@ class BranchTracker:
         errors are not accepted (`gaps`). So the true value is the one nearest to `before` among
         those that differ from the sample by an integer. (2) Otherwise the way to an accepted trial
         point holds no periodic level. So f lies between the same two of them as `before`, and the
-        fractional part of the sample determines it. If this is not proved of the way, the point is
-        not accepted, whatever its value. If f is within its error of a periodic level, the point is
-        accepted only by (1).
+        fractional part of the sample determines it. If the way is not proved to hold no periodic
+        level, the point is not accepted, whatever its value. If f is within its error of a periodic
+        level, the point is accepted only by (1).
         """
         sample, level = ray_sample.sample, self.levels.values[0]
         value, branch = sample.value - level, dr.floor(before - level)
@@ -183,13 +199,13 @@ class BranchTracker:
             periodic level (the mask that `resolve` returns).
         total_error: a bound of the error of the sampled f.
 
-        Mostly the differences are those to the neighboring periodic levels (numbers that differ
-        from a true level by an integer). On some rays, in `passes_level`, they are those to the
-        neighboring true levels: where the nearest periodic level is close and is no true level, or
-        where the error of f is large.
+        Mostly they are the differences to the neighboring periodic levels (numbers that differ from
+        a true level by an integer). On some rays, those of the mask `passes_level` in the code,
+        they are the differences to the neighboring true levels: where the nearest periodic level is
+        close and is no true level, or where the error of f is large.
 
-        The first mask returned holds the rays in `passes_level` whose sample was given with its
-        branch. The second holds the rays whose point has to be sampled again with the branch.
+        The first mask is True for the rays in `passes_level` whose sample was given with its
+        branch. The second is True for the rays whose point has to be sampled again with the branch.
 
         A ray passes a periodic level that is no true level by samples with known branch. A step
         from such a sample may cross that level, so the next sample needs a known branch, too.

@@ -77,8 +77,8 @@ class _NoDerivative(dr.CustomOp):
     them, needed or not, so the derivative is NaN there."""
 
     def eval(self, value: Any, result_name: str, sources: list[Any]) -> Any:
-        """Return `value`, and keep its name for the message. sources: the arrays on which it
-        depends."""
+        """Return `value`, and keep its name `result_name` for the message. sources: the arrays on
+        which it depends; Dr.Jit needs them as inputs of the operation."""
         del sources
         self._result_name = result_name
         return value
@@ -99,8 +99,8 @@ class _NoDerivative(dr.CustomOp):
 def refuse_derivative(
     prepared: SurfaceTracer, o: Vec3, d: Vec3, result_name: str, value: Any
 ) -> Any:
-    """Return the array `value`, which raises an error if its derivative is requested: it is not
-    known, and zero would be wrong. In forward mode the derivative is NaN.
+    """Return the array `value`, whose derivative is not known (and zero would be wrong). In reverse
+    mode an error is raised if its derivative is used; in forward mode the derivative is NaN.
 
     prepared, o, d: the surface, and the origins and directions (3,) of the rays; `value` depends on
         these.
@@ -193,8 +193,12 @@ def _with_derivative(t: Real, change: Real, slope: Real, is_attached: Mask) -> R
 
 
 def _change_of_nearest(prepared: SurfaceTracer, f: Real) -> Real:
-    """Return level - detach(level) for the level nearest to f on each lane: a zero that carries the
-    derivative of this level."""
+    """Return a zero that carries a derivative: that of the level nearest to f on each lane. It is
+    level - detach(level).
+
+    prepared: the surface, with its levels.
+    f: values of the field's function.
+    """
     nearest, change = dr.inf, prepared.backend.Float(0)
     for level in prepared.levels.values:
         with dr.suspend_grad():

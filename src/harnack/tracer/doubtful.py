@@ -41,7 +41,7 @@ class Doubtful:
     position: (3,) the hit.
     normal: (3,) unit vector along the gradient of f.
     size: a bound of the coordinates along the ray up to the hit.
-    distance: the distance from the hit at which the search begins.
+    distance: the first distance from the hit at which the search samples f.
     """
 
     position: Vec3
@@ -103,7 +103,8 @@ def seen_distance(backend: Backend, field: Field, levels: Levels, hits: Doubtful
     smallest = 4 * backend.machine_epsilon * hits.size
 
     def offset_of(sample: Any) -> tuple[Real, Real, Mask]:
-        """Return f minus the level, the bound of its error, and whether it is certain on which side
+        """Return three results for a sample of f: f minus the level that is nearest to f at the
+        hit; a bound of the error of f; and the mask of lanes on which it is certain on which side
         of the level f is."""
         offset, error = (
             sample.value - level,
@@ -183,7 +184,7 @@ def seen_distance(backend: Backend, field: Field, levels: Levels, hits: Doubtful
 def _turning_point(now: _SearchState) -> Real:
     """Return the length along the gradient at which f may turn back from the level: by the secant
     through the slopes at `low` and `high`, and by bisection, in turns. If the secant leaves the
-    interval, it is halved."""
+    interval, bisection takes its place."""
     fraction = now.low_slope / (now.low_slope - now.high_slope)
     by_secant = ((now.sample_count & 1) == 0) & (fraction > 0) & (fraction < 1)
     return dr.fma(dr.select(by_secant, fraction, 0.5), now.high - now.low, now.low)

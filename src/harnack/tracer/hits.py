@@ -81,24 +81,25 @@ class Hits:
     primitive_index: (n,) the index of the facet (such as a triangle) or of the patch (such as a
         face of a `PolygonMesh`) that was hit; -1 for misses, for hits of a smooth level set, and
         for all rays of fields that have neither facets nor patches.
-    uncertainty: (n,) a length. At a hit of a smooth level set, |f - level| is proved to be at most
-        (tolerance + uncertainty) |grad f|. It is 0 if the error of f is within the tolerance, and
-        for all other rays.
+    uncertainty: (n,) a length that rounding adds to the tolerance: at a hit of a smooth level set,
+        |f - level| is proved to be at most (tolerance + uncertainty) |grad f|. It is 0 if the error
+        of f is within the tolerance, and for all other rays.
 
     Tolerance + uncertainty bounds the distance of the surface from a hit to first order. If |grad
     f| may be unbounded, the surface is proved to be within the tolerance, or within the rounding of
-    the point (see `HitTolerance`). An exception are lines and points at which grad f is 0 and f -
+    the point (see `HitTolerance`). Exceptions are lines and points at which grad f is 0 and f -
     level behaves as a power u^m of the distance u, for example where m sheets of the surface meet.
     There the surface may be m times as far. Beside the edge of a cusp, such as y^2 = x^3, it may be
     still farther: 0.002 for a tolerance of 1e-4, and 0.02 for y^2 = x^5.
 
     Rounding hides the surface near such lines and points. If rounding adds more than half the
-    tolerance, the uncertainty is computed as for three sheets. If it adds seven tolerances or more,
-    the surface is searched for: at points within tolerance + uncertainty of the hit, f is certainly
-    on different sides of the level, or touches it up to its error. The uncertainty is infinite if
-    that fails within a sixteenth of the size of coordinates. (The evaluations of this search are
-    not in `evaluations`.) If a ray grazes such a point, t may be too small by more than the
-    uncertainty, since the ray is not proved free any farther. Use `precision="double"` or
+    tolerance, the uncertainty is computed as for three sheets, m = 3. If it adds seven tolerances
+    or more, the surface is searched for around the hit, and the uncertainty is chosen such that at
+    points within tolerance + uncertainty of the hit, f is certainly on different sides of the
+    level, or touches it up to its error. The uncertainty is infinite if no such points are found
+    within a sixteenth of the size of coordinates. (The evaluations of this search are not in
+    `evaluations`.) If a ray passes close by such a line or point, t may be too small by more than
+    the uncertainty, since no more of the ray is proved free. Use `precision="double"` or
     `require_crossing` there.
     """
 
@@ -227,6 +228,7 @@ def _are_scattered(backend: Backend, o: Vec3, d: Vec3) -> bool:
     """Return whether there are many rays on a CPU and successive rays differ much, unlike the rays
     of a camera. Then tracing with a queue of rays is faster.
 
+    backend: the backend that traces the rays.
     o, d: (3,) origins and unit directions of the rays.
 
     A CPU traces packets of successive rays together, and most of such rays would wait for the
@@ -263,8 +265,11 @@ def _first_hits(
 ) -> tuple[MarchResult, Hits, _DistanceDoubt | None]:
     """Trace rays o + t d from t = near to t = far, without derivatives.
 
-    Returns the ends of rays as the tracer gives them; the `Hits` made from them; and for each hit
-    whether it may be due to rounding alone. The last is None if there can be no such hits.
+    prepared: the surface.
+
+    Returns three results: the ends of rays as the tracer gives them; the `Hits` made from them; and
+    for each hit whether it may be due to rounding alone. The third is None if there can be no such
+    hits.
     """
     backend = prepared.backend
     end = prepared.first_hit(o, d, near, far)
@@ -320,7 +325,8 @@ class _DistanceDoubt:
     ) -> _DistanceDoubt:
         """Determine which hits are doubtful, and their first-order distances.
 
-        o, t: origins (3,) and ray parameters of the hits.
+        prepared: the surface, with its tolerance.
+        o, t: origins (3,) of the rays and ray parameters of the hits.
         steepness: |grad f| at the hits.
         uncertainty: the length that rounding adds to the tolerance, to first order.
         """
@@ -340,8 +346,8 @@ class _SearchedHits:
     `compute_on_active`.
 
     doubtful: the hits.
-    part: the index of the patch that each ray hit; it is used only if the field is a union of
-        patches.
+    part: the index of the patch that each ray hit. It is used only if the field is a union of
+        patches (many level sets, each with a function and a box of its own).
     """
 
     doubtful: Doubtful
@@ -350,7 +356,7 @@ class _SearchedHits:
 
 @dataclass(frozen=True)
 class _SearchDistance:
-    """The distance from a hit within which the surface was found, as a dataclass for
+    """For each hit, the distance from it within which the surface was found, as a dataclass for
     `compute_on_active`."""
 
     length: Real
@@ -361,8 +367,9 @@ def _with_searched_distances(prepared: SurfaceTracer, hits: Hits, doubt: _Distan
     these the surface is searched for; its new uncertainty is the distance within which the surface
     was found, less the tolerance.
 
-    doubt: which hits are doubtful, and the distances at which the search begins. Only distances of
-        more than 8 tolerances are searched.
+    prepared: the surface.
+    doubt: which hits are doubtful, and how far the surface may be from them to first order. Only
+        where this distance is more than 8 tolerances is the surface searched for.
 
     All arrays of the hits are evaluated. If there is no such hit, nothing is searched.
     """
@@ -377,7 +384,7 @@ def _with_searched_distances(prepared: SurfaceTracer, hits: Hits, doubt: _Distan
         return hits
 
     def search(hit: _SearchedHits) -> _SearchDistance:
-        """Return the distance within which the surface was found."""
+        """Return the distance from each hit within which the surface was found."""
         sampled = field
         if field.has_patches:
             sampled = field.patch(dr.reinterpret_array(backend.UInt32, hit.part))

@@ -76,7 +76,8 @@ class _CoincidentJumps:
         there is none.
     down, normal_down: the index and normal (3,) of the first facet at which f jumps down; NO_FACET
         if there is none.
-    folded: whether f jumps the other way at a facet parallel to the first.
+    folded: whether one of the crossed facets is parallel to the first of them and f jumps the other
+        way there, as at the two sides of a thin wall.
     active: whether there may be further crossings at this point.
     """
 
@@ -101,10 +102,11 @@ class JumpTracer:
     field: the function f.
     path: the rays.
 
-    A smooth hit is a point within the tolerance of the level set of the function that continues f
-    from its interval beyond the facets. The level set of f itself may end at a facet. Within the
-    tolerance of such an end, a ray may hit the continued level set although the facet cuts it off.
-    That happens mostly near singular edges, where gradients grow without limit.
+    A smooth hit is a hit that is not on a facet: a point within the tolerance of a level set, that
+    of the function which continues f from its interval beyond the facets. The level set of f itself
+    may end at a facet. Within the tolerance of such an end, a ray may hit the continued level set
+    although the facet cuts it off. That happens mostly near singular edges, where gradients grow
+    without limit.
     """
 
     march: March
@@ -136,7 +138,7 @@ class JumpTracer:
         return self.finish(loop_while_active(self.begin(state), self.advance, "harnack intervals"))
 
     def begin(self, state: MarchState) -> JumpTraceState:
-        """Return the tracer's own state (a `JumpTraceState`) of rays that have not moved yet and
+        """Return the tracer's own state, a `JumpTraceState`, for rays that have not moved yet and
         have crossed no facet.
 
         state: the `MarchState` of the same rays, before their first sample.
@@ -233,8 +235,9 @@ class JumpTracer:
 
         previous: the state before the interval.
         now: the march at the end of the interval.
-        ahead, last: the merged crossing at the end of the interval, and the last of the crossings
-            that were merged, from which the ray goes on.
+        ahead, last: facets that the ray crosses at the same point are merged into one crossing,
+            `ahead`, at the end of the interval; `last` is the last of them, from which the ray goes
+            on.
         passed: mask of rays that have passed the facet without crossing the level.
         stopped: mask of rays whose interval ends at a facet.
         """
@@ -289,7 +292,8 @@ class JumpTracer:
         limit = fmax(fmin(first.t + tolerance / sine, self.end), first.t)
 
         def add_next(now: _CoincidentJumps) -> _CoincidentJumps:
-            """Add the next crossing to the sums, if it is at the same point."""
+            """Add the next crossing of a facet to the sums, if it is at the same point, and return
+            the new sums."""
             # The field looks for the next crossing after the place (t, facet) of the last one.
             crossing = self._next(
                 JumpCrossing(now.t, now.last, 0.0, first.normal), limit, now.active

@@ -46,19 +46,20 @@ def largest_component_cells(
 
     levels: the values of f on the level set.
     volume: the volume that contains the surface.
-    solid: (low, high); None for the level set itself.
+    solid: (low, high), the range of f on the solid; None for the level set itself.
     across: the number of cells along the longest side of the box of the volume.
 
     The marked cells also contain all components that no cells proved empty separate from the
     largest one (see `largest_connected_component`).
 
     A cell is not marked if it, or each of its eight octants, is proved to contain no point of the
-    level set or no point of the volume. There are two ways to prove this for the ball around a
-    cell. First, the radius of the ball is at most the clearance of its center, a proved lower bound
-    of the distance from the level set. If the center lies outside the domain of the field, a point
-    at the boundary of the domain takes its place. Second, the signed distance of the volume shows
-    that the ball lies outside. Cells inside a solid are marked, too, although they contain no
-    level. `largest_connected_component` has the rest of the proof.
+    level set or no point of the volume. There are two proofs for the ball around a cell. First, it
+    contains no point of the level set if its radius is at most the clearance of its center, which
+    is a proved lower bound of the distance from the level set. If the center lies outside the
+    domain of the field, a point at the boundary of the domain takes its place. Second, it contains
+    no point of the volume if the signed distance from the volume shows this. Cells inside a solid
+    are marked, too, although they contain no level. `largest_connected_component` has the rest of
+    the proof.
 
     Raises:
         ValueError: the volume is not bounded; or most of the cells that could not be proved empty
@@ -69,7 +70,7 @@ def largest_component_cells(
         raise ValueError("largest needs a surface with bounds: give it a clip, such as a ball")
 
     def build() -> OccupancyGrid:
-        """Compute the cells anew."""
+        """Compute the grid, which is not in the cache."""
         return _build_cells(field.with_levels(levels), levels, volume, solid, across)
 
     if field.parameters():  # they may change in place
@@ -80,17 +81,17 @@ def largest_component_cells(
 def _build_cells(
     field: Field, levels: tuple[float, ...], volume: Volume, solid: _Ends | None, across: int
 ) -> OccupancyGrid:
-    """Compute the cells of `largest_component_cells`, which describes the parameters. There is no
-    marked cell if the volume is empty or a single point."""
+    """Return the grid of `largest_component_cells`, which describes the parameters field, levels,
+    volume, solid and across. No cell is marked if the volume is empty or a single point."""
     distance_beyond = _distance_beyond(volume)
     project_to_domain = _projection_to_domain(field)
     in_solid = None if solid is None else _inside_solid(field, solid)
     distance_to_levels = clearance_function(field, levels, "double")
 
     def clearance(points: FloatArray) -> FloatArray:
-        """Return lower bounds (n,) of the distances of points (n, 3) from the level set, or from
-        the volume if that is farther; 0 inside the solid. They hold also for points outside the
-        field's domain."""
+        """Return lower bounds (n,) of the distances of points (n, 3) from the part of the level set
+        in the volume: bounds of the distance from the level set, or from the volume if that is
+        farther; 0 inside the solid. They hold also for points outside the field's domain."""
         clearances = np.maximum(distance_beyond(points), 0.0)
         inner, distances = project_to_domain(points)
         is_finite = np.isfinite(distances)
@@ -114,9 +115,9 @@ def _build_cells(
 def _refuse_if_unproved(
     field: Field, levels: tuple[float, ...], solid: _Ends | None, cells: OccupancyGrid
 ) -> None:
-    """Raise ValueError if most of the marked cells have centers far from the surface, to first
-    order: |f - level| > 4 |grad f| cell sizes. Centers in the solid or outside the domain do not
-    count as far."""
+    """Raise ValueError if the centers of most marked cells are far from the surface: to first
+    order, farther than 4 cell sizes, |f - level|/|grad f| > 4 sizes. Centers in the solid or
+    outside the domain do not count as far."""
     centers = cells.occupied_centers()
     if field.domain is not None:
         centers = centers[field.domain.contains_points(centers)]
@@ -136,12 +137,13 @@ def _refuse_if_unproved(
 
 
 def _projection_to_domain(field: Field) -> Callable[[FloatArray], tuple[FloatArray, FloatArray]]:
-    """Return a function `project` of points (n, 3). It returns points (n, 3) in the field's domain
-    near them, and the distances (n,) between the two; the distance is inf if no such point was
-    found.
+    """Return a function `project` of points (n, 3). For each point it returns a point in the
+    field's domain near it, as an array (n, 3), and the distance between the two, (n,); the distance
+    is inf if no such point was found.
 
-    The proved bounds of f need not hold outside its domain. If the returned point is at least c
-    away from a set, the given point is at least c minus the distance away from it.
+    The proved bounds of f need not hold outside its domain. If the point in the domain is at least
+    c away from a set, the given point is at least c minus the distance between the two away from
+    it.
     """
     domain = None if field.is_global else field.domain
     backend = choose_backend("double")
@@ -224,9 +226,9 @@ def _inside_solid(field: Field, solid: _Ends) -> Callable[[FloatArray], BoolArra
 
 
 def validate_component_cells(largest: object) -> int:
-    """Return the number of cells along the longest side of the box by which components are told
-    apart, from the option `largest`: 0 if it is False (all components are kept), 128 if it is True,
-    else the number itself.
+    """Return the number of cells that the option `largest` asks for. Components are told apart by
+    cells; the number is that along the longest side of the box of the surface. It is 0 if the
+    option is False (all components are kept), 128 if it is True, else the option itself.
 
     Raises:
         TypeError: neither a truth value nor an integer.

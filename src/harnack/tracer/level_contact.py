@@ -127,9 +127,10 @@ class JumpTest:
     values of f on its two sides.
 
     has_crossing: whether the interval ends at a facet.
-    at_crossing: whether, in addition, the trial point is accepted and lies at that facet.
-    is_hit: whether, in addition, a level lies between the values of f before and behind the facet,
-        up to the error of f.
+    at_crossing: whether the interval ends at a facet, and the trial point lies there and is
+        accepted (no level lies before it on the ray).
+    is_hit: whether, besides, a level lies between the values of f before and behind the facet, up
+        to the error of f.
     gaps: the differences between f and the next levels below and above it. On lanes of
         `at_crossing`, f is taken behind the facet.
     normal: (3,) unit normal of the facet.
@@ -164,10 +165,11 @@ def test_jump(
     total_error: a bound of the error of `value`.
 
     The facet belongs to the surface if a level lies between the values on its two sides. A level
-    within `total_error` of either value counts as between them. Such a facet belongs to the surface
-    or misses it by no more than rounding. The opposite choice could lose a surface: the march has
-    proved that f does not take the level *before* the facet, and rounding may contradict this by as
-    much as `total_error`. Facets at the same t count as one facet with the sum of their jumps
+    within `total_error` of either value counts as between them. Such a facet belongs to the
+    surface, or would belong to it after a change of f by no more than rounding. The opposite choice
+    could lose a surface: the march has proved that f does not take the level *before* the facet,
+    and because of rounding the computed value may be on the other side of the level by as much as
+    `total_error`. Facets at the same t count as one facet with the sum of their jumps
     (`JumpTracer._merge_coincident`).
     """
     has_crossing = ahead.facet != NO_FACET
@@ -215,7 +217,8 @@ class Contact:
     tolerance_excess: by how much |f - level| at the root may exceed what the tolerance allows,
         because of rounding.
     before, after: the ray parameters of the two samples around the root, or the root itself.
-    band: the tolerance in value at the last sample (`Hysteresis.band`).
+    band: the tolerance in value around the level at the last sample, which f must leave to end the
+        contact (`Hysteresis.band`).
     """
 
     side: Real
@@ -242,10 +245,10 @@ class AcceptedPoint:
     t, value, gradient: the ray parameter of the point, f, and its gradient (3,).
     slope: the derivative of f along the ray.
     before: (t, value, slope, gradient) of the accepted point before it.
-    excess: by how much |f - level| at these two points may exceed what the tolerance allows, if the
-        error of f is larger than the tolerance; else 0.
+    excess: by how much |f - level| at this point and the one before it may exceed what the
+        tolerance allows, if the error of f is larger than the tolerance; else 0.
     total_error: a bound of the error of the value.
-    is_near: whether the point would be a hit of a ray that ends at levels.
+    is_near: whether f is so near to a level that a ray that looks for first hits would end there.
     band: the tolerance in value around a level (`Hysteresis.band`).
     is_end: whether the ray ends there.
     """
@@ -267,7 +270,7 @@ class Hysteresis:
     """The rule by which the contact of a ray with a level begins, counts as a crossing, and ends. A
     ray is in contact with a level from where it reaches it until f has left the tolerance around
     it. During contact the level counts as lying a tolerance *beyond* its true place, as seen from
-    the side from which the ray came: the moved level.
+    the side from which the ray came: this is the moved level. The band is that tolerance in value.
 
     A ray that looks for first hits ends where f is within the tolerance of a level. A ray that goes
     on must leave the surface with a proof, and a crossing must not be counted several times because
@@ -278,8 +281,8 @@ class Hysteresis:
     spacing: the difference between the two closest levels; inf for a single level.
     is_free_before, is_free_after: whether the extent of the surface proves that the ray meets no
         level before the interval that is marched, and after it. Then f stays on one side of each
-        level there, and at that end of the interval it need differ from the level by no more than
-        its error.
+        level there. So at that end of the interval a difference between f and the level of more
+        than its error is enough to tell the side.
     start: the ray parameter at which the interval begins.
     rounding: the distance from a facet, at which f jumps, by which rounding may move a ray that
         starts on it.
@@ -289,8 +292,8 @@ class Hysteresis:
 
     1. *Nothing is missed.* If f is farther than W from a level on one side at some point of the
     ray, and on the other side at a later point, there is a crossing between the two points. Proof:
-    consider a ray in contact, on the side of larger values. It is proved not to take the value
-    `level - band`, by the same steps that prove that a ray without contact meets no level
+    consider a ray in contact that came from larger values of f. f is proved not to take the value
+    `level - band` on it, by the same steps that prove that a ray without contact meets no level
     (`March.advance`); band is that of the last sample. So f > level - W as long as no crossing was
     noticed. Before the contact, f was proved not to take the level at all. Beside a pole the band
     grows with the slope of f, and may become larger than all later values of f. So the band of a
@@ -353,7 +356,7 @@ class Hysteresis:
         return cls(levels, spacing, *free, start, rounding)
 
     def contact_tolerance(self, within: Real) -> Real:
-        """Return the difference between f and a level below which contact begins.
+        """Return the contact tolerance: contact begins where |f - level| is less than this.
 
         within: the largest |f - level| at a hit. The result is `within`, or a quarter of the
             spacing of levels if that is less.
@@ -374,9 +377,9 @@ class Hysteresis:
         )
 
     def may_reach(self, now: Contact, band: Real, step: Real, tolerance: Real) -> Mask:
-        """Return the mask of rays that may take a step to a trial point although they are in
-        contact: the band (tolerance in value) of the last sample is not much larger than that at
-        the trial point, or the step is short. Rays without contact are in the mask.
+        """Return the mask of rays that may take a step to a trial point. A ray in contact may if
+        the band (tolerance in value) at the last sample is not much larger than that at the trial
+        point, or if the step is short. A ray without contact always may.
 
         now: the contact at the last sample.
         band: the band at the trial point.
@@ -402,12 +405,14 @@ class Hysteresis:
         """Return the differences between f and the next levels below and above it. For a ray in
         contact, the levels are moved, so that f differs from them.
 
-        value: f.
+        contact: which level each ray reached last, and from which side.
+        value: f at the sample.
         gaps: the differences to the true levels; they are returned for rays without contact.
         band: the tolerance in value.
-        part: a fraction. The level that was reached counts as lying `part * band` beyond its true
-            place. The next level on the other side, from which the ray came, counts as lying `part`
-            times half the spacing away from the level reached.
+        part: a fraction: 1 for proofs, less for the places at which trial steps aim. The level that
+            was reached counts as lying part * band beyond its true place. On the side from which
+            the ray came, f must stay nearer to this level than to the next one; so that next level
+            counts as lying `part` times half the spacing away from the level reached.
         """
         # f minus the level reached.
         offset, far_gap = -self.levels.offset_to_nearest(value), part * _MAX_APPROACH * self.spacing
@@ -429,11 +434,11 @@ class Hysteresis:
         active: mask of rays that have an accepted point.
         accepted: that point.
 
-        A crossing is counted where f is on the other side of the level than the ray came from, by
-        more than half the band and more than the error of f. (At an end of the interval beyond
-        which no level lies, more than the error is enough.) A contact begins at a point that is
-        near enough for a hit, and ends where f is farther from the level than the band. Inactive
-        rays keep their contact.
+        A crossing is counted where f is not on the side of the level from which the ray came, but
+        on the other one, by more than half the band and more than the error of f. (At an end of the
+        interval beyond which no level lies, more than the error is enough.) A contact begins at a
+        point that is near enough for a hit, and ends where f is farther from the level than the
+        band. Inactive rays keep their contact.
         """
         # f minus the nearest level: positive on the side of larger values.
         offset = -self.levels.offset_to_nearest(accepted.value)
@@ -492,8 +497,8 @@ class Hysteresis:
         ahead: the crossing of the facet.
         d: (3,) unit direction of the ray.
 
-        A function with jumps has a single level here. A ray that starts on a facet, up to rounding,
-        is on neither side of the level.
+        A function with jumps has a single level where crossings are counted. A ray that starts on a
+        facet, up to rounding, is on neither side of the level.
         """
         # f minus the level, before the facet and behind it.
         offset = -self.levels.offset_to_nearest(accepted.value)
@@ -592,7 +597,8 @@ def refine_crossing(
     smallest = 4 * float(dr.epsilon(type(contact.root)))
 
     def bisect(now: _Bisection) -> _Bisection:
-        """Sample f at the point t, and keep the half of the interval in which f takes the level."""
+        """Sample f at the point t, and keep the half of the interval in which f takes the level.
+        Returns the new state."""
         sample, size = field.evaluate(path.point(now.t)), max_norm(path.origin) + now.t
         offset, steepness = -levels.offset_to_nearest(sample.value), safe_norm(sample.gradient)
         is_near = dr.abs(offset) <= fmax(

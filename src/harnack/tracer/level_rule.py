@@ -1,4 +1,7 @@
-"""How the march compares a sample of f with the levels, the values of f that rays look for.
+"""How the march, the loop that steps along rays, compares a sample of f with the levels, the values
+of f that rays look for. At a trial point of each ray f is sampled; the point is accepted if it is
+proved that no level lies before it on the ray. The accuracy scale of a sample tells how exactly f
+is computed; larger is more accurate.
 
 A `LevelRule` chooses the accuracy of a sample and reads from it how far f is from the next levels.
 `PlainLevels` is the rule for samples that give f itself. `branch_tracker.BranchTracker` is the rule
@@ -41,14 +44,14 @@ class LevelReading:
     total_error: Real
 
     def gaps_after_jump(self, behind: LevelGaps) -> LevelGaps:
-        """The differences `gaps` for f behind a jump at the point. behind: the differences between
-        f behind the jump and the levels."""
+        """The attribute `gaps` for f behind a jump at the point. behind: the differences between f
+        behind the jump and the next levels."""
         return behind
 
     def must_repeat(self, too_coarse: Mask, accepted: Mask) -> Mask:
         """Mask of the points that have to be sampled again with higher accuracy.
 
-        too_coarse: mask of the points at which the truncation error asks for that.
+        too_coarse: mask of the points at which the truncation error of f is too large.
         accepted: mask of the points before which no level lies.
         """
         del accepted
@@ -58,7 +61,8 @@ class LevelReading:
         """The accuracy scale of the sample after this one, if the point is accepted.
 
         accuracy: the accuracy scale of this sample.
-        coarser: the accuracy scale that the truncation error asks for.
+        coarser: the accuracy scale, mostly a smaller one, that the truncation error of this sample
+            asks for.
         """
         del accuracy
         return coarser
@@ -95,19 +99,20 @@ class PlainLevels:
     levels: Levels
 
     def accuracy_of(self, field: Field, scale: Real) -> Real:
-        """The accuracy scale `scale`; but at least 1 for a field whose coarser samples may lack an
-        integer."""
+        """The accuracy scale with which `field` is sampled: `scale`; but at least 1 for a field
+        whose coarser samples may lack an integer."""
         return fmax(scale, 1) if field.has_unknown_branch else scale
 
     def read(self, ray_sample: RaySample, before: Real, step: Real, size: Real) -> LevelReading:
-        """Compare samples with the levels. Neither `before` nor `step` is needed."""
+        """Compare the samples `ray_sample` with the levels. size: a bound of the absolute values of
+        coordinates on the rays. `before` and `step` are not used."""
         del before, step
         return read_plainly(self.levels, ray_sample, size)
 
 
 def read_plainly(levels: Levels, ray_sample: RaySample, size: Real) -> LevelReading:
-    """The reading of samples whose value is f. size: a bound of the absolute values of coordinates
-    on the ray."""
+    """The `LevelReading` of samples that give f itself. size: a bound of the absolute values of
+    coordinates on the ray."""
     gradient_norm = safe_norm(ray_sample.sample.gradient)
     gaps = levels.gaps(ray_sample.sample.value)
     error = value_error_bound(ray_sample.sample, gradient_norm, size)

@@ -92,11 +92,11 @@ class MarchState:
     enclosure_reach: the length of the ray on which the next sample should bound the change of f.
     value, gradient: f and its gradient (3,) at `proved_to`. If f jumps there, the value behind the
         jump.
-    tolerance_excess: by how much |f - level| at `proved_to` may exceed the hit tolerance, because
-        of rounding.
+    tolerance_excess: by how much |f - level| at `proved_to` may exceed what the hit tolerance
+        allows, because of rounding.
     evaluations: the number of evaluations of f so far.
     accuracy_scale: the accuracy scale of the next sample (`Field.at_accuracy`); larger is more
-        accurate. None if f has a single accuracy. (Then a number would never change, and Dr.Jit
+        accurate. None if f has a single accuracy. (A number would never change then, and Dr.Jit
         records a loop twice if a part of its state never changes.)
     status: how the ray ended, a `RayStatus`.
     active: whether the ray goes on.
@@ -134,7 +134,8 @@ class MarchState:
         start, end: the ray parameters between which rays are traced. Rays without start < end are
             not active.
         active: mask of rays that are traced.
-        has_detail: whether the accuracy of samples can be chosen (`accuracy_scale`).
+        has_detail: whether the accuracy of samples can be chosen; then the state has an
+            `accuracy_scale`.
         crosses: whether rays end only where f has passed to the other side of a level, and not
             where they reach the level.
         """
@@ -162,7 +163,8 @@ class _TrialSample:
     ray.
 
     t: the ray parameter of the trial point.
-    at_end: whether the ray, or its interval up to the next jump of f, ends at the trial point.
+    at_end: whether the trial point is the end of the ray, or of its interval up to the next jump of
+        f.
     coordinate_size: a bound of the absolute values of coordinates on the ray up to t.
     unproved_length: the length of the ray before the trial point that is not yet proved to hold no
         level.
@@ -176,10 +178,11 @@ class _TrialSample:
     band: for rays that look for crossings, the tolerance in value around a level
         (`Hysteresis.band`); else `value_tolerance`.
     is_near: whether f is so near to a level that the point is a hit if it is accepted.
-    accepts_unknown_side: whether the point may be accepted although the error of f hides on which
-        side of the level it lies.
+    accepts_unknown_side: whether the point may be accepted although the error of f leaves it open
+        on which side of the level f is.
     excess: by how much |f - level| may exceed `value_tolerance`, because of rounding.
-    is_smooth: whether values and slopes at two points predict f.
+    is_smooth: whether f is predicted from values and slopes at two points, and not from one slope
+        alone.
     reading: the comparison of the sample with the levels.
     steep: bounds of f that come from ranges of its values, for functions whose slope has no bound;
         else None.
@@ -212,7 +215,8 @@ class _TrialSample:
 
 @dataclass(frozen=True)
 class _Arrival:
-    """How rays that were accepted at their trial points go on.
+    """How rays whose trial points were accepted go on from there. A point is accepted if no level
+    lies before it on the ray.
 
     is_hit: whether the ray ends at the point, as it reaches or crosses a level there.
     gaps: the differences between f and the next levels that the step from the point may not pass.
@@ -220,7 +224,7 @@ class _Arrival:
         rays that count crossings.
     contact: the contact with a level behind the point (`Hysteresis`); None if rays end where they
         reach a level.
-    value: f behind the point, and behind a facet there at which f jumps.
+    value: f at the point; if f jumps there at a facet that the ray passes, f behind the facet.
     jump: the comparison of f on both sides of that facet with the levels; None for functions
         without jumps.
     """
@@ -237,7 +241,9 @@ class _Arrival:
 class March:
     """The fixed parameters of the march, which steps along rays to the first point at which f takes
     a level. A trial point of a ray is accepted if the ray is proved to meet no level before it. A
-    trial step is the length from the last accepted point to the next trial point.
+    trial step is the length from the last accepted point to the next trial point. If rays look for
+    crossings, they do not end at levels: a ray is in contact with a level from where it reaches it
+    until f has left a band around it, a tolerance in value (`Hysteresis`).
 
     rule: the levels, which are the values of f that rays look for, and how samples are compared
         with them.
@@ -249,8 +255,8 @@ class March:
     cone_radius: if cones are marched instead of rays (`pixel_cones`), their radius per unit of t; a
         cone ends where it comes near a level. None for rays.
     occupied: a grid of cells with marks, for rays that end where they reach a level. Outside of the
-        marked cells there is no level, not even of the function that continues f behind a jump.
-        None if no such cells are known.
+        marked cells there is no level. This also holds for the function that continues f beyond a
+        jump. None if no such cells are known.
     ray_end: the ray parameter at which rays end if `occupied` is given.
     only_component: if true, levels may lie outside of the marked cells, but do not belong to the
         surface.
@@ -260,10 +266,10 @@ class March:
     make it active again, to go on to the next level.
 
     With `cone_radius`, a whole cone must stay clear of the levels. The differences between f
-    and the levels shrink by |grad f| times the radius of the cone, which grows with t. A tenth
-    of a difference is reserved for this growth: no step is longer than the length on which the
-    cone grows by that much, unless the level is never met and f moves away from it faster than
-    the cone grows.
+    and the levels shrink by |grad f| times the radius of the cone, which grows with t. A tenth of a
+    difference is reserved for this growth: on a step, |grad f| times the radius grows by no more
+    than that. Only a step on which the level is proved never to be met, and f moves away from it
+    faster than the cone grows, may be longer.
 
     With `occupied`, the part of the ray beyond a proved step is skipped, too, as far as it lies
     in cells that contain no level (`EmptySpaceGrid.empty_run` has the proof).
@@ -305,9 +311,9 @@ class March:
         ahead: for a field with jumps, the crossing of a facet (a flat piece of surface at which f
             jumps) at `end`; its facet is NO_FACET on lanes without one. On lanes with one, the
             point of the crossing is sampled as well. If this point is accepted, the ray has hit the
-            facet or passed it. A ray that has passed it ends as a miss, with the step that the
-            value behind the facet allows from there. `value` is then f behind the facet; but if the
-            facet was hit by a ray without `hysteresis`, f before it.
+            facet or passed it. A ray that has passed it ends as a miss here; its state holds f
+            behind the facet as `value`, and the step that this value allows. If a ray without
+            `hysteresis` has hit the facet, `value` is f before it.
 
         Proof that no hit is missed. `proved_to` is a point before which no level lies, and
         `proved_step` is a proved length from there. A trial point, at the distance `trial_step`
@@ -315,15 +321,15 @@ class March:
         or if an enclosure that reaches back from the trial point covers the difference. In both
         cases no level lies before the trial point. Otherwise the next trial point is proved_to +
         proved_step, which needs no such test. A ray ends as a miss if proved_to + proved_step
-        passes its end, and as a hit only at an accepted point. A point whose sample is too coarse
+        reaches its end, and as a hit only at an accepted point. A point whose sample is too coarse
         (`_refined_accuracy`) is not accepted but sampled again.
 
         Hits. At a hit, |f - level| is at most the tolerance less the truncation error of f, or at
         most twice the rounding error of f if that is larger. If the level is nearer to f than the
         error of f, the trial point may lie beyond the root, by less than the tolerance. Then it is
         a hit (`_refined_accuracy`), so no root is passed. If it is no hit, because the error is
-        large, then no enclosure that reaches back makes it accepted, and no step from it is proved,
-        as it is not known on which side of the point the level lies.
+        large, it is not known on which side of the point the level lies. Then no enclosure that
+        reaches back makes the point accepted, and no step from it is proved.
 
         Rounding. A surface could be missed between the enclosure that reaches ahead from a point
         and the enclosure that reaches back from the next point. So for both enclosures the
@@ -333,7 +339,7 @@ class March:
         """
 
         def one_trial(now: MarchState) -> MarchState:
-            """Return the state after one more trial point of each ray."""
+            """Return the state after one more trial point of each ray. now: the state before."""
             return self.next_trial(field, path, end, now, ahead)
 
         return loop_while_active(state, one_trial, "harnack")
@@ -348,8 +354,10 @@ class March:
     ) -> MarchState:
         """Sample one more trial point of each ray, and return the state after it.
 
-        now: the state before. The other parameters and the proof are those of `advance`, whose loop
-            calls this function.
+        now: the state before.
+
+        The loop of `advance` calls this function; field, path, end, ahead and the proof are
+        described there.
 
         If the point is accepted, the ray moves there. Otherwise it stays, and tries a shorter step
         (`fallback`) or, if the sample was too coarse, the same step with a more accurate sample.
@@ -405,8 +413,12 @@ class March:
     def _shorten_in_contact(
         self, trial: _TrialSample, now: MarchState, accepted: Mask, too_coarse: Mask
     ) -> tuple[Mask, Real]:
-        """Return the mask of accepted trial points, and the length of the next trial step for those
-        that are rejected.
+        """Return the mask of accepted trial points, and the length of the next trial step for rays
+        whose trial point is rejected.
+
+        now: the state before the trial point.
+        accepted: mask of the trial points before which no level lies.
+        too_coarse: mask of the trial points whose sample is not accurate enough.
 
         A trial point at the proved step needs no proof, so it is the next one if this one is
         rejected. On a ray in contact with a level, a step that leads to a point with a much smaller
@@ -431,8 +443,13 @@ class March:
         ahead: JumpCrossing | None,
     ) -> _Arrival:
         """Find out whether accepted trial points are hits, facets or crossings of a level, and from
-        which values the ray goes on behind them. The parameters are those of `next_trial`;
-        accepted: mask of the accepted points."""
+        which values the ray goes on behind them.
+
+        path, now: the rays, and their state before the trial points.
+        accepted: mask of the accepted points.
+        ahead: for a function with jumps, the crossing of the facet at the end of the interval; else
+            None.
+        """
         is_hit, gaps, jump = accepted & trial.is_near, trial.gaps, None
         if ahead is not None:
             jump = test_jump(
@@ -525,7 +542,8 @@ class March:
     def _value_tolerance(
         self, field: Field, path: Ray, t: Real, sample: Sample, steepness: Real
     ) -> Real:
-        """Return the largest |f - level| at a hit; for rays that look for crossings, in contact.
+        """Return the largest |f - level| at a hit. For rays that look for crossings, it is the
+        largest one at which contact with a level begins.
 
         sample: the sample of f at the parameter t of the rays `path`.
         steepness: a proved lower bound of |grad f| there.
@@ -551,21 +569,21 @@ class March:
         is_near: Mask,
         touches: Mask,
     ) -> tuple[Mask, Any]:
-        """Return the mask of points at which f is proved to take the level nearby, and the number
-        of evaluations that this test took. It is for functions whose slope has no bound: there a
+        """Return the mask of points near which f is proved to take the level, and the number of
+        evaluations of f that this test took. It is for functions whose slope has no bound: there a
         small |f - level| does not show that f takes the level.
 
         t: the ray parameters of the points; ray_sample: the samples there.
         gaps: the differences between f at the point and the next levels below and above.
-        size: a bound of the coordinates.
+        size: a bound of the absolute values of coordinates on the ray up to the points.
         is_near: mask of points to be tested: those near a level by the slope of f, and those where
             rounding of the point may hide the level.
         touches: mask of points at which f may equal the level up to rounding.
 
         f must take the level within the hit tolerance, or within twice the rounding of the point if
         that is larger. This is proved by the enclosures of f along the ray, or by a sample at the
-        level or on its other side (`steep.beyond`). A point at which |f - level| is within the
-        tolerance `value` always counts.
+        level or on its other side (`steep.beyond`). A point at which |f - level| is at most
+        `HitTolerance.value` always counts.
         """
         sample, p = ray_sample.sample, path.point(t)
         tolerance = dr.fma(t, self.tolerance.per_length, self.tolerance.distance)
@@ -632,7 +650,8 @@ class March:
         Returns the mask of accepted points, the accuracy scale of the next sample (larger is more
         accurate), and the mask of samples that were too coarse.
 
-        field: the function before its accuracy is chosen. now: the state before the trial.
+        field: the function f; the accuracy of the next sample is chosen here.
+        now: the state before the trial.
         ahead: for a function with jumps, the facet at the end of the interval; else None.
         """
         # Up to the proved step no level lies on the ray. Beyond it, an enclosure that reaches back
@@ -684,9 +703,10 @@ class March:
         ahead, jump: for a function with jumps, the facet at the end of the interval and its
             comparison with the levels; else None.
 
-        Returns the new contact, the mask of rays that have crossed the level before the facet, the
-        comparison with the facet, and f behind it. In the comparison, `is_hit` marks rays that
-        cross the level by the jump.
+        Returns four results: the new contact; the mask of rays that have crossed the level at the
+        trial point, before a jump there; the comparison with the facet, in which `is_hit` now marks
+        rays that cross the level by the jump; and f behind the facet, or at the trial point if
+        there is none.
         """
         value = trial.value
         previous = now.proved_to, now.value, dr.dot(now.gradient, path.direction), now.gradient
@@ -718,7 +738,7 @@ class March:
         contact: the contact with a level after the point; None if rays end at levels.
 
         For cones, the step is also limited by the growth of the cone. It is 0 where the error of f
-        is as large as its distance from a level.
+        is as large as the difference between f and a level.
         """
         growth = _GROWTH_FRACTION * trial.gaps.nearest
         # A tenth of the gap is kept for the growth of the cone.
@@ -790,9 +810,10 @@ class March:
         """Return the length of the ray on which the next sample should bound the change of f.
 
         It is a multiple of `proved`, the proved step. If no step was proved, it is a third of the
-        present length. A ray that has just left a level, or hit it, gets the rest of the ray up to
-        `end`.
+        length for the present sample. For a ray that looks for crossings and has just left a level,
+        or crossed it, it is the rest of the ray up to `end`.
 
+        now: the state before the trial point.
         contact: the contact with a level after the trial point; None if rays end at levels.
         is_hit: mask of trial points that are hits.
         """
@@ -816,8 +837,10 @@ class March:
     ) -> Mask:
         """Return the mask of rays on which no level lies up to their end.
 
-        accepted: mask of accepted trial points. proved_step: the proved step from there, or from
-            the last accepted point on other rays.
+        now: the state before the trial point.
+        end: the ray parameter at which each ray ends; inf for a ray without an end.
+        accepted: mask of accepted trial points.
+        proved_step: the proved step from there, or from the last accepted point on other rays.
         contact: the contact after the trial point; None if rays end at levels.
 
         Rays without an end count as free from a very large t on. A ray in contact must sample its
@@ -845,18 +868,18 @@ class March:
         `advance` states.
 
         gap: the difference between f and the nearest level.
-        within: the largest such difference that the tolerance allows.
+        within: the largest difference of this kind that the tolerance allows.
         total_error, rounding: bounds of the error of f, and of its part due to rounding.
         ray_sample, gradient_norm: the sample of f at the point, and |grad f|.
-        length_scale: a bound of the coordinates.
+        length_scale: a bound of the absolute values of coordinates on the ray.
         end: the ray parameter at which the ray ends.
 
         A point is no hit if rounding leaves the distance to the surface uncertain by more than a
         sixteenth of a length L: the size of the coordinates or, if larger, the radius of the ball
-        in which f is proved to be smooth. On a ray without an end, there is a second condition. If
-        only rounding brings the point near the level, it is no hit if rounding leaves t uncertain
-        by more than L. Otherwise, far enough away, rounding would make a hit of every ray parallel
-        to the surface.
+        in which f is proved to be smooth. On a ray without an end, there is a second condition: a
+        point that only rounding brings near the level is no hit if rounding leaves t uncertain by
+        more than L. Otherwise, far enough away, rounding would make a hit of every ray parallel to
+        the surface.
         """
         sample = ray_sample.sample
         is_close = gap <= fmax(within - sample.truncation_error, 2 * rounding)
@@ -881,9 +904,10 @@ class March:
     ) -> Real:
         """Return the length of the next trial step, at least the proved step `forward`.
 
-        The trial step is up to `over_relaxation` times as long, but does not pass the point at
-        which f is predicted to reach a level. A wrong prediction does no harm: a trial point is
-        accepted only if an enclosure of f that reaches back from it proves the rest of the step.
+        The trial step is up to `over_relaxation` times as long as the proved step, but does not
+        pass the point at which f is predicted to reach a level. A wrong prediction does no harm: a
+        trial point is accepted only if an enclosure of f that reaches back from it proves the rest
+        of the step.
 
         forward, ray_sample: the proved step from the trial point, and the sample of f there.
         gaps: the differences between f and the next levels.
@@ -891,10 +915,11 @@ class March:
         is_smooth: whether value and slope at the last accepted point help to predict f. They do not
             if f has a truncation error, which differs from point to point.
 
-        Let r = |slope|, g be the difference to the level towards which f moves, and c its second
-        derivative towards that level. With is_smooth, f is predicted to reach the level at the
-        first x > 0 with r x + c x^2/2 = g, which is 2g/(r + sqrt(r^2 + 2 c g)); nowhere if the root
-        is not real. Else it is g/r.
+        Let r = |slope|, g the difference between f and the level towards which f moves, and c the
+        second derivative of f along the ray, counted positive towards that level. With is_smooth, f
+        is predicted to reach the level at the first x > 0 with r x + c x^2/2 = g, which is 2g/(r +
+        sqrt(r^2 + 2 c g)), and nowhere if the square root is not real. Without is_smooth it is
+        predicted to reach the level at g/r.
         """
         slope = ray_sample.slope
         slope_size, gap = dr.abs(slope), dr.select(slope > 0, gaps.above, gaps.below)
@@ -909,9 +934,9 @@ class March:
         return fmin(self.over_relaxation * forward, fmax(target, forward))
 
     def _second_derivative(self, ray_sample: RaySample, now: MarchState, path: Ray) -> Real:
-        """Return the second derivative of a cubic along the ray, taken at the trial point. The
-        cubic has the values and slopes of f at the trial point and at the last accepted point. The
-        result is 0 if no point was accepted before.
+        """Return an estimate of the second derivative of f along the ray at the trial point: that
+        of the cubic which has the values and slopes of f at the trial point and at the last
+        accepted point. The result is 0 if no point was accepted before.
 
         ray_sample: the sample at the trial point. now: the state at the last accepted point.
 
@@ -941,8 +966,10 @@ class March:
         """Return the difference between f and the nearest level. Where a trial point lies at a
         facet, at which f jumps, it is the smaller of the differences before and behind the jump.
 
-        value: f before the jump. at_end: mask of points at the end of the interval. ahead: the
-            facet there, or None.
+        value: f at the trial point, before the jump.
+        ahead: the crossing of the facet at the end of the interval; None for functions without
+            jumps.
+        at_end: mask of trial points at the end of the interval.
         """
         gap = self.levels.gaps(value).nearest
         if ahead is not None:
@@ -952,8 +979,8 @@ class March:
 
 
 def _gradient_bounds(reading: LevelReading, *, is_steep: bool) -> tuple[Real, Real]:
-    """Return |grad f| at the point of a sample, and a proved lower bound of it, by which the
-    tolerance in space becomes one in value.
+    """Return |grad f| at the point of a sample, and a proved lower bound of |grad f|. The tolerance
+    in value is the tolerance in space times this bound.
 
     is_steep: whether f may be so steep that samples hold no gradient, but only slopes along the
         ray. Then the first result is at least as large as the second.
@@ -972,8 +999,8 @@ def _gradient_bounds(reading: LevelReading, *, is_steep: bool) -> tuple[Real, Re
 def _refined_accuracy(
     scale: Real, gap: Real, total_error: Real, truncation: Real, within: Real
 ) -> tuple[Real, Mask]:
-    """Return the accuracy scale with which each sample is repeated (larger is more accurate), and
-    the mask of samples that are too coarse and so have to be repeated.
+    """Return the accuracy scale with which each sample would be repeated (larger is more accurate),
+    and the mask of samples that are too coarse and so have to be repeated.
 
     scale, total_error, truncation: the accuracy scale, total error and truncation error of the
         sample.
@@ -1005,8 +1032,8 @@ def _next_accuracy(scale: Real, gap: Real, truncation: Real, coarsest: float) ->
     coarsest, or else at least 1. It is at most `scale`.
 
     scale, truncation: the accuracy scale and the truncation error of this sample.
-    gap: the difference between f and the nearest level; the next truncation error may be a fifth of
-        it.
+    gap: the difference between f and the nearest level. The scale is chosen such that the next
+        truncation error may be a fifth of it.
     coarsest: the accuracy scale that 0 stands for.
     """
     # The truncation error falls as a power of the scale.

@@ -37,9 +37,11 @@ class PatchTraceState:
     patches one after another, in the order in which it enters their boxes.
 
     enter, box: the ray parameter at which the ray entered the last box, and the index of this box.
-    t: the ray parameter of the nearest hit so far; without a hit the end of the ray; for a ray out
-        of steps, the parameter up to which no surface lies.
-    value, gradient, excess, status: the results of the march that gave this t (see `MarchState`).
+    t: the ray parameter of the nearest hit so far; for a ray without a hit, its end; for a ray out
+        of steps, the parameter up to which no surface lies on it.
+    value, gradient, excess, status: the results of the march that gave this t: f and its gradient
+        (3,) there, by how much |f - level| may exceed the tolerance because of rounding, and a
+        `RayStatus`.
     evaluations: the number of evaluations of functions in all marches so far.
     part: the index of the patch that was hit, NO_PATCH for none.
     active: whether the ray may meet further patches.
@@ -83,16 +85,17 @@ class PatchTracer:
 
         Proof that no hit is missed. Each patch lies in its box, and the boxes come in the order in
         which the ray enters them. In each box the ray marches from its entry to its exit, or to the
-        first hit so far if that is nearer. So at the end no patch whose box the ray entered before
-        the hit lies before the hit, and all patches whose boxes it would enter later lie behind the
-        hit. If a ray runs out of steps in a patch, no surface lies before its entry into the box of
-        this patch.
+        first hit so far if that is nearer. So when the search ends, no patch whose box the ray
+        enters before the hit was passed unnoticed before the hit, and all patches whose boxes it
+        enters later lie behind the hit. If a ray runs out of steps in a patch, no surface lies
+        before its entry into the box of this patch.
         """
         end_state = loop_while_active(self.begin(state), self.advance, "harnack parts")
         return self.finish(end_state)
 
     def begin(self, state: MarchState) -> PatchTraceState:
-        """Return the tracer's own state (a `PatchTraceState`) of rays that have entered no box yet.
+        """Return the tracer's own state, a `PatchTraceState`, for rays that have entered no box
+        yet.
 
         state: the `MarchState` of the same rays, before their first sample.
         """

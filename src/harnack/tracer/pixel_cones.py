@@ -93,8 +93,8 @@ class PixelCones:
         """Find the cones that the surface covers in part but not completely. Returns their mask and
         the number of evaluations of f.
 
-        t_max: only the first passage of each ray through the cover that begins before it is
-            examined.
+        t_max: only the first passage of each ray through the cover is examined, and only if it
+            begins before this ray parameter.
         active: mask of cones that are tested.
 
         A ray marches to the cover with proofs (`March.advance`). Levels then count as nearer in
@@ -127,8 +127,8 @@ class PixelCones:
         level, side = now.value + gap, dr.select(gap < 0, real(1), -1)
 
         def sample_at(t: Real) -> tuple[Real, Real]:
-            """Return the height over the surface at parameters t, in radii of the cone, and its
-            derivative along the ray."""
+            """Return the height over the surface at the ray parameters t, in radii of the cone, and
+            the derivative of the height along the ray."""
             field = (
                 prepared.field
                 if now.accuracy_scale is None
@@ -161,12 +161,13 @@ class PixelCones:
     def _height(
         self, value: Real, gradient: Vec3, t: Real, side: Real, level: Real
     ) -> tuple[Real, Real]:
-        """Return the height over the surface, in radii of the cone, and its derivative along the
-        ray.
+        """Return the height of a point of the ray over the surface, in radii of the cone, and the
+        derivative of the height along the ray.
 
         value, gradient, t: f, its gradient (3,) and the ray parameter of a sample.
-        side, level: the level, and 1 or -1 if the ray comes to it from larger or smaller f. They
-            are not used for a solid.
+        side: 1 if the ray comes to the level from larger f, -1 if from smaller f; not used for a
+            solid.
+        level: the level; not used for a solid.
 
         The height is inf where the gradient or t is 0.
         """
@@ -189,10 +190,11 @@ class PixelCones:
         """Return the interval (start, end) of ray parameters on which the cones can touch the
         surface.
 
-        The surface's extent is enlarged about a point m in it by a factor, until it contains all
-        points within the radius of the cone. (Here the ray is shrunk instead, which is equivalent.)
-        Proof: let a convex set C contain the ball of radius h about m = 0. Then it contains h u for
-        every unit vector u. So (1 + a) C = C + a C contains C moved by any vector of length a h.
+        The surface's extent is enlarged by a factor about a point m in it, so that it contains all
+        points whose distance from the extent is at most the radius of the cone. (The code shrinks
+        the ray instead, which is equivalent.) Proof: let a convex set C contain the ball of radius
+        h about m = 0. Then it contains h u for every unit vector u. So (1 + a) C = C + a C contains
+        C moved by any vector of length a h.
         """
         real = self.prepared.backend.Float
         start, end = real(0), real(dr.inf)
@@ -211,16 +213,16 @@ class PixelCones:
 
 
 def _next_step(height: Real, slope: Real, second_derivative: Real, longest: Real) -> Real:
-    """Return the length of the next step of a ray in the cover, at most `longest`: to where the ray
-    is predicted to be lowest over the surface, to a radius behind the surface, or to the outside of
-    the cover, whichever comes first.
+    """Return the length of the next step of a ray in the cover, at most `longest`. The step leads
+    to the first of three predicted points: where the ray is lowest over the surface, where it is a
+    radius behind the surface, or where it leaves the cover.
 
     height, slope, second_derivative: the height over the surface in radii of the cone, and its
         first and second derivatives along the ray.
 
     If the height falls, it reaches -1 after (height + 1)/|slope| at this slope, and is lowest after
     |slope|/second_derivative. If it rises by r = `rest` to the outside, this takes 2r/(slope +
-    sqrt(slope^2 + 2 r second_derivative)). Steps go a little beyond these points.
+    sqrt(slope^2 + 2 r second_derivative)). Steps lead a little beyond these points.
     """
     real = cast("Any", type(height))
     length_to_behind = (height + 1 + _AIM_MARGIN) / fmax(-slope, real(_NEGLIGIBLE))

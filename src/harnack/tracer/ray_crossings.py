@@ -107,7 +107,8 @@ class _SearchState:
         return state
 
     def with_march(self, now: MarchState, count: Any) -> _SearchState:
-        """Return this state with another state of the march and another number of crossings."""
+        """Return this state with another state `now` of the march and another number `count` of
+        crossings."""
         if self.sheets is None:
             return _SearchState(now, None, count)
         return _SearchState(None, dataclasses.replace(self.sheets, march=now), count)
@@ -116,7 +117,8 @@ class _SearchState:
 def find_crossings(
     prepared: SurfaceTracer, o: Vec3, d: Vec3, t_min: Real, t_max: Real, k: int
 ) -> CrossingArrays:
-    """Find the first k crossings of rays o + t d, |d| = 1, for t_min <= t <= t_max.
+    """Find the first k crossings of rays o + t d, |d| = 1, for t_min <= t <= t_max, with the
+    surface `prepared`.
 
     `Hysteresis`, the rule by which a crossing is counted, states the guarantees and proves them. A
     ray is marched from one crossing to the next without a new start: what is known of f at a
@@ -264,11 +266,11 @@ def crossings(
 
     If f goes farther than the tolerance to both sides of the level, the crossing is not missed, and
     no crossing is counted twice. If a ray touches a level without passing to its other side, or
-    starts on it, that is no crossing. If levels are closer in value than four tolerances, a quarter
-    of their distance takes the place of the tolerance; rays run out of steps if that is below
-    rounding. Otherwise the tolerance is at least eight times the rounding error of f, in single
-    precision about 1e-5 of the size of the coordinates: if f goes less far than that to one side,
-    the crossing may not count.
+    starts on it, that is no crossing. The tolerance in value is that of `TraceOptions` times |grad
+    f|. If levels differ by less than four such tolerances, a quarter of their difference takes the
+    place of the tolerance; rays run out of steps if that is below rounding. Otherwise the tolerance
+    is at least eight times the rounding error of f, in single precision about 1e-5 of the size of
+    the coordinates: if f goes less far than that to one side, the crossing may not count.
 
     surface, origins, directions, t_min, t_max, options, keywords: the surface, the rays and the
         options, as `trace` takes them. The options `side`, `largest`, `require_crossing` and
@@ -365,7 +367,7 @@ def empty_crossings(backend: Backend) -> RayCrossings:
 
 
 def crossings_to_numpy(hits: RayCrossings, n: int, k: int) -> RayCrossings:
-    """Return the crossings of n rays, k for each, as NumPy arrays (n, k, ...) and (n,)."""
+    """Return the crossings `hits` of n rays, k for each, as NumPy arrays (n, k, ...) and (n,)."""
 
     def each(array: Any) -> Any:
         """Return an array of crossings as a NumPy array (n, k, ...)."""

@@ -45,6 +45,7 @@ class RayBatch:
     ) -> RayBatch:
         """Make the rays from the arguments of `trace` or `crossings`, and check them.
 
+        origins, directions, t_min, t_max: as users give them (`trace` says in which forms).
         precision: "single" or "double"; None for the precision of the input. Dr.Jit arrays have a
             precision. Other rays are double if origins or directions are arrays of float64, else
             single.
@@ -86,9 +87,8 @@ class RayBatch:
 def _uploaded(
     backend: Backend, origins: Any, directions: Any, t_min: Any, t_max: Any
 ) -> tuple[Vec3, Vec3, Real, Real]:
-    """Return origins, unit directions, t_min and t_max as Dr.Jit arrays of a backend. Raises
-    ValueError for arrays whose lengths do not match, or that are no rays. Directions are
-    normalized."""
+    """Return origins, unit directions, t_min and t_max as Dr.Jit arrays of a backend. Directions
+    are normalized. Raises ValueError for arrays whose lengths do not match, or that are no rays."""
     o = as_kernel_parameters(to_vector3(backend, origins, "origins"))
     d = as_kernel_parameters(to_vector3(backend, directions, "directions"))
     near, far = to_float(backend, t_min, "t_min"), to_float(backend, t_max, "t_max")

@@ -82,8 +82,8 @@ class SteepPlace:
     is_level: whether f may equal a level at the exact point. For this f must be continuous there,
         and the level must lie in the range of f around the rounded point, or just outside of it.
         This does not prove that f takes the level; `beyond` tests that.
-    free: a length of the ray beyond the point on which f does not take a level, because it stays
-        away from levels or has no value at all; 0 if no length is proved.
+    free: a length of the ray beyond the point on which f is proved to take no level, because f
+        stays away from levels or has no value there; 0 if no length is proved.
     ahead: the length of the ray beyond the point on which values were bounded.
     fall, rise: bounds of how far f falls and rises on that length from its value at the point; inf
         if no bound is known.
@@ -107,7 +107,7 @@ class SteepPlace:
 
         Proof of the error. The exact point differs from the rounded point by at most `slack` in
         each coordinate. So it lies in a box around the rounded point, and f there lies in the range
-        of f on this box. With one level, only the error towards it counts.
+        of f on this box. If there is a single level, only the part of the error towards it counts.
 
         Proof of the free length. All points of the ray on this length lie in the box around its two
         ends, enlarged by rounding. All values of f in the box lie in its range, and the range
@@ -169,11 +169,11 @@ class _SearchState:
     searches along the first direction for the point where f comes nearest to a level.
 
     count: the number of all samples so far.
-    side_count: the number of samples after the search.
+    side_count: the number of samples so far that were taken after the search, beside the point.
     passed: whether a sample was at a level or on its other side.
     active: whether the test goes on.
     low, high: lengths along the first direction between which f comes nearest to a level.
-    inner: the best length between them.
+    inner: the length between them at which f was nearest to a level so far.
     least_gap: the difference between f and the level there.
     """
 
@@ -238,8 +238,8 @@ def beyond(
     gaps: the differences between f at p and the next levels below and above.
     ways: two unit directions (3,), each with the slope of f along it.
     value: f at p.
-    searches: mask of points around which more samples are made if the first five do not decide,
-        since the ray can come no nearer.
+    searches: mask of points around which more samples are made if the first five do not decide.
+        These are points from which the ray can come no nearer to the level.
     active: mask of points that are tested.
 
     Proof. Either f at another point q, at most `reach` away, is on the other side of the level, and
@@ -342,6 +342,7 @@ def _narrowed(now: _SearchState, length: Real, gap: Real, is_search: Mask) -> _S
     """Return the state of the search after a sample at another length along the first direction.
     The search looks for the point where f comes nearest to a level.
 
+    now: the state before the sample.
     length, gap: the length of the sample, and the difference between f there and the level.
     is_search: mask of lanes whose sample belongs to the search; other lanes do not change.
 
@@ -363,9 +364,9 @@ def _narrowed(now: _SearchState, length: Real, gap: Real, is_search: Mask) -> _S
 
 
 def down_or_up(gradient: Vec3, gaps: LevelGaps, otherwise: Vec3) -> Vec3:
-    """Return the unit vector (3,) along which f goes towards the nearer level: against the gradient
-    if that level is below f, else along the gradient. It is `otherwise` if the gradient is zero or
-    not finite.
+    """Return the unit vector (3,) along which f goes towards the nearer level: minus the direction
+    of the gradient if that level is below f, else the direction of the gradient. It is `otherwise`
+    if the gradient is zero or not finite.
 
     gaps: the differences between f and the next levels below and above.
     """

@@ -112,7 +112,8 @@ class Surface:
             )
 
     def replace(self, **changes: Any) -> Surface:
-        """Return this surface with some arguments changed, by their names in the constructor."""
+        """Return this surface with some arguments of its constructor changed. changes: new values
+        of arguments, by name."""
         arguments: dict[str, Any] = {"field": self.field, "level": self.levels, **self.keywords}
         arguments |= changes
         return Surface(**arguments)
@@ -182,8 +183,8 @@ def as_number(number: Any, message: str) -> float:
 
 
 def _check_side(side: Any, levels: Sequence[Any]) -> Side | None:
-    """Return the option `side`, which may be None, if it is valid. Raises ValueError if it is
-    unknown, or if the number of levels does not suit it."""
+    """Return the option `side` if it is valid; None is valid, and stands for the default. Raises
+    ValueError if the side is unknown, or if the number of levels does not suit it."""
     if side is not None and not is_one_of(side, SIDES):
         names = ", ".join(f'"{name}"' for name in SIDES)
         raise ValueError(f"side must be one of {names}, not {side!r}{did_you_mean(side, SIDES)}")
@@ -202,8 +203,8 @@ def _check_side(side: Any, levels: Sequence[Any]) -> Side | None:
 
 
 def _in_order(levels: tuple[Any, ...], side: Side | None) -> tuple[Any, ...]:
-    """Return the levels. Raises ValueError if `side` is "between" and they are not in ascending
-    order."""
+    """Return the levels, unchanged. Raises ValueError if `side` is "between" and they are not in
+    ascending order."""
     if side == "between" and not level_number(levels[0]) < level_number(levels[1]):
         low, high = map(level_number, levels)
         raise ValueError(f'side="between" needs level=(low, high), low < high, not {(low, high)}')
@@ -211,8 +212,8 @@ def _in_order(levels: tuple[Any, ...], side: Side | None) -> tuple[Any, ...]:
 
 
 def _as_levels(level: Any) -> tuple[Any, ...]:
-    """Return the levels as a tuple of numbers. level: a number or several, which may be Dr.Jit
-    numbers or a tensor."""
+    """Return the levels of a surface as a tuple of numbers. level: a number or several, which may
+    be Dr.Jit numbers or a tensor."""
     if is_tensor(level):
         numbers = tensor_to_array(level, "level")
         backend = backend_of(numbers)

@@ -46,9 +46,9 @@ __all__ = ["RayTracer", "SmoothTracer", "TracerFactory", "trace_queued"]
 
 class RayTracer(Protocol):
     """Interface to the ways to trace rays: through smooth functions, functions with jumps at
-    facets, and unions of patches. Each has a state of its own, `walk`; a `MarchState` is what all
-    have in common. One call of `advance` makes one trial point, or marches one interval between
-    jumps, or one patch."""
+    facets, and unions of patches. Each has a state of its own, `walk`; it is made from a
+    `MarchState`, and becomes one at the end. One call of `advance` makes one trial point, or
+    marches one interval between jumps, or one patch."""
 
     def begin(self, state: MarchState) -> Any:
         """Return this tracer's own state for rays that have not moved yet. state: their
@@ -68,8 +68,9 @@ class RayTracer(Protocol):
         ...
 
     def run(self, state: MarchState) -> tuple[MarchState, Any]:
-        """Advance rays until all have ended, and return the result of `finish`. state: the
-        `MarchState` of rays that have not moved yet."""
+        """Advance rays until all have ended, and return the result of `finish`: the end state, and
+        the index of the facet or patch that each ray hit. state: the `MarchState` of rays that have
+        not moved yet."""
         ...
 
 
@@ -154,7 +155,7 @@ def trace_queued(
     proofs: EnclosureKinds = path.proofs
 
     def tracer(ray: _QueuedRay) -> RayTracer:
-        """Return the tracer of the rays that are in the lanes now."""
+        """Return the tracer of the rays `ray` that are in the lanes now."""
         return tracer_of(Ray(ray.origin, ray.direction, proofs), ray.start, ray.end)
 
     def advance(ray: _QueuedRay) -> _QueuedRay:
@@ -217,9 +218,9 @@ class MarchResult:
 
 @dataclass(frozen=True)
 class _EndState:
-    """What `SurfaceTracer.first_hit` needs of the end of rays: some attributes of a `MarchState`,
-    and as `sheet` the index of the facet or patch that was hit. A queue writes each of them to
-    memory, so there are no others."""
+    """What `SurfaceTracer.first_hit` needs to know of how rays ended: some attributes of a
+    `MarchState`, and as `sheet` the index of the facet or patch that was hit. If rays are traced
+    from a queue, each attribute is written to memory; so there are no others."""
 
     proved_to: Real
     value: Real
@@ -232,22 +233,22 @@ class _EndState:
 
     @classmethod
     def of(cls, end: MarchState, sheet: Any) -> _EndState:
-        """Take these attributes from the end state of rays. sheet: the index of the facet or patch
-        hit."""
+        """Take these attributes from `end`, the end state of rays. sheet: the index of the facet or
+        patch that was hit."""
         names = (field.name for field in dataclasses.fields(cls) if field.name != "sheet")
         return cls(**{name: getattr(end, name) for name in names}, sheet=sheet)
 
 
 @dataclass(frozen=True)
 class _EndStatus:
-    """What `SurfaceTracer.occluded` needs of the end of rays: their `RayStatus` alone."""
+    """What `SurfaceTracer.occluded` needs to know of how rays ended: their `RayStatus` alone."""
 
     status: Any
 
     @classmethod
     def of(cls, end: MarchState, sheet: Any) -> _EndStatus:
-        """Take the status from the end state of rays; the index of the facet or patch hit is not
-        used."""
+        """Take the status from `end`, the end state of rays; `sheet`, the index of the facet or
+        patch that was hit, is not used."""
         del sheet
         return cls(end.status)
 
@@ -322,8 +323,9 @@ class SurfaceTracer:
         return replace(self, field=self.field.patch(patch))
 
     def level_counts(self, p: Vec3) -> Mask:
-        """Return the mask of points p at which a level belongs to the surface. If only the largest
-        component is traced, these are the points in its cells; else all points."""
+        """Return the mask of the points p at which a level, if f takes one there, belongs to the
+        surface. If only the largest component is traced, these are the points in its cells; else
+        all points."""
         if self.occupied is None or not self.only_component:
             return self.backend.Bool(True)
         return self.occupied.cell(p).empty_distance == 0
@@ -418,6 +420,7 @@ class SurfaceTracer:
         Returns the march, the rays, the ray parameters of their start and end, and their state
         before the first sample.
 
+        t_min, t_max: the ray parameters between which each ray is traced.
         active: mask of rays that are traced.
         crosses: whether rays end only where f has passed to the other side of a level, and not
             where they reach the level.
@@ -488,10 +491,10 @@ class SurfaceTracer:
 
         Proof that this suffices if f is convex along the ray. Suppose that f is W below the level
         at some point of the extent, and reaches the level at the end of the extent. Let e be the
-        error of f there; W >= 8 e (`Hysteresis.band`). Beyond the end, f rises at least as steeply
-        as on average before it, and the way from that point to the end is at most end - start. So
-        (end - start)/7 beyond the end, f is at least W/7 >= 8/7 e above the level, which a sample
-        there shows.
+        error of f there, and W >= 8 e, the least depth at which crossings are guaranteed
+        (`Hysteresis.band`). Beyond the end, f rises at least as steeply as on average before it,
+        and the way from that point to the end is at most end - start. So (end - start)/7 beyond the
+        end, f is at least W/7 >= 8/7 e above the level, which a sample there shows.
         """
         never, size = self.backend.Bool(False), max_norm(path.origin)
         rounding = _AT_JUMP_ROUNDINGS * self.backend.machine_epsilon * (size + t_min)
@@ -538,7 +541,10 @@ class SurfaceTracer:
         )
 
         def tracer(path: Ray, start: Real, end: Real) -> RayTracer:
-            """Return the tracer for this kind of field."""
+            """Return the tracer for this kind of field: smooth, with jumps, or a union of patches.
+
+            path, start, end: the rays, and the ray parameters between which they are traced.
+            """
             to_end = replace(march, ray_end=end)
             if self.field.has_jumps:
                 return JumpTracer(to_end, self.field, path, start, end)

@@ -192,7 +192,7 @@ def trace_options(
 
 def _refusal(verb: str, name: str, honored: Sequence[str]) -> str:
     """Return the text of the error for an option `name` that the called function `verb` does not
-    have. It lists those that it has, `honored`."""
+    have. The text lists the options that the function has, `honored`."""
     return (
         f"{verb} has no {name}; of the options of surfaces and traces it has {', '.join(honored)}"
     )
@@ -219,8 +219,8 @@ def trace_options_among(options: Any, keywords: Mapping[str, Any]) -> TraceOptio
 
 
 def shorthand_parameters() -> dict[str, inspect.Parameter]:
-    """Return the options of `Surface` and `TraceOptions`, by name, as keyword-only parameters for
-    signatures."""
+    """Return a keyword-only parameter for each option of `Surface` and `TraceOptions`, by name;
+    signatures of functions that take these options as keywords are made from them."""
     kinds: tuple[Callable[..., Any], ...] = (Surface, TraceOptions)
     return {
         name: parameter.replace(kind=parameter.KEYWORD_ONLY)
@@ -248,7 +248,7 @@ def shows_parameters(
     """
 
     def decorate(verb: _Function) -> _Function:
-        """Give the function the changed signature, and return it."""
+        """Give the function `verb` the changed signature, and return it."""
         signature = inspect.signature(verb)
         shown = list(signature.parameters.values())
         variadic = [parameter for parameter in shown if parameter.kind is parameter.VAR_KEYWORD]

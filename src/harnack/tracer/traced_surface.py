@@ -175,8 +175,8 @@ class TracedSurface:
         extent and cells are prepared only once. Copies made by `dataclasses.replace` share the
         cache. A surface that has a cache is returned unchanged.
 
-        begins: whether to start with an empty cache in any case, as users may have changed the
-            field in place since the last call.
+        begins: whether to start with an empty cache even if the surface has one, as users may have
+            changed the field in place since the last call.
         """
         return (
             self if self._call_cache is not None and not begins else replace(self, _call_cache={})
@@ -211,7 +211,8 @@ class TracedSurface:
         return default_tolerance(self.volume) if self.tolerance is None else self.tolerance
 
     def for_rays(self, count: int) -> TracedSurface:
-        """Return this surface with the field prepared for `count` rays (`Field.for_ray_count`)."""
+        """Return this surface with its field replaced by the one that suits `count` rays
+        (`Field.for_ray_count`)."""
         return replace(self, field=self.field.for_ray_count(count))
 
     def evaluator(self, backend: Backend) -> Field:
@@ -347,8 +348,7 @@ def default_tolerance(volume: Volume | None) -> HitTolerance:
 
 
 def _with_reduced_levels(levels: tuple[float, ...]) -> tuple[float, ...]:
-    """Return the levels, and after them the remainders modulo 1, in [-1/2, 1/2], of the levels that
-    are larger than 1/2 in absolute value. A remainder is the number nearest to 0 that differs from
-    the level by an integer."""
+    """Return the levels, and after them further levels: for each level of more than 1/2 in absolute
+    value, its remainder modulo 1, the number in [-1/2, 1/2] that differs from it by an integer."""
     remainders = dict.fromkeys(math.remainder(level, 1) for level in levels if abs(level) > 0.5)
     return levels + tuple(level for level in remainders if level not in levels)

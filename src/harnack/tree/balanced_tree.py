@@ -70,7 +70,8 @@ class BalancedTree:
 
     @property
     def counts(self) -> tuple[int, ...]:
-        """The number of nodes of each level of the tree, from the leaves to the root."""
+        """The numbers of nodes of the levels of the tree: one number for each level, the leaves
+        first, the root last."""
         counts = [len(self.leaf_slots)]
         for arity in self.arities:
             counts.append(counts[-1] // arity)
@@ -268,7 +269,8 @@ class PackedTree:
         return self.node_heads.read_record(i)
 
     def payload(self, i: Any, active: Mask) -> list[Real]:
-        """The numbers of node i in `node_payloads`, read on active lanes; [] if there are none."""
+        """The numbers of node i in `node_payloads`, read on active lanes; [] if the tree has no
+        payloads."""
         return [] if self.node_payloads is None else self.node_payloads.read_record(i, active)
 
     def primitive(self, leaf: Any, slot: Any, active: Mask) -> list[Real]:
@@ -335,7 +337,8 @@ class VisitedNode:
     is_leaf: Mask
 
     def payload(self, active: Mask) -> list[Real]:
-        """The further numbers of the node, fetched on active lanes; [] if there are none."""
+        """The further numbers of the node (those after the first six), read on active lanes; [] if
+        the tree has none."""
         return self.tree.payload(self.index, active)
 
 
@@ -357,7 +360,8 @@ def traverse(tree: PackedTree, visit: Visit, state: LoopValues, active: Mask = T
     index, mask = tree.backend.UInt32, tree.backend.Bool
 
     def body(i: Any, *state: Any) -> LoopValues:
-        """Visit node i, and go on to its first child or past its subtree."""
+        """Visit node i. Returns the index of the node to visit next, which is its first child or
+        the node after its subtree, and then the new state."""
         head = tree.head(i)
         is_leaf, number = head[7] >= 0, index(dr.abs(head[7]))
         node = VisitedNode(tree, i, tuple(head[:6]), number, is_leaf)
@@ -391,11 +395,13 @@ def for_each_primitive(
     index = tree.backend.UInt32
 
     def is_running(slot: Any, *_: Any) -> Mask:
-        """Whether an active lane has further slots to visit."""
+        """Whether a lane is active and has further slots to visit. slot: the number of the next
+        slot."""
         return active & (slot < tree.leaf_size)
 
     def step(slot: Any, *state: Any) -> LoopValues:
-        """Call `body` for the primitive in a slot, and go on to the next slot."""
+        """Call `body` for the primitive in a slot. Returns the number of the next slot, and then
+        the new state."""
         return slot + 1, *body(tree.primitive(node.leaf, slot, active), active, state)
 
     return dr.while_loop((index(0), *state), is_running, step, label="leaf")[1:]

@@ -49,8 +49,8 @@ _LEAF_SIZE = 4
 
 @dataclass(frozen=True)
 class BoxTree:
-    """A tree of boxes on a backend, which may overlap, with a search for the boxes that a ray
-    enters. Their coordinates are at most about 1."""
+    """A tree, on a backend, of boxes that may overlap, with a search for the boxes that a ray
+    enters. The coordinates of the boxes are at most about 1."""
 
     tree: PackedTree
 
@@ -68,14 +68,19 @@ class BoxTree:
     def next_box(
         self, o: Vec3, d: Vec3, after: tuple[Real, Any], start: Real, end: Real, active: Mask
     ) -> tuple[Real, Real, Any]:
-        """The next box that each ray o + t d, |d| = 1, enters after the pair `after` = (t, number),
-        on active lanes.
+        """Find, on active lanes, the next box that each ray o + t d, |d| = 1, enters. Boxes are
+        ordered by the pair (t of entering, number of the box); the next box is the first one after
+        the pair `after`. Boxes are enlarged a little, so that rounding never skips a box that the
+        ray meets.
 
-        A ray that has not left a box before t = start enters it at max(t of its first point in the
-        box, start). Boxes are ordered by this t, and at the same t by number. Repeated calls, the
-        first with after = (t, NO_BOX) for any t < start, visit every box that the ray meets for
-        start <= t <= end exactly once. Boxes are enlarged a little, so that rounding never skips a
-        box that the ray meets.
+        o, d: origin and direction of each ray.
+        after: (t, number of a box), the pair after which the search begins.
+        start, end: only the part start <= t <= end of each ray counts. A ray that is in a box at t
+            = start enters this box at `start`.
+        active: the mask of the lanes that search.
+
+        Repeated calls, the first with after = (t, NO_BOX) for any t < start, visit every box that
+        the ray meets for start <= t <= end exactly once.
 
         Returns:
             The t where the ray enters the box, the t where it leaves it, and the number of the box
@@ -87,14 +92,16 @@ class BoxTree:
         enter_and_leave = self._make_slab_test(o, d)
 
         def visit(node: VisitedNode, state: LoopValues) -> tuple[Mask, LoopValues]:
-            """Enter a node if the ray meets its box before the best box so far."""
+            """Enter a node if the ray meets its box before the best box so far. state: the best box
+            so far (the t where the ray enters and leaves it, and its number). Returns the mask of
+            lanes that enter the node, and the state, which the boxes of a leaf have updated."""
             near, far = enter_and_leave(node.head)
             is_met = (near <= far) & (far >= start) & (near <= fmin(state[0], end))
             return is_met, for_each_primitive(node, is_met & node.is_leaf, nearer, state)
 
         def nearer(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
-            """Take the box in the record `row` if it comes after `after` and before the best so
-            far."""
+            """The new state: the box in the record `row` if it comes after `after` and before the
+            best box so far, which is `state`; otherwise `state`."""
             best, leave, number = state
             near, far = enter_and_leave(row)
             # The number -1 of an empty slot is no index; such a slot is never chosen.
@@ -136,7 +143,8 @@ class BoxTree:
         pad = 16 * backend.machine_epsilon * (1 + max_norm(o))
 
         def interval(box: Any) -> tuple[Real, Real]:
-            """The t at which the rays enter the box and leave it."""
+            """The t at which the rays enter the box, and the t at which they leave it. box: its six
+            numbers, lower corner first."""
             low, high = vector(*box[:3]) - pad, vector(*box[3:6]) + pad
             a, b = (low - o) * inverse, (high - o) * inverse
             near = fmax(fmax(fmin(a.x, b.x), fmin(a.y, b.y)), fmin(a.z, b.z))
@@ -186,13 +194,15 @@ def distance_lower_bound(triangles: TriangleTree, x: Vec3) -> Real:
     may_be_within = _distance_test(triangles, x, pad)
 
     def visit(node: VisitedNode, state: LoopValues) -> tuple[Mask, LoopValues]:
-        """Enter a node if its box is nearer than the best distance so far."""
+        """Enter a node if its box is nearer than the best distance so far. state: the best squared
+        distance so far. Returns the mask of lanes that enter the node, and the state, which the
+        triangles of a leaf have updated."""
         is_near = may_be_within(node, state[0])
         return is_near, for_each_primitive(node, is_near & node.is_leaf, nearer, state)
 
     def nearer(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
-        """The smaller of the best squared distance so far and that to the triangle in the record
-        `row`."""
+        """The new state: the smaller of `state`, the best squared distance so far, and the squared
+        distance of the triangle in the record `row`."""
         square = ClosestPointOnTriangle.of(row, x).squared_distance
         return (dr.select(active, fmin(square, state[0]), state[0]),)
 
@@ -225,13 +235,15 @@ def squared_distance_in_nearby_leaf(tree: PackedTree, x: Vec3, column: int) -> R
     x = vector(x)
 
     def body(i: Any, end: Any, best: Real, first: Any, after: Any, nearest_leaf: Any) -> LoopValues:
-        """Compare the center of node i's box with the nearest center among its siblings so far. The
-        node after the last sibling is `end`. After the last sibling, go down to the first child of
-        the sibling with the nearest center.
+        """Compare the center of node i's box with the nearest center among its siblings so far.
+        After the last sibling, go down to the first child of the sibling with the nearest center.
 
+        i, end: the node, and the node after its last sibling.
         best: the smallest squared distance of a sibling's center so far.
         nearest_leaf: the leaf of that sibling, NO_TRIANGLE for an inner node.
         first, after: the first child of that sibling, and the node after its subtree.
+
+        Returns the new values of the parameters, where i is the next node.
         """
         head = tree.head(i)
         middle = 0.5 * (vector(*head[:3]) + vector(*head[3:6]))
@@ -252,8 +264,8 @@ def squared_distance_in_nearby_leaf(tree: PackedTree, x: Vec3, column: int) -> R
         return i, end, best, first, after, nearest_leaf
 
     def is_running(i: Any, end: Any, *state: Any) -> Mask:
-        """Whether a lane has not passed the last sibling, which happens only where that sibling is
-        a leaf."""
+        """Whether a lane still has siblings to compare. It has none left, i = `end`, only when it
+        has found a leaf: from the last sibling `body` otherwise goes down to children."""
         return i != end
 
     start = (
@@ -262,13 +274,14 @@ def squared_distance_in_nearby_leaf(tree: PackedTree, x: Vec3, column: int) -> R
     leaf = dr.while_loop(start, is_running, body, label="to a leaf")[5]
 
     def add(slot: Any, square: Real) -> LoopValues:
-        """Update the smallest squared distance by that of the point in a slot of the leaf."""
+        """Update `square`, the smallest squared distance so far, by that of the point in a slot of
+        the leaf. Returns the next slot and the new `square`."""
         row = tree.primitive(leaf, slot, backend.Bool(True))
         point = vector(*row[column : column + 3])
         return slot + 1, fmin(square, dr.squared_norm(point - x))
 
     def has_slots(slot: Any, square: Real) -> Mask:
-        """Whether the leaf has further slots."""
+        """Whether the leaf has further slots; `square` is not used."""
         del square
         return slot < tree.leaf_size
 
@@ -278,8 +291,9 @@ def squared_distance_in_nearby_leaf(tree: PackedTree, x: Vec3, column: int) -> R
 def next_closest_triangle(
     triangles: TriangleTree, x: Vec3, after: tuple[Real, Any], limit: Real, active: Mask
 ) -> ClosestTriangle:
-    """The next triangle in the order of distance from points x: the one that comes after the pair
-    `after`, and is nearer than `limit`, a squared distance. Only active lanes search.
+    """Find the next of the triangles in the order of distance from points x: the first one that
+    comes after the pair `after`, if its squared distance from x is at most `limit`. Only active
+    lanes search.
 
     Triangles are ordered by squared distance from x, and at equal distances by number; `after` is a
     squared distance and a number. Repeated calls, the first with (-1, NO_TRIANGLE), return each
@@ -293,13 +307,16 @@ def next_closest_triangle(
     may_be_within = _distance_test(triangles, x, _distance_rounding(triangles, x))
 
     def visit(node: VisitedNode, state: LoopValues) -> tuple[Mask, LoopValues]:
-        """Enter a node if its box is nearer than the best triangle so far."""
+        """Enter a node if its box is nearer than the best triangle so far. state: the best triangle
+        so far (squared distance, number, and what `ClosestTriangle` holds besides). Returns the
+        mask of lanes that enter the node, and the state, which the triangles of a leaf have
+        updated."""
         is_near = may_be_within(node, state[0])
         return is_near, for_each_primitive(node, is_near & node.is_leaf, nearer, state)
 
     def nearer(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
-        """Take the triangle in the record `row` if it comes after `after` and before the best so
-        far."""
+        """The new state: the triangle in the record `row` if it comes after `after` and before the
+        best triangle so far, which is `state`; otherwise `state`."""
         best, number, offset, normal, is_inner = state
         point = ClosestPointOnTriangle.of(row, x)
         # The number -1 of an empty slot is no index; such a slot is never chosen.
@@ -324,16 +341,18 @@ def next_closest_triangle(
 
 def _distance_rounding(triangles: TriangleTree, x: Vec3) -> Real:
     """A bound of the rounding error of computed distances from points x to triangles: a length, 16
-    machine epsilons of |x| + 1 (`distance_lower_bound`)."""
+    machine epsilons times 1 plus the largest coordinate of x in magnitude (`distance_lower_bound`).
+    """
     return _ROUNDING_EPSILONS * triangles.tree.backend.machine_epsilon * (1 + dr.max(dr.abs(x)))
 
 
 def _distance_test(triangles: TriangleTree, x: Vec3, pad: Real) -> Any:
     """Make a function that tells whether a node's triangles may be within a distance of x.
 
-    The function takes a node and a squared distance, and returns a mask. It tests the distance of x
-    from the node's bounding box and, if the tree has slabs, from the node's slab (a flat cylinder
-    around its triangles, see `node_slabs`). Box and slab are enlarged by the length `pad`.
+    The function takes a node and a squared distance, and returns a mask: False only where all
+    triangles of the node are proved to be farther from x. It tests the distance of x from the
+    node's bounding box and, if the tree has slabs, from the node's slab (a flat cylinder around its
+    triangles, see `node_slabs`). Box and slab are enlarged by the length `pad`.
     """
     vector = triangles.tree.backend.Array3f
 
@@ -409,8 +428,8 @@ class ClosestPointOnTriangle:
         is_qr_longest = ~is_pr_longest & (squares[1] > squares[0])
 
         def of_longest(of_pq: Any, of_qr: Any, of_pr: Any) -> Any:
-            """Select the number or vector of the longest edge, from the three that belong to the
-            edges pq, qr and pr."""
+            """Select, from three numbers or vectors that belong to the edges pq (`of_pq`), qr
+            (`of_qr`) and pr (`of_pr`), the one of the longest edge."""
             return dr.select(is_pr_longest, of_pr, dr.select(is_qr_longest, of_qr, of_pq))
 
         a, e, inverse = (
@@ -451,7 +470,7 @@ def _closest_on_segment(a: Vec3, e: Vec3, inverse: Real) -> Vec3:
 
 
 def _shortest_vector(*vectors: Vec3) -> tuple[Real, Vec3]:
-    """The squared length of the shortest of the vectors, and this vector."""
+    """The shortest of the vectors: returns its squared length and the vector itself."""
     best, *rest = vectors
     square = dr.squared_norm(best)
     for vector in rest:
@@ -470,20 +489,23 @@ def squared_distance_to_segment(a: Vec3, e: Vec3, inverse: Real) -> Real:
 
 def jump_sum_within(triangles: TriangleTree, x: Vec3, distance: Real, active: Mask = True) -> Real:
     """The sum of |jump| over all triangles within `distance` of points x. The jump is the change of
-    the winding number across a triangle. Except for its sign, it is the number in the column
-    `PARITY_COLUMN` of the triangle's record."""
+    the winding number across a triangle. |jump| is the absolute value of the number in the column
+    `PARITY_COLUMN` of the triangle's record. It is counted on active lanes only."""
     real, vector = triangles.tree.backend.Float, triangles.tree.backend.Array3f
     x, distance = vector(x), real(distance)
     # The test enlarges boxes by a length, here `distance` itself, which is more than rounding.
     square, may_be_within = distance * distance, _distance_test(triangles, x, distance)
 
     def visit(node: VisitedNode, state: LoopValues) -> tuple[Mask, LoopValues]:
-        """Enter a node if its box comes within `distance` of x."""
+        """Enter a node if its box comes within `distance` of x. state: the sum so far. Returns the
+        mask of lanes that enter the node, and the state, to which the triangles of a leaf have been
+        added."""
         is_near = may_be_within(node, square)
         return is_near, for_each_primitive(node, is_near & node.is_leaf, add, state)
 
     def add(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
-        """Add the jump across the triangle in the record `row`, if it is within the distance."""
+        """The new state: the sum so far, `state`, plus |jump| of the triangle in the record `row`,
+        if this triangle is within the distance."""
         is_within = (
             active
             & (row[NUMBER_COLUMN] >= 0)

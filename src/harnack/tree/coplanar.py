@@ -48,8 +48,8 @@ def borders_of_overlaps(
     tree: a tree of the same faces, with coordinates of at most about 1.
     vertices, faces: (n, 3) and (m, 3), the mesh.
     at_every_edge: whether to cut along all edges of the covering faces. If not, an edge is left out
-        if all faces at it cover the face and run it equally often in both directions: the face is
-        then equally covered on both sides of the edge.
+        if all faces at this edge cover the face, and together run the edge equally often in both
+        directions: the face is then equally covered on both sides of the edge.
 
     Returns:
         The indices of the covered faces (k,), repeated for each border edge; and knives (k, 3, 3):
@@ -84,7 +84,7 @@ def borders_of_overlaps(
 
 
 def _edges(faces: IntArray) -> tuple[IntArray, IntArray]:
-    """The three edges of each of the faces (m, 3), with their directions.
+    """The three edges of each of the faces (m, 3), and in which direction the face runs them.
 
     Returns:
         (3 m, 2) the vertices of each edge, the lower index first; and (3 m,) 1 if the face runs the
@@ -116,12 +116,11 @@ def _candidates(corners: FloatArray, normals: FloatArray, heights: FloatArray) -
 
     A plane is a point of R^4: its unit normal and its distance from the origin. The normal is
     turned so that its first coordinate that is larger than 0.3 in magnitude is positive; a unit
-    vector always has one. For two
-    triangles in one plane these points differ only by rounding and by the effect of moving corners
-    by `_IN_PLANE`, divided by the smaller of the triangles' heights. R^4 is divided into cells. So
-    a triangle that is alone in its cell shares its plane with another triangle only in two cases:
-    its point is nearer to a wall of the cell than this difference, or a coordinate of its normal is
-    nearer to 0.3 in magnitude than this difference.
+    vector always has one. For two triangles in one plane these points differ only by rounding and
+    by the effect of moving corners by `_IN_PLANE`, divided by the smaller of the triangles'
+    heights. R^4 is divided into cells. So a triangle that is alone in its cell shares its plane
+    with another triangle only in two cases: its point is nearer to a wall of the cell than this
+    difference, or a coordinate of its normal is nearer to 0.3 in magnitude than this difference.
     """
     excess = np.abs(normals) - 0.3
     # The first coordinate larger than 0.3 in magnitude decides the orientation.
@@ -147,6 +146,7 @@ def overlapping_faces(
     first and (k,) of the second faces of the pairs; each pair occurs in both orders.
 
     tree: a tree of the same faces, with coordinates of at most about 1.
+    vertices: (n, 3).
 
     The search begins at the smaller face of each pair: for each face it finds the overlapping faces
     that are at least as large, and there are few of them. The size of a face is its height above
@@ -195,14 +195,16 @@ def _next_in_plane(
     low, high = fmin(fmin(a, b), c) - _IN_PLANE, fmax(fmax(a, b), c) + _IN_PLANE
 
     def visit(node: VisitedNode, state: LoopValues) -> tuple[Mask, LoopValues]:
-        """Enter a node if its box meets the box of the lane's face."""
+        """Enter a node if its box meets the box of the lane's face. state: the lowest number of a
+        face found so far. Returns the mask of lanes that enter the node, and the state, which the
+        faces of a leaf have updated."""
         node_low, node_high = vector(*node.head[:3]), vector(*node.head[3:6])
         is_near = dr.all((node_low <= high) & (node_high >= low))
         return is_near, for_each_primitive(node, is_near & node.is_leaf, nearer, state)
 
     def nearer(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
-        """Take the face in the record `row` if it is one of those that are sought, and has a lower
-        number than the best so far."""
+        """The new state: the number of the face in the record `row` if this face is sought and its
+        number is lower than `state`, the lowest so far; otherwise `state`."""
         number = index(fmax(row[NUMBER_COLUMN], real(0)))
         other_corners = corners_of(row, vector)
         other_size = dr.gather(real, sizes, number, active)

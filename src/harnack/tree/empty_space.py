@@ -121,7 +121,7 @@ def kdop_of_points(points: FloatArray, slack: float) -> ConvexHull:
 
 def merge_kdops(hull: ConvexHull, other: ConvexHull) -> ConvexHull:
     """The smallest convex polytope with the 26 face normals of `BoxCells.bounding_kdop` that
-    contains two polytopes with these normals."""
+    contains two polytopes with these normals, `hull` and `other`."""
     return ConvexHull(
         hull.normals,
         np.maximum(hull.offsets, other.offsets),
@@ -161,9 +161,9 @@ def refine_cells(
     max_rounds: int,
     margin: float = 0.0,
 ) -> RefinedCells:
-    """Split cells into octants, and split the octants that are not proved empty again, for several
-    rounds. Returns the cells of the last round that are not proved empty, and all cells proved
-    empty.
+    """Split cells into octants, for several rounds. In each further round, those octants are split
+    that are not proved empty. Returns the cells of the last round that are not proved empty, and
+    all cells proved empty.
 
     clearance: gives proved lower bounds of the distances of points from a set. An empty cell holds
         no point of the set.
@@ -207,7 +207,8 @@ Layout = TypeVar("Layout", bound="GridData")
 
 @dataclass(frozen=True)
 class GridData:
-    """A uniform grid of cubes, some of them proved to contain no point of a set (empty); in NumPy.
+    """A uniform grid of cubes in NumPy. Some of the cubes, the empty ones, are proved to contain no
+    point of a set.
 
     origin: (3,) the lower corner of the grid, in numbers of single precision.
     cell_size: the width of a cell (`round_to_short_float`).
@@ -224,9 +225,9 @@ class GridData:
 
 @dataclass(frozen=True)
 class EmptySpaceGrid:
-    """A uniform grid of cubes on a backend, some of them proved to contain no point of a set
-    (empty), for rays that jump across empty cells. All numbers are parameters of kernels, so that
-    kernels are compiled once for all grids.
+    """A uniform grid of cubes on a backend, for rays that jump across empty cells. Some of the
+    cubes, the empty ones, are proved to contain no point of a set. All numbers are parameters of
+    kernels, so that kernels are compiled once for all grids.
 
     A point outside of the grid is treated like its nearest cell.
 
@@ -234,7 +235,7 @@ class EmptySpaceGrid:
     cell_size: the width of a cell.
     shape: the number of cells along x, y and z.
     empty_distance: for each cell, x fastest, the chessboard distance, in cells, to the nearest cell
-        that is not proved empty.
+        that is not proved empty; 0 for such a cell itself.
     margin: an empty cell enlarged on all sides by this number of cells is empty too.
     """
 
@@ -297,8 +298,8 @@ class EmptySpaceGrid:
             ), free_cells > 0
 
         def body(s: Real, active: Mask) -> tuple[Real, Mask]:
-            """Extend s on active lanes. A lane stays active while the cell at p + s d is empty and
-            s is less than `length`."""
+            """Extend s on active lanes. Returns the new s, and the mask of lanes that stay active:
+            where the cell at p + s d is empty and s is less than `length`."""
             further, empty = extend(s)
             return dr.select(active, further, s), active & empty & (further < length)
 
@@ -307,7 +308,7 @@ class EmptySpaceGrid:
         active = dr.full(self.backend.Bool, True, 1) & (start == start) & (length > 0)
 
         def running(s: Real, active: Mask) -> Mask:
-            """Whether s is to be extended further: the path up to s ended in an empty cell, and s
+            """Whether s is to be extended further (`active`): the cell at p + s d is empty, and s
             is less than `length`."""
             del s
             return active
@@ -315,9 +316,13 @@ class EmptySpaceGrid:
         return dr.while_loop((start, active), running, body, label="empty cells")[0]
 
     def is_resolved(self, o: Vec3, end: Real) -> Mask:
-        """Whether coordinates are precise enough for the grid: whether rounding moves points of
-        rays from o, up to the length `end`, by less than the part of the margin that is reserved
-        for rounding. False if o is not finite."""
+        """Whether coordinates are precise enough for the grid. They are if rounding moves points of
+        rays by less than the part of the margin that is reserved for rounding. False if o is not
+        finite.
+
+        o: the origins of the rays.
+        end: the length up to which their points count.
+        """
         rounding = 4 * self.backend.machine_epsilon * (max_norm(o) + end)
         return (rounding < _ROUNDING_SHARE * self.cell_size) & dr.all(dr.isfinite(o))
 
@@ -327,6 +332,9 @@ class EmptySpaceGrid:
 
         It is `t` itself if coordinates are so large that rounding might move a point too far
         (`is_resolved`): a point is off by at most four roundings of its largest coordinate.
+
+        o, d: origin and direction of each ray.
+        t, end: the ray parameters at which the search starts and at which it may stop.
         """
         length = dr.select(self.is_resolved(o, end), end - t, 0)
         run = self.empty_run(dr.fma(type(o)(t), d, o), d, length)
@@ -355,8 +363,8 @@ class GridCell:
         return dr.gather(self.grid.backend.UInt32, self.grid.empty_distance, self.index)
 
     def exit_distance(self, d: Vec3, reach: Real = 1.0) -> Real:
-        """The length up to which the path from the point in direction d stays within a cube of
-        cells.
+        """The length up to which the path from the point (`cell_coordinates`) in direction d stays
+        within a cube of cells around it.
 
         reach: the cube consists of the cells less than `reach` cells away from the point's cell,
             and of the margin around them.
@@ -461,7 +469,7 @@ class OccupancyGrid(GridData):
 
     def refined(self, clearance: Clearance) -> OccupancyGrid:
         """The same grid with more empty cells: a cell also counts as empty if its eight octants are
-        all proved empty, each enlarged by the margin of the cell.
+        all proved empty. Each octant is enlarged by the margin of the cell before it is tested.
 
         clearance: gives proved lower bounds of the distances of points from the set.
         """
@@ -527,8 +535,8 @@ def largest_connected_component(cells: OccupancyGrid) -> OccupancyGrid:
 
 
 def _projection_sizes(group: IntArray, places: IntArray, count: int) -> IntArray:
-    """The number (count,) of different places of each group: the size of its projection onto a
-    plane.
+    """The numbers (count,) of different places of each group: the sizes of the groups' projections
+    onto a plane.
 
     group: (n,) the group that each place belongs to, from 1 to count.
     places: (n, 2) cells of a plane, onto which the cells of groups were projected.

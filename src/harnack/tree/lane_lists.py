@@ -61,7 +61,8 @@ class LaneLists:
         """The lists of all `parts` together: the lists of the first part, then those of the second
         part, and so on.
 
-        In each part, the first list must begin at entry 0 and each list where the one before ends.
+        In each part, the first list must begin at entry 0, and each further list where the one
+        before it ends.
 
         Raises:
             ValueError: there are 2^31 entries or more.
@@ -105,7 +106,8 @@ def build_lists(backend: Backend, walk: Callable[[WriteEntry | None], Any]) -> L
     first, entries = upload_integers(backend, start[:-1]), dr.zeros(index, max(1, int(start[-1])))
 
     def write_entry(position: Any, entry: Any, active: Mask) -> None:
-        """Write an entry at a position of the list of each active lane."""
+        """Write an entry into the list of each active lane. position: the place in the list, from 0
+        on."""
         dr.scatter(entries, index(entry), first + position, active)
 
     dr.eval(walk(write_entry), entries)
@@ -128,7 +130,8 @@ def traverse_subtrees(
 
     def body(k: Any, i: Any, end: Any, *state: Any) -> LoopValues:
         """Visit node i of the subtree of list entry k; `end` is the node after that subtree. If i
-        equals `end`, begin the subtree of entry k instead."""
+        equals `end`, begin the subtree of entry k instead. Returns the next k, i and `end`, and
+        then the new state."""
         # At the start i and end are both 0, so that the first subtree begins.
         begins = i == end
         entry = dr.gather(index, lists.entries, lists.first + k, begins & (k < lists.count))
@@ -141,7 +144,7 @@ def traverse_subtrees(
         return k + dr.select(i == end, index(1), index(0)), i, end, *state
 
     def is_running(k: Any, *_: Any) -> Mask:
-        """Whether a lane's list has further entries."""
+        """Whether entry k of a lane's list exists, so that the list has further entries."""
         return k < lists.count
 
     start = (index(0), index(0), index(0), *state)
@@ -154,7 +157,8 @@ def for_each_entry(
     body: Callable[[Any, Mask, LoopValues], LoopValues],
     state: LoopValues,
 ) -> LoopValues:
-    """Call the function `body` for each entry of each lane's list, and return the final state.
+    """Call the function `body` for each entry of each lane's list in `lists`, and return the final
+    state.
 
     body: takes an entry, the mask of the lanes that have one, and the state, a tuple of arrays;
         returns the new state.
@@ -163,13 +167,14 @@ def for_each_entry(
     index = backend.UInt32
 
     def step(k: Any, *state: Any) -> LoopValues:
-        """Call `body` for entry k of the lists, and go on to the next entry."""
+        """Call `body` for entry k of the lists. Returns the number of the next entry, and then the
+        new state."""
         active = k < lists.count
         entry = dr.gather(index, lists.entries, lists.first + k, active)
         return k + 1, *body(entry, active, state)
 
     def is_running(k: Any, *_: Any) -> Mask:
-        """Whether a lane's list has further entries."""
+        """Whether entry k of a lane's list exists, so that the list has further entries."""
         return k < lists.count
 
     return dr.while_loop((index(0), *state), is_running, step, label="entries")[1:]

@@ -44,6 +44,8 @@ def encode_nodes(is_leaf: BoolArray, leaves: int, split: int) -> IntArray:
     is_leaf: (n,) whether each node of this depth is a leaf.
     leaves: the number of leaves at smaller depths.
     split: the number of inner nodes at smaller depths, the root included.
+
+    Returns (n,) the encoded nodes.
     """
     number = np.empty(len(is_leaf), np.int64)
     number[is_leaf] = -1 - (leaves + np.arange(int(is_leaf.sum())))
@@ -99,8 +101,9 @@ class OctreeLookup:
         return 4 * (nodes + 8**_TOP_DEPTH)
 
     def find_leaf(self, x: Vec3) -> tuple[Any, Mask]:
-        """The index of the leaf that contains x, and a mask of whether x lies in the octree's cube.
-        For points outside of the cube, the index is that of the leaf at the lower corner.
+        """Return the index of the leaf that contains x, and a mask that tells whether x lies in the
+        octree's cube. For points outside of the cube, the index is that of the leaf at the lower
+        corner.
 
         The lookup begins in a uniform grid, and then goes from node to child until it is at a leaf.
         """
@@ -114,12 +117,13 @@ class OctreeLookup:
         first = (((ix >> down) << _TOP_DEPTH | (iy >> down)) << _TOP_DEPTH) | (iz >> down)
 
         def is_inner(node: Any, *_: Any) -> Mask:
-            """Whether a lane has not reached a leaf."""
+            """Whether a lane has not yet reached a leaf: the encoded `node` is an inner node."""
             return node >= 0
 
         def step(node: Any, bit: Any) -> tuple[Any, Any]:
             """Go from a node to its child that contains x. Bit number `bit` of the integer
-            coordinates of x chooses the child."""
+            coordinates of x chooses the child. Returns the child, encoded, and the number of the
+            next lower bit."""
             octant = ((ix >> bit) & 1) * 4 + ((iy >> bit) & 1) * 2 + ((iz >> bit) & 1)
             return dr.gather(integer, self.encoded_nodes, index(node) + octant), bit - 1
 

@@ -82,8 +82,8 @@ def split_intersecting_faces(
 def separates_levels(
     tree: TriangleTree, pieces: FloatArray, levels: tuple[float, ...]
 ) -> BoolArray:
-    """Whether any of the levels lies strictly between the winding numbers of a mesh on the two
-    sides of each triangle: a mask (k,).
+    """A mask (k,) of triangles, true where any of the levels lies strictly between the winding
+    numbers of a mesh on the two sides of the triangle.
 
     tree: the mesh.
     pieces: (k, 3, 3) the triangles.
@@ -140,9 +140,11 @@ def windings_of_sides(
 def _crossing_faces(
     tree: TriangleTree, vertices: FloatArray, faces: IntArray
 ) -> tuple[IntArray, IntArray]:
-    """Pairs of faces, (k,) and (k,), that pass through one another; each pair in both orders.
+    """Find all pairs of faces (m, 3) that pass through one another. Returns the indices (k,) of the
+    first and (k,) of the second faces of the pairs; each pair occurs in both orders.
 
     tree: a tree of the same faces.
+    vertices: (n, 3).
 
     Pairs are found by the edges that cross faces: an edge that crosses a face makes a pair of that
     face with each face at the edge.
@@ -169,6 +171,9 @@ def _crossings_of_edges(
 ) -> tuple[IntArray, IntArray]:
     """All crossings of edges (m, 2) with faces that have neither end of the edge as a corner. Faces
     whose border the edge meets count as crossed.
+
+    tree: a tree of the same faces.
+    vertices: (n, 3).
 
     Returns:
         (k,) the index of the edge and (k,) the index of the face of each crossing.
@@ -219,7 +224,8 @@ def _next_foreign_crossing(
 
     def body(t: Any, n: Any, active: Any) -> tuple[Any, ...]:
         """Go to the next crossing, (t, number n of the crossed face). The lane stays active while
-        an end of its edge is a corner of the crossed face: such crossings are skipped."""
+        an end of its edge is a corner of the crossed face: such crossings are skipped. Returns the
+        new t, n and mask of active lanes."""
         t, n, _, _ = tree.next_crossing(frame, (t, n), t_max, active, _COINCIDENT)
         is_found = active & (n != NO_TRIANGLE)
         corners = [dr.gather(index, column, n, is_found) for column in face_columns]
@@ -230,7 +236,8 @@ def _next_foreign_crossing(
         )
 
     def is_running(t: Any, n: Any, active: Any) -> Any:
-        """Whether an end of the lane's edge is a corner of the face that it crossed last."""
+        """The mask `active`: whether an end of the lane's edge is a corner of the face that it
+        crossed last."""
         del t, n
         return active
 
@@ -249,8 +256,8 @@ def _cut_up(
     knives: (k, 3, 3) the triangles whose planes cut them.
 
     In each round every piece is cut by one of the knives that meet it: the knife in the middle of
-    the piece's list. The remaining knives of the list are passed on to the new pieces that they
-    meet. So the number of knives of a piece falls by about half in each round.
+    the list of the piece's knives. The remaining knives of the list are passed on to the new pieces
+    that they meet. So the number of knives of a piece falls by about half in each round.
 
     Returns:
         The pieces (j, 3, 3), and the index (j,) of the triangle that each is a piece of.
@@ -296,6 +303,7 @@ def _cut_up(
 def _pieces_at_plane(pieces: FloatArray, heights: FloatArray) -> FloatArray:
     """Cut triangles (k, 3, 3) by planes, each into one triangle on one side and two on the other.
 
+    pieces: (k, 3, 3) the triangles.
     heights: (k, 3) the signed distances of the corners from the plane, some positive and some
         negative.
 

@@ -270,14 +270,16 @@ class TriangleTree:
         may_meet_box = self._make_box_test(frame, reach)
 
         def visit(node: VisitedNode, state: LoopValues) -> tuple[Mask, LoopValues]:
-            """Enter a node if the ray comes near its box before the best crossing so far."""
+            """Enter a node if the ray comes near its box before the best crossing so far. state:
+            the best crossing so far (its t first). Returns the mask of lanes that enter the node,
+            and the state, which the triangles of a leaf have updated."""
             limit = fmin(state[0], t_max)
             is_met = may_meet_box(node, t_after, limit)
             return is_met, for_each_primitive(node, is_met & node.is_leaf, nearer, state)
 
         def nearer(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
-            """Take the crossing with a record's triangle if it is after `after` and before the best
-            so far."""
+            """The new state: the crossing with the triangle in the record `row`, if it comes after
+            `after` and before the best crossing so far, which is `state`; otherwise `state`."""
             best, number, sign, normal = state
             t, new_sign = signed_crossing(row, frame)
             # The triangle of an empty slot, number -1, has no area: its sign is 0.
@@ -303,17 +305,22 @@ class TriangleTree:
         return best, number, sign, normal * dr.rsqrt(fmax(dr.squared_norm(normal), real(1e-37)))
 
     def signed_crossings_ahead(self, frame: RayFrame, t_min: Real, active: Mask = True) -> Real:
-        """The sum of the signs of all crossings of each ray with triangles at t > t_min. The sign
-        of a crossing is 1 if the triangle's normal points along the ray, else -1."""
+        """The sum of the signs of all crossings of each ray (of `frame`) with triangles at t >
+        t_min, on active lanes. The sign of a crossing is 1 if the triangle's normal points along
+        the ray, else -1.
+        """
         real, may_meet_box = self.tree.backend.Float, self._make_box_test(frame)
 
         def visit(node: VisitedNode, state: LoopValues) -> tuple[Mask, LoopValues]:
-            """Enter a node if the ray comes near its box ahead of t_min."""
+            """Enter a node if the ray comes near its box ahead of t_min. state: the sum so far.
+            Returns the mask of lanes that enter the node, and the state, to which the triangles of
+            a leaf have been added."""
             is_met = may_meet_box(node, real(t_min), real(dr.inf))
             return is_met, for_each_primitive(node, is_met & node.is_leaf, add, state)
 
         def add(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
-            """Add the sign of the crossing with a record's triangle, if it is ahead of t_min."""
+            """The new state: the sum so far, `state`, plus the sign of the crossing with the
+            triangle in the record `row`, if the crossing is ahead of t_min."""
             t, sign = signed_crossing(row, frame)
             return (state[0] + dr.select(active & (t > t_min), sign, 0),)
 
@@ -322,9 +329,9 @@ class TriangleTree:
     def signed_crossings_between(
         self, frame: RayFrame, end: Real, unit: Real, active: Mask
     ) -> tuple[Real, Mask]:
-        """The sum of the signs of all crossings of each ray with triangles at 0 < t < end, and a
-        mask of the rays for which rounding cannot change the sum. The sign of a crossing is 1 if
-        the triangle's normal points along the ray, else -1.
+        """The sum of the signs of all crossings of each ray (of `frame`) with triangles at 0 < t <
+        end, and a mask of the rays for which rounding cannot change the sum. The sign of a crossing
+        is 1 if the triangle's normal points along the ray, else -1.
 
         unit: the rounding error of a coordinate.
 
@@ -335,13 +342,16 @@ class TriangleTree:
         real, may_meet_box = self.tree.backend.Float, self._make_box_test(frame)
 
         def visit(node: VisitedNode, state: LoopValues) -> tuple[Mask, LoopValues]:
-            """Enter a node if the ray comes near its box between 0 and `end`."""
+            """Enter a node if the ray comes near its box between 0 and `end`. state: the sum so
+            far, and the mask of lanes on which it is certain. Returns the mask of lanes that enter
+            the node, and the state, which the triangles of a leaf have updated."""
             is_met = may_meet_box(node, real(0), real(end))
             return is_met, for_each_primitive(node, is_met & node.is_leaf, add, state)
 
         def add(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
-            """Add the sign of the crossing with a record's triangle, if it is between 0 and `end`;
-            and set the lane's mask to False if rounding may have decided whether it is."""
+            """The new state (sum, mask): the sign of the crossing with the triangle in the record
+            `row` is added to the sum if the crossing is between 0 and `end`. The mask becomes False
+            if rounding may have decided whether it is between them."""
             total, is_sure = state
             t, sign = signed_crossing(row, frame)
             normal = normal_of(row, self.tree.backend.Array3f)
@@ -363,9 +373,9 @@ class TriangleTree:
         return total, is_sure
 
     def signed_crossings_vertical(self, x: Vec3, way: Real, active: Mask = True) -> Real:
-        """The sum of the signs of all crossings of rays from x along the z axis with triangles. The
-        sign of a crossing is 1 if the triangle's normal has a positive z component, else -1, for
-        both directions of the ray.
+        """The sum of the signs of all crossings of rays from x along the z axis with triangles, on
+        active lanes. The sign of a crossing is 1 if the triangle's normal has a positive z
+        component, else -1, whichever of the two directions the ray has.
 
         way: 1 for rays upwards, -1 for rays downwards.
 
@@ -377,7 +387,9 @@ class TriangleTree:
         low_x, high_x, low_y, high_y = x.x - pad, x.x + pad, x.y - pad, x.y + pad
 
         def visit(node: VisitedNode, state: LoopValues) -> tuple[Mask, LoopValues]:
-            """Enter a node if its box, slightly enlarged, meets the vertical ray."""
+            """Enter a node if its box, slightly enlarged, meets the vertical ray. state: the sum so
+            far. Returns the mask of lanes that enter the node, and the state, to which the
+            triangles of a leaf have been added."""
             # For rays downwards, z and the ray are mirrored: the upper end of the box is at -z0.
             x0, y0, z0, x1, y1, z1 = node.head
             is_met = (
@@ -387,15 +399,15 @@ class TriangleTree:
             return is_met, for_each_primitive(node, is_met & node.is_leaf, add, state)
 
         def add(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
-            """Add the sign of the ray's crossing with the triangle in the record `row`, if the
-            crossing is ahead of x."""
+            """The new state: the sum so far, `state`, plus the sign of the ray's crossing with the
+            triangle in the record `row`, if the crossing is ahead of x."""
             t, sign = signed_crossing(row, VerticalRayFrame(x))
             return (state[0] + dr.select(active & (way * t > 0), sign, 0),)
 
         return traverse(self.tree, visit, (real(0),), active)[0]
 
     def _make_box_test(self, frame: RayFrame, reach: float = 0.0) -> Any:
-        """Make a function that tells whether rays come near a node's box.
+        """Make a function that tells whether the rays of `frame` come near a node's box.
 
         The function takes a node, t_min and t_max. It returns a mask: whether the ray comes within
         `reach` (a length) of the node's box at some t between these two. Rounding may turn a no
@@ -427,7 +439,8 @@ class TriangleTree:
 
 
 def corners_of(row: list[Real], vector: Any) -> tuple[Vec3, Vec3, Vec3]:
-    """The three corners of the triangle in the record `row`. vector: the type of the points."""
+    """The three corners of the triangle in the record `row`. vector: the type of the result's
+    points, a Dr.Jit 3-vector."""
     return vector(*row[0:3]), vector(*row[3:6]), vector(*row[6:9])
 
 
@@ -435,16 +448,16 @@ def normal_of(row: list[Real], vector: Any) -> Vec3:
     """A normal of the triangle in the record `row`, in the direction of its face's right-hand rule;
     its length is twice the area.
 
-    vector: the type of the normal.
+    vector: the type of the normal, a Dr.Jit 3-vector.
     """
     p, q, r = corners_of(row, vector)
     return row[PARITY_COLUMN] * dr.cross(q - p, r - p)
 
 
 def signed_crossing(row: list[Real], frame: RayFrame | VerticalRayFrame) -> tuple[Real, Real]:
-    """The t and the sign of the crossing of a ray with the triangle in the record `row`. The sign
-    is 1 if the triangle's normal points along the ray, -1 if it points back, and 0 if the ray does
-    not cross the triangle.
+    """The t and the sign of the crossing of a ray (of `frame`) with the triangle in the record
+    `row`. The sign is 1 if the triangle's normal points along the ray, -1 if it points back, and 0
+    if the ray does not cross the triangle.
 
     In the plane across the ray, with coordinates (u, v), the sign is the winding number of the
     triangle about the ray. It is a sum over the edges of the triangle: +1 for each that crosses the
@@ -455,8 +468,8 @@ def signed_crossing(row: list[Real], frame: RayFrame | VerticalRayFrame) -> tupl
     closed surface is right whatever the rounding was, and rays through edges and vertices need no
     special case.
 
-    t is the depth of a point of the triangle within a few roundings of coordinates of the ray,
-    however thin the triangle is (`_crossing_depth`).
+    t is the depth of some point of the triangle whose distance from the ray is at most a few
+    roundings of the coordinates. This holds however thin the triangle is (`_crossing_depth`).
     """
     vector = cast("Any", type(frame.o))
     p, q, r = corners_of(row, vector)
@@ -487,9 +500,9 @@ def signed_crossing(row: list[Real], frame: RayFrame | VerticalRayFrame) -> tupl
 
 
 def _is_beside(row: list[Real], frame: RayFrame, reach: float) -> Mask:
-    """Whether the line of a ray comes within `reach` (a length) of an edge or a corner of the
-    triangle in the record `row`. (Dr.Jit computes terms that `signed_crossing` has as well only
-    once.)"""
+    """Whether the line along a ray (of `frame`) comes within `reach` (a length) of an edge or a
+    corner of the triangle in the record `row`. (Dr.Jit computes only once what `signed_crossing`
+    computes as well.)"""
     p, q, r = corners_of(row, type(frame.o))
     a, b, c = frame.transverse(p), frame.transverse(q), frame.transverse(r)
     is_near: Mask = False
@@ -513,8 +526,9 @@ def _crossing_depth(
     """The t at which a ray passes through a triangle.
 
     corners: (u, v, depth) of each corner a, b and c, in the frame of the ray.
-    areas: the `edge_function` of the edges ab, bc and ac.
-    close: the distance from an edge within which the ray passes through the edge.
+    areas: the `edge_function` of the edges ab, bc and ac: twice the signed area of the triangle
+        from the ray to the edge.
+    close: a ray within this distance of an edge counts as passing through the edge.
 
     The barycentric weight of a corner is an area divided by the triangle's area, which for a thin
     triangle is only rounding error. So t is computed along the longest edge, on which coordinates
@@ -534,8 +548,8 @@ def _crossing_depth(
     is_last = squares[2] > squares[1]
 
     def select_longest(first: Real, second: Real, last: Real) -> Real:
-        """Select the number that belongs to the longest edge, from the three of the edges ab, bc
-        and ac."""
+        """Select the number that belongs to the longest edge, from the numbers of the edges ab
+        (`first`), bc (`second`) and ac (`last`)."""
         return dr.select(is_first, first, dr.select(is_last, last, second))
 
     start, end, apex = (
@@ -572,6 +586,6 @@ def _crossing_depth(
 
 
 def _square(a: RayCoordinates, b: RayCoordinates) -> Real:
-    """The squared distance between two points across a ray; their depths do not matter."""
+    """The squared distance between the points a and b across a ray; their depths do not matter."""
     u, v = b[0] - a[0], b[1] - a[1]
     return dr.fma(u, u, v * v)

@@ -265,7 +265,7 @@ def evaluate_on_device(
 
 
 def _gather_lanes(array: Any, rows: npt.NDArray[np.int64]) -> Any:
-    """Return the entries of a Dr.Jit array at the indices `rows` (k,), evaluated."""
+    """Return the entries of a Dr.Jit array or vector at the indices `rows` (k,), evaluated."""
     index = upload_integers(backend_of(array), rows.astype(np.uint32))
     gathered = dr.gather(type(array), array, index)
     dr.make_opaque(gathered)

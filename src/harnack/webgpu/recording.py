@@ -159,7 +159,8 @@ class _ArrayLabels:
         original = module.gather
 
         def gather(dtype: Any, source: Any, index: Any, *args: Any, **kwargs: Any) -> Any:
-            """Call `drjit.gather`, and label its result."""
+            """Call `drjit.gather` with these arguments, and label its result. source: the array
+            that is read."""
             gathered = original(dtype, source, index, *args, **kwargs)
             if dr.is_array_v(type(source)) and dr.depth_v(type(source)) == 1:
                 self._label_gathered(gathered, source)

@@ -226,12 +226,13 @@ class _WGSLWriter:
         return bits if load.kind == "u32" else f"bitcast<f32>({bits})"
 
     def _operation(self, operation: Operation) -> str:
-        """Return the WGSL expression of an operation; `a` holds the expressions of its operands.
-        Integers are unsigned in the shader; signed operations reinterpret their bits.
+        """Return the WGSL expression of an operation. Integers are unsigned in the shader; signed
+        operations reinterpret their bits.
 
         The name of an operation may be followed by a variant: the predicate of a comparison ("fcmp
         olt"), the classes of a test, or the source type of a conversion.
         """
+        # The expressions of the operands.
         a = [self._operand_text(value) for value in operation.operands]
         name, _, variant = operation.name.partition(" ")
         if name in _INFIX:

@@ -154,8 +154,8 @@ class PlaneRegion(abc.ABC):
 
     @abc.abstractmethod
     def distances(self, at: Complex) -> tuple[Real, Real]:
-        """How near to the point `at` and how far from it the region's points are: a lower bound of
-        the smallest distance and an upper bound of the largest."""
+        """Return two bounds of the distances of the region's points from the point `at`: a lower
+        bound of the smallest and an upper bound of the largest."""
 
     @abc.abstractmethod
     def disk(self) -> tuple[Complex, Real]:
@@ -167,7 +167,7 @@ class PlaneSegment(PlaneRegion):
     """The straight segment of the complex plane from z to z + length w.
 
     z, w: Dr.Jit complex numbers; w need not have length 1.
-    length: a multiple of w, >= 0.
+    length: the factor of w, >= 0.
     rounding: a bound of the rounding error of z, as a distance.
     """
 
@@ -239,8 +239,8 @@ class Branches(abc.ABC):
     @property
     @abc.abstractmethod
     def branch_points(self) -> tuple[BranchPoint, ...]:
-        """The points where a branch is not analytic. Along every curve that avoids them each branch
-        can be continued."""
+        """The points where a branch is not analytic. Along every curve that avoids these points,
+        each branch can be continued."""
 
     def period(self, imaginary: bool) -> float | None:
         """A number by which the drawn part of each branch may be shifted to give the drawn part of
@@ -287,13 +287,16 @@ class Branches(abc.ABC):
 
     @abc.abstractmethod
     def evaluate(self, z: Complex) -> tuple[Branch, ...]:
-        """All branches at the point z, in any order. Of branches that differ by whole periods there
-        is one."""
+        """All branches at the point z, in any order. Of branches whose drawn parts differ by whole
+        periods, there is only one."""
 
     @abc.abstractmethod
     def second_derivative_bound(self, part: PlaneRegion) -> Real:
         """A bound of |g"| on a region of the plane that holds for all branches g; infinite if no
-        bound is known."""
+        bound is known.
+
+        part: the region.
+        """
 
     def move_off_singularities(self, z: Complex, rounding: Real) -> Complex:
         """The point z, or a point beside it if z is at a singular point, where derivatives are NaN.
@@ -308,8 +311,8 @@ class Branches(abc.ABC):
         return z
 
     def clearance(self, z: Complex) -> Real:
-        """The distance from z to the nearest singular point. If there are no singular points it is
-        2, because it limits the size of the disks on which the branches are bounded."""
+        """The distance from z to the nearest singular point. If there are no singular points, the
+        result is 2, since it limits the size of the disks on which the branches are bounded."""
         nearest = 0 * z.real + (dr.inf if self.branch_points else _CLEARANCE_WITHOUT_POINTS)
         for point in self.points_on(z):
             nearest = fmin(abs(z - point.at), nearest)
@@ -325,7 +328,8 @@ class Branches(abc.ABC):
         """A bound of the rounding error of the values of all branches, as a multiple of the machine
         epsilon (2^-23 in single precision). By default it is 8 times the largest |value|.
 
-        z: the point at which `branches` were evaluated.
+        z: the point.
+        branches: all branches at z, as `evaluate` returns them.
         """
         del z
         largest: Real = 0.0
@@ -495,6 +499,8 @@ class PowerProduct(Branches):
         """A bound of the rounding error of the values of all branches at z, as a multiple of the
         machine epsilon.
 
+        branches: all branches at z, as `evaluate` returns them.
+
         Each value is exp of a sum of logarithms and angles, so its relative error is a few
         roundings of the terms of these sums. All branches have the same absolute value.
         """
@@ -556,8 +562,12 @@ class Logarithm(Branches):
         return total * _BOUND_MARGIN
 
     def value_rounding(self, z: Complex, branches: tuple[Branch, ...]) -> Real:
-        """A bound of the rounding error of g = sum n_i log(z - a_i), as a multiple of the machine
-        epsilon: the sum of those of the logarithms and of the angles, which are at most pi."""
+        """A bound of the rounding error of g = sum n_i log(z - a_i) at z, as a multiple of the
+        machine epsilon. It is a sum of bounds for the logarithms and for the angles, which are at
+        most pi.
+
+        branches: not used.
+        """
         del branches
         roundings = 0 * z.real
         for a, n in zip(self._centers(z), self.multiplicities, strict=True):
@@ -592,8 +602,8 @@ class ArcSine(Branches):
         return None if imaginary else 2 * math.pi
 
     def evaluate(self, z: Complex) -> tuple[Branch, ...]:
-        """Both branches g and pi - g of asin at z, by Kahan's formulas (1987), in which nothing
-        cancels."""
+        """The two branches g and pi - g of asin at z, where g is the principal branch, by Kahan's
+        formulas (1987), in which nothing cancels."""
         root_minus, root_plus = dr.sqrt(1 - z), dr.sqrt(1 + z)
         product = root_minus * root_plus
         real = dr.atan2(z.real, product.real)
@@ -617,7 +627,8 @@ class UserBranches(Branches):
 
     function: a function of z that returns all branches at z, each as (g, g') or (g, g', g").
     singular: the points where a branch is not analytic.
-    second_bound: a function: second_bound(z, r) bounds |g"| on the disk of radius r about z.
+    second_bound: a function of z and r that returns a bound of |g"| on the disk of radius r about
+        z, for all branches g.
     branch_count: the number of branches.
     shift: the period of the drawn part, or None.
 

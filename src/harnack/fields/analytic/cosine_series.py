@@ -62,9 +62,9 @@ def fit_cosines(grid: FloatArray, terms: tuple[int, int, int]) -> FloatArray:
     grid: (n_x, n_y, n_z) the values.
     terms: the numbers of terms (K_x, K_y, K_z).
 
-    They come from the discrete cosine transform of type 2. With as many terms as values the series
-    passes through all values. With fewer terms it is the best fit in mean square, since the cosines
-    are orthogonal on the midpoints.
+    The coefficients come from the discrete cosine transform of type 2. With as many terms as values
+    the series passes through all values. With fewer terms it is the best fit in mean square, since
+    the cosines are orthogonal on the midpoints.
     """
     from scipy import fft  # imported here, as it takes time and is rarely needed
 
@@ -271,14 +271,13 @@ def _spectral_norms(
 def _cell_extremes(
     values: FloatArray, angles: list[FloatArray], count: int, margin: int, ufunc: Any
 ) -> FloatArray:
-    """The smallest or largest of values at the nodes of a grid, for each of count^3 equal cells of
-    the box: an array (count, count, count). The nodes of a cell are those in it and the next ones
-    around it.
+    """For each of count^3 equal cells of the box, the smallest (or the largest) of values at the
+    nodes of a grid that lie in the cell or next to it: an array (count, count, count).
 
     values: the values at the nodes, an array over the three axes.
     angles: the angles of the nodes along each axis, evenly spaced from 0 to pi.
     margin: the number of neighboring cells, on each side, whose nodes are also included.
-    ufunc: np.minimum or np.maximum.
+    ufunc: np.minimum for the smallest values, np.maximum for the largest.
     """
     for axis in range(3):
         interval_count = len(angles[axis]) - 1
@@ -309,9 +308,10 @@ class CosineSums:
     rate: pi over the sides of the box, the change of the angles per length.
     rows: a record for each i, the highest i first.
     rounding: bounds of the rounding errors of value and gradient, as multiples of the unit roundoff
-        u, without the error that acts like a move of the point.
+        (half of the machine epsilon). The rounding of the angles, which acts like a move of the
+        point, is left out.
     curvature: a bound of the absolute second derivatives along directions, on the box.
-    cells: bounds of the same on single cells, finest grid first.
+    cells: bounds of the same derivatives on single cells of grids, finest grid first.
 
     Evaluation. Sums over k are computed for each i and j, then sums over j for each i, and the sum
     over i last (sum factorization). This takes about 2 K^3 products, whereas a sum of terms would
@@ -346,7 +346,7 @@ class CosineSums:
         bounds: bounds of the second derivatives of the series along directions, on the box and on
             cells.
         rounding: two numbers, bounds of the rounding errors of the value and of the gradient, as
-            multiples of the unit roundoff u.
+            multiples of the unit roundoff (half of the machine epsilon).
         """
         along_x, along_y, along_z = coefficients.shape
         index_column = np.arange(along_x, dtype=np.float64)[:, None]
@@ -368,7 +368,7 @@ class CosineSums:
         return (self.backend.Array3f(p) - self.lower) * self.rate
 
     def value(self, p: Vec3) -> tuple[Real, Vec3]:
-        """The value and the gradient of the cosine series at points p."""
+        """Return the value and the gradient of the cosine series at points p."""
         angles = self.angles(p)
         y_waves, z_waves = _waves(angles.y, self.shape[1]), _waves(angles.z, self.shape[2])
 

@@ -98,7 +98,8 @@ class FourierSeries(Field):
     from coefficients."""
 
     def __init__(self, coefficients: Any, box: Box | tuple[Any, Any]) -> None:
-        """Check the arguments, and compute proved bounds of the series."""
+        """Check the coefficients (K_x, K_y, K_z) and the box, and compute proved bounds of the
+        series."""
         checked = as_real_array(coefficients, "coefficients").astype(np.float64)
         if checked.ndim != 3 or 0 in checked.shape:
             raise ValueError(f"coefficients must have shape (K_x, K_y, K_z), not {checked.shape}")
@@ -217,8 +218,8 @@ class FourierSeries(Field):
         return SurfaceDisplacement(float(distances.mean()), float(distances.max()), len(points))
 
     def _near(self, level: float, rng: int) -> tuple[FloatArray, FloatArray]:
-        """Points (n, 3) on or next to the surface of the series at this level, and numbers (n,)
-        that tell the difference between the fitted function and the series there.
+        """Two results: points (n, 3) on or next to the surface of the series at this level; and the
+        fitted function minus the series (n,) at each of them.
 
         level: the level of the surface.
         rng: the seed of the random points, if a callable was fitted. They are moved to the surface
@@ -315,7 +316,7 @@ class FourierSeries(Field):
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
         """The box around all cells in which the series may take one of the levels; the whole box if
-        there are none.
+        there are no such cells.
 
         levels: the levels.
         """
@@ -345,6 +346,7 @@ class FourierSeries(Field):
 def _as_triple(numbers: Any, name: str) -> tuple[int, int, int]:
     """Three integers, from one integer, which is repeated, or from three.
 
+    numbers: the integer, or the three.
     name: what the integers are, for the messages.
 
     Raises:
@@ -425,9 +427,9 @@ def _values(function: Function, points: FloatArray) -> FloatArray:
 
 
 def _rounding(coefficients: FloatArray, size: FloatArray) -> tuple[float, float]:
-    """Bounds of the rounding errors of the value and of the gradient of a cosine series, as
-    multiples of the unit roundoff u; `FourierSeries` has the proof. The error that acts like a move
-    of the point is left out.
+    """Two bounds, of the rounding errors of the value and of the gradient of a cosine series, as
+    multiples of the unit roundoff (half of the machine epsilon). `FourierSeries` has the proof. The
+    rounding of the angles, which acts like a move of the point, is left out.
 
     coefficients: (K_x, K_y, K_z).
     size: (3,) the lengths of the box's sides.

@@ -91,14 +91,15 @@ class _OrderTerm:
     def of(cls, l: int, j: int, weights: Weights) -> _OrderTerm:  # noqa: E741
         """The part S(y) C(w) that belongs to this j of a function of degree l.
 
-        weights: (j, m) -> coefficient of the solid harmonic in S, the factor N_lj included.
+        weights: (j, m) -> coefficient of the solid harmonic in S. It includes N_lj, the factor that
+            normalizes the harmonic polynomial of R^4.
         """
         bounds = value_bound(weights), gradient_bound(weights), hessian_bound(weights)
         rounding = HarmonicRounding.of(weights, is_divided=True)
         return cls(j, l - j, j + 1, weights, *bounds, rounding)
 
     def largest(self, rho: Real, r: Real) -> tuple[Real, Real]:
-        """Bounds of the first and second derivatives of S(y) C(w) in R^4, for |w| <= 1.
+        """Two bounds, of the first and of the second derivatives of S(y) C(w) in R^4, for |w| <= 1.
 
         rho, r: y is within rho of the third axis and within r of 0.
 
@@ -109,8 +110,8 @@ class _OrderTerm:
         return slope * c + value * first, curvature * c + slope * first + value * second
 
     def axial(self, w: Real) -> tuple[Real, Real, Real]:
-        """The values at w of the Gegenbauer polynomial C_n^k and of its first two derivatives,
-        which are Gegenbauer polynomials, too."""
+        """Return three numbers, the values at w of the Gegenbauer polynomial C_n^k and of its first
+        and second derivatives, which are Gegenbauer polynomials, too."""
         n, k = self.n, self.k
         first = 2 * k * gegenbauer(n - 1, k + 1, w)
         return gegenbauer(n, k, w), first, 4 * k * (k + 1) * gegenbauer(n - 2, k + 2, w)
@@ -135,20 +136,20 @@ class HypersphericalHarmonic(Field):
 
     Proofs. On S^3 let |P| <= M, and let A be half the length of the range of P
     (`HypersphereRange`). P is harmonic and homogeneous, so |grad P| <= l M on S^3 and |v . H v| <=
-    l (l-1) M for unit vectors v and the Hessian H (`BallRange.curvature` has the proof). Let S = 1
+    l (l-1) M for unit vectors v and the Hessian H (`BallRange.curvature` has the proof). Let Q = 1
     + |p|^2.
 
-    - `TaylorRemainder` on a ball. The image on S^3 of a line with parameter t moves at speed 2/S,
-      and its second derivative by t has the length 4/S^1.5 (for the circle in `SphereArcEnclosure`
-      it is sqrt(c^2 + t^2) 4/S^2). By the chain rule |f''| <= M l (4 (l-1)/S^2 + 4/S^1.5) with the
-      smallest S on the ball, and |grad f| <= 2 l A/S (Bernstein on the great circle along the
+    - `TaylorRemainder` on a ball. The image on S^3 of a line with parameter t moves at speed 2/Q,
+      and its second derivative by t has the length 4/Q^1.5 (for the circle in `SphereArcEnclosure`
+      it is sqrt(c^2 + t^2) 4/Q^2). By the chain rule |f''| <= M l (4 (l-1)/Q^2 + 4/Q^1.5) with the
+      smallest Q on the ball, and |grad f| <= 2 l A/Q (Bernstein on the great circle along the
       line).
     - A further `TaylorRemainder` near places where f vanishes to an order above 2: the point y = 0,
       and for |m| > 2 the circle y_1 = y_2 = 0. Its ball has a radius that is a fraction of the
       distance to that place. `AxialBound` bounds S_jm, its gradient and its Hessian at such
       distances. The bound for S_jm(y) C(w) follows by the same chain rule, with 2ab <= 1 for the
-      components (a, b) of unit vectors. The ball's image: for R <= 0.3 sqrt(S), 1 + |q|^2 >= 0.49 S
-      at all points q of the ball, so on S^3 the image is within the chord 2R/(0.7 S).
+      components (a, b) of unit vectors. The ball's image: for R <= 0.3 sqrt(Q), 1 + |q|^2 >= 0.49 Q
+      at all points q of the ball, so on S^3 the image is within the chord 2R/(0.7 Q).
     - `SphereArcEnclosure` along a ray. The image of the ray lies on a circle of radius 1/c. The
       first and the second derivative of its point by the angle have the length 1/c, so |f_aa| <= M
       l ((l-1)/c^2 + 1/c) for derivatives by the angle. And f is a trigonometric polynomial of
@@ -208,7 +209,11 @@ class HypersphericalHarmonic(Field):
         return field
 
     def _initialize(self, l: int, weights: SphereWeights, domain: Volume | None) -> None:  # noqa: E741
-        """Set up the sum of P_ljm of degree l. weights: a mapping (j, m) -> coefficient."""
+        """Set up the function whose P is a sum of the P_ljm of degree l.
+
+        weights: a mapping (j, m) -> coefficient of P_ljm.
+        domain: the volume in which f is drawn; None for all of space.
+        """
         self.domain = domain
         self.degree = l
         self._orders = [
@@ -236,16 +241,17 @@ class HypersphericalHarmonic(Field):
         )
 
     def _values(self, p: Vec3, total: Real) -> tuple[Real, Vec3, Real, Real]:
-        """The value and the gradient of f at p, and bounds of the rounding errors of both.
+        """Return four results: the value and the gradient of f at p, and bounds of the rounding
+        errors of both.
 
         total: 1 + |p|^2.
 
         Let s = 1/total, y = 2 s p and w = 1 - 2 s. f is a sum of S(y) C(w). Since S is homogeneous
         of degree j, grad f = 2 s (sum of C grad S + p S (2 s C' - j C)). The errors, to first order
-        in the unit roundoff u, come from y, from w, and from S, grad S and C. The error of y is
-        `_SCALE_ERROR` of its size, the same for all coordinates, and two roundings of each
-        coordinate (`is_divided`). The error of w is `_W_ERROR`. Those of S, grad S and C come from
-        their recurrences.
+        in the unit roundoff u, come from y, from w, and from S, grad S and C. The relative error of
+        y is `_SCALE_ERROR` u, the same for all coordinates, and two roundings of each coordinate,
+        which `HarmonicRounding` includes. The error of w is `_W_ERROR` u. The errors of S, grad S
+        and C come from their recurrences.
         """
         s = 1 / total
         y, w, norm_p = 2 * s * p, 1 - 2 * s, dr.norm(p)
@@ -293,8 +299,8 @@ class HypersphericalHarmonic(Field):
         )
 
     def _min_square(self, square: Real, fraction: float) -> Real:
-        """A lower bound of 1 + |y|^2 for points y of space in the ball of radius fraction * sqrt(1
-        + |p|^2) about p.
+        """A lower bound of 1 + |q|^2 for all points q of space in the ball of radius fraction *
+        sqrt(1 + |p|^2) about p.
 
         square: |p|^2.
         """
@@ -356,9 +362,9 @@ class HypersphericalHarmonic(Field):
         return (TaylorRemainder(second_max * (1 + _ROUNDING), radius),)
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
-        """The sample at the position t of a ray, with enclosures (proofs of lengths in front of and
-        behind the point on which f takes none of the levels, the values that rays look for). They
-        use that the image of the ray on S^3 lies on a circle.
+        """The sample at the position t of a ray, with enclosures (proved bounds of the change of f
+        along the ray) in front of the point and behind it. Their proof uses that the image of the
+        ray on S^3 lies on a circle.
 
         path: the ray.
         t: a length along it.
@@ -408,8 +414,8 @@ class HypersphericalHarmonic(Field):
         """The three rows of the Hessian of f at p. Its trace is not 0: f is harmonic on S^3 and not
         in space.
 
-        Let s = 1/(1 + |x|^2) at the point x, and d_ik = 1 for i = k, else 0. The chain rule is
-        applied with
+        Let x be the point p, s = 1/(1 + |x|^2), and d_ik = 1 for i = k, else 0. The chain rule is
+        applied to f = P(y, w), with
 
         - first derivatives dy_i/dx_k = 2s (d_ik - 2s x_i x_k) and dw/dx_k = 4 s^2 x_k;
         - second derivatives 4 s^2 (4s x_i x_k x_m - x_m d_ik - x_k d_im - x_i d_km) of y_i and 4

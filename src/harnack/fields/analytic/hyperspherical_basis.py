@@ -99,8 +99,8 @@ def gegenbauer_rounding(n: int, k: int) -> float:
 
 
 def weights_by_order(l: int, weights: SphereWeights) -> dict[int, dict[tuple[int, int], float]]:  # noqa: E741
-    """A sum of P_ljm, sorted by j: the terms of the same j have the common factor C_(l-j)^(j+1)(w),
-    times a sum of solid harmonics of y.
+    """Sort the terms of a sum of P_ljm by j. The terms of the same j have the common factor
+    C_(l-j)^(j+1)(w), which is multiplied by a sum of solid harmonics of y.
 
     weights: a mapping (j, m) -> coefficient of P_ljm.
 
@@ -114,8 +114,8 @@ def weights_by_order(l: int, weights: SphereWeights) -> dict[int, dict[tuple[int
 
 
 def from_monomials(coefficients: Monomials) -> tuple[int, dict[tuple[int, int], float]]:
-    """The degree l and the weights (j, m) -> c of a homogeneous harmonic polynomial of R^4, as the
-    sum of c P_ljm.
+    """Write a homogeneous harmonic polynomial of R^4 as a sum of c P_ljm. Returns its degree l and
+    its weights, a mapping (j, m) -> c.
 
     coefficients: a mapping (a, b, c, d) -> coefficient of x^a y^b z^c w^d.
 

@@ -89,7 +89,8 @@ class Lobes(Field):
     over_relaxation = 1.6
 
     def __init__(self, l: int, m: int, *, scale: float = 1.0, sign: LobeSign = "both") -> None:  # noqa: E741
-        """Set up the lobes of a single spherical harmonic."""
+        """Set up the lobes of a single spherical harmonic, Y_lm. The class describes the arguments
+        `scale` and `sign`."""
         self._initialize({(integer(l, "l"), integer(m, "m")): 1.0}, scale, sign)
 
     @classmethod
@@ -251,9 +252,9 @@ class Lobes(Field):
         most G = |slope| + 1.05 q L^2 M, and |Y| <= H = |Y(u)| + 1.05 q G. Second derivatives along
         a unit vector with the radial component c and the tangential component t are, for r^2 Y^2, 2
         Y^2 + 2 Y (2 c t Y' + t^2 Y") + 2 t^2 Y'^2. This is at most 2 H^2 + 2 H b + 2 G^2, where b
-        is the bound N^2 A of `Lobes` for Y itself. The second derivatives of r^4 are at most 12
-        r^2. As f = r^4 - r^2 Y^2, its second derivatives are between minus the first bound and 12
-        r^2 + 2 H b.
+        bounds |2 c t Y' + t^2 Y"| (the class docstring has such bounds, here for Y itself). The
+        second derivatives of r^4 are at most 12 r^2. As f = r^4 - r^2 Y^2, its second derivatives
+        are between minus the first bound and 12 r^2 + 2 H b.
         """
         max_value, degree = max(map(abs, self.value_range)), self.degree
         # Near the surface |Y| is r. Where its slope is 0, it changes by about r within the angle
@@ -270,13 +271,13 @@ class Lobes(Field):
         return TaylorRemainder(bound * (1 + _ROUNDING) + _MIN_BOUND, radius_fraction * r)
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
-        """The sample at the position t of a ray, with enclosures (proofs of bounds of f) in front
-        of and behind the point: those from the sample, and parabolas from ranges of second
-        derivatives on the whole length asked for.
+        """The sample at the position t of a ray, with enclosures (proved bounds of f along the ray)
+        in front of the point and behind it. Some follow from the sample. The others are parabolas,
+        from ranges of the second derivatives of f on the whole length that is asked for.
 
         path: the ray.
         t: a length along it.
-        ahead, back: the lengths in front of and behind the point on which proofs are wanted.
+        ahead, back: the lengths in front of and behind the point on which bounds are wanted.
         """
         p = path.point(t)
         sample = self.evaluate(p)
@@ -402,8 +403,8 @@ class Lobes(Field):
         return inverse_square * rows[0], inverse_square * rows[1], inverse_square * rows[2]
 
     def _of_power(self, u: Vec3, n: int) -> tuple[Real, Vec3, tuple[Vec3, Vec3, Vec3]]:
-        """Value, gradient and Hessian of the function r^n Y(x/r) of space at x = u, for unit
-        vectors u.
+        """Return the value, the gradient and the three rows of the Hessian of the function r^n
+        Y(x/r) of points x of space, with r = |x|, at the unit vectors x = u.
 
         The function is the sum of r^(n-l) P_l, where P_l is the part of degree l of Y as a sum of
         solid harmonics (homogeneous harmonic polynomials). With k = n - l and P = P_l, whose

@@ -125,8 +125,9 @@ class ExtensionBounds:
 
     @classmethod
     def at(cls, waves: WaveBounds, radius: float) -> ExtensionBounds:
-        """The bounds for the radius R. The wavenumber kappa, which the proof may choose, is the
-        weighted median of all, which makes E smallest.
+        """The bounds for the radius R. The proof compares F with cosh(kappa w) f for a wavenumber
+        kappa of our choice, and E bounds their difference on the ball. kappa is the median of all
+        wavenumbers, weighted by the amplitudes, which makes E smallest.
 
         waves: bounds of the sum of waves f.
         """
@@ -170,7 +171,8 @@ class ExtensionBounds:
         to four dimensions. With -f in place of f, it is a bound of F. The class has the proof.
 
         f: the value at p, without the constant term.
-        rise: the number D, for which |f(y) - f(p)| <= D |y-p|/R.
+        rise: the number D, for which |f(y) - f(p)| <= D |y-p|/R at all points y of space in the
+            ball.
         """
         alpha, spread = self.alpha, self.spread
         alpha_f_minus_spread = alpha * f - spread
@@ -188,8 +190,9 @@ class ExtensionBounds:
         return fmin(fmax(at_critical_point, near_rise - f), self.largest)
 
     def _descent_at_zero(self, slope: float) -> float:
-        """The bound `_max_descent` at a point where f = 0 and the gradient has the length `slope`,
-        from samples and without rounding: to choose the radius."""
+        """About the bound `_max_descent` at a point where f = 0 and the gradient has the length
+        `slope`. It is computed from samples and without rounding, as it only serves to choose the
+        radius."""
         r, alpha, spread = self.radius, self.alpha, self.spread
         rise = min(self.largest_gradient * r, slope * r + 0.5 * self.curvature * r * r)
         x = np.linspace(0.0, 1.0, 101)
@@ -253,8 +256,8 @@ class EigenfunctionSum(Field):
         )
 
     def _bounds(self) -> WaveBounds:
-        """Proved bounds of the sum and of its derivatives; classes with sharper proved constants
-        override it."""
+        """Proved bounds of the sum and of its derivatives. Subclasses with sharper proved constants
+        override this method."""
         return WaveBounds.of(self.terms)
 
     @property
@@ -306,7 +309,10 @@ class EigenfunctionSum(Field):
         return x, y, z
 
     def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
-        """Bounds of the rounding errors of the gradient and of the Hessian of f at p."""
+        """Two bounds, of the rounding errors of the gradient and of the Hessian of f at p.
+
+        sample: not used.
+        """
         del sample
         return self._rounding.derivative_errors(p)
 
@@ -392,14 +398,17 @@ class _CubicSurface(EigenfunctionSum):
     _steepness: float
 
     def __init__(self, cell: float, terms: tuple[Term, ...], domain: Volume | None) -> None:
-        """Set up the sum of waves, with the wavenumber that belongs to the cell."""
+        """Set up the sum of the waves `terms`, which repeats after the length `cell`.
+
+        domain: the volume in which f is drawn; None for the ball of radius `cell` about the origin.
+        """
         self.cell = float(cell)
         self._wavenumber = _wavenumber(cell)
         super().__init__(terms, domain=Ball(radius=self.cell) if domain is None else domain)
 
     def _bounds(self) -> WaveBounds:
-        """Proved bounds of the sum of waves and of its derivatives, with the constants of the class
-        in place of two of them."""
+        """Proved bounds of the sum of waves and of its derivatives. The bounds of |f| and |grad f|
+        are those that the class states."""
         return replace(
             super()._bounds(),
             largest_value=self._largest_value,

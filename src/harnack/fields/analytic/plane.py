@@ -80,7 +80,11 @@ def make_branches(
     exponent: only, and always, with "power": the rational exponent.
     argument: only with "log", "sqrt", "cbrt" and "power": a mapping {a_i: n_i} with integers n_i
         other than 0. The function is then applied to the product of (z - a_i)^n_i instead of to z.
-    singular_points, second_bound, period: only with a callable, as for `RiemannSurface`.
+    singular_points, second_bound, period: only with a callable; the first two are then needed.
+        singular_points: the points where a branch is not analytic, as complex numbers or
+        `BranchPoint`s. second_bound: a function of z and r that returns a bound of |g"| on the disk
+        of radius r about z, for all branches. period: the period of the drawn part; None if it has
+        none.
 
     Raises:
         TypeError, ValueError: a parameter is given that does not belong to this function, or is
@@ -195,7 +199,14 @@ def _user_branches(
     function: Any, singular_points: Any, second_bound: Any, period: Any
 ) -> UserBranches:
     """The `Branches` of a user's function, after all functions that the user gave have been called
-    once as a test. The parameters are those of `make_branches`.
+    once as a test.
+
+    function: a function of z that returns all branches at z, each as (g, g') or (g, g', g").
+    singular_points: the points where a branch is not analytic, as complex numbers or
+        `BranchPoint`s.
+    second_bound: a function of z and r that returns a bound of |g"| on the disk of radius r about
+        z.
+    period: the period of the drawn part; None if it has none.
 
     Raises:
         TypeError, ValueError: a parameter is missing or invalid, or a function returns something
@@ -269,7 +280,7 @@ def _try_bound(second_bound: Callable[[Any, Any], Any], z: Any, radius: Any) -> 
 def _refuse_settings(context: str, **settings: Any) -> None:
     """Raise ValueError if a setting was given, that is, if one is not None.
 
-    context: what the settings do not belong to, for the message.
+    context: the kind of function that does not have these settings, for the message.
     """
     names = [name for name, value in settings.items() if value is not None]
     if names:
@@ -320,7 +331,7 @@ class LevelCurves(Field):
         level: float = 0.0,
         domain: Volume | None = None,
     ) -> None:
-        """Check the arguments, and make the branches of the function."""
+        """Check the arguments, which the class describes, and make the branches of the function."""
         if part not in ("imag", "real"):
             raise ValueError(f'part must be "real" or "imag", not {part!r}')
         self.part = part
@@ -478,7 +489,7 @@ class HeightField(Formula):
         return VolumeIntersection((self.domain, slab))
 
     def _heights(self, lower: FloatArray, upper: FloatArray) -> tuple[float, float]:
-        """Proved bounds (lowest, highest) of the height u over a box.
+        """Proved bounds (lowest, highest) of the height u(x, y) over a box.
 
         lower, upper: (3,) the corners of the box; their z does not matter.
 

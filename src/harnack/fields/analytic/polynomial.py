@@ -77,8 +77,8 @@ class HarmonicPromises:
     order: the order to which f minus its constant term vanishes along the z axis.
     center_radius, boundary_radius: radii of harmonic balls at r = 0 and r = 1.
     axis_share: if rho is less than this fraction of r, rho determines the radius of the ball.
-    axial: bounds of value, gradient and Hessian in powers of rho and r, if the order is 3 or more;
-        else None.
+    axial: three bounds, of |f| without the constant term, of the gradient and of the Hessian, in
+        powers of rho and r, if the order is 3 or more; else None.
     rounding: bounds of the rounding of value and gradient.
 
     The radius R. The paper uses the fixed ball |y| <= 1.25. Near level 0 steps are shortened by the
@@ -198,14 +198,15 @@ class HarmonicPromises:
         return Lipschitz(dr.fma(bound, 1 + _ROUNDING, self._underflow(r)), radius)
 
     def error(self, rho: Real, r: Real, curvature: TaylorRemainder) -> Real:
-        """A bound of the rounding error of the value of f at a point, plus the effect of that of
-        the gradient on bounds by Taylor's formula.
+        """A bound of the rounding error of the value of f at a point, plus the effect that the
+        rounding error of the gradient has on bounds by Taylor's formula.
 
         rho, r: the distances of the point from the z axis and from the origin.
         curvature: the bound of the Hessian on the smallest ball about the point.
 
-        Let E bound the rounding error of the gradient, and let H bound the Hessian. The constant in
-        `curvature` is (1 + h) H with h = `_SLOPE_SHARE`. For all lengths t
+        Let E bound the rounding error of the gradient, let H bound the Hessian, and let u be the
+        unit roundoff. The constant in `curvature` is (1 + h) H with h = `_SLOPE_SHARE`. For all
+        lengths t
 
             E t <= E^2/(2 h H) + h H t^2/2   (since 2 a b <= a^2 + b^2),
 
@@ -250,7 +251,8 @@ class HarmonicPromises:
         return fmax(radius, _MIN_DISTANCE * self.boundary_radius)
 
     def _underflow(self, r: Real) -> float:
-        """A bound of the error of any of these sums by underflow, in the precision of r."""
+        """A bound of the error by underflow in any of the sums that this class computes or bounds
+        (f, its derivatives, their bounds), in the precision of r."""
         return self.rounding.underflow * max(1, self.degree) ** 2 * float(dr.smallest(type(r)))
 
 

@@ -173,7 +173,7 @@ class RiemannSurface(Field):
         height: float = 1.0,
         domain: Volume | None = None,
     ) -> None:
-        """Check the arguments, and make the branches of the function."""
+        """Check the arguments, which the class describes, and make the branches of the function."""
         if part not in ("imag", "real"):
             raise ValueError(f'part must be "imag" or "real", not {part!r}')
         if as_finite(height, "height") == 0:
@@ -211,7 +211,8 @@ class RiemannSurface(Field):
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
         """The part of the domain between the lowest and the highest height that the level sets can
-        have over it; the whole domain if the heights are not bounded or exceed it.
+        have over it; the whole domain if the heights are not bounded or exceed it; None if there is
+        no domain.
 
         levels: the levels of f.
         """
@@ -242,9 +243,9 @@ class RiemannSurface(Field):
         return abs(self.height) * self.branches.max_abs(middle, reach)
 
     def evaluate(self, p: Vec3) -> Sample:
-        """The sample at p, with bounds of f on disks about p that contain no singular point: a
-        bound of second derivatives, a Lipschitz constant and, as an alternative, a range on a ball
-        in which f is harmonic.
+        """The sample at p, with three proved bounds of f near p, which use disks of the plane
+        without singular points. They are a bound of second derivatives; a Lipschitz constant; and,
+        as an alternative, a range of f on a ball in which f is harmonic.
 
         The bound of second derivatives holds within the radius in which no other branch can become
         the nearest, the Lipschitz constant on the whole disk. If two branches touch at p, f is not
@@ -298,13 +299,13 @@ class RiemannSurface(Field):
         )
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
-        """The sample at the position t of a ray, with enclosures: proofs of lengths in front of and
-        behind the point on which f takes none of the levels (the values that rays look for). They
-        are proved from all branches, on segments of the plane below the ray.
+        """The sample at the position t of a ray, with enclosures (proved bounds of the change of f
+        along the ray) in front of the point and behind it. They follow from bounds of all branches
+        on the segment of the plane below the ray.
 
         path: the ray.
         t: a length along it.
-        ahead, back: the lengths in front of and behind the point on which proofs are wanted.
+        ahead, back: the lengths in front of and behind the point on which enclosures are wanted.
 
         If the ray's options exclude the sharpest proofs (`PiecewiseTaylorEnclosure`), the
         enclosures follow from the sample of `evaluate` instead.
@@ -494,14 +495,14 @@ class RiemannSurface(Field):
     def _bounded_branch_points(
         self, local: _PointBranches
     ) -> list[tuple[PreparedBranchPoint, Complex, Real]]:
-        """The branch points with a bound |g - value| <= constant |z - location|^power of all
-        branches; an empty list if the function has only one branch.
+        """The branch points near which all branches are near one value: those with a bound |g -
+        value| <= constant |z - location|^power. An empty list if the function has only one branch.
 
-        local: all branches at a point of space.
+        local: all branches at a point p of space, with the projection z of p to the plane.
 
-        For each branch point: the point itself; z minus its location; and the height of the point
-        of space above the value of g there (if heights repeat, above the nearest of all shifts by
-        whole periods).
+        The result has three members for each branch point: the branch point itself; z minus its
+        location; and the height of p above the height that belongs to `value`. (If heights repeat
+        with a period, it is the height above the nearest of all shifts of that one.)
         """
         points: list[tuple[PreparedBranchPoint, Complex, Real]] = []
         if self._is_single:
@@ -519,9 +520,9 @@ class RiemannSurface(Field):
     def _cusp_enclosures(
         self, local: _PointBranches, d: Vec3, projection: Complex
     ) -> list[Enclosure]:
-        """Proofs of lengths of a ray on which f takes none of the levels (the values that rays look
-        for), one for each branch point where all branches meet: they are near one value there, and
-        the ray is at another height.
+        """Enclosures: proofs of lengths of a ray on which f takes none of the levels (the values
+        that rays look for). There is one for each branch point where all branches meet. Near it the
+        branches are near one value; the proof holds if the ray passes it at another height.
 
         local: all branches at the sample on the ray.
         d: the direction of the ray.
@@ -592,8 +593,9 @@ class RiemannSurface(Field):
     def _enclosure(
         self, local: _PointBranches, d: Vec3, projection: Complex, length: Real
     ) -> Enclosure:
-        """A proof about f along a ray, from a sample on it and from bounds of all branches: how far
-        the ray can go before f takes a level, a value that rays look for.
+        """An enclosure of f along a ray: a proof how far the ray can go before f takes a level, a
+        value that rays look for. It follows from a sample on the ray and from bounds of all
+        branches.
 
         local: all branches at the sample.
         d: the direction of the ray.
@@ -612,7 +614,7 @@ class RiemannSurface(Field):
 
         def slope_range(branch: _BranchValue, sign: Real) -> SlopeRange:
             """An interval that contains the derivative of sign * phi along the ray at the sample,
-            where phi is the height of the point above the branch. It includes the rounding of the
+            where phi is the height of the point above `branch`. It includes the rounding of the
             derivative."""
             slope = branch.slope(d)
             size = dr.abs(branch.x * d.x) + dr.abs(branch.y * d.y) + dr.abs(d.z)
@@ -643,6 +645,9 @@ class RiemannSurface(Field):
 
     @staticmethod
     def _extra_rounding(branch: _BranchValue, local: _PointBranches) -> Real:
-        """By how much more the rounding of z may change phi of this branch than phi of the nearest
-        branch; at least 0. phi is the height of the point above the branch."""
+        """By how much more the rounding of z may change phi of `branch` than phi of the nearest
+        branch; at least 0. phi is the height of the point above the branch.
+
+        local: all branches at the point, with the projection z of the point to the plane.
+        """
         return fmax(branch.steepness - local.nearest.steepness, 0) * local.rounding

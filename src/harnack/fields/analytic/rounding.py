@@ -170,12 +170,12 @@ def _complex_power_error(m: int) -> float:
 
 
 def _value_errors(l: int, m: int, addition_count: int, is_divided: bool) -> tuple[float, float]:  # noqa: E741
-    """Two bounds of the error of the computed value of a solid harmonic r^l Y_lm, divided by
-    `legendre_weight`. The first one is in units of u rho^m r^(l-m), the second one in units of u
-    r^l.
+    """Two bounds of the error of the computed value of a solid harmonic r^l Y_lm, which is a term
+    of a sum; both are divided by its constant factor, `legendre_weight`. The first one is in units
+    of u rho^m r^(l-m), the second one in units of u r^l.
 
     addition_count: the number of additions in which the term takes part.
-    is_divided: whether the point was divided by a size.
+    is_divided: whether the point was divided by a size before.
     """
     abs_q, q_error, _ = _recurrence(l, m)
     cosine, sine = polar_samples(_SAMPLES)
@@ -190,18 +190,19 @@ def _value_errors(l: int, m: int, addition_count: int, is_divided: bool) -> tupl
 
 
 def _slope_errors(l: int, m: int, addition_count: int, is_divided: bool) -> tuple[float, float]:  # noqa: E741
-    """Two bounds of the error of the computed gradient of a solid harmonic r^l Y_lm, as a length,
-    divided by `legendre_weight`. The first one is in units of u rho^(m-1) r^(l-m) (for m = 0: of u
-    r^(l-1)), the second one in units of u r^(l-1).
+    """Two bounds of the error, a length, of the computed gradient of a solid harmonic r^l Y_lm,
+    which is a term of a sum; both are divided by its constant factor, `legendre_weight`. The first
+    one is in units of u rho^(m-1) r^(l-m) (for m = 0: of u r^(l-1)), the second one in units of u
+    r^(l-1).
 
     addition_count: the number of additions in which the term takes part.
-    is_divided: whether the point was divided by a size.
+    is_divided: whether the point was divided by a size before.
 
     The errors in the order in which `solid_harmonics.evaluate` computes: 4u for weights,
     coefficients and products in each component, 2u for the two terms of the x- and y-components,
     then the sums. If the point was divided by a size, this adds 3u (rho |H| + |z grad f_z|), where
-    H is the Hessian and f_z = (l+m) Q_(l-1)^m B, with B = C_m or S_m, has the degree l-1 and the
-    order m; and 3u for the division of the gradient by the size.
+    H is the Hessian and f_z = (l+m) Q_(l-1)^m B, with B the real or imaginary part of (x + iy)^m,
+    has the degree l-1 and the order m; and 3u for the division of the gradient by the size.
     """
     _, sine = polar_samples(_SAMPLES)
     operations = 4 + 2 + 2 * addition_count + _complex_power_error(m) + (3 if is_divided else 0)
@@ -232,8 +233,8 @@ def _largest_sample(sampled: FloatArray) -> float:
 
 
 def _underflow(l: int, m: int) -> float:  # noqa: E741
-    """A bound of the error of a computed solid harmonic r^l Y_lm by underflow, divided by
-    `legendre_weight`, in smallest normal numbers."""
+    """A bound of the error by underflow of a computed solid harmonic r^l Y_lm, divided by its
+    constant factor, `legendre_weight`. It is a multiple of the smallest normal number."""
     abs_q, _, factors = _recurrence(l, m)
     return factors + (2 * m + 2) * float(abs_q.max()) + 2
 
@@ -314,9 +315,9 @@ class WaveRounding:
         return cls((moves[0], moves[1], moves[2]), a, b, c, d)
 
     def errors(self, p: Vec3, gradient: Vec3) -> tuple[Real, Real]:
-        """Bounds of the errors of the computed value and gradient of the sum at p. That of the
-        gradient is the difference from the exact gradient at the point moved by `move`, as a
-        length.
+        """Two bounds, of the errors of the computed value and of the computed gradient of the sum
+        at p. The error of the gradient is a length: its difference from the exact gradient at the
+        point p moved by `move`.
 
         gradient: the computed gradient at p.
         """
@@ -332,8 +333,9 @@ class WaveRounding:
         return roundoff * (value + 0 * p.x), roundoff * (slope + 0 * p.x)
 
     def derivative_errors(self, p: Vec3) -> tuple[Real, Real]:
-        """Bounds of the errors of the computed gradient and Hessian of the sum, compared with the
-        exact ones at p itself: a length, and a matrix norm."""
+        """Two bounds, of the error of the computed gradient of the sum, as a length, and of the
+        error of the computed Hessian, as a matrix norm. Both are compared with the exact ones at p
+        itself."""
         roundoff = float(dr.epsilon(type(p.x)))
 
         def at(parts: _LinearBound) -> Real:
@@ -345,17 +347,19 @@ class WaveRounding:
 
 
 def _wave_vector(term: Term) -> tuple[float, ...]:
-    """The wave vector of a plane wave; for a product of sines and cosines the frequencies of its
-    factors."""
+    """The wave vector of a term that is a plane wave. For a product of sines and cosines, the
+    frequencies of its factors."""
     if isinstance(term, PlaneWave):
         return term.wave_vector
     return tuple(factor.frequency for _, factor in term.factors)
 
 
 def _common_frequency(terms: Sequence[Term], axis: int) -> float | None:
-    """The absolute frequency of all factors (sines and cosines) of one coordinate; None if they
-    differ, if there are none, or if a plane wave has a component along this axis.
+    """The absolute frequency that all factors (sines and cosines) of one coordinate have in common;
+    None if their frequencies differ, if there are no factors, or if a plane wave has a component
+    along this axis.
 
+    terms: the terms of a sum of waves.
     axis: the index of the coordinate.
     """
     frequencies: set[float] = set()
@@ -372,8 +376,8 @@ def _common_frequency(terms: Sequence[Term], axis: int) -> float | None:
 
 def _product_rounding(frequency: float) -> float:
     """The error of the computed product of frequency and coordinate, as a multiple of u times the
-    product. It includes the rounding of the frequency: 0 if the frequency is a power of two, else
-    2."""
+    product. It is 0 if the frequency is a power of two, else 2, which includes the rounding of the
+    frequency."""
     return 0.0 if abs(math.frexp(frequency)[0]) == 0.5 else 2.0
 
 
@@ -384,8 +388,9 @@ def _term_roundings(term: Term, common: Sequence[float | None]) -> tuple[float, 
     common: for each axis the frequency that all terms share, or None. The error of a product with a
         shared frequency is left out, as it counts as a move of the point.
 
-    Returns the constant part of the errors of its angles; their part for each axis, in units of the
-    absolute value of that coordinate; and the error of the other operations.
+    Returns three results: the part of the errors of its angles that is constant; for each axis, the
+    part that is proportional to the absolute value of that coordinate, as a factor; and the error
+    of the other operations.
     """
     if isinstance(term, PlaneWave):
         operations = _SINE + 2

@@ -122,8 +122,9 @@ def order_on_axis(weights: Weights) -> int:
 
 def value_bound(weights: Weights) -> AxialBound:
     """A bound of |f|, as a sum of terms c rho^i r^j, for the sum f of solid harmonics with these
-    weights. rho and r are the distances from the z axis and from the origin. For each harmonic |r^l
-    Y_lm| <= max(N |Q(cos a)|) rho^m r^(l-m), where the maximum is over all polar angles a.
+    weights. rho and r are the distances from the z axis and from the origin. With Y_lm = N Q(cos a)
+    sin(a)^m times cos or sin of m b, |r^l Y_lm| is at most the largest N |Q(cos a)|, over all polar
+    angles a, times rho^m r^(l-m).
 
     weights: a mapping (l, m) -> coefficient.
     """
@@ -220,8 +221,9 @@ def largest_gradient(l: int, m: int) -> float:  # noqa: E741
     """A bound of |grad r^l Y_lm| / sin(a)^(m-1) on the unit sphere, for m >= 0 (m = 0: of |grad|),
     where a is the polar angle.
 
-    Let B = rho^m cos(m b). The components of the gradient along rho and z are cos(m b) times the
-    derivative of Q rho^m by rho and (l+m) Q_(l-1)^m rho^m; the component along the azimuth b is
+    Without its constant factor, the harmonic is Q rho^m cos(m b), with the polynomial Q = Q_l^m of
+    z and r^2 (`solid_harmonics`). The components of the gradient along rho and z are cos(m b) times
+    the derivative of Q rho^m by rho and (l+m) Q_(l-1)^m rho^m; the component along the azimuth b is
     -sin(m b) m Q rho^(m-1). So the length is at most the larger of the lengths of these two parts.
     """
     if l == 0:
@@ -440,8 +442,11 @@ class BallRange:
         return total
 
     def at(self, s: Real) -> tuple[Real, Real]:
-        """A lower and an upper bound of f on the ball |y| <= s, the tighter ones of those by degree
-        and those on spheres. s: a Dr.Jit array."""
+        """A lower and an upper bound of f on the ball |y| <= s. Each is the tightest of several
+        bounds: that of `by_degree`, and those on the `spheres` with a radius of s or more.
+
+        s: a Dr.Jit array.
+        """
         lower, upper = self.by_degree(s)
         for radius, low, high in self.spheres:
             # The range on a sphere holds for all smaller balls.
@@ -451,8 +456,10 @@ class BallRange:
         return lower, upper
 
     def on_ball(self, s: float) -> tuple[float, float]:
-        """A lower and an upper bound of f on the ball |y| <= s, the tighter ones of those by degree
-        and those on spheres. s: a Python number."""
+        """A lower and an upper bound of f on the ball |y| <= s, as `at` returns them.
+
+        s: a Python number.
+        """
         bounds = [self.by_degree(s), *((low, high) for r, low, high in self.spheres if s <= r)]
         return max(low for low, _ in bounds), min(high for _, high in bounds)
 
@@ -478,8 +485,8 @@ def _values(weights: Weights, points: FloatArray) -> dict[int, FloatArray]:
 
 
 def sphere_range(values: dict[int, FloatArray], s: float, covering: float) -> tuple[float, float]:
-    """A proved range (low, high) of a harmonic polynomial on the sphere of radius s, the sum of its
-    parts f_l of each degree l.
+    """A proved range (low, high) of a harmonic polynomial f on the sphere of radius s about the
+    origin. f is the sum of its parts f_l of each degree l.
 
     values: the values of each f_l at sample points of the unit sphere, by degree l.
     covering: an angle. Every point of the unit sphere is within this angle of one of these points.

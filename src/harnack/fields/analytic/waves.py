@@ -158,7 +158,7 @@ class _FactorEvaluator:
         self._sincos: dict[Any, tuple[Real, Real]] = {}
 
     def __call__(self, axis: int, factor: WaveFactor) -> tuple[Real, Real]:
-        """The values at p of the factor and of its derivative by its coordinate.
+        """Return the values at p of a factor and of its derivative by its coordinate.
 
         axis: the index of the coordinate.
         """
@@ -174,8 +174,8 @@ class _FactorEvaluator:
 
 
 def evaluate_terms(terms: Sequence[Term], p: Vec3) -> tuple[Real, list[Real]]:
-    """The value and the three components of the gradient of the sum of the terms at p, a Dr.Jit
-    vector."""
+    """Return the value of the sum of the terms at p, a Dr.Jit vector, and the three components of
+    its gradient."""
     evaluate_factor = _FactorEvaluator(p)
     value, gradient = p[0] * 0.0, [p[0] * 0.0 for _ in range(3)]
     for term in terms:
@@ -332,8 +332,9 @@ def mean_wavelength(amplitudes: npt.ArrayLike, wavenumbers: npt.ArrayLike) -> fl
 
 
 def _plane_waves(term: Term) -> list[tuple[tuple[float, ...], complex]]:
-    """The plane waves whose sum is the term, as pairs (k, A) with term = sum of Re(A exp(i k . p))
-    and complex A. The first nonzero component of each wave vector k is positive (`_canonical`).
+    """The plane waves whose sum is the term, as pairs (k, A) of a wave vector and a complex
+    amplitude: the term is the sum of all Re(A exp(i k . p)). The first nonzero component of each
+    wave vector k is positive (`_canonical`).
 
     A product cos a cos b cos c is the mean of cos(a +- b +- c) over the signs.
     """

@@ -133,8 +133,8 @@ def value_at(kernel: BlobKernel, backend: Backend, p: Vec3, for_each: ForEach) -
     real = backend.Float
 
     def add_blob(row: list[Real], state: State) -> State:
-        """The numbers of the sum so far (`_add_value`), with one more blob added. row: the blob's
-        record."""
+        """Return the numbers of the sum so far, with one more blob added; `_add_value` lists them.
+        row: the blob's record. state: the numbers before."""
         # One over the radius of the blob's support, and the factor of its kernel.
         inverse_radius, amplitude = row[6], row[7]
         offset = _vector_to_center(p, row) * inverse_radius
@@ -171,12 +171,13 @@ def sum_along(
     jumps = kernel.second_derivative_jumps
 
     def add_blob(row: list[Real], state: State) -> State:
-        """The sums so far (`state`), with one more blob added. row: the blob's record.
+        """Return the sums so far (`state`), with one more blob added. row: the blob's record.
 
-        The state is that of `_add_value`. Then come, for each piece, the ends of the range of the
-        first derivative and those of the second. The last three numbers are for the rounding
-        errors: the sums of the slope scales and of the scales of second derivatives, and the number
-        of blobs near the path.
+        The state begins with the numbers that `_add_value` lists. Then come, for each piece, the
+        ends of the range of the first derivative and those of the second. The last three numbers
+        are for the rounding errors. With A the amplitude of a blob and R the radius of its support,
+        they are the sums, over the blobs near the path, of |A|/R and of |A|/R^2, each times a
+        weight; and the number of these blobs.
         """
         start, sums = state[:_VALUE_STATE_SIZE], list(state[_VALUE_STATE_SIZE:])
         inverse_radius, amplitude = row[6], row[7]
@@ -276,8 +277,8 @@ def hessian_at(kernel: BlobKernel, backend: Backend, p: Vec3, for_each: ForEach)
     """
 
     def add_blob(row: list[Real], state: State) -> State:
-        """The six sums so far (`state`), with the second derivatives of one more blob added. row:
-        the blob's record.
+        """Return the six sums so far (`state`), with the second derivatives of one more blob added.
+        row: the blob's record.
 
         With v the vector from p to the center in units of the support's radius R, and q = |v|^2,
         the Hessian of A k(q) is (A/R^2) (2 k' I + 4 k'' v v^T).
@@ -305,8 +306,9 @@ _VALUE_STATE_SIZE = 8
 def _add_value(
     kernel: BlobKernel, offset: Vec3, inverse_radius: Real, amplitude: Real, state: State
 ) -> State:
-    """The sums at a point p, with another blob added.
+    """Return the sums at a point p, with another blob added.
 
+    kernel: the shape of all blobs.
     state: the sums so far, `_VALUE_STATE_SIZE` numbers: the value; the three components of the
         gradient; the sums of |A dk/dq| and of |A| m, for the error of the value; the sum of the
         blobs' bounds of the gradient, for its error; and the number of blobs near p. Here A is the
@@ -352,7 +354,8 @@ def _add_value(
 def _finished_value(kernel: BlobKernel, backend: Backend, state: State) -> SumValue:
     """The value and gradient of a sum of blobs, with bounds of their rounding errors.
 
-    state: the numbers of `_add_value` after the last blob.
+    kernel: the shape of all blobs.
+    state: the numbers that `_add_value` returned for the last blob.
     """
     (
         value,
@@ -422,7 +425,8 @@ def _with_jumps(
     inner_range: the range (lower, upper) on the part of the piece inside the support.
     half_chord_squared: S^2, with S half the length of the line's part inside the support.
     margin: a bound of the rounding of squared positions.
-    begin, end: the positions of the ends of the piece, measured from the middle of the chord.
+    begin, end: the positions of the ends of the piece, measured from the middle of the line's part
+        inside the support.
 
     Lengths are in units of the support's radius.
     """
@@ -460,7 +464,9 @@ def for_each_listed(records: RecordTable, entries: Any, begin: Any, end: Any) ->
     entries[begin:end]. The function for_each(body, state) calls state = body(record, state) for
     each of these records and returns the last state.
 
-    begin, end: may differ from lane to lane.
+    records: the table of the records.
+    entries: an array of indices of records.
+    begin, end: positions in that array, which may differ from lane to lane.
     """
     kind = records.backend.UInt32
 
@@ -497,8 +503,8 @@ def sum_jets(term: Term, like: Jet, zero: Real, for_each: ForEach) -> Jet:
     """
 
     def add_term(row: list[Real], state: State) -> State:
-        """The ends of the intervals of the sum, with the jet of one more blob added. row: the
-        blob's record. state: the ends so far."""
+        """Return the ends of the intervals of the sum, with the jet of one more blob added. row:
+        the blob's record. state: the ends so far."""
         total = jet_from_bounds(like, iter(state)) + term(row)
         return tuple(jet_bounds(total, zero))
 
@@ -528,9 +534,10 @@ def blob_term(kernel: BlobKernel, coordinates: Coordinates) -> Term:
 
 
 def jet_bounds(jet: Jet, zero: Real) -> Iterator[Any]:
-    """The ends of all intervals of a jet, one after another, as numbers of the backend: lower and
-    upper end of the value, of each first derivative, and of each second derivative; then, if the
-    jet has a jet at the start of its piece, the ends of that one.
+    """Yield the ends of all intervals of a jet, one after another, as numbers of the backend. The
+    order is: lower and upper end of the value, of each first derivative, and of each second
+    derivative. If the jet has a jet at the start of its piece, the ends of that one follow in the
+    same order.
 
     zero: the number 0 on each lane. It is added to each end, so that Python numbers become Dr.Jit
         numbers.

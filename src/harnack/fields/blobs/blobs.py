@@ -110,7 +110,8 @@ class Blobs(Formula):
         kernel: str | BlobKernel = "compact",
         groups: Any = None,
     ) -> None:
-        """Check the arguments. The blobs are sorted by groups."""
+        """Check the arguments, which the class describes (centers, radii, weights, kernel, groups).
+        The blobs are sorted by groups."""
         self.centers, self.radii, self.weights, self.groups = _checked(
             centers, radii, weights, groups
         )
@@ -429,13 +430,16 @@ class DelayedEnclosure(Enclosure):
 
     def free_length(self, gaps: LevelGaps) -> Real:
         """A length of the path that is proved to contain no level (a value of F that rays look
-        for): the first part, where F is 0, plus a proved length behind it. gaps: the differences of
-        F at the start, which is 0, from the next levels below and above."""
+        for): the first part, where F is 0, plus a proved length behind it.
+
+        gaps: the differences between F at the start, which is 0, and the next levels below and
+            above.
+        """
         return self.run + self.then.free_length(gaps)
 
 
 def _zero_where(mask: Any, sums: SumValue) -> SumValue:
-    """The sums of blobs at points, with value, gradient and errors replaced by 0 on lanes on which
+    """Sums of blobs at points, with value, gradient and errors replaced by 0 on the lanes on which
     the mask is true."""
     zero = 0 * sums.value
     return SumValue(

@@ -133,8 +133,8 @@ class _OneGroup:
 
 
 def group_maximum_at(kernel: BlobKernel, backend: Backend, p: Vec3, blobs: GroupedList) -> SumValue:
-    """The largest of the groups' sums of blobs at points p (3, n), with its gradient. Its error
-    bounds are the largest of those of all groups.
+    """The largest of the groups' sums of blobs at points p (3, n), with its gradient. Its two error
+    bounds, of value and gradient, are the largest that any group has.
 
     kernel: the shape of all blobs.
     blobs: the list of the blobs that may be nonzero at p.
@@ -142,8 +142,8 @@ def group_maximum_at(kernel: BlobKernel, backend: Backend, p: Vec3, blobs: Group
     real = backend.Float
 
     def add_group(for_each: ForEach, state: State) -> State:
-        """The state with another group included. It consists of the largest sum so far, the three
-        components of its gradient, and the largest error bounds so far of value and gradient.
+        """Return the state with another group included. It consists of the largest sum so far, the
+        three components of its gradient, and the largest error bounds so far of value and gradient.
 
         for_each: the loop over the blobs of the group.
         """
@@ -179,8 +179,9 @@ def group_maximum_jet(term: Term, like: Jet, zero: Real, blobs: GroupedList) -> 
     """
 
     def add_group(for_each: ForEach, state: State) -> State:
-        """The state with another group included. It consists of a number that is 1 before the first
-        group and 0 afterwards, and of the ends of the intervals of the maximum's jet so far.
+        """Return the state with another group included. It consists of a number that is 1 before
+        the first group and 0 afterwards, and of the ends of the intervals of the maximum's jet so
+        far.
 
         for_each: the loop over the blobs of the group.
         """

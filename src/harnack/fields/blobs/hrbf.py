@@ -79,7 +79,8 @@ class HRBF(Formula):
     default_level: float = 0.0
 
     def __init__(self, points: Any, normals: Any, *, domain: Volume | None = None) -> None:
-        """Check the arguments, and solve for the coefficients of the function."""
+        """Check points, normals and domain (see the class), and solve for the coefficients a_i and
+        b_i of the function."""
         check_volume(domain, "domain")
         self.points, self.normals = _checked(points, normals)
         self.value_coefficients, self.gradient_coefficients = _solve_coefficients(
@@ -208,8 +209,8 @@ class HRBF(Formula):
         pairs = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
         def add_point(row: list[Real], state: State) -> State:
-            """The sums so far of the second derivatives xx, xy, xz, yy, yz, zz (`state`), with the
-            term of one more point added. row: the point's record."""
+            """Return the sums so far of the second derivatives xx, xy, xz, yy, yz, zz (`state`),
+            with the term of one more point added. row: the point's record."""
             # The vector from the point, its length, and three times the vector of the point.
             v, b, r, inverse_r = _offset_of_point(p, row)
             b_dot_e = dr.dot(b, v) * inverse_r
@@ -218,9 +219,10 @@ class HRBF(Formula):
             def entry(i: int, j: int) -> Real:
                 """The second derivative of the point's term by coordinates i and j.
 
-                Let v be the vector from the point, r its length, e = v/r, and b three times the
-                vector b_i of the point. Then it is 3 a (r delta_ij + v_i e_j) + (b . e) (delta_ij -
-                e_i e_j) + b_i e_j + b_j e_i.
+                Let v be the vector from the point, r its length and e = v/r; let a be the number of
+                the point's record, and b the vector of its entries 7 to 9. With the indices i and j
+                for components of vectors, the derivative is 3 a (r delta_ij + v_i e_j) + (b . e)
+                (delta_ij - e_i e_j) + b_i e_j + b_j e_i.
                 """
                 delta = 1.0 if i == j else 0.0
                 vector_part = b_dot_e * (delta - e[i] * e[j]) + b[i] * e[j] + b[j] * e[i]
@@ -267,8 +269,8 @@ class HRBF(Formula):
         tiny = float(dr.smallest(real))
 
         def add_point(row: list[Real], state: State) -> State:
-            """The sums so far (`state`), with the term of one more point added. row: the point's
-            record.
+            """Return the sums so far (`state`), with the term of one more point added. row: the
+            point's record. In the code a and b are the a and b of the proof.
 
             The state consists of the value; the three components of the gradient; the sums of |a|
             r^3 + |b| r^2 and of |a| r^2 + |b| r, for the errors of both; and the number of terms.
@@ -286,17 +288,17 @@ class HRBF(Formula):
                 term_count,
                 *sums,
             ) = state
-            piece_begin = row[6]
-            v, piece_end, r, inverse_r = _offset_of_point(p, row)
+            a = row[6]
+            v, b, r, inverse_r = _offset_of_point(p, row)
             # The term is a r^3 + r (b . v), and its gradient is (3 a r + (b . v)/r) v + r b.
-            along_b = dr.dot(piece_end, v)
-            radial = dr.fma(3 * piece_begin, r, along_b * inverse_r)
-            value = value + r * dr.fma(piece_begin * r, r, along_b)
+            along_b = dr.dot(b, v)
+            radial = dr.fma(3 * a, r, along_b * inverse_r)
+            value = value + r * dr.fma(a * r, r, along_b)
             gradient = [
-                component + dr.fma(radial, v[k], r * piece_end[k])
+                component + dr.fma(radial, v[k], r * b[k])
                 for k, component in enumerate((gradient_x, gradient_y, gradient_z))
             ]
-            abs_a, norm_b = dr.abs(piece_begin), dr.norm(piece_end)
+            abs_a, norm_b = dr.abs(a), dr.norm(b)
             value_size = dr.fma(dr.fma(abs_a, r, norm_b), r * r, value_size)
             gradient_size = dr.fma(dr.fma(abs_a, r, norm_b), r, gradient_size)
             term_count = term_count + 1
@@ -309,7 +311,7 @@ class HRBF(Formula):
             w = v - position * d
             h_squared = dr.dot(w, w)
             h = dr.sqrt(h_squared)
-            c, rate_b = dr.dot(piece_end, w), dr.dot(piece_end, d)
+            c, rate_b = dr.dot(b, w), dr.dot(b, d)
             start_shapes = _term_functions(h_squared, position, tiny)
             # The values at x = 0 of the functions that are not monotone.
             values_at_zero = (h, h_squared / fmax(h_squared * h, tiny))
@@ -328,10 +330,10 @@ class HRBF(Formula):
                 # Add the range of each function times its factor: to the first derivative (index 0)
                 # or to the second one (index 2).
                 for index, scale, (lower, upper) in (
-                    (0, 3 * piece_begin, (start_shapes.lift, end_shapes.lift)),
+                    (0, 3 * a, (start_shapes.lift, end_shapes.lift)),
                     (0, c, (start_shapes.sine, end_shapes.sine)),
                     (0, rate_b, bowl),
-                    (2, 3 * piece_begin, bowl),
+                    (2, 3 * a, bowl),
                     (2, c, bell),
                     (2, rate_b, (start_shapes.turn, end_shapes.turn)),
                 ):
@@ -374,14 +376,15 @@ class HRBF(Formula):
             roundoff * (64 + 3 * term_count) * gradient_size,
         )
         pieces: list[PathPiece] = []
-        for k, (piece_begin, piece_end) in enumerate(itertools.pairwise(knots)):
+        # From here on a and b are the two ends of a piece.
+        for k, (a, b) in enumerate(itertools.pairwise(knots)):
             lower, upper, min_second, max_second = sums[4 * k : 4 * k + 4]
             slope_error = roundoff * (64 + 3 * term_count) * sums[-2]
             second_error = roundoff * (100 + 6 * term_count) * sums[-1]
             slopes = SlopeRange(lower - slope_error, upper + slope_error)
             pieces.append(
                 PathPiece(
-                    piece_end - piece_begin,
+                    b - a,
                     slopes,
                     min_second - second_error,
                     max_second + second_error,
@@ -431,8 +434,11 @@ def _term_functions(h_squared: Real, x: Real, tiny: float) -> _TermFunctions:
 
 
 def _offset_of_point(p: Vec3, row: list[Real]) -> tuple[Vec3, Vec3, Real, Real]:
-    """Four results for the point p_i with this record: the vector v from p_i to p; the vector 3 b_i
-    of the record; the length of v; and one over that length."""
+    """Return four results for one of the given points, p_i: the vector v from p_i to p; the vector
+    3 b_i; the length of v; and one over that length.
+
+    row: the record of p_i.
+    """
     v = type(p)(*((p[k] - row[k]) - row[3 + k] for k in range(3)))
     b = type(p)(row[7], row[8], row[9])
     r = dr.norm(v)

@@ -83,7 +83,7 @@ class BlobKernel(abc.ABC):
     the distance h from the center, at the position x from the line's point nearest to it, q = h^2 +
     x^2. The part of the line inside the support is |x| <= S with S^2 = 1 - h^2. A blob of weight 1
     is the kernel times `amplitude`, so that it has the value 1 at the blob's radius, which is
-    smaller than the support's."""
+    smaller than the radius of the support."""
 
     name: ClassVar[str]
     second_derivative_jumps: ClassVar[bool] = True

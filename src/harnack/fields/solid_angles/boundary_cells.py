@@ -155,11 +155,12 @@ class BoundaryCells:
         w(c) and of the cell. The value of the cell is w(x) modulo 1. Among the numbers that differ
         from it by integers, w(x) is the one nearest to the estimate, because all errors together
         are below three eighths. The result is NaN on a triangle, and where
-        `signed_crossings_between` or `change_from_center` is not certain. Off all triangles the
-        result is also the value on the side on which x lies on the ray, for this reason: the
-        computed position t of a crossing on the ray is that of a point of the triangle a few
-        roundings off the ray, and so is the true t. If x were between these two, a point of the
-        triangle would be as near to x.
+        `signed_crossings_between` or `change_from_center` is not certain. If x lies on a ray, its
+        own position and the crossings that the tracer has computed on the ray must agree about the
+        side of each triangle on which x lies. They do, unless x counts as on the triangle. The
+        computed t of a crossing is that of a point of the triangle a few roundings off the ray, and
+        so is the true t. If x were between these two, the triangle would come within a few
+        roundings of x.
         """
         # cell_sums: the sums in the cell of x. turns: the number of triangles that the line from
         # its center to x crosses, counted with signs. value: w modulo 1.
@@ -224,8 +225,9 @@ class BoundaryCells:
             line = RayLine(x, direction, rounding)
 
             def rates(lengths: tuple[Real, ...], lanes: Mask) -> tuple[Real, ...]:
-                """For each length T, bound the derivative of f along the line at its points within
-                T of x (`CurveCells.rates_along`). lanes: the mask of the lanes to compute."""
+                """For each length T in `lengths`, bound the derivative of the boundary's solid
+                angle along the line at all points within T of x (`CurveCells.rates_along`). lanes:
+                the mask of the lanes to compute. Returns one bound for each length."""
                 return self.cells.rates_along(cell_sums, line, lengths, lanes & inside)
 
             ray_promises = lipschitz_along(line, sums.gradient, sums.distance, rates)

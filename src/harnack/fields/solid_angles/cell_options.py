@@ -151,8 +151,8 @@ class FieldWithCells(Field):
     def describe_cells(self, built: BuiltCells | None) -> dict[str, str]:
         """Make the entry "cells" of `describe`, or an empty dictionary if the field has no cells.
 
-        built: in a prepared field (which is on a backend) its cells; None if they would have taken
-            too much memory.
+        built: the cells of a prepared field (whose data are on a backend); None if they would have
+            taken too much memory. It is not used if the field is not prepared.
 
         For a prepared field the entry states the number and the memory of the cells; for another
         one, how much memory they may take. If the number of rays decides, the entry states the

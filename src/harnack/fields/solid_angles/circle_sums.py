@@ -259,8 +259,9 @@ class CircleSet:
         x = vector(x)
 
         def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
-            """Add the circle in the record `row` to the state: angle, gradient, distance of the
-            nearest circle, the three integrals, and the lower bound of the continued angle."""
+            """Add the circle in the record `row` to the state, and return the new state. It holds
+            the angle, the gradient, the distance of the nearest circle, the three integrals, and
+            the lower bound of the continued angle."""
             angle, gradient, distance, inverse_squares, inverse_cubes, inverse_fourths, lower = (
                 state
             )
@@ -306,7 +307,7 @@ class CircleSet:
 
         def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
             """Add the Hessian of the circle in the record `row` to the total, whose entries are the
-            state."""
+            state. Returns the new state."""
             relative = self._relative(row, x)
             a, n, outward = relative.a, relative.normal, relative.outward
             f_zz, f_rz_over_r, f_tt = relative.circle.second_derivatives()
@@ -364,14 +365,15 @@ class CircleSet:
         plane.
 
         (3) These bounds fall as d and P grow. So they hold on a whole part of the line with the
-        smallest d and P on it. If the point moves by t, d and P fall by at most t. Also
-        d >= |r - a|: for a line that passes by the circle, this is a better bound than the distance
-        of a single point of the line.
+        smallest d and P, and the largest |z|, on it. If the point moves by t, d and P fall by at
+        most t. Also d >= |r - a|: for a line that passes by the circle, this is a better bound than
+        the distance of a single point of the line.
         """
         real, vector = self._types
 
         def add(row: list[Real], rates: tuple[Any, ...]) -> tuple[Any, ...]:
-            """Add the circle in the record `row` to the bounds `rates`, one for each length."""
+            """Add the circle in the record `row` to the bounds `rates`, one for each length.
+            Returns the new bounds."""
             relative = self._relative(row, line.x)
             # slack: the rounding of distances. axial: |w| of the proof.
             slack, axial = line.slack, fmin(dr.abs(dr.dot(relative.normal, line.v)), 1)
@@ -417,7 +419,7 @@ class CircleSet:
 
         def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
             """Update the state by the circle in the record `row`. The state holds the closest point
-            so far, and its squared distance."""
+            so far, and its squared distance. Returns the new state."""
             closest_point, smallest_square = state
             relative = self._relative(row, x)
             # The closest point lies in the direction of `outward` from the center. If x is on the
@@ -440,7 +442,7 @@ class CircleSet:
         return self.records.backend.Float, self.records.backend.Array3f
 
     def _relative(self, row: list[Real], x: Vec3) -> _RelativeCircle:
-        """Compute how the circle in the record `row` is seen from points x (3, n), in unit
+        """Compute how the circle in the record `row` lies relative to points x (3, n), in unit
         coordinates."""
         vector = self.records.backend.Array3f
         center, a, normal = vector(*row[:3]), row[3], vector(*row[4:7])
@@ -455,7 +457,7 @@ class CircleSet:
 def _perpendicular(vector: Any, n: Vec3) -> Vec3:
     """Compute a vector perpendicular to the unit vector n. Its length is at least 0.7.
 
-    vector: the type of vectors.
+    vector: the type of the result, a Dr.Jit 3-vector.
     """
     is_flat = dr.abs(n.z) < 0.7
     return dr.select(is_flat, vector(-n.y, n.x, 0), vector(0, -n.z, n.y))

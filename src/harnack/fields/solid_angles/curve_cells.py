@@ -221,7 +221,8 @@ class CurveCells:
         count, center = dr.select(active, cell_sums.count, 0), cell_sums.center
 
         def runs(i: Any, *_: Any) -> Mask:
-            """Whether the loop goes on, for each lane: its cell has a record i of near edges."""
+            """Whether the loop goes on, on each lane: its cell has a record number i of near
+            edges."""
             return i < count
 
         def body(i: Any, p: Vec3, is_certain: Mask, *products: Real) -> tuple[Any, ...]:
@@ -232,7 +233,7 @@ class CurveCells:
             is_certain: the mask of the lanes on which no rounding has mattered so far.
             products: the attributes of the product at x, then those of the product at the center.
 
-            Returns the new arguments.
+            Returns the arguments for the next record.
             """
             row = self.near.read_record(cell_sums.near_first + i, i < count)
             at_x, at_center = LiftedProduct(*products[:3]), LiftedProduct(*products[3:])
@@ -286,7 +287,8 @@ class CurveCells:
         count = dr.select(active, cell_sums.count, 0)
 
         def runs(i: Any, *_: Any) -> Mask:
-            """Whether the loop goes on, for each lane: its cell has a record i of near edges."""
+            """Whether the loop goes on, on each lane: its cell has a record number i of near
+            edges."""
             return i < count
 
         def body(i: Any, p: Vec3, field: Vec3, *rates: Real) -> tuple[Any, ...]:
@@ -295,7 +297,7 @@ class CurveCells:
 
             p: the vertex before the record.
 
-            Returns the new arguments.
+            Returns the arguments for the next record.
             """
             row = self.near.read_record(cell_sums.near_first + i, i < count)
             for k in range(VERTICES_PER_RECORD):
@@ -336,14 +338,16 @@ class CurveCells:
         real, index, vector = self.backend.Float, self.backend.UInt32, self.backend.Array3f
 
         def runs(i: Any, *_: Any) -> Mask:
-            """Whether the loop goes on, for each lane: its cell has a record i of near edges."""
+            """Whether the loop goes on, on each lane: its cell has a record number i of near
+            edges."""
             return i < count
 
         def body(i: Any, *state: Any) -> tuple[Any, ...]:
-            """Add the edges in record i of the cell to the state. The state holds: the product of
-            factors (zr, zi); half the gradient g; the smallest squared distance d2; a quarter of
-            the first integral and half of the others; and of the last vertex the position p,
-            a = p - x, |a|, s, and the spinor.
+            """Add the edges in record i of the cell to the state. The state holds the product of
+            factors (zr, zi), half the gradient (g), the smallest squared distance (d2), a quarter
+            of the first integral and half of the other two. Then, for the last vertex, come its
+            position p, the vector a = p - x, |a|, and the number s and the spinor of a
+            (`edges.spinor`). Returns i + 1, and then the new state.
             """
             zr, zi, g, d2, inverse_squares, inverse_cubes, inverse_fourths, p, a, la, sa, *ca = (
                 state

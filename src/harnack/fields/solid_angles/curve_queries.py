@@ -104,7 +104,7 @@ def closest_on_segments(segments: RecordTable, x: Vec3) -> Vec3:
 
     def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
         """Update the state by the segment in the record `row`. The state holds the smallest squared
-        distance so far, and the closest point."""
+        distance so far, and the closest point. Returns the new state."""
         nearest, closest = state
         p, q = vector(*row[:3]), vector(*row[4:7])
         # row[7] is 1/|q - p|^2; the fraction is 0 at p and 1 at q.
@@ -135,8 +135,8 @@ def continuous_change(edges: LoopEdges, p: Vec3, q: Vec3) -> Real:
     real = edges.backend.Float
 
     def add(a: Vec3, b: Vec3, inverse: Real, state: tuple[Any, ...]) -> tuple[Any, ...]:
-        """Add the part of the edge from a to b to the change of the solid angle, the only entry of
-        the state. inverse: not used here."""
+        """Add the part of the edge from a to b to the change of the solid angle, which is the only
+        entry of the state. Returns the new state. inverse: not used here."""
         del inverse
         # The corners of the parallelogram, in order.
         ap, bp, bq, aq = a - p, b - p, b - q, a - q
@@ -147,7 +147,8 @@ def continuous_change(edges: LoopEdges, p: Vec3, q: Vec3) -> Real:
 
 def _angle(a: Vec3, b: Vec3, c: Vec3) -> Real:
     """Compute the signed solid angle, at the origin, of the triangle with the corners a, b, c:
-    twice the argument of |a||b||c| + (a.b)|c| + (b.c)|a| + (c.a)|b| + i det(a, b, c)."""
+    twice the argument of the complex number |a||b||c| + (a.b)|c| + (b.c)|a| + (c.a)|b| + i det(a,
+    b, c)."""
     la, lb, lc = dr.norm(a), dr.norm(b), dr.norm(c)
     volume = dr.dot(a, dr.cross(b, c))
     dot_terms = dr.fma(dr.dot(a, b), lc, dr.fma(dr.dot(b, c), la, dr.dot(c, a) * lb))

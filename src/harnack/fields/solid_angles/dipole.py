@@ -548,7 +548,8 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
 
     def sharp_values_at(self, x: Vec3) -> PointValues:
         """Compute f and its gradient at points x (3, n), with error bounds. Unless the user chose
-        the accuracy, it is increased until the error of the gradient is about 1 % of its length."""
+        the accuracy, it is increased until the error of the gradient is about 1 % of the gradient's
+        length."""
         if self.accuracy is not None:
             return self.values_at(x, 1)
         return sharpened(lambda points, factor: self.values_at(points, 1, factor), x)
@@ -651,7 +652,8 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
                 )
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
-        """Compute a box around the points that contains the level sets of f at these levels.
+        """Compute a box around the points that contains the level sets of f at these levels. The
+        result is never None.
 
         Proof. At a distance of at least rho from all points |f| <= (sum of areas)/rho^2. This holds
         for the smoothed sum as well: with q = h^2/rho^2 each of its terms is the plain one times
@@ -689,7 +691,7 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
 @dataclass(frozen=True)
 class _DipoleData(UnitFrame):
     """The data of a dipole potential on a backend, with the map from the user's coordinates to unit
-    coordinates (centered at 0, of size about one).
+    coordinates, in which the points are centered at 0 and have a size of about one.
 
     tree: the sum over the dipoles in unit coordinates, plain or smoothed.
     """

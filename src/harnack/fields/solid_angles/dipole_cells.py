@@ -186,12 +186,13 @@ class DipoleCells:
         first, count = index(low) + index(high) * _INDEX_BASE, dr.select(active, index(count), 0)
 
         def runs(i: Any, *_: Any) -> Mask:
-            """Whether the loop goes on, for each lane: its cell has a near primitive i."""
+            """Whether the loop goes on, on each lane: its cell has a near primitive number i."""
             return i < count
 
         def step(i: Any, sums: Any, extra_state: Any) -> tuple[Any, ...]:
-            """Add near primitive i of the cell to the sums, given as a flat state, and update
-            `extra_state`, the state of the caller."""
+            """Add near primitive number i of the cell to the sums, given as a tuple of arrays, and
+            update `extra_state`, the state of the caller. Returns i + 1, the new sums and the new
+            state of the caller."""
             # Other lanes in the loop have longer lists.
             in_list = i < count
             primitive = self.primitives.read_record(
@@ -248,6 +249,8 @@ def _truncation_at(
     error, slope: bounds of the part of each error that is the same in the whole ball.
     tail, tail_slope: bounds of the other part at q = 1. It is proportional to q^(p+1) for the value
         and to q^p for the gradient, with p = `DEGREE` (`DipoleExpansions`).
+
+    Returns the two bounds: of the value's error, and of the gradient's error.
     """
     power = 1.0 + 0 * q  # 1 on each lane of q
     for _ in range(DEGREE):

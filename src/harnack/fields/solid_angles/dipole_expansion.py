@@ -101,8 +101,12 @@ def source_tree(tree: BalancedTree, levels: list[NodeMoments], rows: FloatArray)
 
 
 def _columns(level: NodeMoments, keys: Iterable[tuple[int, int, int]]) -> list[FloatArray]:
-    """List the real or imaginary parts of the moments with these keys (degree, order, 0 for real or
-    1 for imaginary). For each key there is one array, with an entry for each node."""
+    """List the real or imaginary parts of the moments with these keys. A key is (degree, order,
+    part), where part is 0 for the real and 1 for the imaginary part. For each key there is one
+    array, with an entry for each node.
+
+    level: the moments of the nodes at one level of the tree.
+    """
     return [level.moments[l, m].imag if part else level.moments[l, m].real for l, m, part in keys]
 
 
@@ -217,7 +221,7 @@ class DipoleExpansions:
 
         def term(i: Any, active: Mask) -> list[Any]:
             """Compute what node i adds to the attributes of `DipoleExpansions`, in their order, as
-            a flat list of numbers."""
+            a flat list of numbers. active: the mask of the lanes that have this node."""
             # The record of the node, in the order of `source_tree`.
             head, payload = tree.node_heads.read_record(i, active), tree.payload(i, active)
             moments = dict(zip(_MOMENTS, payload, strict=False))
@@ -243,7 +247,8 @@ class DipoleExpansions:
 
         def term(i: Any, active: Mask) -> list[Any]:
             """Compute what primitive i, a dipole or a triangle, adds to the attributes of
-            `DipoleExpansions`, in their order, as a flat list of numbers."""
+            `DipoleExpansions`, in their order, as a flat list of numbers. active: the mask of the
+            lanes that have this primitive."""
             # row: position, area times normal, area; of a triangle all of `triangle_sources`.
             row = tree.primitives.read_record(i, active)
             # The moments of degree 1, from area times normal.
@@ -282,7 +287,7 @@ class DipoleExpansions:
 
         def add(i: Any, active: Mask, state: tuple[Any, ...]) -> tuple[Any, ...]:
             """Add the term of source i to the state, on active lanes. The last number of the state
-            is a minimum, all other numbers are sums."""
+            is a minimum, all other numbers are sums. Returns the new state."""
             *sums, minimum = state
             *added, nearest = term(i, active)
             pairs = zip(sums, added, strict=True)
@@ -307,8 +312,9 @@ def _fourth(number: Any) -> Any:
 
 
 def _pairs(numbers: dict[Any, Any]) -> dict[tuple[int, int], tuple[Any, Any]]:
-    """Join the real and imaginary parts of moments. The keys of `numbers` are (degree, order, 0 for
-    real or 1 for imaginary); those of the result, whose values are pairs, are (degree, order)."""
+    """Join the real and imaginary parts of moments to pairs. The keys of `numbers` are (degree,
+    order, part), where part is 0 for the real and 1 for the imaginary part. The keys of the result
+    are (degree, order), and its values are pairs (real part, imaginary part)."""
     return {
         (l, m): (numbers[l, m, 0], numbers.get((l, m, 1), 0.0))
         for l, m, part in numbers
@@ -540,7 +546,7 @@ class PendingSources:
             node: its `head` holds center, `_NODE_RATIO` times the radius, and radius.
             state: a tuple with the number of primitives so far.
 
-            Returns the mask of the lanes that enter the node, and the new number.
+            Returns the mask of the lanes that enter the node, and the new number, in a tuple.
             """
             square = dr.squared_norm(c - vector(*node.head[:3]))
             enters = square <= dr.square(far_radius + node.head[3])
@@ -553,12 +559,13 @@ class PendingSources:
                 enters &= state[0] <= count_limit
 
             def runs(slot: Any, *_: Any) -> Mask:
-                """Whether the loop goes on, for each lane: it enters a leaf that has this slot."""
+                """Whether the loop goes on, on each lane: the lane enters a leaf, and the leaf has
+                this slot."""
                 return enters & node.is_leaf & (slot < tree.leaf_size)
 
             def step(slot: Any, count: Any) -> tuple[Any, ...]:
                 """Count and store the primitive in a slot of the leaf if it is sought. count: the
-                number so far."""
+                number so far. Returns the next slot and the new number."""
                 chosen = is_chosen(tree.primitive(node.leaf, slot, enters), enters)
                 if store is not None:
                     store(count, node.leaf * tree.leaf_size + slot, chosen)
@@ -571,7 +578,8 @@ class PendingSources:
         def listed(i: Any, active: Mask, state: tuple[Any, ...]) -> tuple[Any, ...]:
             """Count and store primitive i of the ball's list if it is sought.
 
-            state: a tuple with the number of primitives so far. Returns the new number.
+            active: the mask of the lanes that have an entry.
+            state: a tuple with the number of primitives so far. Returns the new number, in a tuple.
             """
             chosen = is_chosen(tree.primitives.read_record(i, active), active)
             if store is not None:
@@ -605,6 +613,7 @@ def _count_nodes(
     c: (3, n) the centers of the balls.
     far_radius: k times the balls' radius, k > 1. A node of radius R is far if its center is farther
         from c than far_radius + `_NODE_RATIO` R.
+    max_node_radius: the largest radius of pending nodes.
     store: a function that writes an entry to a list; None to count only.
     far: whether far nodes are sought, and not pending ones.
 
@@ -618,7 +627,7 @@ def _count_nodes(
         node: its `head` holds center, `_NODE_RATIO` times the radius, and radius.
         state: a tuple with the number of nodes so far.
 
-        Returns the mask of the lanes that enter the node, and the new number.
+        Returns the mask of the lanes that enter the node, and the new number, in a tuple.
         """
         # Nodes that are neither far nor pending are entered: the walk goes on to their children.
         is_far = dr.squared_norm(c - vector(*node.head[:3])) > dr.square(far_radius + node.head[3])

@@ -123,10 +123,12 @@ class EdgeExpansions:
         radius: the radius of the balls.
         n: the number of cells.
 
-        Rounding of the angle at the center, as in `LoopEdges.rounding`: each edge is off by less
-        than 2^-46, and by the effect of moving its ends by 2^-50 of coordinates below 2^3. The
-        second is less than 2^-46 over the distance of the edge. All edges are farther than 2^-9,
-        the radius of the smallest cells. So `_ANGLE_ROUNDING` bounds both.
+        Rounding. The value of an expansion at its ball's center is the solid angle there. Each
+        edge's part of this angle has two errors (as in `LoopEdges.rounding`). The arithmetic makes
+        one of less than 2^-46. The other comes from the ends: their coordinates are below 2^3 and
+        have a relative error of 2^-50, so that the angle changes by less than 2^-46 over the
+        distance of the edge. That distance is more than 2^-9, the radius of the smallest cells. So
+        `_ANGLE_ROUNDING`, counted once for each edge, bounds the sum of both errors.
         """
         if not len(edges.cell):
             return cls.zero(n)
@@ -164,7 +166,7 @@ def _over_pieces(
     index, real, vector = backend.UInt32, backend.Float, backend.Array3f
 
     def runs(j: Any, *_: Any) -> Mask:
-        """Whether the loop goes on, for each lane: its ball has a far edge j."""
+        """Whether the loop goes on, on each lane: its ball has a far edge number j."""
         return j < count
 
     def body(j: Any, t: Real, zr: Real, zi: Real, *sums: Real) -> tuple[Any, ...]:
@@ -277,8 +279,9 @@ def tail_bounds(q: Any) -> tuple[Any, Any]:
 
     q: rho/|d|.
 
-    Returns two numbers. Times |d x dp|/|d|^2, they bound the sum of all terms of g of degree above
-    p = DEGREE, and the gradient of this sum times rho, anywhere in the ball.
+    Returns two numbers. Let S be the sum of all terms of degree above p = DEGREE of the edge's
+    function g (see the module). Anywhere in the ball |S| is at most the first number times |d x
+    dp|/|d|^2, and rho |grad S| is at most the second number times |d x dp|/|d|^2.
 
     Proof. For a point u of the ball, phi = sum over j of |u|^j P_j(s)/|d|^(j+1), with s the cosine
     of the angle between u and d and Legendre's polynomials P_j. So u x grad phi = sum of
@@ -329,6 +332,8 @@ def _quadrature_errors(distance: Real, half: Real, area: Real, radius: Real) -> 
     4. Gradient. It is a x e times the same mean, plus u . (a x e) times a mean over s of s times
        the gradient of W. This gradient is 3 times the mean of (b + zv)/|b + zv|^5, which on the
        ellipse is at most 3 (D+S)/(D-S)^5. That falls with D, and the mean of s is 1/2.
+
+    Returns the bounds for the value and for the gradient.
     """
     # x = S/h, and r = x + sqrt(x^2 - 1). power: r^-8 for the n = 4 nodes. inverse_gap: 1/(D - S).
     x = (8 / 11) * distance / half

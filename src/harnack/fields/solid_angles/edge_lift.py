@@ -134,12 +134,14 @@ class LiftedEdge:
 
         direction: 1 if the boundary runs from p to q, -1 if it runs back.
         inverse: 1/|q-p|^2.
+
+        p, q: the end with the lower vertex index, and the other end.
         """
         return cls(Edge.between(p, q, inverse, x), (p, q), frame, direction)
 
     def factor(self) -> tuple[Real, Real]:
-        """Compute the real and the imaginary part of the edge's factor F_e, whose argument is half
-        the solid angle of the edge's triangle."""
+        """Compute the real and the imaginary part of the edge's factor F_e, a complex number whose
+        argument is half the solid angle of the edge's triangle."""
         # a, b: the ends relative to x, as two coordinates across the ray and one along it.
         vector, frame, edge = cast("Any", type(self.edge.a)), self.frame, self.edge
         pairs = zip(self.ends, (edge.a, edge.b), strict=True)
@@ -171,7 +173,7 @@ class LiftedEdge:
 
     def bounds(self, unit: Real) -> tuple[Real, Real, Real]:
         """Compute bounds of what the edge adds to the rounding error of the sum of solid angles,
-        and to the remainder of its linear Taylor polynomial.
+        and to the remainder of this sum beyond its linear Taylor polynomial.
 
         unit: a bound of the rounding of a coordinate (`coordinate_rounding`). Coordinates that are
             correctly rounded are off by half of it.
@@ -251,7 +253,8 @@ class LiftedSums:
         return self.sums.to_state(), self.product.parts()
 
     def add_edge(self, edge: LiftedEdge, unit: Real, active: Mask) -> LiftedSums:
-        """Add an edge on active lanes, and return the new sums.
+        """Add an edge on active lanes, and return the new sums. On other lanes they stay as they
+        are.
 
         unit: a bound of the rounding of a coordinate.
         """
@@ -292,7 +295,8 @@ def lifted_sums(edges: LiftedEdges, x: Vec3, derivatives: int) -> LiftedSums:
     vector = backend.Array3f
 
     def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
-        """Add the edge in the record `row` to the sums, given as a state."""
+        """Add the edge in the record `row` to the sums, whose `parts` are the state. Returns the
+        new state."""
         p, q = vector(*row[:3]), vector(*row[4:7])
         # Padding has the direction row[3] = 0 and is not active.
         edge = LiftedEdge.between(p, q, row[3], row[7], VerticalRayFrame(x), x)
@@ -314,8 +318,8 @@ def edge_rates(edges: LiftedEdges, x: Vec3, derivatives: int) -> SourceSums:
     vector = backend.Array3f
 
     def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
-        """Add the edge in the record `row` to the sums, given as a state. Padding, of direction 0,
-        adds nothing."""
+        """Add the edge in the record `row` to the sums, given as a state (`SourceSums.to_state`). A
+        record that is padding has the direction 0 and adds nothing. Returns the new state."""
         p, q, active = vector(*row[:3]), vector(*row[4:7]), row[3] != 0
         edge = LiftedEdge.between(p, q, row[3], row[7], VerticalRayFrame(x), x)
         sums = SourceSums.from_state(state).add_term(edge.terms(derivatives, active), True)
@@ -355,13 +359,15 @@ def view_vertex(p: Vec3, frame: RayFrame, x: Vec3) -> VertexView:
 
 def edge_factor_of_views(a: VertexView, b: VertexView, direction: Real) -> tuple[Real, Real]:
     """Compute the real and the imaginary part of the factor F_e = (s_a s_b + a'.b') - i (a' x b')
-    of the edge from a to b. Its argument is half the solid angle of the edge's triangle (see the
-    module).
+    of the edge from a to b. Its argument is half the solid angle of the edge's triangle. Here a'
+    and b' are the two coordinates (u, v) of the ends across the ray, and s_a and s_b the numbers
+    `s` of their `VertexView`s. a' x b' is the number a'_u b'_v - a'_v b'_u.
 
     a, b: the ends of the edge, as seen from x.
-    direction: positive if a has the lower vertex index, else negative. The cross product a' x b' is
-        computed from the ends in the order of their indices. So all computations of the same edge
-        get the same bits, and agree on which side of the ray the edge passes.
+    direction: which end comes first in the order of vertex indices: positive if it is a, negative
+        if it is b. It is not the direction of the ray. The cross product a' x b' is computed from
+        the ends in the order of their indices. So all computations of the same edge get the same
+        bits, and agree on which side of the ray the edge passes.
     """
     rises = direction > 0
     low, high = (dr.select(rises, a.u, b.u), dr.select(rises, a.v, b.v)), (
@@ -372,8 +378,8 @@ def edge_factor_of_views(a: VertexView, b: VertexView, direction: Real) -> tuple
 
 
 def edge_factor(a: Vec3, b: Vec3, la: Real, lb: Real) -> tuple[Real, Real]:
-    """Compute the real and the imaginary part of the factor F_e of the edge from a to b. Its
-    argument is half the solid angle of the edge's triangle (see the module).
+    """Compute the real and the imaginary part of the factor F_e of the edge from a to b. The
+    argument of F_e is half the solid angle of the edge's triangle (see the module).
 
     a, b: the ends relative to a point x, as (u, v, z), with two coordinates across the direction d
         and the coordinate along it.
@@ -387,7 +393,8 @@ def edge_factor(a: Vec3, b: Vec3, la: Real, lb: Real) -> tuple[Real, Real]:
 
 def _factor(a: tuple[Real, Real], b: tuple[Real, Real], sa: Real, sb: Real) -> tuple[Real, Real]:
     """Compute the real and the imaginary part of the factor F_e = (sa sb + a.b) - i (a x b) of an
-    edge. Its argument is half the solid angle of the edge's triangle (see the module).
+    edge from a to b. Here a x b is the number a_u b_v - a_v b_u. The argument of F_e is half the
+    solid angle of the edge's triangle (see the module).
 
     a, b: the coordinates (u, v) of both ends relative to the ray, across its direction d.
     sa, sb: for both ends, the distance from x minus the component along d.
@@ -439,7 +446,7 @@ class LiftedProduct:
         return cls(real(1), real(0), real(0))
 
     def parts(self) -> tuple[Real, Real, Real]:
-        """List the attributes in the order of the constructor, for the state of a recorded loop."""
+        """List the attributes re, im and turns, for the state of a recorded loop."""
         return self.re, self.im, self.turns
 
     def times(self, re: Real, im: Real) -> LiftedProduct:

@@ -158,16 +158,19 @@ class LoopEdges:
     def for_each(
         self, body: EachEdge, state: tuple[Any, ...], label: str, active: Mask = True
     ) -> tuple[Any, ...]:
-        """Loop over all edges: state = body(p, q, 1/|q - p|^2, state) for one edge from p to q
-        after another. Returns the last state.
+        """Loop over all edges, one after another, and for each edge from p to q set state = body(p,
+        q, 1/|q - p|^2, state). Returns the last state.
 
         state: the first state.
         label: the name of the recorded loop.
         active: the mask of the lanes on which the loop runs.
+
+        body: the function that returns the new state.
         """
 
         def of_record(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
-            """Update the state by the edges in the record `row`, one after another."""
+            """Update the state by the edges in the record `row`, one after another. Returns the new
+            state."""
             for k in range(self.edges_per_record):
                 # row[4 * k + 3] is 1/|q - p|^2.
                 p, q = self.vertex(row, k), self.vertex(row, k + 1)
@@ -275,7 +278,7 @@ class Edge:
 
     @functools.cached_property
     def lengths(self) -> tuple[Real, Real]:
-        """The distances |a| and |b| from x to both ends of the edge."""
+        """The distances from x to both ends of the edge: |a|, then |b|."""
         return dr.norm(self.a), dr.norm(self.b)
 
     @functools.cached_property
@@ -343,10 +346,10 @@ class Edge:
 
 
 def edge_variation(square: Real, inverse: Real) -> tuple[Real, Real]:
-    """Compute two numbers for an edge of half length h at the distance d from a point: the number
-    h/(d sqrt(d^2+h^2)), and this number divided by d. Twice the first is an upper bound of the
-    length of the edge's Biot and Savart field. Twice the second is an upper bound of the integral
-    of |dp|/D^3 along the edge (`LiftedEdge.bounds`).
+    """Compute two numbers for an edge of half length h at the distance d from a point: first h/(d
+    sqrt(d^2+h^2)), second this number divided by d. Twice the first is an upper bound of the length
+    of the edge's Biot and Savart field. Twice the second is an upper bound of the integral of
+    |dp|/D^3 along the edge (`LiftedEdge.bounds`).
 
     square: d^2.
     inverse: 1/(2h)^2.
@@ -418,9 +421,10 @@ def sum_over_edges(edges: LoopEdges, x: Vec3, active: Mask = True) -> EdgeSums:
     real, x = edges.backend.Float, edges.backend.Array3f(x)
 
     def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
-        """Add the edges in the record `row` to the state: the product of factors (zr, zi), half the
-        gradient g, the smallest squared distance d2, a quarter of the bound of the integral of
-        |dp|/D^2, and half of the other two integrals."""
+        """Add the edges in the record `row` to the state, and return the new state. It holds the
+        product of factors (zr, zi), half the gradient (g), and the smallest squared distance (d2).
+        Then come a quarter of the bound of the integral of |dp|/D^2, and half of the other two
+        integrals."""
         zr, zi, g, d2, inverse_squares, inverse_cubes, inverse_fourths = state
         p = edges.vertex(row, 0)
         a = p - x
@@ -467,8 +471,8 @@ def hessian_over_edges(edges: LoopEdges, x: Vec3) -> tuple[Vec3, Vec3, Vec3]:
     x = edges.backend.Array3f(x)
 
     def add(p: Vec3, q: Vec3, inverse: Real, state: tuple[Any, ...]) -> tuple[Any, ...]:
-        """Add the edge from p to q to the Hessian, whose entries are the state. inverse:
-        1/|q - p|^2."""
+        """Add the edge from p to q to the Hessian, whose six entries are the state. inverse: 1/|q -
+        p|^2. Returns the new state."""
         return (
             SymmetricMatrix(*state)
             .add_outer_product(*Edge.between(p, q, inverse, x).hessian_factors())
@@ -480,8 +484,8 @@ def hessian_over_edges(edges: LoopEdges, x: Vec3) -> tuple[Vec3, Vec3, Vec3]:
 
 
 def inner_product(a: Spinor, b: Spinor) -> tuple[Real, Real]:
-    """Compute the inner product <a, b> of two spinors, conj(a_1) b_1 + conj(a_2) b_2, as (real
-    part, imaginary part)."""
+    """Compute the inner product <a, b> of two spinors (pairs of complex numbers), conj(a_1) b_1 +
+    conj(a_2) b_2. Returns its real and its imaginary part."""
     re = dr.fma(a[0], b[0], dr.fma(a[1], b[1], dr.fma(a[2], b[2], a[3] * b[3])))
     im = dr.fma(a[0], b[1], dr.fma(a[2], b[3], -dr.fma(a[1], b[0], a[3] * b[2])))
     return re, im

@@ -199,11 +199,11 @@ class _AbsoluteValues:
     sums. So an expression in such arrays gives the sum of the absolute values of its terms."""
 
     def __init__(self, number: Any) -> None:
-        """number: the absolute values, as an array or a single number."""
+        """number: the numbers whose absolute values are kept, as an array or a single number."""
         self.number = number
 
     def __add__(self, other: Any) -> _AbsoluteValues:
-        """Add the absolute values of both operands; used for differences, too."""
+        """Add the absolute values of both operands. This method also computes differences."""
         return _AbsoluteValues(
             self.number + np.abs(other.number if isinstance(other, _AbsoluteValues) else other)
         )
@@ -269,5 +269,7 @@ def tail_factors(degree: int, l: int) -> tuple[float, float]:
     times the bound before: the sum is at most a geometric series. For the gradient, by Bernstein
     and Szego's inequality, a harmonic polynomial of degree j has a gradient of at most j/rho times
     its largest value on the sphere; and j C(l+j, j) grows from j to j+1 by the factor (l+j+1)/j.
+
+    Returns b, and c for the truncation error itself (not for its gradient).
     """
     return float(math.comb(l + degree + 1, degree + 1)), (l + degree + 2) / (degree + 2)

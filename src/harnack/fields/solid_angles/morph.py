@@ -114,7 +114,7 @@ class Morph(BatchedField):
         integration over the triangles would give, at points of the surface.
 
         points: (n, 3).
-        precision: that of the computation; None for the default.
+        precision: of the computation, "single" or "double"; None for that of the points.
 
         Returns (n,) lengths in the unit of the meshes: the bound of the quadrature's error of f,
         divided by the length of the gradient. For meshes of regular triangles the true distance is

@@ -128,9 +128,9 @@ class SlicedKernel(RadialKernel):
         with the largest n comes from a polynomial, and all others from the recurrence i_n = (2n s^2
         i_(n+1) + c)/(2n-1), where c = w/D and s = r/D.
 
-        distance: D, which is not used.
+        distance: D; not used.
         inverse: 1/D.
-        last: the largest index.
+        last: the largest index k of psi_k.
         """
         del distance
         # c = w/D, s2 = (r/D)^2; moment: i_(k+1), from k = last down; theta_k = psi_k D^(2k+1).
@@ -144,9 +144,10 @@ class SlicedKernel(RadialKernel):
         return KernelValues(inverse, thetas)
 
     def bounds(self, distance: Real, last: int) -> list[Real]:
-        """List numbers Q_2, ..., Q_last, but at least Q_2 and Q_3: m! Q_m/D^(m+1) bounds the m-th
-        derivatives of the kernel along lines. Here they are the same for all distances. Q_2 bounds
-        the gradient of a dipole's potential in four dimensions as well."""
+        """List the numbers Q_2, ..., Q_last, but at least Q_2 and Q_3. They are defined by bounds:
+        m! Q_m/D^(m+1) bounds the m-th derivatives of the kernel along lines at the distance D. Here
+        they are the same for all distances. Q_2 bounds the gradient of a dipole's potential in four
+        dimensions as well. last: the largest index m."""
         del distance
         return [GRADIENT_BOUND, *(1.0 for _ in range(3, last + 1))]
 
@@ -190,7 +191,7 @@ def moment_polynomial(n: int, degree: int) -> tuple[float, ...]:
 
 
 def _horner(x: Real, coefficients: tuple[float, ...]) -> Real:
-    """Evaluate at x the polynomial with these coefficients, in ascending order."""
+    """Evaluate at x the polynomial with these coefficients, which begin with that of x^0."""
     total: Real = coefficients[-1]
     for coefficient in coefficients[-2::-1]:
         total = dr.fma(total, x, coefficient)
@@ -242,7 +243,7 @@ def piece_counts(corners: FloatArray, longest: float) -> IntArray:
 
 
 def quadrature_points(corners: FloatArray, longest: float) -> QuadraturePoints:
-    """Make quadrature points for triangles (m, 3, 3).
+    """Make quadrature points for triangles with these corners (m, 3, 3).
 
     longest: the largest length of the edges of pieces. A larger triangle is cut into similar
         pieces, each with a point at its centroid. Much smaller triangles that lie in the same cell
@@ -268,13 +269,13 @@ def quadrature_points(corners: FloatArray, longest: float) -> QuadraturePoints:
 
 
 def _longest_edges(corners: FloatArray) -> FloatArray:
-    """Compute the length (m,) of the longest edge of each triangle (m, 3, 3)."""
+    """Compute the length (m,) of the longest edge of each triangle. corners: (m, 3, 3)."""
     return np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
 
 
 def _corner_distances(corners: FloatArray, points: FloatArray) -> FloatArray:
-    """Compute for each triangle (m, 3, 3) the distance (m,) of its farthest corner from the
-    triangle's own point (m, 3)."""
+    """Compute, for each of m triangles, the distance (m,) of its farthest corner from a given
+    point. corners: (m, 3, 3). points: (m, 3) one for each triangle."""
     return np.linalg.norm(corners - points[:, None], axis=2).max(axis=1)
 
 
@@ -291,9 +292,9 @@ def _mean_squares(corners: FloatArray) -> FloatArray:
 
 
 def _subdivide(corners: FloatArray, longest: float) -> QuadraturePoints:
-    """Make quadrature points for triangles (m, 3, 3) that are not merged: the centroids of their
-    pieces. A triangle is cut into count^2 similar pieces, where count is its number from
-    `piece_counts`.
+    """Make quadrature points for triangles with these corners (m, 3, 3), which are not merged: the
+    centroids of their pieces. A triangle is cut into count^2 similar pieces, where count is its
+    number from `piece_counts`.
 
     longest: the largest length of the edges of pieces.
 
@@ -325,10 +326,10 @@ def _subdivide(corners: FloatArray, longest: float) -> QuadraturePoints:
 
 
 def _merge_small(corners: FloatArray, longest: float) -> QuadraturePoints:
-    """Make quadrature points for small triangles (m, 3, 3). Triangles form a group, which has a
-    single point, if their centroids are in the same cell of space and their normals have the same
-    largest component with the same sign. So the length of the group's moment is at least 1/sqrt(3)
-    of its area.
+    """Make quadrature points for small triangles with these corners (m, 3, 3). Triangles form a
+    group, which has a single point, if their centroids are in the same cell of space and their
+    normals have the same largest component with the same sign. So the length of the group's moment
+    is at least 1/sqrt(3) of its area.
 
     longest: the largest length of the edges of pieces. Cells are `_CELL_FRACTION` times as wide.
     """
@@ -450,7 +451,7 @@ class MorphSlice(VariableAccuracyField["_SliceBuffers"]):
 
     @property
     def point_counts(self) -> tuple[int, ...]:
-        """The number of quadrature points of mesh a, and that of mesh b."""
+        """Two numbers: how many quadrature points mesh a has, and how many mesh b has."""
         return tuple(len(dipoles.rows) for dipoles in self._dipoles)
 
     def values_at(self, x: Vec3, derivatives: int, closer: Real = 1.0) -> PointValues:
@@ -477,7 +478,7 @@ class MorphSlice(VariableAccuracyField["_SliceBuffers"]):
         by the length of the gradient.
 
         points: (n, 3) points of the surface.
-        precision: that of the computation; None for the default.
+        precision: of the computation, "single" or "double"; None for that of the points.
 
         Returns (n,) lengths in the unit of the meshes. They are infinite if a triangle of a mesh
         reaches as far from its quadrature point as the slice is from that mesh.
@@ -492,7 +493,8 @@ class MorphSlice(VariableAccuracyField["_SliceBuffers"]):
         """
 
         def kernel(backend: Backend, x: Vec3) -> tuple[Real]:
-            """Compute the bound at points x (3, n), as a length in the unit of the meshes."""
+            """Compute the bound at points x (3, n), as a length in the unit of the meshes, in a
+            tuple of one entry."""
             data = self._batch_data(backend)
             x = data.to_unit(x)
             # error: the bound of the quadrature's error of f, over both meshes.

@@ -204,7 +204,8 @@ def dipole_tree_moments(
     p, n, lows, highs = (upload_floats(backend, x.ravel()) for x in (points, normals, low, high))
 
     def primitive(i: Any) -> _DipolePrimitive:
-        """Read the dipoles and the box of primitive i from the buffers. i: an index per lane."""
+        """Read the dipoles and the box of primitive i from the buffers. i may differ from lane to
+        lane."""
         dipoles = [
             _Dipole(_row(backend, n, i * each + k), ((1.0, _row(backend, p, i * each + k)),))
             for k in range(each)
@@ -229,8 +230,8 @@ def triangle_tree_moments(tree: BalancedTree, corners: FloatArray) -> list[NodeM
     rule = tuple(zip(*(part.tolist() for part in triangle_rule()), strict=True))
 
     def primitive(i: Any) -> _DipolePrimitive:
-        """Read triangle i, as a dipole that is spread over the points of `triangle_rule`, with the
-        triangle's box. i: an index per lane."""
+        """Read triangle i, as a dipole that is spread over the points of `triangle_rule`, and the
+        triangle's box. i may differ from lane to lane."""
         a, b, c = (_row(backend, buffer, 3 * i + k) for k in range(3))
         points = [(weight, a * u + b * v + c * w) for (u, v, w), weight in rule]
         dipole = _Dipole(0.5 * dr.cross(b - a, c - a), points)
@@ -262,8 +263,8 @@ class _DipolePrimitive:
 
 
 def _row(backend: Backend, buffer: Real, i: Any) -> Vec3:
-    """Read vector i from a buffer that holds three numbers for each vector. i: an index per
-    lane."""
+    """Read vector i from a buffer that holds three numbers for each vector. i may differ from lane
+    to lane."""
     return backend.Array3f(*(dr.gather(backend.Float, buffer, 3 * i + k) for k in range(3)))
 
 
@@ -309,22 +310,24 @@ def _leaf_moments(
     end = first + dr.gather(index, upload_integers(backend, filled.sum(axis=1)), leaf)
 
     def visit(body: Callable[..., tuple[Any, ...]], state: tuple[Any, ...]) -> tuple[Any, ...]:
-        """Loop over the primitives of each leaf: state = body(primitive, *state) for one after
-        another. Returns the last state."""
+        """Loop over the primitives of each leaf, one after another, and for each of them set state
+        = body(primitive, *state). Returns the last state."""
 
         def step(slot: Any, *state: Any) -> tuple[Any, ...]:
-            """Update the state by the primitive in a slot, and go on to the next slot."""
+            """Update the state by the primitive in a slot. Returns the next slot, and then the new
+            state."""
             return slot + 1, *body(primitive(dr.gather(index, slots, slot)), *state)
 
         def more(slot: Any, *_: Any) -> Any:
-            """Whether the loop goes on, for each lane: its leaf has this slot."""
+            """Whether the loop goes on, on each lane: its leaf has this slot."""
             return slot < end
 
         return dr.while_loop((first, *state), more, step, label="slots")[1:]
 
     def measure(source: _DipolePrimitive, low: Vec3, high: Vec3, area: Real, weighted: Vec3) -> Any:
-        """Update a leaf's measures by the primitive `source`: the box from low to high, the area,
-        and `weighted`, the sum of area times position over the dipoles."""
+        """Update four measures of a leaf by the primitive `source`, and return them. They are the
+        two corners `low` and `high` of a box, the area, and `weighted`, the sum of area times
+        position over the dipoles."""
         for dipole in source.dipoles:
             size = dr.norm(dipole.normal)
             area, weighted = area + size, weighted + size * sum(w * p for w, p in dipole.points)
@@ -333,7 +336,7 @@ def _leaf_moments(
     def sum_up(source: _DipolePrimitive, *parts: Real) -> tuple[Any, ...]:
         """Add the primitive `source` to the sums `parts` about `center`, the leaf's center, which
         is computed below before this function is used. The first sums are those of `_power_terms`,
-        the further ones the real and imaginary parts of M_lm."""
+        the further ones the real and imaginary parts of M_lm. Returns the new sums."""
         for dipole in source.dipoles:
             offsets = [(weight, point - center) for weight, point in dipole.points]
             more = _power_terms(dr.norm(dipole.normal), offsets) + _flatten(
@@ -362,9 +365,9 @@ def _leaf_moments(
 
 
 def _power_terms(area: Real, points: Sequence[tuple[float, Vec3]]) -> list[Real]:
-    """Compute what a dipole that is spread over points adds to the moments of its node: ten numbers
-    for the entries xx, yy, zz, xy, xz, yz of `NodeMoments.second_moment`, then for `third_moment`
-    (3,) and `fourth_moment`.
+    """Compute what a dipole that is spread over points adds to the moments of its node. Returns ten
+    numbers: six for the entries xx, yy, zz, xy, xz, yz of `NodeMoments.second_moment`, then three
+    for `third_moment` and one for `fourth_moment`.
 
     area: the area of the dipole.
     points: pairs of a fraction of the area, and an offset from the node's center.
@@ -478,8 +481,8 @@ def _shifted_powers(level: NodeMoments, s: FloatArray) -> tuple[FloatArray, Floa
 
 
 def _bounding_radius(center: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
-    """Compute the distances (k,) from points to the farthest corner of a box. center, low, high:
-    (k, 3) the points, and two opposite corners of each point's box."""
+    """Compute, for each of k points, the distance (k,) to the farthest corner of a box of its own.
+    center: (k, 3) the points. low, high: (k, 3) two opposite corners of their boxes."""
     return np.linalg.norm(np.maximum(high - center, center - low), axis=1)
 
 
@@ -565,6 +568,7 @@ def truncation_bounds(
 
     level: the moments of the n nodes at one level of the tree.
     nearest: (n,) the bounds hold at distances r >= nearest from the nodes' centers.
+    order: from 0 to 3.
 
     Returns (E, G, H), each (n,): the omitted terms, whose degrees are l >= k = order + 2, add at
     most E/r^(k+1) to f, at most G/r^(k+2) to its gradient, and at most H/r^(k+3) to second

@@ -83,7 +83,7 @@ def lies_on_own_level(mesh: WindingMesh, level: float) -> bool:
     max_distance = 2 * _ON_SURFACE if has_inner else _ROUNDING
 
     def is_on(queries: FloatArray) -> BoolArray:
-        """Whether points (k, 3) are on the surface: a mask (k,)."""
+        """A mask (k,) of points `queries` (k, 3): whether each is on the surface."""
         gap, distance = _level_gaps(edges, queries, level)
         return (distance if has_inner else gap) < max_distance
 
@@ -104,7 +104,7 @@ def lies_on_own_level(mesh: WindingMesh, level: float) -> bool:
 
 
 def _spaced_rows(rows: FloatArray, max_count: int) -> FloatArray:
-    """At most `max_count` rows of an array, evenly spaced."""
+    """Select at most `max_count` rows of an array, at evenly spaced indices."""
     return rows[:: -(-len(rows) // max_count)]
 
 

@@ -68,12 +68,13 @@ class PlanarRegion:
     def lift_range(
         self, angle: Real, height: Real, distance: Real, slack: Real, error: Real = 0.0
     ) -> HarmonicBall:
-        """A ball around each point, and a proved range of the lift on it: of the curves' solid
-        angle f, continued from the point without its jumps of 4 pi. The docstring of the module has
-        the proof. In short: the ball whose radius is the distance d to the curves meets the plane
-        in a disk D, which is inside or outside of the region that the curves bound. Which one it
-        is, and so the range, follows from |f| and from the distance h to the plane. If rounding
-        leaves it open, a smaller ball that does not meet the plane is used.
+        """Make a ball around each point, and a proved range, on this ball, of the lift: the curves'
+        solid angle f, continued from the point without its jumps of 4 pi. The docstring of the
+        module has the proof. In short: the ball whose radius is the distance d to the curves meets
+        the plane in a disk D, which is inside or outside of the region that the curves bound. Which
+        one it is, and so the range, follows from |f| and from the distance h to the plane. If |f|
+        and h do not tell which one it is, a smaller ball that does not meet the plane is used; or,
+        near the plane, the range (-4 pi, 4 pi), which holds in both cases.
 
         angle: f at the point, known modulo 4 pi.
         height: the signed distance of the point from the plane, positive on the normal's side. It
@@ -148,10 +149,10 @@ class _PlanarLoop:
 
 def planar_region(loops: Loops, circles: Sequence[Circle]) -> PlanarRegion | None:
     """The plane of the region that closed curves bound together; None if they do not bound a region
-    of a plane, or if they have too many vertices to be tested.
+    of a plane, or if there is too much to test.
 
-    loops: polygons (n, 3).
-    circles: circles.
+    loops: the polygons, each an array (n, 3) of vertices.
+    circles: the circles.
 
     The result is None in these cases: the loops do not lie in one plane up to 1e-12 of their size;
     one is not simple; they cross, or come nearer to each other than 1e-6 of their size; they have
@@ -236,8 +237,8 @@ def _plane_of(
 
 
 def _are_separated(first: _PlanarLoop, second: _PlanarLoop) -> bool:
-    """Whether two loops of a plane are nowhere nearer to each other than 1e-6 of the size of all
-    curves. One may lie inside the other."""
+    """Whether two loops of a plane, `first` and `second`, are nowhere nearer to each other than
+    1e-6 of the size of all curves. One loop may lie inside the other."""
     if first.radius > 0 and second.radius > 0:
         distance = float(np.linalg.norm(first.points[0] - second.points[0]))
         # They are beside each other, or one is inside the other.

@@ -177,8 +177,8 @@ class FaceSolidAngle(Field):
 
     def _sample(self, p: Vec3, direction: Vec3 | None) -> Sample:
         """A sample of f at points p in user coordinates: value, gradient, errors and promises
-        (proved bounds of f near p). On the boundary curve itself the value is 0 and the gradient is
-        so steep that p counts as close to any level.
+        (proved bounds of f near p). At points of the boundary curve itself the value is 0, and the
+        gradient is so long that p counts as close to any level.
 
         direction: (3,) a unit vector. The sample gets further bounds along the line through p in
             this direction; None for no such bounds.
@@ -209,8 +209,9 @@ class FaceSolidAngle(Field):
             line = RayLine(x, backend.Array3f(direction), rounding)
 
             def rates(lengths: tuple[Real, ...], active: Mask) -> tuple[Real, ...]:
-                """For each length T, a bound of the derivative of f along the line at its points
-                within T of x (`line_rates`)."""
+                """For each length T in `lengths`, a bound of the derivative of f along the line at
+                its points within T of x (`line_rates`). Returns one bound for each length. active:
+                the mask of the lanes to compute."""
                 return line_rates(face.edges, line, lengths, active)
 
             ray_promises = lipschitz_along(line, sums.gradient, sums.distance, rates)
@@ -235,9 +236,9 @@ _CORNERS = np.array(list(itertools.product((0, 1), repeat=3)), dtype=np.float64)
 
 
 def face_boxes(faces: PolygonFaces, levels: tuple[float, ...]) -> tuple[FloatArray, FloatArray]:
-    """Boxes that are proved to contain the surfaces of faces: the level sets of each face's solid
-    angle f. They are computed in double precision, for all faces at once. `PolygonMesh.boxes`
-    computes them once for a mesh and its levels.
+    """Make boxes that are proved to contain the surfaces of faces, that is, the level sets of each
+    face's solid angle f. The boxes are computed in double precision, for all faces at once.
+    `PolygonMesh.boxes` computes them once for a mesh and its levels.
 
     levels: the values of f whose level sets are meant.
 
@@ -278,8 +279,8 @@ def _carve_boxes(
 
     Returns the lower and the upper corners of the new boxes, both (k, 3).
 
-    Only cells at the sides of a box can make it smaller. So all cells are split twice, and then
-    only those at the sides, until they are small or the work is too large.
+    A box becomes smaller only if cells at its sides are removed. So all cells are split twice, and
+    then only the cells at the sides, until they are small or the work is too large.
     """
     curves = FaceLoops.upload(choose_backend("double"), faces)
     box_sizes, pair_count = upper - lower, 0
@@ -370,7 +371,8 @@ def _are_empty(
     curves: FaceLoops, face: IntArray, centers: FloatArray, half: FloatArray,
     levels: tuple[float, ...],
 ) -> BoolArray:  # fmt: skip
-    """Which balls are proved to contain no level set of the solid angle f of a face: a mask (k,).
+    """A mask (k,) of balls, true where the ball is proved to contain no level set of the solid
+    angle f of a face. Each ball has a face of its own.
 
     curves: the boundary curves of all faces.
     face: (k,) for each ball the index of the face.
@@ -399,9 +401,10 @@ def _are_empty(
     h = upload_floats(backend, half) / data.size
 
     def add(p: Vec3, q: Vec3, inverse: Real, state: tuple[Any, ...]) -> tuple[Any, ...]:
-        """Add the edge from p to q to the state: the product (zr, zi) of the factors whose
-        arguments are half the angles of edges, the gradient, the distance of the nearest edge, and
-        the sums over edges in the two bounds S.
+        """Add the edge from p to q to the state, and return the new state. It holds the product
+        (zr, zi) of the edges' factors, the gradient, the distance of the nearest edge, and the sums
+        over edges in the two bounds S. The argument of an edge's factor is half the solid angle of
+        the edge.
 
         inverse: 1/|q - p|^2.
         """

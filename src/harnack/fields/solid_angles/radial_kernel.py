@@ -73,7 +73,7 @@ class RadialKernel(abc.ABC):
     @abc.abstractmethod
     def at(self, distance: Real, inverse: Real, last: int) -> KernelValues:
         """The values psi_0 to psi_last at the distance D = `distance`, where psi_0 = K and
-        psi_(k+1) = -psi_k'/r. inverse: 1/D."""
+        psi_(k+1) = -psi_k'/r. inverse: 1/D. last: the largest index."""
 
     @abc.abstractmethod
     def bounds(self, distance: Real, last: int) -> list[Real]:
@@ -81,13 +81,13 @@ class RadialKernel(abc.ABC):
         m-th derivatives of K along lines are at most m! Q_m/D^(m+1) at all distances D >=
         `distance`.
 
-        last: at most 6.
+        last: the largest index m; at most 6.
         """
 
     @abc.abstractmethod
     def growth(self, r: Real) -> Real:
-        """A factor that bounds how much larger the numbers Q_m of `bounds` are at a distance that
-        is shorter by r."""
+        """A factor c that bounds how the numbers Q_m of `bounds` grow as the distance shrinks: at
+        the distance D - r they are at most c times as large as at D."""
 
     @abc.abstractmethod
     def accepting_distance(self, radius: FloatArray, accuracy: float) -> FloatArray:
@@ -128,8 +128,8 @@ class RadialSums:
 
     @classmethod
     def zero(cls, backend: Backend, derivatives: int) -> RadialSums:
-        """The sums over no dipoles. derivatives: 0 for the value only, 1 with the gradient, 2 with
-        the Hessian."""
+        """The sums over no dipoles, to which dipoles can be added. derivatives: 0 for the value
+        only, 1 with the gradient, 2 with the Hessian."""
         zero = backend.Float(0)
         return cls(SourceSums.zero(backend, dr.inf, derivatives), zero, zero)
 
@@ -139,15 +139,16 @@ class RadialSums:
         return cls(SourceSums.from_state(parts[0]), *parts[1:])
 
     def parts(self) -> tuple[Any, ...]:
-        """The attributes in the order of the constructor, for the state of a loop."""
+        """The numbers of `sums`, q2_d3 and q2_d4, as a tuple for the state of a recorded loop."""
         return self.sums.to_state(), self.q2_d3, self.q2_d4
 
     def plus(self, source: SourceAtPoint, rounding: Real, active: Mask) -> RadialSums:
         """The sums with a further dipole or cluster, `source`, added on active lanes.
 
-        rounding: a bound of the rounding of its term, as a fraction of w Q_2/d^2, which is at least
-            the term's absolute value. The rounding of positions adds 6 epsilon w Q_2/d^3;
-            `SourceSums.add_term` counts the rounding of the sum.
+        rounding: a bound of the rounding of the source's term, as a fraction of w Q_2/d^2. That
+            number is at least the term's absolute value, with the source's weight w and distance d.
+            The rounding of positions adds 6 epsilon w Q_2/d^3; `SourceSums.add_term` counts the
+            rounding of the sum.
         """
         tail, sums = source.tail, self.sums.add_term(source.terms, active)
         # What the source adds to q2_d3, q2_d4, s4 and s5; then 0 on lanes that are not active.
@@ -194,8 +195,8 @@ class RadialSums:
         self, growth: Callable[[Real], Real], least_distance: Real, size: Real
     ) -> tuple[TaylorRemainder, ...]:
         """Proved bounds of second derivatives of f on balls around x, one for each of several
-        radii. Each bounds the difference between f and its linear Taylor polynomial at x, by
-        `remainder`.
+        radii. By `remainder`, each bounds the difference between f and f's linear Taylor polynomial
+        at x.
 
         growth: the function `RadialKernel.growth`: for a radius r, a bound of the factor by which
             the numbers Q_m grow if distances shrink by r.
@@ -352,7 +353,9 @@ def dipole_source(
 
 def cluster_parts(c: Sequence[Real], z: Vec3, inverse: Real) -> list[PolynomialTerm]:
     """The polynomials P_k of a cluster of dipoles, for k = 1, 2, 3. The cluster is added as the sum
-    of P_k(z) psi_k, where z is the vector from the point to the cluster's center.
+    of P_k(z) psi_k, where z is the vector from the point to the cluster's center. Each P_k is
+    returned with its gradient and Hessian, all divided by D^(2k); `combine_terms` makes up for
+    that.
 
     c: the 23 coefficients of the cluster (`radial_tree.coefficients`).
     inverse: 1/D, with D the distance of the center.

@@ -142,7 +142,8 @@ class DirectSum(RadialSum):
         derivatives = sums.sums.derivatives
 
         def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
-            """Add the dipole in the record `row` to the state of the sums."""
+            """Add the dipole in the record `row` to the sums, whose `parts` are the state. Returns
+            the new state."""
             return self._with_dipole(row, x, derivatives, state)
 
         return RadialSums.of(self._records.for_each(add, sums.parts(), "radial dipoles"))
@@ -177,14 +178,15 @@ class RadialTreecode(RadialSum):
         derivatives = sums.sums.derivatives
 
         def near(row: list[Real], active: Mask, state: tuple[Any, ...]) -> tuple[Any, ...]:
-            """Add the dipole in the record `row`, which is in a leaf that is not far, to the state
-            of the sums."""
+            """Add the dipole in the record `row` to the sums, whose `parts` are the state. Its leaf
+            is not far from x on active lanes. Returns the new state."""
             # Lanes on which the leaf is far do not take part in the loop over its dipoles.
             del active
             return self._with_dipole(row, x, derivatives, state)
 
         def far(node: ClusterView, state: tuple[Any, ...]) -> tuple[Any, ...]:
-            """Add a cluster to the state of the sums, on lanes on which it is far."""
+            """Add the cluster `node` to the sums, whose `parts` are the state, on lanes on which it
+            is far. Returns the new state."""
             length = dr.sqrt(node.square)
             cluster = cluster_source(
                 node.head, node.payload, -node.r, length, self.kernel, derivatives
@@ -331,7 +333,8 @@ def _moved_to_parents(
     children: TaylorMoments, center: FloatArray, arity: int
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """The moments T1 (k, 3), T2 (k, 3, 3), T3 (k, 3, 3, 3) of k parents, from the moments of their
-    children, `arity` consecutive ones for each parent. center: (k, 3) the parents' centers.
+    children. Each parent has `arity` children, which follow each other. center: (k, 3) the parents'
+    centers.
 
     Let s be the offset of a child's center from that of its parent. The parent's moments are the
     sums over its children of T1, sym(T2 + T1 s) and sym(T3 + 2 T2 s + T1 s s), where sym is the
@@ -348,9 +351,9 @@ def _moved_to_parents(
 def _symmetric(
     t1: FloatArray, t2: FloatArray, t3: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """The symmetric parts of k tensors each of first, second and third order: (k, 3), (k, 3, 3) and
-    (k, 3, 3, 3). The second order is symmetrized over two indices; for the third, the mean is over
-    all six orders of the indices."""
+    """The symmetric parts of tensors: of k tensors `t1` (k, 3) of first order, which stay as they
+    are; of `t2` (k, 3, 3), the mean over both orders of the indices; and of `t3` (k, 3, 3, 3), the
+    mean over all six orders. Returns three arrays of these shapes."""
     orders = itertools.permutations((1, 2, 3))
     total = sum((t3.transpose(0, *order) for order in orders), start=np.zeros_like(t3))
     return t1, 0.5 * (t2 + t2.transpose(0, 2, 1)), total / 6

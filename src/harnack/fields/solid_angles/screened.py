@@ -71,9 +71,9 @@ _MAX_LEVEL_PAIRS, _MAX_LEVEL_POINTS, _MIN_LEVEL_POINTS = 8_000_000, 512, 24
 
 
 class YukawaKernel(RadialKernel):
-    """The kernel K = exp(-kappa r)/r on a backend, with kappa one over the screening length. psi_0
-    = K, psi_(k+1) = -psi_k'/r. The numbers Q_m bound its derivatives: the m-th derivative along
-    lines is at most m! Q_m/r^(m+1).
+    """The kernel K = exp(-kappa rho)/rho on a backend, where rho is the distance from a dipole and
+    kappa is one over the screening length. psi_0 = K, psi_(k+1) = -psi_k'/rho. The numbers Q_m
+    bound its derivatives: the m-th derivative along lines is at most m! Q_m/rho^(m+1).
 
     Kernel. K(rho) = exp(-kappa rho)/rho is the Yukawa potential: Delta K = kappa^2 K away from 0.
     One has psi_k = theta_k(kappa rho) exp(-kappa rho)/rho^(2k+1), where theta_0 = 1, theta_1 = 1 +
@@ -106,6 +106,7 @@ class YukawaKernel(RadialKernel):
         are psi_k = exp(-kappa rho) theta_k(kappa rho)/rho^(2k+1), with polynomials theta_k.
 
         inverse: 1/distance.
+        last: the largest index k.
         """
         # Farther away exponentials are not computed, as they would underflow.
         t = fmin(self.kappa * distance, MAX_LENGTHS)
@@ -114,7 +115,7 @@ class YukawaKernel(RadialKernel):
     def bounds(self, distance: Real, last: int) -> list[Real]:
         """The numbers Q_2(t), ..., Q_last(t) for t = kappa times `distance`, which bound
         derivatives of the kernel at this distance and beyond. Q_m(t) is exp(-t) times the sum of
-        t^j/j! over j <= m."""
+        t^j/j! over j <= m. last: the largest index m."""
         t = fmin(self.kappa * distance, MAX_LENGTHS)
         decay = dr.exp(-t)
         sum2 = dr.fma(t, dr.fma(t, 0.5, 1), 1)
@@ -127,8 +128,8 @@ class YukawaKernel(RadialKernel):
         return factors
 
     def growth(self, r: Real) -> Real:
-        """A factor that bounds how much larger the numbers Q_m of `bounds` are at a distance that
-        is shorter by r."""
+        """A factor that bounds how the numbers Q_m of `bounds` grow as the distance shrinks by r:
+        at the distance rho - r they are at most this many times as large as at rho."""
         return dr.exp(self.kappa * r)
 
     def accepting_distance(self, radius: FloatArray, accuracy: float) -> FloatArray:
@@ -140,7 +141,7 @@ class YukawaKernel(RadialKernel):
 
 def thetas(t: Real, last: int) -> list[Real]:
     """The values theta_0(t), ..., theta_last(t) of the reverse Bessel polynomials: theta_0 = 1,
-    theta_1 = 1 + t, theta_k = (2k-1) theta_(k-1) + t^2 theta_(k-2)."""
+    theta_1 = 1 + t, theta_k = (2k-1) theta_(k-1) + t^2 theta_(k-2). last: the largest index k."""
     square = t * t
     values: list[Real] = [1.0, 1 + t]
     for k in range(2, last + 1):
@@ -151,12 +152,12 @@ def thetas(t: Real, last: int) -> list[Real]:
 def screened_promises(
     radial: RadialSums, f: Real, gradient: Vec3, kernel: YukawaKernel, size: Real, epsilon: float
 ) -> tuple[tuple[TaylorRemainder, ...], HarmonicBall]:
-    """Proved bounds of f, a sum over screened dipoles, near a point x: several bounds of second
-    derivatives on balls around x; and a ball with a range of f, which proves shorter steps.
-    `ScreenedWindingNumber` has the proofs.
+    """Proved bounds of f, a sum over screened dipoles, near a point x. Returns a tuple of bounds of
+    second derivatives, each on a ball around x; and one ball with a range of f, which proves
+    shorter steps. `ScreenedWindingNumber` has the proofs.
 
     radial: the sums at x, in unit coordinates.
-    f, gradient: value and gradient at x, in units of `size`.
+    f, gradient: value and gradient of f at x, in unit coordinates.
     kernel: the kernel of the sum.
     size: the length, in the user's unit, that is 1 in unit coordinates. The results are in the
         user's unit.
@@ -319,7 +320,8 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
         accuracy: float = 6.0,
     ) -> None:
         """Validate the points, choose the method, scale the points to unit coordinates, and compute
-        the default level. The parameters are described at the class."""
+        the default level. The parameters (points, normals, areas, length, method, accuracy) are
+        described at the class."""
         super().__init__()
         length = as_positive(length, "length")
         if method not in ("auto", "sum", "tree"):
@@ -422,8 +424,9 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
     def _cutoff_errors(
         self, data: _ScreenedBuffers, sums: SourceSums, unit: Real
     ) -> tuple[Real, Real, Real]:
-        """Bounds of the errors of value, gradient and second derivatives that screening causes, in
-        addition to those of plain dipoles. All is in unit coordinates.
+        """Return bounds of three errors, of the value, of the gradient and of second derivatives,
+        which screening causes in addition to the errors of plain dipoles. All is in unit
+        coordinates.
 
         data: the kernel and the dipoles on a backend.
         sums: the sums at the points.
@@ -506,8 +509,8 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
         return self._extents[levels]
 
     def _extent(self, levels: tuple[float, ...]) -> Volume | None:
-        """Compute the volume that `extent` returns and caches. The distance D of the proof is found
-        by bisection, in unit coordinates."""
+        """Compute the volume that `extent` returns and caches; None for level 0. The distance D of
+        the proof is found by bisection, in unit coordinates."""
         min_level = min(abs(level) for level in levels)
         if min_level < _SMALLEST_LEVEL:
             return None

@@ -65,10 +65,11 @@ class SmoothedKernel(RadialKernel):
         self.height_square = dr.opaque(backend.Float, height * height)
 
     def at(self, distance: Real, inverse: Real, last: int) -> KernelValues:
-        """The values psi_0, ..., psi_last at the distance D, by their closed form psi_k = (2k-1)!!
-        (1 + (2k+1) q/2)/D^(2k+1) with q = h^2/D^2.
+        """The values psi_0, ..., psi_last of the class docstring at the distance D, by their closed
+        form psi_k = (2k-1)!! (1 + (2k+1) q/2)/D^(2k+1) with q = h^2/D^2.
 
         distance, inverse: D and 1/D. Only 1/D is used.
+        last: the largest index k.
         """
         del distance
         half_q = 0.5 * self.height_square * inverse * inverse
@@ -82,21 +83,21 @@ class SmoothedKernel(RadialKernel):
     def bounds(self, distance: Real, last: int) -> list[Real]:
         """The numbers Q_2, ..., Q_last, which bound derivatives of the kernel: Q_m = 1 + q
         (m+1)(m+2)/4 with q = h^2/D^2. They hold at all distances D of at least 0.55
-        (`_BOUND_FRACTION`) times `distance`."""
+        (`_BOUND_FRACTION`) times `distance`. last: the largest index m."""
         # h/D at the least of these distances; its square is q.
         ratio = dr.sqrt(self.height_square) / (_BOUND_FRACTION * fmax(distance, 1e-30))
         q = fmin(ratio * ratio, 1)
         return [dr.fma(0.25 * (m + 1) * (m + 2), q, 1) for m in range(2, last + 1)]
 
     def growth(self, r: Real) -> Real:
-        """The factor by which the numbers Q_m may be larger at a distance that is shorter by r: 1,
-        as `bounds` already holds at shorter distances."""
+        """The factor by which the numbers Q_m of `bounds` may grow if the distance shrinks by r: 1,
+        because `bounds` already holds at shorter distances."""
         del r
         return 1.0
 
     def accepting_distance(self, radius: FloatArray, accuracy: float) -> FloatArray:
         """The distances (k,) beyond which k clusters of dipoles may be replaced by their moments:
-        `accuracy` times their radii (k,)."""
+        `accuracy` times their radii, which are given as `radius` (k,)."""
         return accuracy * radius + 1e-5  # not 0 for a cluster of radius 0
 
 

@@ -158,7 +158,7 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         cells: bool | float | None = None,
     ) -> None:
         """Validate the curve, remove edges that cancel each other, and decide how the range of the
-        lift is bounded. The parameters are described at the class."""
+        lift is bounded. The parameters (loops, lift_bound, cells) are described at the class."""
         super().__init__()
         self.circles: tuple[Circle, ...]
         # Loops that are Dr.Jit arrays are kept besides, for derivatives by their vertices.
@@ -313,8 +313,8 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         )
 
     def _box(self, center: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """The lower and upper corners (3,) of a box that contains the curve and the surface of the
-        default level, in unit coordinates. FMM cells are built in this box.
+        """Return the lower and the upper corner (3,) of a box that contains the curve and the
+        surface of the default level, in unit coordinates. FMM cells are built in this box.
 
         center: (3,) the origin of the unit coordinates, in user coordinates.
         """
@@ -342,7 +342,8 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
     ) -> npt.NDArray[Any]:
         """Evaluate the field at points (n, 3), and return what the function `choose` takes from
         each sample, such as its value. A field with FMM cells uses the same field without cells,
-        because values at points are sums over all edges."""
+        because values at points are sums over all edges. precision: "single" or "double"; None for
+        that of the points."""
         if self.has_variable_accuracy:
             return self._without_cells._evaluate_points(points, precision, choose)
         return super()._evaluate_points(points, precision, choose)
@@ -352,8 +353,8 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         return self.at_accuracy(backend.Float(EXACT)) if self.has_variable_accuracy else self
 
     def at_accuracy(self, detail: Real) -> Field:
-        """The same field with samples of this accuracy scale. Samples come from FMM cells at scales
-        up to 1, and from all edges at larger ones, which are more accurate."""
+        """The same field with samples of the accuracy scale `detail`. Samples come from FMM cells
+        at scales up to 1, and from all edges at larger ones, which are more accurate."""
         field = copy.copy(self)
         field._detail = detail
         return field
@@ -558,7 +559,8 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         return nearest * data.size + data.center
 
     def parameters(self) -> tuple[Any, ...]:
-        """The loops that are Dr.Jit arrays, by whose vertices values can be differentiated."""
+        """The loops that were given as Dr.Jit arrays or tensors, by whose vertices values can be
+        differentiated. The tuple is empty if there are none."""
         return tuple(loop for loop in self._differentiable_loops if _is_drjit(loop))
 
     def differentiable_value(self, p: Vec3) -> Real:
@@ -590,8 +592,8 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         edges = data.edges
 
         def changes(start: Vec3, end: Vec3) -> tuple[Real]:
-            """The change of the solid angle along the segment from start to end, which are in user
-            coordinates."""
+            """The change of the solid angle along the segments from `start` to `end`, which are in
+            user coordinates; in a tuple of one entry."""
             return (continuous_change(edges, data.to_unit(start), data.to_unit(end)),)
 
         return map_batches(backend, changes, p, q)[0]
@@ -626,7 +628,8 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         return self._extents[levels]
 
     def _extent(self, levels: tuple[float, ...]) -> Volume | None:
-        """Compute the volume that `extent` returns and caches.
+        """Compute the volume that `extent` returns and caches; None if a level is a multiple of 4
+        pi.
 
         Curves in convex position whose levels are all at 2 pi (modulo 4 pi) get their convex hull,
         padded by 1e-4 of their size. Otherwise the volume is the box of the proof in `extent`, from
@@ -715,10 +718,10 @@ class _CurveData(UnitFrame):
     cells: CurveCells | None = None
 
     def at_detail(self, x: Vec3, detail: Real) -> tuple[CurveSums, CellErrors]:
-        """The sums over all edges and circles at points x in unit coordinates, and bounds of their
-        errors. On lanes on which x is in an FMM cell and the accuracy scale `detail` is at most 1,
-        the sums over edges come from that cell. On all other lanes, and if there are no cells, all
-        edges are summed. A larger accuracy scale is more accurate."""
+        """Return the sums over all edges and circles at points x in unit coordinates, and bounds of
+        the errors of these sums. On lanes on which x is in an FMM cell and the accuracy scale
+        `detail` is at most 1, the sums over edges come from that cell. On all other lanes, and if
+        there are no cells, all edges are summed. A larger accuracy scale is more accurate."""
         if self.cells is None or self.edges is None:
             return self.sums(x), CellErrors(0.0, 0.0, self.value_rounding)
         cell_sums, is_in_cell = self.cells.sums(x, detail <= 1)
@@ -888,8 +891,9 @@ def _line_bounds(
     line = RayLine(x, data.backend.Array3f(direction), data.rounding)
 
     def rates(lengths: tuple[Real, ...], active: Mask) -> tuple[Real, ...]:
-        """For each length T, a bound of |df/ds| at the points x + s v of the line with |s| <= T,
-        summed over edges and circles. It is infinite on lanes that are not active."""
+        """For each length T in `lengths`, a bound of |df/ds| at the points x + s v of the line with
+        |s| <= T, summed over edges and circles. Returns one bound for each length. It is infinite
+        on lanes that are not active."""
         summands: list[tuple[Real, ...]] = []
         if data.edges is not None:
             summands.append(data.edge_rates(errors, line, lengths, active))

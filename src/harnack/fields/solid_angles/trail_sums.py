@@ -80,8 +80,8 @@ class RayLine:
 
     @property
     def slack(self) -> Real:
-        """A length that bounds the rounding of points of the line, and of differences p - x of
-        points p of the curve and x, which are about as long as x."""
+        """A length that bounds the rounding of points of the line, and the rounding of the
+        differences p - x, for points p of the curve. Such a difference is about as long as x."""
         return dr.fma(8 * float(dr.epsilon(self.x)), dr.norm(self.x), self.rounding)
 
 
@@ -98,7 +98,7 @@ def lipschitz_along(
     line: the lines, with their points x.
     gradient: the gradient of f at x.
     distance: the distance from x to the curve.
-    rates: a function that computes the constants, from the lengths and a mask of active lanes.
+    rates: a function that takes the lengths and a mask of active lanes, and returns the constants.
 
     Along a straight edge the longest length is of use, near the ends of an edge the other lengths.
     Along a flat part of the surface, bounded by a plane curve, the shortest length is of use.
@@ -119,10 +119,11 @@ def lipschitz_along(
 def line_rates(
     edges: LoopEdges, line: RayLine, lengths: tuple[Real, ...], active: Mask
 ) -> tuple[Real, ...]:
-    """For each length T, a constant K with |f(x + s v) - f(x)| <= |s| K for |s| <= T, where f is
-    the solid angle of the edges and x + s v are points of the line.
+    """Return, for each length T, a constant K with |f(x + s v) - f(x)| <= |s| K for |s| <= T. Here
+    f is the solid angle of the edges, and x + s v are the points of the line.
 
     edges: the edges of closed curves.
+    line: the line, with its point x and its direction v.
     lengths: the lengths T.
     active: mask of the lanes on which constants are wanted.
 
@@ -156,7 +157,7 @@ def line_rates(
 
     def add(p: Vec3, q: Vec3, inverse: Real, rates: tuple[Real, ...]) -> tuple[Real, ...]:
         """Add the term of the edge from p to q to the constants `rates`, one for each length.
-        inverse: 1/|q - p|^2."""
+        inverse: 1/|q - p|^2. Returns the new constants."""
         return add_edge_rates(line, Edge.between(p, q, inverse, line.x), lengths, rates)
 
     start = tuple(edges.backend.Float(0) for _ in lengths)
@@ -309,8 +310,8 @@ class _AngleProduct:
         return _AngleProduct(x, y, self.half + (sign_change & (bits.sign(factor[1]) | 1)))
 
     def times_product(self, bits: _FloatFormat, other: _AngleProduct) -> _AngleProduct:
-        """The product of this product and another one. The sums theta of arguments are added. bits:
-        the format of the numbers."""
+        """The product of this product and `other`. The sums theta of arguments are added. bits: the
+        format of the numbers."""
         # `times` takes the principal argument of the other product. The whole turns by which its
         # theta differs from that are an even number of half turns.
         z = self.times(bits, (other.x, other.y))
@@ -318,7 +319,8 @@ class _AngleProduct:
 
     def scaled(self, bits: _FloatFormat) -> tuple[_AngleProduct, Real]:
         """The same product, multiplied by a power of two so that |x| + |y| lies between one and
-        two; and the value of |x| + |y| before. This scaling is exact."""
+        two; and the value of |x| + |y| before the scaling. This scaling is exact. bits: the format
+        of the numbers."""
         length = dr.abs(self.x) + dr.abs(self.y)
         scale = bits.reciprocal_power_of_two(length)
         return _AngleProduct(self.x * scale, self.y * scale, self.half), length
@@ -377,9 +379,9 @@ class TrailValues:
 
         x: (3, n) the points, in units in which the mesh has a size of about one.
         ray_sign: (n,) 1 or -1, for each point. With 1 all triangles have their apex at infinity in
-            the direction -z. With -1 the edges and x are mirrored in a plane z = const before the
-            sum is computed (`_relative_vertex` does it). The result is then minus the sum of the
-            given edges for an apex in the direction +z.
+            the direction -z. With -1 this method mirrors the edges and x in a plane z = const
+            before it computes the sum (by `_relative_vertex`). The result is then minus the sum
+            over the given edges, with an apex in the direction +z.
 
         Each lane of the kernel computes several points. The mask is true in three cases: rounding
         could have changed the sign of the imaginary part of a factor F_e; a product of factors
@@ -416,14 +418,16 @@ class TrailValues:
 
         Returns two lists with an entry for each point: the product; and a margin, a number that is
         at most 0 if rounding could have changed a sign, or if the product nearly underflowed.
+
+        points: the points of a lane, each with the direction of its ray.
         """
         backend = self.records.backend
         real, bits = backend.Float, _FloatFormat.of(backend)
         slack = real(-_SIGN_ROUNDINGS * 0.5 * backend.machine_epsilon)
 
         def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
-            """The products and margins of all points, which `state` holds, with the edges of the
-            record `row` added."""
+            """The new state: the products and margins of all points, which `state` holds, after
+            multiplication by the factors of the edges in the record `row`."""
             # Column 15, behind five vertices, is the number of edges that are no padding. Padding
             # leads from a vertex to itself: it is never uncertain.
             slacks = [dr.select(row[15] > k, slack, 1) for k in range(_EDGES_PER_RECORD)]
@@ -501,9 +505,10 @@ def _relative_vertex(bits: _FloatFormat, vertex: list[Real], point: Point) -> Se
 
 
 def _factor(a: Seen, b: Seen, slack: Real) -> tuple[Complex, Real]:
-    """The factor of an edge, and whether its sign is certain. Returns two results: the complex
-    conjugate of the factor F_e (`edge_lift`), times a positive number, as real and imaginary part;
-    and a margin, which is at most 0 if rounding could have changed the sign of the imaginary part.
+    """Compute the factor of an edge, and whether its sign is certain. Returns two results. The
+    first is the complex conjugate of the factor F_e (`edge_lift`), times a positive number, as real
+    and imaginary part. The second is a margin: a number that is at most 0 if rounding could have
+    changed the sign of the imaginary part.
 
     a, b: the ends of the edge, from `_relative_vertex`.
     slack: minus the relative error of the products in the imaginary part, or 1 for an edge that is
@@ -582,10 +587,10 @@ class LiftedTrails:
 
     def sum(self, frame: RayFrame, x: Vec3, active: Mask = True) -> SourceSums:
         """The sum of the solid angles Omega_e of the edges' triangles (`edge_lift`) at points x of
-        rays, on active lanes; with the gradient, and the sums by which errors and proved bounds
-        near x are computed.
+        rays, on active lanes; with the gradient, and with the sums from which error bounds and
+        proved bounds near x follow.
 
-        frame: the rays, with points x on them.
+        frame: the rays; x lies on them.
 
         Symbols. Let L be the length of an edge, e the vector along it, a the vector from x to its
         start, d the distance from x to the edge, and rho the distance from x to a point p of the
@@ -613,8 +618,9 @@ class LiftedTrails:
         steep_rounding = 0.5 * backend.machine_epsilon * STEEP_ROUNDINGS
 
         def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
-            """The state with the edges of the record `row` added: the product of factors, the
-            gradient, the least squared distance, the bound of the rounding, s4 and s5."""
+            """The new state, after the edges in the record `row` have been added. It holds the
+            product of factors, the gradient, the least squared distance, the bound of the rounding,
+            s4 and s5."""
             product, g, min_square, rounding, s4, s5 = state
             product = LiftedProduct(*product)
             a = view_vertex(self._vertex(row, 0), frame, x)
@@ -667,8 +673,9 @@ class LiftedTrails:
         return self.records.backend.Array3f(*row[3 * k : 3 * k + 3])
 
     def _edge(self, row: list[Real], k: int) -> tuple[Real, Real]:
-        """One over the squared length of edge k of the record `row`, and its signed length:
-        negative if the edge runs from a higher to a lower vertex index, 0 if there is no edge."""
+        """Two numbers of edge k in the record `row`: one over its squared length; and its length
+        with a sign, which is negative if the edge runs from a higher to a lower vertex index. The
+        length is 0 if there is no edge."""
         first = 3 * (self.edges_per_record + 1)
         return row[first + k], row[first + self.edges_per_record + k]
 

@@ -335,6 +335,7 @@ class Treecode:
     ) -> Treecode:
         """Upload a tree with its moments and sources.
 
+        tree: the hierarchy of the tree: which sources are in which node.
         levels: the moments of the nodes, one entry for each level of the tree, from the leaves to
             the root.
         primitives: the records of the sources in their slots, as `tree.pack_tree` takes them.
@@ -408,7 +409,7 @@ class Treecode:
 
         def add_cluster(node: ClusterView, state: ExtraState) -> ExtraState:
             """Add a node to the state on lanes on which it is far. The state consists of the state
-            of the sums and the caller's own state."""
+            of the sums and the caller's own state. Returns the new state."""
             # The coefficients c[:15] of the moments, and c[15] = E (`node_records`).
             c, inverse = node.payload, node.inverse
             error = c[15] * self._decay(inverse)
@@ -428,8 +429,8 @@ class Treecode:
             return sums.to_state(), state[1]
 
         def add_primitive(row: list[Real], active: Mask, state: ExtraState) -> ExtraState:
-            """Add the primitive in the record `row` of a near leaf to the state, on active
-            lanes."""
+            """Add the primitive in the record `row` of a near leaf to the state, on active lanes.
+            Returns the new state."""
             sums, extra_state = add(row, active, SourceSums.from_state(state[0]), state[1])
             return sums.to_state(), extra_state
 

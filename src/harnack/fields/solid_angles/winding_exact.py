@@ -145,7 +145,8 @@ class ExactWinding:
 
     def crossings_ahead(self, frame: RayFrame, t: Real, active: Mask) -> Real:
         """The sum (n,) of the signs of all crossings of triangles by rays of the frame, beyond the
-        ray parameter t. It is the integer that `sample_interval` takes as `turns`."""
+        ray parameter t, on active lanes. It is the integer that `sample_interval` takes as `turns`.
+        """
         return self.rays.signed_crossings_ahead(frame, t, active)
 
     def sample_interval(
@@ -157,7 +158,8 @@ class ExactWinding:
         along the ray. w is continued smoothly along the interval.
 
         frame: the rays, with points x on them.
-        turns: the sum of the signs of all crossings ahead of the interval's start.
+        turns: the sum of the signs of all crossings ahead of the interval's start
+            (`crossings_ahead`).
         behind, detail: not used here, as no triangles are summed and every sample has full
             accuracy.
         """
@@ -175,8 +177,9 @@ class ExactWinding:
         line, loops = RayLine(x, frame.d, 8 * unit), self.loops
 
         def rates(lengths: tuple[Real, ...], lanes: Mask) -> tuple[Real, ...]:
-            """For each length T, a bound of the derivative of 4 pi w along the line at its points
-            within T of x (`line_rates`); infinite where `lanes` is False."""
+            """For each length T in `lengths`, a bound of the derivative of 4 pi w along the line at
+            its points within T of x (`line_rates`). Returns one bound for each length; it is
+            infinite on lanes on which `lanes` is False."""
             return line_rates(loops, line, lengths, lanes & active)
 
         bounds_along = lipschitz_along(line, sums.gradient, sums.singularity_distance, rates)

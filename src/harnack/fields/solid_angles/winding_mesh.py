@@ -165,8 +165,8 @@ class WindingMesh:
     @functools.cached_property
     def ray_records(self) -> FloatArray:
         """Records (m, 14) of the faces, the rows of numbers that kernels read
-        (`tree.triangle_tree`). The sign of crossings in a record is multiplied by the face's
-        multiplicity."""
+        (`tree.triangle_tree`). The number in a record that gives crossings their sign (the parity)
+        is multiplied by the face's multiplicity."""
         records = triangle_records(self.unit_vertices, self.faces)
         records[:, PARITY_COLUMN] *= self.multiplicity
         return records

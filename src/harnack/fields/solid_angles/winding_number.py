@@ -113,7 +113,7 @@ class WindingModuloOne(Field):
     has_variable_accuracy = True
 
     def __init__(self, winding: ModuloOneEvaluable) -> None:
-        """The parameter is described at the class."""
+        """The parameter `winding` is described at the class."""
         self._winding = winding
 
     def prepare(self, backend: Backend) -> Self:
@@ -131,7 +131,8 @@ class WindingModuloOne(Field):
         return EvaluateOnly(lambda p: self._winding.evaluate_modulo_one(p, detail))
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
-        """A volume that is proved to contain the level sets of w."""
+        """A volume that is proved to contain the level sets of w; None if there is no bounded
+        one."""
         return self._winding.extent(levels)
 
 
@@ -172,10 +173,10 @@ def winding_extent(
 
 
 def winding_box(mesh: WindingMesh, levels: tuple[float, ...]) -> Box:
-    """A box that is proved to contain the level sets of the winding number w of a mesh. It contains
-    the mesh. Where it is larger than the box of the mesh, two bounds limit it: the level sets reach
-    at most the length (a) beyond the mesh; and off the triangles, at most the length (b) beyond the
-    singular edges.
+    """A box that is proved to contain the level sets, for these levels, of the winding number w of
+    a mesh. It contains the mesh. Where it is larger than the box of the mesh, two proofs bound its
+    size. By (a), the level sets reach at most a certain length beyond the mesh. By (b), off the
+    triangles they reach at most another length beyond the singular edges.
 
     (a) At distance rho from a mesh of this area |w| <= area/(4 pi rho^2). So a level lies within
     rho = sqrt(area/(4 pi |level|)) of the mesh. (b) Off the triangles 4 pi w is, modulo 4 pi, the
@@ -293,8 +294,8 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         order: int = 2,
         cells: bool | float | None = None,
     ) -> None:
-        """Validate the mesh and the options, and choose the method. The parameters are described at
-        the class."""
+        """Validate the mesh and the options, and choose the method. The parameters (vertices,
+        faces, method, accuracy, order, cells) are described at the class."""
         super().__init__()
         if not is_one_of(method, ("auto", "exact", "tree")):
             hint = did_you_mean(method, ("auto", "exact", "tree"))
@@ -386,7 +387,8 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
     def sharp_values_at(self, x: Vec3) -> PointValues:
         """w and its gradient at points x (3, n) in user coordinates, with error bounds. With a
         tree, gradients come from the singular edges (`winding_rates`), unless the user chose the
-        accuracy. Their error is then about 1 % of their length in most places, or far less."""
+        accuracy. The error of a gradient is then about 1 % of the gradient's length in most places,
+        or far less."""
         data = self._batch_data(backend_of(x))
         winding = data.winding
         if not isinstance(winding, TreeWinding) or self.accuracy is not None:
@@ -540,7 +542,7 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         return _sample_at_start(data, frame, data.winding.crossings_ahead(frame, 0, True), 1.0)
 
     def without_jumps(self) -> Field | None:
-        """This winding number modulo 1, which is continuous across triangles."""
+        """This winding number modulo 1, which is continuous across triangles. It is never None."""
         return WindingModuloOne(self)
 
     def evaluate_modulo_one(self, p: Vec3, detail: Real = 0.0) -> Sample:
@@ -583,7 +585,7 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         self, o: Vec3, d: Vec3, after: JumpCrossing, t_max: Real, active: Mask
     ) -> JumpCrossing:
         """The next crossing of each ray o + t d with a triangle, after the crossing `after` and up
-        to t = t_max, with the jump of w there along the ray."""
+        to t = t_max, with the jump of w there along the ray. Only active lanes search."""
         data = self._data_for(o)
         frame = RayFrame.along(data.backend, data.to_unit(o), d)
         behind = (after.t / data.size, after.facet)
@@ -642,9 +644,12 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         self, p: Vec3, after: tuple[Real, Any], limit: Real, active: Mask
     ) -> NearestFacet:
         """The next triangle in the order of distance from p, after the triangle given by `after`,
-        within the distance `limit`. Called repeatedly, it lists the triangles by distance.
+        on active lanes. No triangle is found (NO_FACET) where it would be farther from p than
+        `limit`. Called repeatedly, it lists the triangles by distance.
 
-        after: the squared distance and the index of the previous triangle.
+        after: the squared distance in unit coordinates (`NearestFacet.sort_key`), and the index, of
+            the previous triangle.
+        limit: a length, in the user's unit.
         """
         data = self._data_for(p)
         facet = next_closest_triangle(
@@ -661,7 +666,7 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
 
     def jump_mesh(self) -> tuple[FloatArray, IntArray, bool] | None:
         """The mesh at which w jumps: vertices (n, 3), triangles (k, 3), and whether the mesh is
-        closed."""
+        closed. It is never None."""
         return self.mesh.vertices, self.mesh.triangles, not len(self.mesh.singular_edges)
 
     def validate_levels(self, levels: tuple[float, ...]) -> None:
@@ -673,7 +678,8 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
         """A volume that is proved to contain the level sets: all triangles, and the cells around
-        them that are not proved empty (`winding_extent`). It is computed once for these levels."""
+        them that are not proved empty (`winding_extent`). It is computed once for these levels, and
+        is never None."""
         if levels not in self._extents:
             self._extents[levels] = winding_extent(self.with_cells(False), self.mesh, levels)
         return self._extents[levels]
@@ -751,7 +757,7 @@ class _WindingOnInterval(Field):
         offset: Real,
         detail: Real = 1.0,
     ) -> None:
-        """The parameters are described at the class."""
+        """The parameters (on, frame, behind, offset, detail) are described at the class."""
         self.has_variable_accuracy = on.winding.has_detail or on.cells is not None
         self.coarsest_accuracy = on.winding.coarsest_detail
         self._on, self._frame, self._detail = on, frame, on.backend.Float(detail)
@@ -804,7 +810,8 @@ class _BesideSheets(Field):
     def __init__(
         self, backend: Backend, level: float, behind: JumpCrossing, ahead: JumpCrossing
     ) -> None:
-        """The parameters are described at the class."""
+        """The parameters level, behind and ahead are described at the class. backend: that of the
+        crossings."""
         real = backend.Float
         # A positive jump ahead leads up through the level, so that the field is below it before.
         # After a positive jump behind the field is above it. A jump of 0 means that there is no

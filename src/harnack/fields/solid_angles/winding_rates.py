@@ -81,7 +81,8 @@ class BoundaryRates:
 
     def at(self, x: Vec3, derivatives: int, closer: Real) -> PointValues:
         """The derivatives of w up to order `derivatives` (1 or 2) at points x (3, n), with error
-        bounds. The value in the result has no meaning, unless the mesh's own triangles are summed.
+        bounds. The value in the result has no meaning, unless a tree of the mesh's own triangles is
+        summed.
 
         closer: the accuracy scale of a tree; larger is more accurate.
         """
@@ -96,9 +97,9 @@ class BoundaryRates:
         return sums.values(1 / (4 * math.pi), coordinate_rounding(x), real(0))
 
     def sharp(self, x: Vec3) -> PointValues:
-        """The gradient of w at points x (3, n), with error bounds. Its error is about 1 % of its
-        length in most places: if it comes from a tree, the accuracy is increased until that is so
-        (`sharpened`)."""
+        """The gradient of w at points x (3, n), with error bounds. The error of the gradient is
+        about 1 % of the gradient's length in most places: if it comes from a tree, the accuracy is
+        increased until that is so (`sharpened`)."""
         if isinstance(self.summed, TreeWinding):
             return sharpened(lambda points, accuracy: self.at(points, 1, accuracy), x)
         return self.at(x, 1, 1.0)

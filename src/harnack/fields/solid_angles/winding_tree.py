@@ -208,7 +208,8 @@ class TreeWinding:
         )
 
         def is_ahead(row: list[Real], t: Real) -> Mask:
-            """Mask of the lanes on which a crossing at the ray parameter t is ahead of x."""
+            """Mask of the lanes on which a crossing at the ray parameter t is ahead of x. row: not
+            used."""
             del row
             return t > 0
 
@@ -247,7 +248,8 @@ class TreeWinding:
                 row: list[Real], active: Mask, sums: SourceSums, state: tuple[Any, ...]
             ) -> tuple[SourceSums, tuple[Any, ...]]:
                 """Add the triangle in the record `row` to the sums, on active lanes. state: the
-                parts of the product of the edges' factors so far (`LiftedProduct`)."""
+                parts of the product of the edges' factors so far (`LiftedProduct`). Returns the new
+                sums and the new state."""
                 t, sign = signed_crossing(row, frame)
                 # A crossing is a full turn of the product, which counts them without rounding.
                 re, im, turns = state
@@ -267,9 +269,9 @@ class TreeWinding:
         active_lanes: Mask, derivatives: int = 1,
     ) -> tuple[SourceSums, tuple[Any, ...]]:  # fmt: skip
         """Sums at points x over far clusters, to which the caller's function adds near triangles.
-        They come from the FMM cells if there are cells and no second derivatives are requested, on
-        lanes on which x is in the cells' cube and the accuracy scale `detail` is at most 1;
-        otherwise from the tree.
+        The sums come from the tree, or from the FMM cells if there are cells and no second
+        derivatives are requested. The cells are used on lanes on which x is in the cells' cube and
+        the accuracy scale `detail` is at most 1.
 
         adder: a function that makes the function that adds a near triangle. Its argument is the
             number of radii beyond which nodes are far.
@@ -291,8 +293,9 @@ class TreeWinding:
         return self.cells.sums_with_tree(self.clusters, x, detail, adders, state, active_lanes)
 
     def crossings_ahead(self, frame: RayFrame, t: Real, active: Mask) -> Real:
-        """Always 0. The crossings of rays with triangles need not be counted before sampling,
-        because every sum over the tree contains them and gives w with its integer."""
+        """Always 0, whatever `frame` and t are. The crossings of rays with triangles need not be
+        counted before sampling, because every sum over the tree contains them and gives w with its
+        integer."""
         del frame, t, active
         return self.backend.Float(0)
 
@@ -347,8 +350,9 @@ class TreeWinding:
         """
 
         def rates(lengths: tuple[Real, ...], active: Mask) -> tuple[Real, ...]:
-            """For each length T, a bound of the derivative of 4 pi w along the line at its points
-            within T of x; infinite on lanes that are not active."""
+            """For each length T in `lengths`, a bound of the derivative of 4 pi w along the line at
+            its points within T of x. Returns one bound for each length; it is infinite on lanes
+            that are not active."""
             active = active & active_lanes
 
             def adder(reach: Real) -> AddPrimitive:
@@ -359,8 +363,8 @@ class TreeWinding:
                     row: list[Real], active: Mask, sums: SourceSums, old: tuple[Any, ...]
                 ) -> tuple[SourceSums, tuple[Any, ...]]:
                     """Add the open edges of the triangle in the record `row` to the bounds `old`,
-                    one for each length, on active lanes. The sums over far clusters stay as they
-                    are."""
+                    one for each length, on active lanes. Returns the sums over far clusters,
+                    unchanged, and the new bounds."""
                     # Of the edges only the positions relative to x are used. The rays matter only
                     # for their solid angles, so any direction does.
                     for near_edge in edges_of(row, line.x, VerticalRayFrame(line.x)):

@@ -165,13 +165,14 @@ class BooleanSolid(Solid):
 
     def for_ray_count(self, count: int) -> Field:
         def make(parts: list[Any]) -> Solid:
-            """The same combination of other operands."""
+            """The same combination (union or intersection) of other operands, `parts`."""
             return BooleanSolid(tuple(parts), self.is_union)
 
         return self._for_rays(self.parts, count, make)
 
     def _with_parts(self, parts: list[Field]) -> Solid:
-        """The same combination of other operands, which need not be solids."""
+        """The same combination (union or intersection) of other operands, `parts`. These may be any
+        fields."""
         combination = copy.copy(self)
         object.__setattr__(combination, "parts", tuple(parts))
         coarsest = min((part.coarsest_accuracy for part in parts), default=1.0)
@@ -189,8 +190,8 @@ class BooleanSolid(Solid):
         return self._combine_samples(samples, max_norm(p))[0]
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
-        """The rows of the Hessian at p: that of the operand whose value is the smallest (for a
-        union) or the largest (for an intersection)."""
+        """The three rows of the Hessian of f at p. It is the Hessian of the operand whose value is
+        the smallest (for a union) or the largest (for an intersection)."""
         extreme: Any = None
         rows: Any = None
         for part in self.parts:
@@ -205,10 +206,13 @@ class BooleanSolid(Solid):
         return rows
 
     def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
-        """Two error bounds at p: of the gradient, as a length, and of the Hessian. If the errors of
-        the values leave no doubt which operand has the smallest value (for a union) or the largest
-        (for an intersection), they are the bounds of that operand. Otherwise both are infinite,
-        since derivatives jump from one operand to the other."""
+        """Two error bounds at p: of the gradient, as a length, and of the Hessian. They are the
+        bounds of the operand whose value is the smallest (for a union) or the largest (for an
+        intersection). Where the errors of the values leave open which operand that is, both are
+        infinite, since derivatives jump from one operand to the other.
+
+        sample: the sample of the combination at p.
+        """
         size = max_norm(p)
         sign = -1.0 if self.is_union else 1.0
         total_error = value_error_bound(sample, safe_norm(sample.gradient), size)
@@ -255,13 +259,13 @@ class BooleanSolid(Solid):
     def _combine_enclosures(
         self, operands: list[tuple[Enclosure, ...]], deficits: list[tuple[Real, Real]]
     ) -> tuple[Enclosure, ...]:
-        """The enclosures of the combination's function along a ray, from those of its operands; ()
-        if an operand has none.
+        """The enclosures of the combination's function along a ray, from the enclosures of its
+        operands; () if an operand has no enclosures.
 
-        operands: the enclosures of each operand's function f_i.
-        deficits: for each operand, bounds (lower, upper) of its deficit. That is the difference
-            between the greatest value of all operands and its own value; for a union, values are
-            those of -f_i.
+        operands: for each operand, the enclosures of its function f_i.
+        deficits: for each operand, bounds (lower, upper) of its deficit at the start. The deficit
+            is the greatest value of all operands minus the operand's own value; for a union, the
+            values are those of -f_i.
         """
         if not all(operands):
             return ()
@@ -296,9 +300,9 @@ class BooleanSolid(Solid):
         v_i)) bounds the error of the combination. As max f_i >= v_j - e_j for every j, an operand
         with a smaller error may exclude most of that range. Then the value is set to the middle of
         the remaining range. Without this, a large rounding error of one operand could make a ray
-        hit a surface of it that lies inside of another operand. The tracer reduces the differences
-        between f and the levels by the error of the combination. If the error of an operand is
-        larger than that, the bounds of its deficit are widened by the excess.
+        hit that operand's surface where it lies inside of another operand. The tracer reduces the
+        differences between f and the levels by the error of the combination. If the error of an
+        operand is larger than that, the bounds of its deficit are widened by the excess.
         """
         sign = -1.0 if self.is_union else 1.0
         values = [sign * operand.value for operand in samples]
@@ -382,16 +386,16 @@ def min_wavelength(parts: Iterable[Solid]) -> float | None:
 
 def lipschitz_of(sample: Sample) -> Lipschitz | None:
     """A Lipschitz constant of f on a ball about the point of a sample, as a promise (a proved bound
-    near the point): one that the sample has, or one that follows from another of its promises; None
-    if there is none."""
+    near the point). It is a promise of the sample, or follows from one. None if no promise of the
+    sample implies a Lipschitz constant."""
     implied = [promise.implied_lipschitz(sample.value) for promise in sample.all_promises]
     stated = (promise for promise in sample.all_promises if isinstance(promise, Lipschitz))
     return next(stated, None) or next((promise for promise in implied if promise is not None), None)
 
 
 def _box_around_volumes(volumes: list[Volume]) -> Volume | None:
-    """A box that contains several volumes. A single bounded volume is returned as it is. None if a
-    volume is unbounded."""
+    """A volume that contains the given volumes: a box around them or, if there is only one, that
+    volume itself. None if one of them is unbounded."""
     corners = [volume.bounds() for volume in volumes]
     lower = np.min([volume for volume, _ in corners], axis=0)
     upper = np.max([volume for _, volume in corners], axis=0)

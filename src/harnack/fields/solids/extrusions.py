@@ -282,10 +282,11 @@ class Extrusion(Solid):
         return x, y, z
 
     def _path_lipschitz(self, p: Vec3, direction: Vec3, length: Real) -> Lipschitz:
-        """A Lipschitz constant of f along the ray from p, up to the length `length`. It is the
-        largest speed at which the preimage moves as p moves along the ray, because f has the
-        Lipschitz constant 1 as a function of the preimage. If no bound is found, the constant holds
-        on the length 0."""
+        """A Lipschitz constant of f along the ray that starts at p with the unit vector
+        `direction`, up to the length `length`. It is a bound of the speed of the preimage (the
+        point that twist and taper move to a point of the ray), since f has the Lipschitz constant 1
+        as a function of the preimage. On lanes where no bound is found, the constant is infinite,
+        and holds on the length 0."""
         local = self._preimage(*Jet.along_ray(p, direction, 0.0, length))
         speeds = [0 * p.x + jet.first_derivatives[0].max_abs for jet in local]
         speed = dr.norm(cast("Any", type(p))(*speeds)) * (1 + 1e-5)
@@ -360,22 +361,23 @@ def _corner(d: Real, w: Real) -> tuple[Real, Real, Real]:
 @dataclass(frozen=True)
 class ExtrusionEnclosure(Enclosure):
     """A proved bound of the change of f along a ray, where f is the signed distance from a straight
-    extrusion. d is the signed distance from the outline in the plane, and w = |height| - half the
-    signed distance from the two ends, where `height` is z above the middle of the solid. The gaps
-    are the differences between f at the start and the next level below and above.
+    extrusion. d is the signed distance from the outline in the plane. w is the signed distance from
+    the two ends: w = |v| - h, where v is z above the middle of the solid, and h is half of the
+    solid's height. The gaps are the differences between f at the start of the ray and the next
+    level below and above.
 
     value, error: f at the start, and a bound of its error.
     side: the enclosure of d.
-    height: z above the middle of the solid, at the start.
-    half: half of the solid's height.
+    height: v at the start.
+    half: h.
     rate: the derivative of z along the ray.
 
     Proof. max(d, w) <= f, with equality where f <= 0. So f stays above a level as long as d does or
     w does, and it stays below a level <= 0 as long as both do. The errors of d and w are at most
-    `error`. Besides, f changes by no more than the length of the ray. Along a line w is |height|
-    minus a constant. If w falls, it reaches the value lower by g at the length g/|rate|, unless the
-    height comes to 0 before. If it rises, it never reaches that value. It reaches the value higher
-    by g at the length g/|rate| if it rises, and at (2 |height| + g)/|rate| if it falls first.
+    `error`. Besides, f changes by no more than the length of the ray. Along a line w is |v| minus a
+    constant. If w falls at first, it is lower by g at the length g/|rate|, unless v comes to 0
+    before; and it is higher by g at the length (2 |v| + g)/|rate|, with v at the start. If w rises
+    at first, it is never lower than at the start, and it is higher by g at the length g/|rate|.
     """
 
     value: Real
@@ -391,9 +393,9 @@ class ExtrusionEnclosure(Enclosure):
 
         gaps: the differences between f at the start and its next levels.
 
-        In the code `end_distance` is w and `side` is about d. The deficits are bounds of f - w and
-        of f - d at the start, with the error added: by so much less than f may w or d fall before
-        it is at the level below.
+        In the code `end_distance` is w, and names with `side` belong to d. The deficits are upper
+        bounds of f - w and f - d at the start. So w is above the level below by at least gaps.below
+        minus its deficit, and so is d with its own.
         """
         inf = type(gaps.below)(dr.inf)
         end_distance = dr.abs(self.height) - self.half
@@ -423,8 +425,8 @@ class ExtrusionEnclosure(Enclosure):
         return dr.select(is_valid, fmin(down, up) * (1 - 1e-6), 0)
 
     def _fall(self, gap: Real) -> Real:
-        """A length of the ray on which w falls by less than `gap`; infinite if it never falls so
-        far."""
+        """A length of the ray on which w (the signed distance from the two ends) falls by less than
+        `gap`; infinite if w never falls so far."""
         # w never falls by the gap if |height| grows along the ray, or if |height| is less than the
         # gap, so that the height comes to 0 before.
         is_unreached = (self.height * self.rate >= 0) | (gap > dr.abs(self.height))
@@ -432,7 +434,8 @@ class ExtrusionEnclosure(Enclosure):
         return dr.select((gap > 0) & (length >= 0), length, 0)
 
     def _rise(self, gap: Real) -> Real:
-        """A length of the ray on which w rises by less than `gap`; infinite if it is constant."""
+        """A length of the ray on which w (the signed distance from the two ends) rises by less than
+        `gap`; infinite if w is constant along the ray."""
         # w falls until the height is 0, and rises from there on.
         is_falling = self.height * self.rate < 0
         path = gap + dr.select(is_falling, 2 * dr.abs(self.height), 0)
@@ -469,7 +472,8 @@ def outline_distance_jet(nearest: Callable[[Real, Real], OutlineSample], x: Jet,
     value = value + Interval(-value_error, value_error)
 
     def lipschitz_range(i: int, jet_u: Jet, jet_v: Jet) -> Interval:
-        """The range of the derivative of d by variable i that the Lipschitz constant 1 of d proves.
+        """The range of the derivative of d by the variable i of the jets, as it follows from the
+        Lipschitz constant 1 of d.
 
         jet_u, jet_v: the jets of the two coordinates.
         """
@@ -603,11 +607,11 @@ class SolidOfRevolution(Solid):
         return self._sample(p, r, outward, _prepared_for(self, p)._outline.sample(r, p.z))
 
     def _sample(self, p: Vec3, r: Real, outward: tuple[Real, Real], side: OutlineSample) -> Sample:
-        """The sample of f at p, from the sample of the outline's signed distance at (r, z).
+        """The sample of f at p, from the sample of the signed distance from the outline at (r, z).
 
         r: the distance of p from the axis.
         outward: x and y of the unit vector from the axis to p.
-        side: the sample of the outline's distance.
+        side: the sample of the distance from the outline.
         """
         epsilon = 2 * float(dr.epsilon(type(p.x)))
         radial, up = side.gradient
@@ -623,11 +627,12 @@ class SolidOfRevolution(Solid):
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
         """The sample at the point of a ray with parameter t, with an enclosure (a proved bound of
-        the change of f along the ray) in front of the point, up to the length `ahead`; there is
-        none behind it.
+        the change of f along the ray) in front of the point, up to the length `ahead`. Behind the
+        point there is no enclosure.
 
-        It is the enclosure of the distance from the outline along the tangent line of (r(s), z(s)),
-        whose lower bounds are reduced by `_tangent_gap`. If the caller asks for other kinds of
+        In the half-plane (r, z) the ray is a curve. The enclosure is that of the distance from the
+        outline along the tangent line of this curve at the point. Its lower bounds are reduced by
+        the distance between curve and line, `_tangent_gap`. If the caller asks for other kinds of
         enclosures, they follow from the Lipschitz constant 1.
 
         path: the ray.

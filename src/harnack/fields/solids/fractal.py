@@ -78,9 +78,12 @@ CONSTANTS: dict[Fade, NoiseConstants] = {
 
 
 def fade(kind: Fade, t: Any) -> tuple[Any, Any, Any]:
-    """The fade function and its first two derivatives at t, 0 <= t <= 1. It is the interpolation
-    weight of the far end of an edge, at the position t from the near end. The weight rises from 0
-    to 1, with slope 0 at both ends."""
+    """Return the fade function and its first two derivatives at t, 0 <= t <= 1. The fade function
+    is the interpolation weight of the far end of an edge, at the position t from the near end. It
+    rises from 0 to 1, with slope 0 at both ends.
+
+    kind: which fade function: "quintic" or "cubic".
+    """
     if kind == "cubic":
         return t * t * (3 - 2 * t), 6 * t * (1 - t), 6 - 12 * t
     rest = 1 - t
@@ -139,7 +142,8 @@ def cell_noise(kind: Fade, t: Any, vectors: Any) -> tuple[Any, list[Any], list[A
 
 
 def lattice_vector(x: Any, y: Any, z: Any, seed: Any, like: Real) -> list[Any]:
-    """A pseudo-random unit vector (3,) for a lattice point, the same for equal numbers.
+    """A pseudo-random unit vector (3,) for a lattice point, the same whenever coordinates and seed
+    are the same.
 
     x, y, z: the integer coordinates of the lattice point, Dr.Jit UInt32.
     seed: a Dr.Jit UInt32; another seed gives other vectors.
@@ -198,8 +202,10 @@ class FractalNoise(FormulaSolid):
             object.__setattr__(self, name, value)
 
     def _sum(self, power: float) -> float:
-        """The sum of a_i (2^i k)^power over the octaves i, rounded up. A bound of the derivatives
-        of order `power` of gradient noise, multiplied by this sum, bounds the derivatives of f."""
+        """The sum of a_i (2^i k)^power over the octaves i, rounded up; a_i is the amplitude of
+        octave i, and 2^i k its number of lattice points per unit of length. A bound of the
+        derivatives of order `power` of gradient noise, multiplied by this sum, bounds the
+        derivatives of f of that order."""
         terms = (2.0 ** (i * (power - self.beta)) for i in range(self.octaves))
         return self.amplitude * self.frequency**power * sum(terms) * (1.0 + 1e-5)
 
@@ -375,8 +381,9 @@ class Noise(FractalNoise):
         seed: int = 0,
         fade: Fade = "quintic",
     ) -> None:
-        """Make fractal noise with one octave. Its exponent beta, by which amplitudes fall from
-        octave to octave, is then of no effect, and set to 0."""
+        """Make fractal noise with one octave; the class docstring describes the arguments. The
+        exponent beta says how amplitudes fall from octave to octave. With one octave it has no
+        effect, and is set to 0."""
         # In this order: octaves, beta, frequency, amplitude, seed, fade.
         super().__init__(1, 0.0, frequency, amplitude, seed, fade)
 
@@ -456,9 +463,10 @@ class _Octave:
         starts: the jets where the piece starts; for a point, `coordinates` themselves. Their values
             lie within `start_error` of the octave's point q.
 
-        Proof. Within the distance m of q, the gradient differs from the gradient at q by at most
-        bend m (mean value theorem). Derivatives along a line follow by the chain rule. The value is
-        the value at the start plus the integral of the slope.
+        Proof. Let `bend` bound all second derivatives of the octave along lines. Within the
+        distance m of q, the gradient differs from the gradient at q by at most bend m (mean value
+        theorem). Derivatives along a line follow by the chain rule. The value is the value at the
+        start plus the integral of the slope.
         """
         error = self.error + self.slope * start_error * (1 + 1e-5)
         value = Interval(self.value - error, self.value + error)
@@ -488,7 +496,7 @@ class _Octave:
         jets: the jets of the coordinates, whose values lie within `distance` of the octave's point.
         value: the range of the value.
         is_point: whether second derivatives are computed from the Hessian; else they are bounded by
-            `bend`.
+            `bend`, which bounds all second derivatives of the octave along lines.
         """
         change = self.bend * distance + self.slope_error
         # The gradient within `distance` of the point, and never longer than `slope`. (-max(-a, -b)
@@ -534,7 +542,7 @@ def _interval_sum(parts: list[Interval]) -> Interval:
 
 def _hessian_form(hessian: list[Interval], jets: list[Jet], i: int, j: int) -> Interval:
     """The number x_i^T H x_j as an interval, where x_i is the derivative of the coordinates (x, y,
-    z) by variable i.
+    z) by the variable i of their jets.
 
     hessian: the upper triangle (6,) of the matrix H, row by row, as intervals.
     jets: the jets of the three coordinates, which hold these derivatives.

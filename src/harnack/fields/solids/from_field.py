@@ -108,8 +108,7 @@ def solid(
 
 
 def _levels(levels: Any, count: int) -> tuple[float, ...] | None:
-    """The levels as a tuple of `count` finite numbers. None if they are not numbers, not finite, or
-    not that many."""
+    """The levels as a tuple of floats; None unless they are `count` finite numbers."""
     try:
         numbers = tuple(float(level) for level in levels)
     except (TypeError, ValueError):
@@ -140,7 +139,7 @@ class SublevelSolid(SolidOfField):
             return None
 
         def is_inside(value: float) -> bool:
-            """Whether a point at which f has this value is one of the points that the volume must
+            """Whether points at which f is `value` are among the points that the volume must
             contain."""
             return value >= level if above else value <= level
 
@@ -166,10 +165,10 @@ class SublevelSolid(SolidOfField):
 def bounded_side_extent(
     field: Field, levels: tuple[float, ...], is_inside: Callable[[float], bool]
 ) -> Volume | None:
-    """A volume that contains all points inside a solid made of the field f. If f is defined only in
-    the field's domain, or the field has no extent, it is the domain (None if there is none).
-    Otherwise it is the extent, if that has bounds and all points outside of it are outside of the
-    solid; else None.
+    """A volume that contains all points inside a solid made of the field f; None if none is known.
+    If f is defined only in the field's domain, or the field has no extent (a volume that contains
+    the level sets), it is the domain. Otherwise it is the extent, if that is bounded and all points
+    outside of it are outside of the solid.
 
     field: the field f.
     levels: the values of f on the surface of the solid.
@@ -240,8 +239,8 @@ def field_jet(field: Field, x: Jet, y: Jet, z: Jet) -> Jet:
     def derivative_ranges(
         jets: list[Jet], distance: Real
     ) -> tuple[tuple[Interval, ...], tuple[Interval, ...]]:
-        """The ranges of the first and of the second derivatives of f with respect to the variables
-        of the jets, by the chain rule.
+        """Return two tuples: the ranges of the first derivatives of f with respect to the variables
+        of the jets, and those of the second derivatives, by the chain rule.
 
         jets: the jets of the three coordinates.
         distance: a bound of the distance from q to all points of the box of these jets (m in the
@@ -387,17 +386,22 @@ class BandSolid(SolidOfField):
         return prepared
 
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
-        """A volume that is proved to contain all points where |f - level| - half_width is at most
-        the number `level`. These points lie between two level sets of f. If no such volume is
-        known, or if `above` (a volume for all points where that difference is at least `level`), it
-        is the field's domain, outside of which f is not defined; None if there is no domain."""
+        """A volume that is proved to contain all points where the solid's function, |f -
+        self.level| - half_width, is at most the argument `level`. These points lie between two
+        level sets of f. With `above` the volume contains all points where the solid's function is
+        at least `level`.
+
+        The field's domain (outside of which f is not defined) is returned with `above`, and if no
+        smaller volume is known. None if there is no domain.
+        """
         # The two values of f on the surface of these points.
         ends = tuple(self.level + sign * (self.half_width + level) for sign in (-1, 1))
         if above or (self.field.is_global and self.field.period is None):
             return self.domain
 
         def is_inside(value: float) -> bool:
-            """Whether a point at which f has this value is one of these points."""
+            """Whether points at which f is `value` are among the points that the volume must
+            contain."""
             offset, period = value - self.level, self.field.period
             if period is not None:
                 offset -= period * round(offset / period)
@@ -417,7 +421,10 @@ class BandSolid(SolidOfField):
         """Two error bounds at p, of the gradient and of the Hessian: those of the field f. Both are
         infinite where rounding leaves open whether f is above or below the level, since derivatives
         jump there. For an angle-valued f they are also infinite where rounding leaves open which
-        multiple of the period is nearest."""
+        multiple of the period is nearest.
+
+        sample: the sample of the solid at p; not used.
+        """
         inner_sample = self.field.evaluate(p)
         first_error, second_error = self.field.derivative_errors(p, inner_sample)
         error = value_error_bound(inner_sample, safe_norm(inner_sample.gradient), max_norm(p))
@@ -441,7 +448,7 @@ class BandSolid(SolidOfField):
         sample, offset = self._sample_with_difference(ray_sample.sample)
 
         def folded(enclosures: tuple[Enclosure, ...]) -> tuple[Enclosure, ...]:
-            """The enclosures of |f - level| from those of f."""
+            """The enclosures of |f - level|, from the given enclosures of f: one for each."""
             return tuple(
                 FoldedEnclosure(enclosure, offset, self.field.period) for enclosure in enclosures
             )
@@ -468,8 +475,9 @@ class BandSolid(SolidOfField):
         return offset if period is None else offset - period * dr.round(offset / period)
 
     def _sample_with_difference(self, sample: Sample) -> tuple[Sample, Real]:
-        """The sample of |f - level| - half_width, from the sample of f at the same point; and the
-        difference f - level of `_level_difference`.
+        """Two results: the sample of |f - level| - half_width, from the sample of f at the same
+        point; and the difference f - level, reduced by the nearest multiple of the period if f is
+        angle-valued.
 
         The only promise of the new sample (a proved bound near the point) is a Lipschitz constant
         of f, if one is known. Other bounds of f are not bounds of |f - level|, whose gradient jumps

@@ -169,18 +169,22 @@ class Julia(Solid):
         return Sample(value, gradient, tuple(promises), error)
 
     def _parameter(self, name: str) -> Any:
-        """The attribute with this name, a number of the backend (of the prepared solid)."""
+        """The attribute `name` of the prepared solid, a number (or a tuple) on the backend."""
         return getattr(self, name)
 
     def _orbit(self, p: Vec3, radii: tuple[Real, ...]) -> tuple[Any, ...]:
         """Compute the orbit of p. Returns four results: f at p; its gradient; a bound of the error
         of f; and for each radius a bound of |grad f| on the ball of that radius about p.
 
-        radii: the first must be 0, so that the error of f is that of rounding alone.
+        radii: of the balls. The first must be 0: it gives the rounding error of f.
 
-        In the notation of the class docstring `Julia`, `size` is |c|, b is B, and for each radius
-        `change` holds e_n, `slopes` d_n, `min_q` m_n and `rates` g_n. `jac` is the Jacobian of q_n
-        with respect to x, y and z. `rounded` is the bound of the rounding of one iteration.
+        The class docstring has the formulas, for all orbits that begin in the ball about p. In the
+        code `size` is |c|, and b is B. For each radius, `change` holds e_n, a bound of how far the
+        n-th iterates of these orbits are from q_n; `slopes` holds d_n, a bound of the derivatives
+        of these iterates by the starting point; `min_q` holds m_n, a lower bound of their absolute
+        values; and `rates` holds g_n, a bound of the derivatives of the logarithms of these. `jac`
+        is the Jacobian of q_n with respect to x, y and z. `rounded` is the bound of the rounding of
+        one iteration.
         """
         c, size, b = self._parameter("_c"), self._parameter("_size"), self._parameter("_b")
         real = cast("Any", type(p.x))
@@ -200,8 +204,8 @@ class Julia(Solid):
             """The state of the loop after one more iteration.
 
             The state consists of the number n of iterations; the four components of q_n; the 12
-            entries of its Jacobian with respect to x, y and z, row by row; and `change`, `slopes`,
-            `min_q` and `rates`.
+            entries of its Jacobian with respect to x, y and z, row by row; and four bounds for each
+            radius, `change`, `slopes`, `min_q` and `rates`, which `_orbit` explains.
             """
             q, jac = list(state[:4]), state[4:16]
             change, slopes, min_q, rates = _split_in_four(state[16:])
@@ -236,7 +240,8 @@ class Julia(Solid):
             return n + 1, *next_q, *next_jac, *next_change, *next_slopes, *next_min_q, *next_rates
 
         def is_active(n: Any, *state: Any) -> Any:
-            """Whether iterations are left, and the orbit has not escaped."""
+            """A mask of the lanes on which iterations are left and the orbit has not escaped. n,
+            state: as in `iterate`."""
             return (n < self.iterations) & (_squared_norm(state[:4]) <= escape * escape)
 
         index = dr.uint32_array_t(real)

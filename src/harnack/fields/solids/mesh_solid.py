@@ -226,12 +226,12 @@ class MeshSolid(Solid):
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
         """The sample at the point of a ray with parameter t, with enclosures (proved bounds of the
-        change of f along the ray) in front of the point and behind it, which follow from the
-        Lipschitz constant 1; and with a lower bound of |grad f|.
+        change of f along the ray) in front of the point and behind it, and with a lower bound of
+        |grad f|. The enclosures follow from the Lipschitz constant 1.
 
         path: the ray.
-        ahead, back: lengths for which enclosures are wanted; not used, as these hold on all
-            lengths.
+        ahead, back: the lengths in front of and behind the point for which enclosures are wanted;
+            not used, as the enclosures hold on all lengths.
         """
         del ahead, back
         ray_sample = path.enclose(self.evaluate(path.point(t)))
@@ -272,7 +272,7 @@ def share_samples() -> Generator[None]:
 
 
 def _data_on_backend(solid: Any, like: Any) -> _MeshData:
-    """The data of a solid on a backend; they are uploaded if the solid is not prepared.
+    """The triangles of a solid on a backend; they are uploaded if the solid is not prepared.
 
     like: a number or a point of the backend.
     """
@@ -473,9 +473,10 @@ def mesh_distance_jet(solid: MeshSolid, x: Jet, y: Jet, z: Jet) -> Jet:
     value = Interval(sample.value, sample.value).widened(1e-6, 0.0) + Interval(-error, error)
 
     def speeds(jets: Any) -> list[Real]:
-        """For each variable, a bound of the length of the derivative of (x, y, z) by that variable.
+        """For each variable of the jets, a bound of the length of the derivative of (x, y, z) by
+        that variable: of the speed at which the point moves.
 
-        jets: the jets of the coordinates.
+        jets: the jets of the three coordinates, which are functions of one or more variables.
         """
         return [
             dr.sqrt(sum(dr.square(zero + coord.first_derivatives[i].max_abs) for coord in jets))
@@ -502,10 +503,11 @@ def mesh_distance_jet(solid: MeshSolid, x: Jet, y: Jet, z: Jet) -> Jet:
         first.append(Interval(lower, upper))
 
     def rate_along(direction: Vec3, jets: Any, i: int) -> Interval:
-        """The range of the dot product of a vector with the derivative of (x, y, z) by variable i.
+        """The range of the dot product of a vector with the derivative of (x, y, z) by the variable
+        i of the jets.
 
         direction: (3,) the vector.
-        jets: the jets of the coordinates.
+        jets: the jets of the three coordinates, which are functions of one or more variables.
         """
         total = Interval(0.0, 0.0)
         for coord, jet in zip(direction, jets, strict=True):
@@ -645,10 +647,10 @@ def _boundary_pieces(
     area, pieces that coincide count once. If several faces coincide, and more of them are turned
     one way than the opposite way, each of these is a piece of the boundary.
 
-    Triangles thinner than `_THIN_HEIGHT` have no reliable normal, and so the winding numbers on
-    their two sides are not reliable. If the boundary is all faces, it includes these triangles,
-    too. Otherwise their computed winding numbers decide whether they are part of it; a wrong
-    decision moves the surface by no more than their height.
+    Triangles thinner than `_THIN_HEIGHT` (about 1e-9 of the mesh's size) have no reliable normal,
+    and so the winding numbers on their two sides are not reliable. If the boundary is all faces, it
+    includes these triangles, too. Otherwise their computed winding numbers decide whether they are
+    part of it; a wrong decision moves the surface by no more than their height.
 
     Raises:
         MeshError: the mesh is inside out, or faces lie on each other.
@@ -716,7 +718,7 @@ def _boundary_pieces(
 
 
 def _is_closed(pieces: FloatArray, jump: FloatArray, is_thick: BoolArray) -> bool:
-    """Whether triangles, some of which may coincide, together bound a volume.
+    """Whether triangles together bound a volume. Some of them may coincide.
 
     pieces: (k, 3, 3) their corners.
     jump: (k,) by how much the winding number changes across each piece.
@@ -743,8 +745,8 @@ def _is_closed(pieces: FloatArray, jump: FloatArray, is_thick: BoolArray) -> boo
 
 def _check_closed(vertices: FloatArray, welded: Welded) -> None:
     """Raise MeshError unless every edge occurs as often in one direction as in the other. The
-    message names an open edge, which belongs to one face only; or else an edge at which faces are
-    turned differently.
+    message names an open edge, one that belongs to a single face. If there is none, it names an
+    edge whose faces do not agree on which side is outside.
 
     vertices: (n, 3).
     welded: the faces; its `edges` are those that occur more often in one direction than in the

@@ -198,11 +198,12 @@ class OutlineEdges:
     def _add_edges_by_chains(
         self, chains: RecordTable, query: _OutlineQuery, state: tuple[Any, ...]
     ) -> tuple[Any, ...]:
-        """Loop over the chains: the state of the loop over edges (see `_OutlineQuery`) with all
-        edges added. A chain that is too far away to hold the nearest edge is added by its box, in
-        place of its edges.
+        """Loop over the chains of edges, and return the state of the loop over edges with all edges
+        added; `_OutlineQuery` lists the members of this tuple. A chain that is too far away to hold
+        the nearest edge is added by its box, in place of its edges.
 
         chains: the records of the chains.
+        query: the query points and the lines from them.
         state: the state before any edge.
         """
         # A distance within which some chain must have a point, so that the nearest edge is not
@@ -212,8 +213,8 @@ class OutlineEdges:
         index = type(chains.iteration_count)(0)
 
         def visit_chain(i: Any, *state: Any) -> tuple[Any, ...]:
-            """The index of the next chain; and the state with chain i added, by its edges if it is
-            near, else by its box."""
+            """Return the index of the next chain; and the state of the loop over edges with chain i
+            added, by its edges if it is near, else by its box."""
             record = chains.read_record(i)
             # A near chain has `count` edges to visit. A far one has 0, and its box is already in
             # the state.
@@ -221,7 +222,7 @@ class OutlineEdges:
             first_edge, count = type(i)(record[6]), type(i)(count)
 
             def each(j: Any, *edge_state: Any) -> tuple[Any, ...]:
-                """The next index, and the state with edge j of the chain added."""
+                """Return the next index, and the state with edge j of the chain added."""
                 return j + 1, *query.with_edge(self.edges.read_record(first_edge + j), edge_state)
 
             def has_more(j: Any, *_: Any) -> Mask:
@@ -240,8 +241,11 @@ class OutlineEdges:
 class _OutlineQuery:
     """Query points of the plane, one per lane, at which the signed distance from an outline is
     wanted, and lines from these points along which it is bounded at given positions, the knots. A
-    loop visits the edges of the outline one by one; the methods update its state, a tuple, by an
-    edge or by a chain of edges. Edges and chains are read as records (`OutlineEdges`).
+    loop visits the edges of the outline one by one; the methods update its state by an edge or by a
+    chain of edges. The state is a tuple: the distance from the nearest edge so far, with numbers
+    about this edge; whether the ray from the point towards +x has crossed an odd number of edges,
+    so that the point is inside; and the bounds at the knots. Edges and chains are read as records
+    (`OutlineEdges`).
 
     x, y: the query points, relative to the outline's center.
     velocity: the direction of the lines, of length 1 at most; None without lines.
@@ -249,12 +253,12 @@ class _OutlineQuery:
     error: a bound of the rounding of distances from boxes.
     unit: the machine epsilon.
 
-    The state consists of these parts: the distance from the nearest edge so far, and its rounding
-    error; x and y of the vector from the nearest point of that edge to the query point; x and y of
-    the edge's unit normal; whether the nearest point lies inside the edge, so that it is no vertex;
-    whether the ray towards +x has crossed an odd number of edges; and for each knot a lower bound
-    of the distance there. The distance from an edge lies above its tangent at the start of the
-    line, so the bound is the smallest value at the knot of all these tangents.
+    In detail, the state consists of these parts: the distance from the nearest edge so far, and its
+    rounding error; x and y of the vector from the nearest point of that edge to the query point; x
+    and y of the edge's unit normal; whether the nearest point lies inside the edge, so that it is
+    no vertex; whether the ray towards +x has crossed an odd number of edges; and for each knot a
+    lower bound of the distance there. The distance from an edge lies above its tangent at the start
+    of the line, so the bound is the smallest value at the knot of all these tangents.
     """
 
     x: Real
@@ -265,9 +269,10 @@ class _OutlineQuery:
     unit: float
 
     def with_edge(self, row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
-        """The state of the loop after one more edge was visited.
+        """Return the state of the loop after one more edge was visited: a tuple, whose members the
+        class docstring lists.
 
-        row: the record of the edge: (ax, ay, bx, by, 1/length^2).
+        row: the record of the edge from a to b: (ax, ay, bx, by, 1/length^2).
         state: the state before.
         """
         nearest, error, away_x, away_y, normal_x, normal_y, on_edge, inside, *bounds = state
@@ -337,7 +342,7 @@ class _OutlineQuery:
 
         row: the record of the chain.
         limit: a distance within which the nearest edge lies.
-        state: the state before (see the class).
+        state: the state of the loop before, whose members the class docstring lists.
         """
         nearest, error, away_x, away_y, normal_x, normal_y, on_edge, inside, *bounds = state
         to_x, to_y = self.x - clamp(self.x, row[0], row[2]), self.y - clamp(self.y, row[1], row[3])
@@ -356,8 +361,9 @@ class _OutlineQuery:
     def _with_tangent(
         self, bounds: list[Real], x: Real, y: Real, distance: Real, error: Real
     ) -> list[Real]:
-        """The lower bounds at the knots after one more edge or box: the smaller of the bounds so
-        far and of the tangent of the distance from it at the start of the line.
+        """The lower bounds at the knots after one more edge or box was visited. Along the line, the
+        distance from the edge or box lies above its tangent at the start. So at each knot the new
+        bound is the smaller of the bound so far and of the tangent's value.
 
         bounds: the bounds so far, one for each knot.
         x, y: the vector from the nearest point of the edge or box to the query point.
@@ -418,7 +424,7 @@ class SignedDistanceEnclosure(Enclosure):
     def around(
         cls, nearest: OutlineSample, slope: Real, knots: tuple[Real, ...]
     ) -> SignedDistanceEnclosure:
-        """The enclosure from a sample of d at the start of the line.
+        """The enclosure of d, from the sample of d at the start of the line.
 
         nearest: the sample, with lower bounds at the knots.
         slope: the derivative of d along the line at its start.

@@ -58,8 +58,8 @@ def ball_around(center: tuple[float, float, float], radius: float) -> Volume:
 
 
 def set_frozen(shape: Any, name: str, value: Any) -> None:
-    """Set an attribute of a solid although its class is a frozen dataclass, whose attributes cannot
-    be set in the usual way."""
+    """Set the attribute `name` of a solid, `shape`. Its class is a frozen dataclass, whose
+    attributes cannot be set in the usual way."""
     object.__setattr__(shape, name, value)
 
 
@@ -99,9 +99,9 @@ def not_a_solid(other: Any) -> str:
 
 
 def _with_source(prepare: Callable[[Any, Backend], Field]) -> Callable[[Any, Backend], Field]:
-    """Decorator of the method `prepare` of a solid: the prepared solid, whose numbers lie on a
-    backend, keeps a reference to the original in its attribute `_source`. Python knows the
-    original's numbers, from which `Solid.extent` is computed."""
+    """Decorator of the method `prepare` of a solid. The prepared solid, whose numbers lie on a
+    backend, keeps a reference to the original in its attribute `_source`. The original has Python
+    numbers, from which `Solid.extent` is computed."""
 
     @functools.wraps(prepare)
     def remembering(self: Any, backend: Backend) -> Field:
@@ -146,16 +146,16 @@ class Solid(Field):
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
         """A volume that is proved to contain the level sets of f at these levels; None if none is
         known. It is a volume that contains all points with f at most the highest level; if none is
-        known, one that contains all points with f at least the lowest level. A prepared solid asks
-        the original, whose numbers are known to Python."""
+        known, one that contains all points with f at least the lowest level. For a prepared solid
+        it is computed from the original, which has Python numbers."""
         original: Solid = vars(self).get("_source", self)
         return original.sublevel_extent(max(levels)) or original.sublevel_extent(
             min(levels), above=True
         )
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
-        """Wrap the method `prepare` of a new subclass: a prepared solid keeps a reference to the
-        original."""
+        """Wrap the method `prepare` of a new subclass, so that a prepared solid keeps a reference
+        to the original."""
         super().__init_subclass__(**kwargs)
         if "prepare" in vars(cls):
             cls.prepare = _with_source(cls.prepare)  # type: ignore[method-assign]
@@ -176,8 +176,8 @@ class Solid(Field):
     @abc.abstractmethod
     def map_operands(self, change: Callable[[Solid], Solid]) -> Solid:
         """The same combination with each operand replaced by change(operand). (Operands are the
-        solids that are combined.) A solid that is not a combination is its own operand: the result
-        is change(self)."""
+        solids that are combined.) For a solid that is not a combination the result is
+        change(self)."""
 
     # Combinations. Operands that are not solids are refused.
 

@@ -78,7 +78,8 @@ class Thread(Solid):
 
     def __post_init__(self) -> None:
         """Check the arguments, and compute the numbers that the formula needs: three periods of the
-        profile, the lead, the smallest and largest radii, and the Lipschitz constant.
+        profile, the lead (the distance by which the screw moves in a turn), the smallest and
+        largest radii, and the Lipschitz constant.
 
         Raises:
             ValueError, TypeError: arguments of another kind.
@@ -207,7 +208,7 @@ class Thread(Solid):
         return replace(ray_sample, forward=(*ray_sample.forward, cylinder))
 
     def _profile_radius(self, z: Real) -> Real:
-        """The r of the polyline at the position z along the axis, from 0 to the pitch."""
+        """The profile's r at the position z along the axis. z: from 0 to the pitch."""
         height = 0 * z
         for (start_z, start_r), (end_z, end_r) in itertools.pairwise(self._corners()):
             r = start_r + (z - start_z) / (end_z - start_z) * (end_r - start_r)
@@ -215,7 +216,8 @@ class Thread(Solid):
         return height
 
     def _corners(self) -> tuple[tuple[Real, Real], ...]:
-        """The corners (z, r) of three periods of the profile."""
+        """The vertices (z, r) of three periods of the profile, and the first one of the next
+        period."""
         return cast("Any", self)._points
 
     def _distance_with_gradient(

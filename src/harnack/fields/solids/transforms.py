@@ -254,8 +254,8 @@ class TransformedSolid(SolidOfField):
         return self._image_sample(self.field.evaluate(local), self._term_bound(p, 0.0))
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
-        """The rows of the Hessian of f at p: M^-T H M^-1 times the value factor, where H is the
-        Hessian of the inner solid at the preimage of p."""
+        """The three rows of the Hessian of f at p: of M^-T H M^-1 times the map's `value_factor`,
+        where H is the Hessian of the inner solid at the preimage of p."""
         numbers = self.numbers
         rows = self.field.hessian(type(p)(*numbers.local(p.x, p.y, p.z)))
         # `pull_back` multiplies a vector by M^-T. Applied to each row of H it gives the rows of H
@@ -268,8 +268,11 @@ class TransformedSolid(SolidOfField):
     def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
         """Two error bounds at p, of the gradient and of the Hessian. For an inner solid with a
         formula they follow from the ranges of the formula. For any other inner solid they are its
-        own bounds at the preimage of p, scaled. These leave out the effect of the rounding of the
-        preimage, which is not known."""
+        own bounds at the preimage of p, scaled; these leave out the effect of the preimage's
+        rounding on the derivatives, since no bound of that effect is known.
+
+        sample: the sample of f at p; not used.
+        """
         del sample
         numbers = self.numbers
         local = type(p)(*numbers.local(p.x, p.y, p.z))
@@ -305,7 +308,8 @@ class TransformedSolid(SolidOfField):
         sample = self._image_sample(ray_sample.sample, self._term_bound(o, t))
 
         def stretched(enclosures: tuple[Any, ...]) -> tuple[Any, ...]:
-            """The enclosures along the ray from those along the line of the preimages."""
+            """Return the enclosures along the ray, from the given enclosures along the line of the
+            preimages: one for each."""
             return tuple(
                 ScaledEnclosure(enclosure, speed, numbers.factor) for enclosure in enclosures
             )
@@ -340,9 +344,9 @@ class TransformedSolid(SolidOfField):
         factor, stretch = numbers.factor, numbers.stretch
 
         def image_of_promise(promise: Promise) -> Promise:
-            """A proved bound of the image's function near the point, from such a bound of the inner
-            solid's function. If the map is no similarity, harmonic functions do not stay harmonic,
-            so such bounds are weakened first."""
+            """A proved bound of the image's function near the point, from a proved bound of the
+            inner solid's function. If the map is no similarity, harmonic functions do not stay
+            harmonic; so a bound that holds for harmonic functions is weakened first."""
             if self.map.similarity is None:
                 promise = promise.weakened_for_linear_maps(sample.value)
             return promise.scaled(factor).linearly_mapped(stretch)
@@ -381,7 +385,7 @@ class _InverseMap:
 
     @classmethod
     def of(cls, change: AffineMap) -> _InverseMap:
-        """The inverse of an affine map, in Python numbers."""
+        """The inverse of the affine map `change`, in Python numbers."""
         inverse = change.inverse
         stretch = float(np.linalg.svd(inverse, compute_uv=False)[0]) * (1 + 1e-6)
         return cls(
@@ -410,8 +414,8 @@ class _InverseMap:
         return replace(prepared, rows=rows[:3], translation_vector=rows[3])
 
     def local(self, x: Any, y: Any, z: Any) -> tuple[Any, Any, Any]:
-        """The preimage M^-1 (p - b) of the point p = (x, y, z). Coordinates may be numbers of any
-        arithmetic."""
+        """The three coordinates of M^-1 (p - b), the preimage of the point p = (x, y, z).
+        Coordinates may be numbers of any arithmetic."""
         a, b, c = (
             coordinate if _is_literal(shift, 0.0) else coordinate - shift
             for coordinate, shift in zip((x, y, z), self.translation_vector, strict=True)
@@ -419,7 +423,7 @@ class _InverseMap:
         return self.local_direction(a, b, c)
 
     def local_direction(self, x: Any, y: Any, z: Any) -> tuple[Any, Any, Any]:
-        """The preimage M^-1 d of a direction d = (x, y, z)."""
+        """The three components of M^-1 d, the preimage of a direction d = (x, y, z)."""
         u, v, w = (_weighted_sum(row, (x, y, z)) for row in self.rows)
         return u, v, w
 

@@ -257,9 +257,10 @@ class Tube(Solid):
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
         """The sample at the point of a ray with parameter t, with an enclosure (a proved bound of
-        the change of f along the ray) in front of the point, up to the length `ahead`; there is
-        none behind it. It is a `TangentEnclosure`. If the caller asks for other kinds of
-        enclosures, they follow from the Lipschitz constant 1, in front of the point and behind it.
+        the change of f along the ray) in front of the point. The enclosure is a `TangentEnclosure`,
+        up to the length `ahead`; behind the point there is none. If the caller asks for other kinds
+        of enclosures, they follow from the Lipschitz constant 1, in front of the point and behind
+        it.
 
         path: the ray.
         ahead, back: the lengths in front of and behind the point; `back` is not used.
@@ -352,8 +353,7 @@ class Tube(Solid):
         return sample, distance, tuple(bound - distance - error for bound in final[5:])
 
     def _parameter(self, name: str) -> Any:
-        """The attribute with this name, which is a number of the backend once the tube is
-        prepared."""
+        """The attribute `name`, which is a number of the backend once the tube is prepared."""
         return getattr(self, name)
 
 
@@ -421,8 +421,8 @@ def _add_segments_by_groups(
     max_distance = min_end * (1 + 16 * epsilon) + 16 * epsilon * dr.norm(p)
 
     def visit_group(i: Any, *state: Any) -> tuple[Any, ...]:
-        """The next index, and the state with group i added: by its segments if the group is near,
-        else by the tangent of the distance from its ball."""
+        """Return the next index, and the state of the loop over segments with group i added: by its
+        segments if the group is near, else by the tangent of the distance from its ball."""
         ball = groups.read_record(i)
         from_center = p - vector(*ball[:3])
         distance = dr.norm(from_center)
@@ -439,7 +439,7 @@ def _add_segments_by_groups(
             )
 
         def visit_segment(j: Any, *segment_state: Any) -> tuple[Any, ...]:
-            """The next index, and the state with segment j of the group added."""
+            """Return the next index, and the state with segment j of the group added."""
             return j + 1, *add_segment(records.read_record(i * _GROUP_SIZE + j), segment_state)
 
         def has_more_segments(j: Any, *_: Any) -> Any:
@@ -578,7 +578,7 @@ class TubeNetwork(PatchField["_TubeBuffers"]):
     default_level: float = 0.0
 
     def __init__(self, points: Any, segments: Any, radius: Any) -> None:
-        """Check the arguments, and store them as NumPy arrays."""
+        """Check points, segments and radius (see the class), and store them as NumPy arrays."""
         super().__init__()
         array = as_real_array(points, "the points of tubes")
         check_vectors(array, "the points of tubes")
@@ -589,9 +589,11 @@ class TubeNetwork(PatchField["_TubeBuffers"]):
         self.radius: FloatArray = _checked_radius(radius, len(self.segments))
 
     def boxes(self, levels: tuple[float, ...] | None = None) -> tuple[FloatArray, FloatArray]:
-        """Lower and upper corners, two arrays (m, 3), of boxes. Each box contains one tube.
+        """Return two arrays (m, 3): the lower and the upper corners of boxes. There is a box for
+        each segment, which contains the segment's tube.
 
-        levels: the largest of them is added to the radii; None for the levels of the field.
+        levels: values of f that are drawn; the largest is added to the radii. None for the levels
+            of the field.
         """
         level = max(self.levels if levels is None else levels)
         ends = self.points[self.segments]
