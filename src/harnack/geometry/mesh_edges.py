@@ -22,6 +22,7 @@ __all__ = [
     "distances_from_triangles",
     "edge_keys",
     "half_edges",
+    "has_distinct_corners",
     "limited_rows",
     "longest_edges",
     "normals_at_vertices",
@@ -179,6 +180,11 @@ def half_edges(faces: IntArray) -> IntArray:
     indices of points. First come the edges of all faces from corner 0 to corner 1, then those from
     1 to 2, then those from 2 to 0. So row k m + i is edge k of face i."""
     return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+
+
+def has_distinct_corners(faces: IntArray) -> BoolArray:
+    """(m,) whether the three corners of each of the faces (m, 3) are different vertices."""
+    return (faces != np.roll(faces, 1, axis=1)).all(axis=1)
 
 
 def boundary_edges(faces: IntArray) -> IntArray:

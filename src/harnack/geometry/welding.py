@@ -12,7 +12,7 @@ import numpy as np
 
 from harnack.backend.validation import FloatArray, IntArray
 from harnack.geometry.boundary_edges import NetFaces, net_faces, singular_edges, weld_vertices
-from harnack.geometry.mesh_edges import shortest_edges_at_vertices
+from harnack.geometry.mesh_edges import has_distinct_corners, shortest_edges_at_vertices
 from harnack.geometry.meshes import zero_area_faces
 from harnack.geometry.neighborhoods import connected_groups, pairs_within
 
@@ -110,7 +110,7 @@ def _joined_by_rounding(positions: FloatArray, faces: IntArray, candidates: IntA
         representative = np.unique(group, return_index=True)[1][group]
         joined = representative[faces]
         changed_faces = np.flatnonzero((joined != faces).any(axis=1))
-        is_degenerate = (joined == np.roll(joined, 1, axis=1)).any(axis=1)
+        is_degenerate = ~has_distinct_corners(joined)
         # Faces that lose their area by the joining.
         new_flat = changed_faces[zero_area_faces(positions, joined[changed_faces])]
         is_degenerate[np.setdiff1d(new_flat, zero_area_faces(positions, faces))] = True

@@ -11,13 +11,14 @@ from harnack.geometry import Ball, Box, ConvexHull, HalfSpace, Volume, VolumeInt
 from harnack.geometry.mesh_edges import (
     boundary_edges,
     edge_keys,
+    has_distinct_corners,
     normals_at_vertices,
     shortest_edges_at_vertices,
 )
 from harnack.meshing.lattice_meshing import TriangleMesh
 from harnack.meshing.meshing_errors import MeshingError
 
-__all__ = ["clip_to_volume"]
+__all__ = ["clip_to_volume", "snap_to_box"]
 
 # Vertices that are no farther from a boundary than this, relative to the size of the mesh, count as
 # on it.
@@ -77,15 +78,15 @@ def clip_to_volume(surface: TriangleMesh, volume: Volume) -> TriangleMesh:
     for row in volume.planes():
         surface = _cut(surface, _ClipBoundary(row[:3] * row[3], row[:3], None))
     if isinstance(volume, Box):
-        return TriangleMesh(_snap_to_box(surface.vertices, volume), surface.faces)
+        return TriangleMesh(snap_to_box(surface.vertices, volume), surface.faces)
     return surface
 
 
-def _snap_to_box(vertices: FloatArray, box: Box) -> FloatArray:
+def snap_to_box(vertices: FloatArray, box: Box, rounding: float = _ON_BOUNDARY) -> FloatArray:
     """Move vertices (n, 3) onto the plane of a face of the box if only rounding separates them from
-    it; returns all vertices."""
+    it, by no more than `rounding` relative to the plane's coordinate; returns all vertices."""
     for end in box.bounds():
-        near = np.abs(vertices - end) <= _ON_BOUNDARY * (1 + np.abs(end))
+        near = np.abs(vertices - end) <= rounding * (1 + np.abs(end))
         vertices = np.where(near, end, vertices)
     return vertices
 
@@ -167,7 +168,7 @@ def _cut(surface: TriangleMesh, boundary: _ClipBoundary) -> TriangleMesh:
         )
     new = np.concatenate(pieces)
     # Where a corner lies on the boundary, two corners of a piece may be the same.
-    is_proper = (new != np.roll(new, 1, axis=1)).all(axis=1)
+    is_proper = has_distinct_corners(new)
     return TriangleMesh.without_unused_vertices(np.concatenate([vertices, points]), new[is_proper])
 
 

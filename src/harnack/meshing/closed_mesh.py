@@ -11,7 +11,7 @@ import numpy as np
 import trimesh
 
 from harnack.backend import BoolArray, FloatArray, IntArray
-from harnack.geometry.mesh_edges import unique_with_inverse
+from harnack.geometry.mesh_edges import has_distinct_corners, unique_with_inverse
 from harnack.meshing.checks import check_manifold
 from harnack.meshing.lattice_meshing import TriangleMesh
 from harnack.meshing.manifold_conversion import from_manifold, to_manifold, without_short_edges
@@ -177,7 +177,7 @@ def _merge_on_grid(surface: TriangleMesh, step: float) -> tuple[FloatArray, IntA
     first = np.empty(len(x), np.int64)
     first[group[::-1]] = np.arange(len(x))[::-1]
     faces = first[group][surface.faces]
-    return x, faces, (faces != np.roll(faces, 1, axis=1)).all(axis=1)
+    return x, faces, has_distinct_corners(faces)
 
 
 def _resolve_after_rounding(

@@ -43,6 +43,7 @@ from harnack.fields.solids.tube import Tube
 from harnack.geometry import Ball, Box, Volume, VolumeIntersection
 from harnack.meshing.bcc_lattice import BccLattice
 from harnack.meshing.checks import check_manifold
+from harnack.meshing.clipping import snap_to_box
 from harnack.meshing.components import drop_degenerate_components
 from harnack.meshing.csg_rewrite import drop_cancelled_operands, factor_common_operands, flatten_csg
 from harnack.meshing.lattice_meshing import (
@@ -886,7 +887,7 @@ def _mesh_in_volume(
     manifold = mesher.mesh_sublevel(solid, level)
     mesher.report("putting the parts together")
     if volume is None:
-        volume = Box(_as_tuple(lower), _as_tuple(upper))
+        volume = Box(tuple(lower.tolist()), tuple(upper.tolist()))
         # If the solid ends inside the box, it need not be cut at the box.
         ends = np.array(manifold.bounding_box(), np.float64)
         if (ends[:3] > lower).all() and (ends[3:] < upper).all():
@@ -922,11 +923,6 @@ def _bounds(solid: Solid, level: float, volume: Volume | None) -> tuple[FloatArr
     return lower, upper
 
 
-def _as_tuple(x: FloatArray) -> tuple[float, float, float]:
-    """The coordinates of a point (3,) as three floats."""
-    return float(x[0]), float(x[1]), float(x[2])
-
-
 def _snap_to_boxes(surface: TriangleMesh, volume: Volume) -> TriangleMesh:
     """The surface, with vertices moved onto the faces of boxes if they are outside, or within
     rounding of a face. The boxes are `volume` itself or, if it is an intersection of volumes, the
@@ -935,8 +931,5 @@ def _snap_to_boxes(surface: TriangleMesh, volume: Volume) -> TriangleMesh:
     vertices = surface.vertices
     for box in boxes:
         if isinstance(box, Box):
-            vertices = np.clip(vertices, *box.bounds())
-            for end in box.bounds():
-                near = np.abs(vertices - end) <= 1e-12 * (1 + np.abs(end))
-                vertices = np.where(near, end, vertices)
+            vertices = snap_to_box(np.clip(vertices, *box.bounds()), box, 1e-12)
     return TriangleMesh(vertices, surface.faces)

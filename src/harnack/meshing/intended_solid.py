@@ -25,6 +25,7 @@ from harnack.geometry import MeshError, validate_mesh, without_zero_area_faces
 from harnack.geometry.mesh_edges import (
     area_normals,
     distance_from_triangles,
+    has_distinct_corners,
     row_dots,
     row_norms,
 )
@@ -154,7 +155,7 @@ class IntendedSolid:
         if welded.rounded:
             faces = joined
         # Faces that still have three different corners.
-        rows = np.flatnonzero((joined != np.roll(joined, 1, axis=1)).all(axis=1))
+        rows = np.flatnonzero(has_distinct_corners(joined))
         # Every face has its reverse: keep one of both.
         if not len(welded.net.faces):
             rows = rows[np.unique(np.sort(joined[rows], axis=1), axis=0, return_index=True)[1]]

@@ -24,6 +24,7 @@ from harnack.geometry.mesh_edges import (
     Edges,
     area_normals,
     half_edges,
+    has_distinct_corners,
     row_dots,
     row_norms,
 )
@@ -98,7 +99,7 @@ def boundary_of_solid(vertices: FloatArray, faces: IntArray) -> TriangleMesh:
     first_at_place = np.unique(group, return_index=True)[1][group]  # corners of the mesh come first
     joined = first_at_place[len(x) :].reshape(-1, 3)
     # Pieces of which two corners became one vertex have no area.
-    joined = joined[(joined != np.roll(joined, 1, axis=1)).all(axis=1)]
+    joined = joined[has_distinct_corners(joined)]
     joined = _cut_at_corners(points, joined)
     all_vertices = np.concatenate([x, cut.center + cut.size * points[len(x) :]])
     return TriangleMesh.without_unused_vertices(*_apart_at_contacts(all_vertices, joined))

@@ -48,7 +48,7 @@ from harnack.meshing.marching_tetrahedra import (
     extract_triangles,
 )
 from harnack.meshing.meshing_errors import MeshingError, TriangleLimitError, UnrefinableError
-from harnack.meshing.refinement import refine, smooth, smooth_within_tolerance
+from harnack.meshing.refinement import fan_faces, refine, smooth, smooth_within_tolerance
 
 if TYPE_CHECKING:
     from harnack.tree.empty_space import Clearance
@@ -599,10 +599,9 @@ def split_faces_off_level(
         # Each of these faces becomes a fan of three around its new vertex. The new faces are the
         # last ones, and are examined in the next round.
         rows, new_vertices = pending[off_level], len(vertices) + np.arange(len(off_level))
-        a, b, c = faces[rows].T
         vertices = np.concatenate([vertices, moved])
-        fans = [np.stack([*ends, new_vertices], axis=1) for ends in ((a, b), (b, c), (c, a))]
-        faces = np.concatenate([np.delete(faces, rows, axis=0), *fans])
+        fans = fan_faces(faces[rows], new_vertices)
+        faces = np.concatenate([np.delete(faces, rows, axis=0), fans])
         pending = np.arange(len(faces) - 3 * len(rows), len(faces))
     return TriangleMesh(vertices, faces)
 

@@ -23,6 +23,7 @@ from harnack.geometry.mesh_edges import (
     area_normals,
     boundary_edges,
     half_edges,
+    has_distinct_corners,
     row_norms,
 )
 from harnack.geometry.neighborhoods import connected_groups, pairs_within
@@ -132,7 +133,7 @@ def weld_near_corners(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray
         count = np.bincount(group)[:, None]
         mean = np.stack([np.bincount(group, column) for column in points.T], axis=1) / count
         renumbered = group[corners]
-        welded_faces = renumbered[(renumbered != np.roll(renumbered, 1, axis=1)).all(axis=1)]
+        welded_faces = renumbered[has_distinct_corners(renumbered)]
         lost_edges = 3 * (
             len(faces) - len(welded_faces)
         )  # a lost triangle counts as three open edges

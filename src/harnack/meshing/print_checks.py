@@ -20,7 +20,7 @@ from harnack.backend.validation import as_positive
 from harnack.fields.solids.mesh_solid import MeshSolid
 from harnack.files.geometry_files import LoadedMesh, read_geometry
 from harnack.geometry import MeshError, validate_mesh, zero_area_faces
-from harnack.geometry.mesh_edges import Edges, half_edges, longest_edges
+from harnack.geometry.mesh_edges import Edges, half_edges, has_distinct_corners, longest_edges
 from harnack.geometry.welding import Welded
 from harnack.meshing.checks import nonmanifold_vertices
 from harnack.meshing.components import Shells
@@ -242,8 +242,7 @@ def _topology(x: FloatArray, faces: IntArray) -> list[PrintProblem]:
     x, faces: (n, 3), (m, 3) the mesh. Faces with two equal corners count only as faces without an
         area."""
     zero_area = zero_area_faces(x, faces)
-    has_equal_corners = (faces == np.roll(faces, 1, axis=1)).any(axis=1)
-    proper_faces = faces[~has_equal_corners]
+    proper_faces = faces[has_distinct_corners(faces)]
     pairs = half_edges(proper_faces)
     edges = Edges.of(pairs)
     middle = x[edges.vertices].mean(axis=1)
@@ -346,7 +345,7 @@ def _contacts(
     is_without_flat_faces = np.isin(
         shells.component_of_face, shells.component_of_face[is_flat], invert=True
     )
-    rows = np.flatnonzero((faces != np.roll(faces, 1, axis=1)).all(axis=1))
+    rows = np.flatnonzero(has_distinct_corners(faces))
     # Duplicates are reported separately.
     rows = rows[np.unique(np.sort(faces[rows], axis=1), axis=0, return_index=True)[1]]
     crossing = intersecting_faces(x, faces[rows])

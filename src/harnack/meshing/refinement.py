@@ -35,6 +35,7 @@ from harnack.meshing.level_function import LevelFunction, LevelSamples
 from harnack.meshing.mesh_improvement import collapse_slivers, flip_edges, relax_vertices
 
 __all__ = [
+    "fan_faces",
     "improve",
     "refine",
     "smooth",
@@ -129,10 +130,8 @@ def refine(
         vertices = np.concatenate(
             [vertices, _crease_corners(function, vertices, faces[is_fan], walls)]
         )
-        a, b, c = faces[is_fan].T
-        fans = [np.stack([*ends, fan_centers], axis=1) for ends in ((a, b), (b, c), (c, a))]
         smaller_faces = split_faces(vertices, faces[~is_fan], new_vertex[marks.edges[~is_fan]])
-        faces = np.concatenate([smaller_faces, *fans])
+        faces = np.concatenate([smaller_faces, fan_faces(faces[is_fan], fan_centers)])
     if function.field.has_variable_accuracy:
         vertices = _converge_vertices(function, vertices, faces, tolerance, walls)
     return vertices, faces
@@ -402,6 +401,13 @@ def _edges(faces: IntArray) -> tuple[IntArray, IntArray, BoolArray]:
     """
     edges = Edges.of(half_edges(faces))
     return edges.vertices, edges.edge_of_pair.reshape(3, -1).T, edges.multiplicity == 1
+
+
+def fan_faces(faces: IntArray, centers: IntArray) -> IntArray:
+    """Divide each of the faces (k, 3) into a fan of three around a new vertex in its interior.
+    Returns the faces (3k, 3). centers: (k,) the indices of the new vertices."""
+    a, b, c = faces.T
+    return np.concatenate([np.stack([*ends, centers], 1) for ends in ((a, b), (b, c), (c, a))])
 
 
 def split_faces(vertices: FloatArray, faces: IntArray, middle: IntArray) -> IntArray:

@@ -24,6 +24,7 @@ from harnack.geometry.mesh_edges import (
     distance_from_triangles,
     edge_keys,
     half_edges,
+    has_distinct_corners,
     row_dots,
     row_norms,
     sorted_unique,
@@ -203,7 +204,7 @@ class _Neighborhood:
         old_rows = self.around(a)
         new_faces = np.where(self.faces[old_rows] == a, b, self.faces[old_rows])
         # Faces of which two corners are now the same vanish.
-        return old_rows, new_faces[(new_faces != np.roll(new_faces, 1, axis=1)).all(axis=1)]
+        return old_rows, new_faces[has_distinct_corners(new_faces)]
 
     def flip_edge(self, a: int, b: int) -> tuple[IntArray, IntArray] | None:
         """Replace the edge between the vertices a and b by the edge between the two corners
