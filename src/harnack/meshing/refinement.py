@@ -35,6 +35,7 @@ from harnack.meshing.level_function import LevelFunction, LevelSamples
 from harnack.meshing.mesh_improvement import collapse_slivers, flip_edges, relax_vertices
 
 __all__ = [
+    "cuts_off_crease",
     "fan_faces",
     "improve",
     "refine",
@@ -47,9 +48,9 @@ __all__ = [
 Walls = tuple[FloatArray, FloatArray] | None
 # A function from points (k, 3) to the mask (k,) of those that matter; None if all do.
 Where = Callable[[FloatArray], BoolArray] | None
-# An edge cuts off a crease if the normals at its ends differ by at least the first number, an
-# angle; and the normals at its middle and at one of its ends by at least the second number times
-# the angle between the normals at both ends.
+# At the ends of an edge that cuts off a crease, normals differ by more than the first number, an
+# angle; at a point between and at one of the ends by at least the second times the angle between
+# those at both ends.
 _CREASE, _SHARE = math.radians(20), 0.75
 # A vertex within this distance, relative to the tolerance, counts as on the surface.
 _ON_SURFACE = 1e-5
@@ -198,13 +199,9 @@ def _project_to_creases(
     midpoint_normal = unit_rows(function.sample(moved).gradient)
     n_a, n_b = end_normals[:, 0], end_normals[:, 1]
     cosine = row_dots(n_a, n_b)
-    angle_to_end = np.arccos(
-        np.clip(np.minimum(row_dots(n_a, midpoint_normal), row_dots(n_b, midpoint_normal)), -1, 1)
-    )
-    angle_of_ends = np.arccos(np.clip(cosine, -1, 1))
     # The last condition: the tangent planes are not nearly parallel, so that they meet in a line.
     rows = np.flatnonzero(
-        (angle_of_ends > _CREASE) & (angle_to_end > _SHARE * angle_of_ends) & (1 - cosine**2 > 0.01)
+        cuts_off_crease(n_a, n_b, midpoint_normal, _CREASE) & (1 - cosine**2 > 0.01)
     )
     if not len(rows):
         return moved
@@ -221,6 +218,26 @@ def _project_to_creases(
     moved = moved.copy()
     moved[rows[is_found]] = projected[is_found]
     return moved
+
+
+def cuts_off_crease(
+    first: FloatArray, second: FloatArray, between: FloatArray, min_angle: float
+) -> BoolArray:
+    """(k,) whether edges of a mesh cut off a crease of the surface. The normals at both ends differ
+    by more than `min_angle` (in radians), and those between the ends and at one of the ends by
+    nearly that angle. On a smooth surface the latter two differ by about half of it.
+
+    first, second: (k, 3) the normals of the surface at the ends of each edge.
+    between: (k, 3) those at a point of the surface between the ends.
+    """
+    angle_of_ends, angle_to_end = (
+        np.arccos(np.clip(cosine, -1, 1))
+        for cosine in (
+            row_dots(first, second),
+            np.minimum(row_dots(first, between), row_dots(second, between)),
+        )
+    )
+    return (angle_of_ends > min_angle) & (angle_to_end > _SHARE * angle_of_ends)
 
 
 def _crease_corners(

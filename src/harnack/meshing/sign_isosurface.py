@@ -50,7 +50,7 @@ from harnack.meshing.meshing_errors import (
     LocalizedMeshingError,
     MeshingError,
 )
-from harnack.meshing.refinement import split_faces
+from harnack.meshing.refinement import cuts_off_crease, split_faces
 from harnack.meshing.self_intersection import intersecting_faces
 from harnack.meshing.sign_function import SignFunction
 
@@ -82,9 +82,8 @@ _SIMPLIFY_TOLERANCE, _SIMPLIFY_CELL_FRACTION = 0.5, 0.05
 _SHORTEST = 4.0
 # An edge is cut no nearer to its ends than this, relative to its length.
 _FROM_CORNERS = 0.1
-# Across a crease normals turn by at least this angle; and by this fraction of the angle between the
-# point on the crease and one of the ends of the edge.
-_MIN_CREASE_ANGLE, _CREASE_ANGLE_SHARE = math.radians(2), 0.75
+# Across a crease normals turn by more than this angle.
+_MIN_CREASE_ANGLE = math.radians(2)
 # The level set is searched for on the line from an edge to the point where tangent planes meet. The
 # search begins before the edge and ends after that point, by the first and up to the second of the
 # displacement between them. The displacement is clamped to the third, in lengths of the edge.
@@ -578,17 +577,8 @@ class _CreaseRefinement:
         ends = all_edges.vertices[rows]
         vertex_of_edge = np.full(len(all_edges.vertices), -1, np.int64)
         vertex_of_edge[rows] = len(x) + np.arange(len(rows))
-        # Two angles for each split edge: between the normals at its ends; and the larger one
-        # between the normal at the new vertex and that at an end.
-        angle_of_ends, angle_to_end = (
-            np.arccos(np.clip(cosine, -1, 1))
-            for cosine in (
-                row_dots(normals[ends[:, 0]], normals[ends[:, 1]]),
-                np.minimum(*(row_dots(normals[ends[:, k]], new_normal) for k in (0, 1))),
-            )
-        )
-        is_on_crease = (angle_of_ends > _MIN_CREASE_ANGLE) & (
-            angle_to_end > _CREASE_ANGLE_SHARE * angle_of_ends
+        is_on_crease = cuts_off_crease(
+            normals[ends[:, 0]], normals[ends[:, 1]], new_normal, _MIN_CREASE_ANGLE
         )
         is_bent = np.concatenate([bent, is_on_crease])
         new_vertices_of_face = vertex_of_edge[edges]
