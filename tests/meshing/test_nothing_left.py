@@ -10,7 +10,7 @@ import trimesh
 
 import harnack as hk
 from harnack.meshing.components import drop_degenerate_components
-from harnack.meshing.lattice_meshing import TriangleMesh
+from harnack.meshing.triangle_mesh import TriangleMesh
 
 BALL = trimesh.creation.icosphere(2)
 

@@ -17,8 +17,8 @@ from harnack.cli import main
 from harnack.geometry import example_curves
 from harnack.meshing import checks, components, thickening
 from harnack.meshing.bcc_lattice import BccLattice
-from harnack.meshing.lattice_meshing import TriangleMesh
 from harnack.meshing.self_intersection import intersecting_faces
+from harnack.meshing.triangle_mesh import TriangleMesh
 from tests.oracles.extents import longest_side
 from tests.oracles.mesh_files import read_closed
 

@@ -28,10 +28,10 @@ from harnack.meshing.checks import check_manifold
 from harnack.meshing.components import winding_around
 from harnack.meshing.csg_meshing import apart_of
 from harnack.meshing.joined_pieces import boundary_of_solid, neighbors, passes_itself
-from harnack.meshing.lattice_meshing import TriangleMesh
 from harnack.meshing.manifold_conversion import grown, to_manifold
 from harnack.meshing.meshing_errors import SelfIntersectionError
 from harnack.meshing.self_intersection import intersecting_faces
+from harnack.meshing.triangle_mesh import TriangleMesh
 
 if TYPE_CHECKING:
     from manifold3d import Manifold

@@ -15,8 +15,8 @@ from harnack.geometry.mesh_edges import (
     normals_at_vertices,
     shortest_edges_at_vertices,
 )
-from harnack.meshing.lattice_meshing import TriangleMesh
 from harnack.meshing.meshing_errors import MeshingError
+from harnack.meshing.triangle_mesh import TriangleMesh
 
 __all__ = ["clip_to_volume", "snap_to_box"]
 

@@ -13,7 +13,6 @@ import trimesh
 from harnack.backend import BoolArray, FloatArray, IntArray
 from harnack.geometry.mesh_edges import has_distinct_corners, unique_with_inverse
 from harnack.meshing.checks import check_manifold
-from harnack.meshing.lattice_meshing import TriangleMesh
 from harnack.meshing.manifold_conversion import from_manifold, to_manifold, without_short_edges
 from harnack.meshing.meshing_errors import (
     LocalizedMeshingError,
@@ -22,6 +21,7 @@ from harnack.meshing.meshing_errors import (
 )
 from harnack.meshing.self_intersection import intersecting_faces
 from harnack.meshing.self_intersection_repair import resolve_self_intersections
+from harnack.meshing.triangle_mesh import TriangleMesh
 
 __all__ = ["ClosedMesh"]
 

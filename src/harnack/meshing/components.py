@@ -19,8 +19,8 @@ from harnack.geometry.mesh_edges import (
 )
 from harnack.geometry.meshes import solid_angles
 from harnack.geometry.neighborhoods import connected_groups
-from harnack.meshing.lattice_meshing import TriangleMesh
 from harnack.meshing.meshing_errors import MeshingError
+from harnack.meshing.triangle_mesh import TriangleMesh
 
 __all__ = [
     "Shells",

@@ -49,7 +49,6 @@ from harnack.meshing.csg_rewrite import drop_cancelled_operands, factor_common_o
 from harnack.meshing.lattice_meshing import (
     IrrelevantRegion,
     MissedPartsError,
-    TriangleMesh,
     mesh_closed_surface,
     split_faces_off_level,
 )
@@ -81,6 +80,7 @@ from harnack.meshing.meshing_errors import (
 from harnack.meshing.outlier_projection import project_outliers
 from harnack.meshing.self_intersection_repair import resolve_self_intersections
 from harnack.meshing.thread_mesh import thread_manifold
+from harnack.meshing.triangle_mesh import TriangleMesh
 from harnack.meshing.tube_mesh import tube_manifold
 
 if TYPE_CHECKING:

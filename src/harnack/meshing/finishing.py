@@ -19,11 +19,11 @@ from harnack.geometry.mesh_edges import (
     unit_normals,
 )
 from harnack.meshing.checks import euler_characteristic
-from harnack.meshing.lattice_meshing import TriangleMesh
 from harnack.meshing.level_function import LevelFunction
 from harnack.meshing.manifold_conversion import from_manifold, to_manifold, without_short_edges
 from harnack.meshing.meshing_errors import MeshingError
 from harnack.meshing.self_intersection_repair import resolve_self_intersections
+from harnack.meshing.triangle_mesh import TriangleMesh
 
 if TYPE_CHECKING:
     from collections.abc import Callable

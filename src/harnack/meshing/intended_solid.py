@@ -31,8 +31,8 @@ from harnack.geometry.mesh_edges import (
 )
 from harnack.geometry.welding import Welded
 from harnack.meshing.bodies import closed_parts, nested, volume_of
-from harnack.meshing.lattice_meshing import TriangleMesh
 from harnack.meshing.mesh_cleaning import against_neighbors
+from harnack.meshing.triangle_mesh import TriangleMesh
 
 __all__ = ["Difference", "IntendedSolid"]
 

@@ -30,9 +30,9 @@ from harnack.geometry.mesh_edges import (
 )
 from harnack.geometry.meshes import without_zero_area_faces
 from harnack.geometry.neighborhoods import connected_groups, kd_tree, pairs_within
-from harnack.meshing.lattice_meshing import TriangleMesh
 from harnack.meshing.meshing_errors import MeshingError
 from harnack.meshing.self_intersection import touching_pairs
+from harnack.meshing.triangle_mesh import TriangleMesh
 from harnack.tree import build_balanced_tree
 from harnack.tree.coplanar import overlapping_faces
 from harnack.tree.triangle_splitting import split_intersecting_faces, windings_of_sides

@@ -49,6 +49,7 @@ from harnack.meshing.marching_tetrahedra import (
 )
 from harnack.meshing.meshing_errors import MeshingError, TriangleLimitError, UnrefinableError
 from harnack.meshing.refinement import fan_faces, refine, smooth, smooth_within_tolerance
+from harnack.meshing.triangle_mesh import TriangleMesh
 
 if TYPE_CHECKING:
     from harnack.tree.empty_space import Clearance
@@ -56,7 +57,6 @@ if TYPE_CHECKING:
 __all__ = [
     "IrrelevantRegion",
     "MissedPartsError",
-    "TriangleMesh",
     "check_estimated_triangles",
     "check_no_missed_parts",
     "mesh_closed_surface",
@@ -363,31 +363,6 @@ _BORDER = 2.0
 # The number of cells along an edge of a block.
 _BLOCK = 8
 _MOST_ROUNDS = 20
-
-
-@dataclass(frozen=True)
-class TriangleMesh:
-    """A triangle mesh in space.
-
-    vertices: (n, 3).
-    faces: (m, 3) the indices of the vertices of each face, counter-clockwise as seen from the
-        outside, where the meshed function is larger."""
-
-    vertices: FloatArray
-    faces: IntArray
-
-    @classmethod
-    def without_unused_vertices(cls, vertices: FloatArray, faces: IntArray) -> TriangleMesh:
-        """The mesh of `faces` (m, 3) with only those of the `vertices` (n, 3) that a face uses.
-        Their order stays; faces are renumbered."""
-        used = np.flatnonzero(np.bincount(faces.ravel()))
-        index = np.full(len(vertices), -1, np.int64)
-        index[used] = np.arange(len(used))
-        return cls(vertices[used], index[faces])
-
-    def reversed(self) -> TriangleMesh:
-        """The same mesh with the orientation of all faces reversed."""
-        return TriangleMesh(self.vertices, self.faces[:, ::-1])
 
 
 @dataclass(frozen=True)

@@ -31,9 +31,9 @@ from harnack.fields.solid_angles.oriented_points import OrientedPoints
 from harnack.fields.solid_angles.winding_number import WindingNumber
 from harnack.geometry.mesh_edges import area_normals, distances_from_triangles, row_norms
 from harnack.geometry.neighborhoods import kd_tree
-from harnack.meshing.lattice_meshing import TriangleMesh
 from harnack.meshing.meshing_errors import point_text
 from harnack.meshing.sign_function import SignFunction
+from harnack.meshing.triangle_mesh import TriangleMesh
 
 if TYPE_CHECKING:
     from harnack.fields import Field

@@ -32,9 +32,9 @@ from harnack.meshing.checks import check_manifold, nonmanifold_vertices
 from harnack.meshing.components import Shells, faces_to_flip
 from harnack.meshing.hole_filling import fill_holes, hole_loops
 from harnack.meshing.joined_pieces import passes_itself
-from harnack.meshing.lattice_meshing import TriangleMesh
 from harnack.meshing.meshing_errors import MeshingError
 from harnack.meshing.self_intersection import intersecting_faces
+from harnack.meshing.triangle_mesh import TriangleMesh
 
 __all__ = ["CleanedMesh", "against_neighbors", "clean_and_fill", "weld_near_corners"]
 

@@ -38,7 +38,7 @@ from harnack.meshing.csg_meshing import (
 )
 from harnack.meshing.curve_spanning import mesh_spanning_curve
 from harnack.meshing.finishing import check_options, simplify_mesh, to_trimesh, vertex_normals
-from harnack.meshing.lattice_meshing import TriangleMesh, mesh_open_surface
+from harnack.meshing.lattice_meshing import mesh_open_surface
 from harnack.meshing.level_function import CELLS_PER_WAVE, MOST_FACES, LevelFunction
 from harnack.meshing.lost_parts import LostParts
 from harnack.meshing.manifold_conversion import (
@@ -66,6 +66,7 @@ from harnack.meshing.sign_isosurface import (
     mesh_from_signs,
 )
 from harnack.meshing.thickening import thicken
+from harnack.meshing.triangle_mesh import TriangleMesh
 from harnack.progress import teller
 from harnack.tracer import Surface
 from harnack.tracer.surface import intersection_of

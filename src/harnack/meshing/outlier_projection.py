@@ -17,12 +17,12 @@ import numpy as np
 from harnack.backend import BoolArray, FloatArray, IntArray
 from harnack.geometry.mesh_edges import edge_keys, half_edges, row_norms, sorted_unique
 from harnack.meshing.delaunay_points import newton_to_level
-from harnack.meshing.lattice_meshing import TriangleMesh
 from harnack.meshing.level_function import LevelFunction
 from harnack.meshing.meshing_errors import MeshingError, OffLevelError
 from harnack.meshing.refinement import fan_faces, split_faces
 from harnack.meshing.self_intersection import intersecting_faces
 from harnack.meshing.self_intersection_repair import resolve_local_intersections
+from harnack.meshing.triangle_mesh import TriangleMesh
 
 __all__ = ["project_outliers"]
 

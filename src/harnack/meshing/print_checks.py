@@ -24,10 +24,10 @@ from harnack.geometry.mesh_edges import Edges, half_edges, has_distinct_corners,
 from harnack.geometry.welding import Welded
 from harnack.meshing.checks import nonmanifold_vertices
 from harnack.meshing.components import Shells
-from harnack.meshing.lattice_meshing import TriangleMesh
 from harnack.meshing.meshing_errors import point_text
 from harnack.meshing.self_intersection import intersecting_faces, touching_pairs
 from harnack.meshing.thickness import wall_thickness
+from harnack.meshing.triangle_mesh import TriangleMesh
 
 __all__ = ["PrintCheck", "PrintProblem", "check_print"]
 

@@ -49,12 +49,12 @@ from harnack.meshing.harmonic_filling import (
 from harnack.meshing.hole_filling import fill_holes, hole_loops
 from harnack.meshing.intended_solid import Difference, IntendedSolid
 from harnack.meshing.joined_pieces import passes_itself
-from harnack.meshing.lattice_meshing import TriangleMesh
 from harnack.meshing.mesh_cleaning import CleanedMesh, clean_and_fill, weld_near_corners
 from harnack.meshing.mesh_pipeline import mesh as mesh_of
 from harnack.meshing.mesh_tolerance import MeshTolerance
 from harnack.meshing.meshing_errors import MeshingError, TriangleLimitError
 from harnack.meshing.self_intersection import intersecting_faces
+from harnack.meshing.triangle_mesh import TriangleMesh
 from harnack.name_suggestions import is_one_of
 from harnack.progress import teller
 from harnack.tracer.trace_options import trace_options

@@ -31,9 +31,9 @@ from harnack.geometry.mesh_edges import (
 )
 from harnack.geometry.neighborhoods import connected_groups
 from harnack.meshing.checks import check_no_self_intersection
-from harnack.meshing.lattice_meshing import TriangleMesh
 from harnack.meshing.meshing_errors import SelfIntersectionError
 from harnack.meshing.self_intersection import intersecting_faces
+from harnack.meshing.triangle_mesh import TriangleMesh
 
 __all__ = ["resolve_local_intersections", "resolve_self_intersections"]
 

@@ -39,7 +39,6 @@ from harnack.geometry.neighborhoods import kd_tree
 from harnack.meshing.bcc_lattice import BccLattice, distinct_rows
 from harnack.meshing.checks import check_triangle_limit, points_off_level
 from harnack.meshing.delaunay_points import TetrahedronPoints
-from harnack.meshing.lattice_meshing import TriangleMesh
 from harnack.meshing.level_function import LevelSamples
 from harnack.meshing.lost_parts import LostParts, PointsOnLevel
 from harnack.meshing.manifold_conversion import from_manifold, to_manifold, without_short_edges
@@ -53,6 +52,7 @@ from harnack.meshing.meshing_errors import (
 from harnack.meshing.refinement import cuts_off_crease, split_faces
 from harnack.meshing.self_intersection import intersecting_faces
 from harnack.meshing.sign_function import SignFunction
+from harnack.meshing.triangle_mesh import TriangleMesh
 
 if TYPE_CHECKING:
     from harnack.geometry import Volume
